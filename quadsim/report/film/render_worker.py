@@ -9,14 +9,12 @@ from __future__ import annotations
 import itertools
 import json
 import pickle
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
 import imageio
-import imageio_ffmpeg
 import mujoco
 import numpy as np
 
@@ -189,18 +187,6 @@ def film(shot: Shot, path: Path) -> None:
             print(i, flush=True)
 
 
-def join(segments: Path, path: Path) -> None:
-    """Join the MP4 files that an ffmpeg concat list names, without encoding again."""
-    _ffmpeg("-f", "concat", "-safe", "0", "-i", str(segments), "-c", "copy", "-movflags", "+faststart", str(path))
-
-
-def make_gif(source: Path, path: Path, width: int) -> None:
-    """Turn an MP4 into a looping GIF of a given width [pixels], with few colours and little noise to keep it small."""
-    picture = f"scale={width}:-2:flags=area,hqdn3d=3:3:0:0,split[a][b];[a]palettegen=max_colors=96:stats_mode=diff[p]"
-    dither = "[b][p]paletteuse=dither=none:diff_mode=rectangle"
-    _ffmpeg("-i", str(source), "-filter_complex", f"{picture};{dither}", "-loop", "0", str(path))
-
-
 def draw_portrait(vehicle: Vehicle, path: Path, width: int, height: int) -> None:
     """Draw a vehicle standing on a floor of 10 cm squares, seen from its front left."""
     model = compile_model(vehicle, visuals=True)
@@ -263,37 +249,13 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
             pictures.flush()
 
 
-def probe() -> None:
-    """Render one tiny picture, and fail unless there is something in it."""
-    model = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></mujoco>"
-    )
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    with mujoco.Renderer(model, 32, 32) as renderer:
-        renderer.update_scene(data)
-        if not renderer.render().any():
-            raise RuntimeError("the picture is black")
-
-
-def _ffmpeg(*arguments: str) -> None:
-    start = (imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error")
-    subprocess.run([*start, *arguments], check=True, stdin=subprocess.DEVNULL)
-
-
 def main(arguments: list[str]) -> None:
-    """Do `probe`, `serve`, `film SHOT MP4`, `join LIST MP4`, `gif MP4 GIF WIDTH` or `portrait VEHICLE PNG W H`."""
+    """Do `serve`, `film SHOT MP4` or `portrait VEHICLE PNG W H`."""
     match arguments:
-        case ["probe"]:
-            probe()
         case ["serve"]:
             serve(sys.stdin.buffer, sys.stdout.buffer)
         case ["film", shot, path]:
             film(Shot(**json.loads(shot)), Path(path))
-        case ["join", segments, path]:
-            join(Path(segments), Path(path))
-        case ["gif", source, path, width]:
-            make_gif(Path(source), Path(path), int(width))
         case ["portrait", vehicle, path, width, height]:
             draw_portrait(Vehicle(**json.loads(vehicle)), Path(path), int(width), int(height))
         case _:

@@ -1,7 +1,7 @@
 """A run directory -> a film of its flight, rendered after the flight in child processes.
 
 The caller never touches OpenGL: each child (`render_worker`) gets its own environment, renders and encodes a run of
-frames, and one more joins the pieces without encoding again.
+frames, and ffmpeg joins the pieces without encoding again.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from quadsim.vehicle import Vehicle
 
 BACKENDS: Final = ("egl", "osmesa")  # what can render without a screen, in the order tried
 _WORKER: Final = (sys.executable, "-m", "quadsim.report.film.render_worker")
+_PROBE: Final = (sys.executable, "-m", "quadsim.report.film.probe")
 _PROBE_SECONDS: Final = 60.0
 _LEAST_FREE_BYTES: Final = 1024 * 1024
 _FEWEST_FRAMES: Final = 30  # A further worker is not worth its start for fewer frames than these
@@ -58,8 +59,7 @@ def rendering_backend() -> str:
 
 @functools.cache  # a working one is not tried again by this process; one that raises is
 def _probe(backend: str) -> None:
-    command = [*_WORKER, "probe"]
-    subprocess.run(command, env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS)
+    subprocess.run(_PROBE, env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS)
 
 
 def worker_count(frames: int, most: int | None = None) -> int:
@@ -137,14 +137,14 @@ def render_gif(
     with _making(path, ".gif") as new:
         film = new.with_suffix(".mp4")
         backend = _film(shot, film, workers, None)
-        _work([("gif", str(film), str(new), str(width))], backend, new.parent)
+        _work([_to_gif(film, new, width)], backend, new.parent)
 
 
 def render_portrait(vehicle: Vehicle, path: Path, *, width: int = 1280, height: int = 720) -> None:
     """Draw a vehicle standing on a floor of 10 cm squares, as a PNG of so many pixels; errors as `render_video`."""
     with _making(path, ".png") as new:
-        task = ("portrait", json.dumps(asdict(vehicle)), str(new), str(width), str(height))
-        _work([task], rendering_backend(), new.parent)
+        command = (*_WORKER, "portrait", json.dumps(asdict(vehicle)), str(new), str(width), str(height))
+        _work([command], rendering_backend(), new.parent)
 
 
 def _plan(run: Run, start: float, stop: float | None, shot: Shot) -> Shot:
@@ -162,12 +162,34 @@ def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None
     edges = [shot.count * piece // pieces for piece in range(pieces + 1)]
     shots = [replace(shot, first=a, count=b - a) for a, b in itertools.pairwise(edges)]
     names = [f"piece{piece}.mp4" for piece in range(pieces)]
-    tasks = [("film", json.dumps(asdict(s)), str(path.parent / name)) for s, name in zip(shots, names, strict=True)]
-    _work(tasks, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
+    commands = [
+        (*_WORKER, "film", json.dumps(asdict(s)), str(path.parent / name)) for s, name in zip(shots, names, strict=True)
+    ]
+    _work(commands, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
     listing = path.parent / "pieces.txt"
     listing.write_text("".join(f"file '{name}'\n" for name in names), encoding="utf-8")
-    _work([("join", str(listing), str(path))], backend, path.parent)
+    _work([_join(listing, path)], backend, path.parent)
     return backend
+
+
+def _join(listing: Path, path: Path) -> tuple[str, ...]:
+    """The command that joins the MP4 files which an ffmpeg concat list names, without encoding again."""
+    copied = ("-f", "concat", "-safe", "0", "-i", str(listing), "-c", "copy", "-movflags", "+faststart")
+    return (*_ffmpeg(), *copied, str(path))
+
+
+def _to_gif(film: Path, path: Path, width: int) -> tuple[str, ...]:
+    """The command that makes a looping GIF of an MP4, `width` pixels wide, small by few colours and little noise."""
+    picture = f"scale={width}:-2:flags=area,hqdn3d=3:3:0:0,split[a][b];[a]palettegen=max_colors=96:stats_mode=diff[p]"
+    dither = "[b][p]paletteuse=dither=none:diff_mode=rectangle"
+    return (*_ffmpeg(), "-i", str(film), "-filter_complex", f"{picture};{dither}", "-loop", "0", str(path))
+
+
+def _ffmpeg() -> tuple[str, ...]:
+    """The command of ffmpeg, without its banner and without standard input."""
+    import imageio_ffmpeg
+
+    return (imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-y", "-loglevel", "error")
 
 
 class _WorkerFailure(Exception):
@@ -204,21 +226,21 @@ def _environment(backend: str, workers: int = 1) -> dict[str, str]:
 
 
 def _work(
-    tasks: Sequence[Sequence[str]], backend: str, folder: Path, report: Callable[[int], None] | None = None
+    commands: Sequence[Sequence[str]], backend: str, folder: Path, report: Callable[[int], None] | None = None
 ) -> None:
-    """Run worker tasks side by side; when one fails, or anything is raised here, the others are killed.
+    """Run commands of workers side by side; when one fails, or anything is raised here, the others are killed.
 
     Their stderr goes to `folder`; `report` is called with the sum of the last numbers that they printed.
     """
     with contextlib.ExitStack() as stack:
         watched = stack.enter_context(selectors.DefaultSelector())
         logs: list[IO[bytes]] = []
-        done = [0] * len(tasks)
-        environment = _environment(backend, len(tasks))
-        for i, task in enumerate(tasks):
+        done = [0] * len(commands)
+        environment = _environment(backend, len(commands))
+        for i, command in enumerate(commands):
             logs.append(stack.enter_context((folder / f"worker{i}.log").open("w+b")))
             process = stack.enter_context(
-                subprocess.Popen([*_WORKER, *task], env=environment, stdout=subprocess.PIPE, stderr=logs[i])
+                subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=logs[i])
             )
             stack.callback(process.kill)  # runs before Popen's own exit, which waits; kills none that has ended
             assert process.stdout is not None

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import elliprd
 
 from quadsim.state import Array
 
@@ -27,6 +26,8 @@ def added_mass(areas: Sequence[float], density: float) -> Array:
         areas: projected ones along its axes [m^2].
         density: of the air [kg/m^3].
     """
+    from scipy.special import elliprd  # whose package takes a while to load, and what draws the vehicle needs none
+
     r = semi_axes(areas)
     squares, product = np.square(r), float(np.prod(r))
     alpha = 2.0 / 3.0 * product * elliprd(np.roll(squares, -1), np.roll(squares, -2), squares)

@@ -199,19 +199,17 @@ def test_the_users_backend_is_tried_first(monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.fixture
-def fake_worker(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     """Workers that report one frame; the one that renders the first frames then waits, another fails."""
     script = (
         "import json, sys, time\n"
-        "if sys.argv[1] == 'probe': sys.exit()\n"
         "print(1, flush=True)\n"
         "open(sys.argv[3], 'w').write('half a film')\n"
         "if json.loads(sys.argv[2])['first'] == 0: time.sleep(600)\n"
         "sys.exit('Traceback ...\\nGLError: the picture is lost')\n"
     )
     monkeypatch.setattr(video, "_WORKER", (sys.executable, "-c", script))
-    yield
-    video._probe.cache_clear()  # what it answered is not known of the real one
+    monkeypatch.setattr(video, "rendering_backend", lambda: "egl")
 
 
 @pytest.mark.usefixtures("fake_worker")
@@ -248,8 +246,6 @@ def test_ctrl_c_kills_the_workers(short_run: Run, tmp_path: Path, monkeypatch: p
     def interrupt(_: int, __: int) -> None:
         raise KeyboardInterrupt
 
-    rendering_backend()  # the probe is not one of the workers to be watched
-    monkeypatch.setattr(video, "rendering_backend", lambda: "egl")
     monkeypatch.setattr(subprocess, "Popen", spy)
     with pytest.raises(KeyboardInterrupt):
         render_video(short_run.directory, tmp_path / "film.mp4", workers=2, progress=interrupt)
