@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import gc
 import os
 import pickle
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import settings
+from support import Here, draw_nothing
 
+from quadsim.controller import Controller
 from quadsim.flight import rundir
 from quadsim.flight.rundir import Run
+from quadsim.report.recording import write_recording
+from quadsim.sim.effects import Force
 from quadsim.vehicle import Vehicle
 from scenarios.cost.measure import ARM_LENGTHS, DRAGS
 from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
@@ -24,7 +29,10 @@ from scenarios.flight import Flight, Outputs
 from scenarios.gc_tuning import freeze_for_good
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.progress import Progress, silent
 from scenarios.run import fly_scenario, run_scenario
+from scenarios.schema.scenario import Scenario
+from scenarios.shipped import scenario_names
 
 # Compiled code is cached, whatever the environment sets: the workers, and all processes that tests
 # start, would compile the same modules again.  `make clean` removes it.
@@ -139,6 +147,53 @@ def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Figure, "savefig", sketch)
     monkeypatch.setattr(Figure, "get_layout_engine", lambda _: None)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """See `support.draw_nothing`."""
+    draw_nothing(monkeypatch)
+
+
+@pytest.fixture
+def recorded_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recordings are written in this process, which imports rerun once, not in one of their own each."""
+
+    @contextlib.contextmanager
+    def recording(directory: Path) -> Iterator[None]:
+        yield
+        write_recording(rundir.load_run(directory), directory / rundir.RECORDING_FILE)
+
+    monkeypatch.setattr("quadsim.report.recording.recording_in_background", recording)
+
+
+@pytest.fixture
+def cheap_benchmarks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`bench ladder` and `bench speed` with `--quick` fly here, less; small films: that they run is what is tested."""
+    monkeypatch.setattr("scenarios.bench.worker_pool.ProcessPoolExecutor", Here)
+    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.QUICK_DURATION", 1.0)
+    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.TIMED", 1)
+    monkeypatch.setattr("scenarios.bench.speed.QUICK_SPEEDS", (6.0,))
+    monkeypatch.setattr("scenarios.bench.film.WIDTH", 320)
+    monkeypatch.setattr("scenarios.bench.film.HEIGHT", 180)
+
+
+@pytest.fixture
+def fly_known(fly_once: Fly) -> Fly:
+    """Stands in for `scenarios.run.fly_scenario`: a scenario as the library has it is flown once per session."""
+
+    def fly(
+        scenario: Scenario,
+        progress: Progress = silent,
+        law: Controller | None = None,
+        forces: Sequence[Force] | None = None,
+    ) -> Flight:
+        known = scenario.name in scenario_names() and load_scenario(scenario.name) == scenario
+        if known and law is None and not forces:
+            return fly_once(scenario.name)
+        return fly_scenario(scenario, progress, law, forces)
+
+    return fly
 
 
 @pytest.fixture(scope="session")

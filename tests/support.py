@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 from ocp_peer import Period
 from scipy.linalg import block_diag
 
@@ -37,6 +38,14 @@ class Here:
 
     def shutdown(self, **_: object) -> None:
         pass
+
+
+def draw_nothing(patch: pytest.MonkeyPatch) -> None:
+    """Leave the files of figures empty, for tests of what is neither a figure nor its text."""
+    from matplotlib.figure import Figure
+
+    patch.setattr(Figure, "savefig", lambda *_arguments, **_options: None)
+    patch.setattr(Figure, "get_layout_engine", lambda _: None)
 
 
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:
