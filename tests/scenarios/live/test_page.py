@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time as clock
 import urllib.error
@@ -29,13 +28,12 @@ from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.live.guard import Guard
 from scenarios.live.pacing import Pace
 from scenarios.live.page import Page
-from scenarios.live.session import Session
+from scenarios.live.session import Frame, Session
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE = 60.0
-ROOT = Path(__file__).resolve().parents[3]
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 
 
@@ -118,17 +116,6 @@ def test_ten_clients_are_served_and_foreign_ones_are_not(served: Served) -> None
         served.wait(lambda: served.session.k > k + 10)
 
 
-def test_a_closed_page_ends_its_push(browser: Any, served: Served) -> None:
-    page = browser.new_page(viewport={"width": 400, "height": 300})
-    page.set_default_timeout(1e3 * PATIENCE)
-    page.goto(served.page.address)
-    page.get_by_text("of real time").wait_for()
-    served.session.submit({"type": "pull", "to": [0.1, 0.0, 1.0]}, subject="pull")
-    served.wait(lambda: served.session._held.pull is not None)
-    page.close()
-    served.wait(lambda: served.session._held.pull is None)
-
-
 @pytest.mark.parametrize(
     ("option", "value", "rule"),
     [
@@ -150,6 +137,7 @@ def test_where_no_page_can_be_served_is_refused(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("undrawn", "recorded_here")
 def test_an_interrupted_script_is_saved_up_to_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     script = tmp_path / "script.toml"
     script.write_text("duration = 5.0\n")
@@ -167,19 +155,35 @@ def test_an_interrupted_script_is_saved_up_to_there(tmp_path: Path, monkeypatch:
     assert load_scenario(str(out / "scenario.toml")).duration == pytest.approx(0.2)
 
 
-def test_an_interrupt_keeps_what_was_flown(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("undrawn", "recorded_here")
+def test_an_interrupt_keeps_what_was_flown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the signal itself, with Python's handler: a process that a shell started in the background ignores it."""
+    show, threads = Page.show, {*threading.enumerate()}
+
+    def interrupted(page: Page, frame: Frame, factor: float) -> None:
+        show(page, frame, factor)
+        if frame.k == 4 and threading.current_thread() is threading.main_thread():
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Page, "show", interrupted)
     saved = tmp_path / "saved"
-    line = ["live", "hover", "--no-browser", "--set", "controller.horizon=5", "--out", str(saved)]
-    code = "import sys; from scenarios.cli import main; sys.exit(main(sys.argv[1:]))"
-    process = subprocess.Popen([sys.executable, "-c", code, *line], stdout=subprocess.PIPE, text=True, cwd=ROOT)
-    assert process.stdout is not None
-    assert "token=" in process.stdout.readline()
-    clock.sleep(1.0)
-    process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=2.0 * PATIENCE)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        status = main(["live", "hover", "--no-browser", "--set", "controller.horizon=5", "--out", str(saved)])
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert status == EXIT_DONE
+    output = capsys.readouterr().out
+    address = re.findall(r"Open (\S+[?]token=\S+)", output)[0]
     assert str(saved) in output
-    assert process.returncode == 0
-    assert load_scenario(str(saved / "scenario.toml")).duration > 0.0
+    assert load_scenario(str(saved / "scenario.toml")).duration == pytest.approx(0.25)
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(address)  # nothing is served any more, and nothing keeps the process
+    for thread in {*threading.enumerate()} - threads:
+        thread.join(0.0 if thread.daemon else PATIENCE)
+        assert thread.daemon or not thread.is_alive()
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +200,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def tab(browser: Any, served: Served) -> Iterator[Any]:
-    tab = browser.new_page(viewport={"width": 900, "height": 700})
+    tab = browser.new_page(viewport={"width": 760, "height": 360})
     tab.set_default_timeout(1e3 * PATIENCE)
     tab.goto(served.page.address)
     tab.get_by_text("of real time").wait_for()
@@ -215,17 +219,21 @@ def test_the_address_alone_opens_the_page(served: Served) -> None:
 def test_a_push_by_the_mouse_acts_and_ends(tab: Any, served: Served) -> None:
     box = tab.locator("canvas").first.bounding_box()
     x, y = box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
-    tab.mouse.move(x, y)
-    tab.wait_for_timeout(600)
-    tab.mouse.move(x + 2.0, y)
-    tab.wait_for_timeout(600)
-    tab.mouse.down()
-    for i in range(8):
-        tab.mouse.move(x + 8.0 * i, y - 4.0 * i)
-        tab.wait_for_timeout(80)
-    served.wait(
-        lambda: any(event.type == "push" and any(event.force) for event in served.session.flights[0].scenario.events)
-    )
+
+    def is_pushed() -> bool:
+        return any(event.type == "push" and any(event.force) for event in served.session.flights[0].scenario.events)
+
+    limit = clock.monotonic() + PATIENCE
+    while not is_pushed():  # the page has to see the mouse above the vehicle before its button goes down
+        assert clock.monotonic() < limit
+        tab.mouse.up()
+        for i in range(4):
+            tab.mouse.move(x + i, y)
+            tab.wait_for_timeout(50)
+        tab.mouse.down()
+        for i in range(8):
+            tab.mouse.move(x + 8.0 * i, y - 4.0 * i)
+            tab.wait_for_timeout(30)
     tab.mouse.up()
     served.wait(lambda: served.session._held.pull is None)
 
@@ -302,11 +310,17 @@ def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
     assert served.session.flights[0].loop.controller.horizon == 10
 
 
-def test_a_second_page_watches(browser: Any, served: Served, tab: Any) -> None:
-    phone = browser.new_page(viewport={"width": 390, "height": 800})
+@pytest.fixture(scope="module")
+def phone(browser: Any, served: Served) -> Iterator[Any]:
+    phone = browser.new_page(viewport={"width": 390, "height": 500})
     phone.set_default_timeout(1e3 * PATIENCE)
     phone.goto(served.page.address)
     phone.get_by_text("of real time").wait_for()
+    yield phone
+    phone.close()
+
+
+def test_a_second_page_watches(served: Served, tab: Any, phone: Any) -> None:
     before = served.pace.paused
     phone.get_by_role("button", name="Pause", exact=True).click()
     phone.get_by_text("You watch").first.wait_for()
@@ -320,4 +334,13 @@ def test_a_second_page_watches(browser: Any, served: Served, tab: Any) -> None:
     bars = phone.get_by_text("roll", exact=True).bounding_box()
     assert bars["x"] >= 0.0
     assert bars["x"] + bars["width"] <= 390
+
+
+def test_a_closed_page_ends_its_push(served: Served, phone: Any) -> None:
+    if (take := phone.get_by_role("button", name="Take the controls")).is_visible():
+        take.click()
+        take.wait_for(state="hidden")
+    served.session.submit({"type": "pull", "to": [0.1, 0.0, 1.0]}, subject="pull")
+    served.wait(lambda: served.session._held.pull is not None)
     phone.close()
+    served.wait(lambda: served.session._held.pull is None)

@@ -46,6 +46,8 @@ CONTROLLERS = {
     name: load_scenario(name, ["controller.horizon=8"]).controller.model_dump(mode="json", exclude_none=True)
     for name in ("paper-constrained", "robust")
 }
+WINDY = load_scenario("steady-wind", ["controller.horizon=10"])
+ROBUST = load_scenario("robust", ["controller.horizon=10"]).controller
 INPUTS = st.one_of(
     st.builds(lambda to: {"type": "pull", "to": to}, st.lists(number(-2.0, 2.0), min_size=3, max_size=3)),
     st.just({"type": "pull"}),
@@ -100,8 +102,8 @@ def same_bits(session: Session, which: int = 0) -> bool:
 @settings(max_examples=8, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 20), INPUTS), max_size=12))
 def test_a_saved_session_flies_to_the_same_bits(given: list[tuple[int, dict[str, Any]]]) -> None:
-    scenario = load_scenario("steady-wind", ["controller.horizon=10"])
-    session = Session(scenario, load_scenario("robust").controller)
+    scenario = WINDY
+    session = Session(scenario, ROBUST)
     try:
         for k in range(24):
             for at, table in given:
@@ -166,7 +168,7 @@ def test_what_cannot_be_held_any_more_is_released_and_reported_once(
 
 
 def test_a_second_vehicle_feels_the_same(hover: Scenario) -> None:
-    session = Session(hover, load_scenario("robust").controller)
+    session = Session(hover, ROBUST)
     flown(session, 3)
     session.submit({"type": "pull", "to": [3.0, 0.0, 1.0]})
     flown(session, 10)
@@ -248,6 +250,7 @@ def test_paused_it_flies_single_periods(session: Session) -> None:
     assert session.k == 2
 
 
+@pytest.mark.usefixtures("undrawn", "recorded_here")
 def test_a_script_is_saved_as_a_run_that_flies_to_the_same_bytes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -287,6 +290,7 @@ def test_where_it_cannot_be_saved_nothing_is_flown(tmp_path: Path, capsys: pytes
     assert "mine" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn", "recorded_here")
 def test_a_finished_run_is_flown_on(tmp_path: Path) -> None:
     short, on, script = tmp_path / "short", tmp_path / "on", tmp_path / "script.toml"
     outputs = ("--no-video", "--no-recording", "--no-figures")
