@@ -162,8 +162,8 @@ def bench_ladder(
     Examples:
         >>> import quadsim
         >>> found = quadsim.bench_ladder(quick=True)
-        >>> found.duration, len(found.flights)  # [s]
-        (12.0, 9)
+        >>> len(found.controllers), len(found.conditions), len(found.flights)
+        (3, 3, 9)
     """
     from scenarios.bench.mismatch import benchmark
 

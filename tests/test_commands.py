@@ -8,10 +8,10 @@ import shutil
 import subprocess
 import time as clock
 from argparse import Namespace
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support import Here
 from tuning_formula import write_tuning
 
 import quadsim
@@ -19,7 +19,7 @@ from quadsim.errors import RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
 from scenarios.cli import main, make_parser
 from scenarios.commands import COMMANDS, EXIT_DONE, EXIT_FAILED
-from scenarios.flight import Outputs
+from scenarios.flight import Flight, Outputs
 from scenarios.loading import load_scenario
 from scenarios.run import run_scenario
 
@@ -31,6 +31,7 @@ ADDED = {
     "bench flight": (*SHORT, "--repeats", "1"),
     "bench render": (*SHORT, "--seconds", "0.2"),
     "bench ladder": ("--set", "controller.horizon=5"),
+    "export": ("--set", "duration=1.0"),
     "campaign": ("--set", "duration=1.0", "--flights", "2", "--no-report", "--out", "campaign"),
     "tune": ("--no-report",),
     "live": ("--script", "push.toml"),
@@ -77,10 +78,17 @@ def promised_file(options: Namespace) -> Path | None:
 
 
 @pytest.fixture
-def workplace(flown: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def workplace(
+    cheap_benchmarks: None,
+    fly_known: Callable[..., Flight],
+    flown: Path,
+    campaign: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The working directory after `make demo`, with a shorter flight in the place of both, and after a campaign.
 
-    The ladder's flights too are shorter, and flown in this process.
+    Scenarios of the library that are flown as they are have been flown once.
     """
     for place in (f"campaigns/{campaign.name}", "mine", "other"):
         shutil.copytree(campaign, tmp_path / "runs" / place)
@@ -95,8 +103,9 @@ def workplace(flown: Path, campaign: Path, tmp_path: Path, monkeypatch: pytest.M
     for name in ("paper-unconstrained", "paper-constrained"):
         shutil.copytree(flown, tmp_path / "runs" / name)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.QUICK_DURATION", 2.0)
-    monkeypatch.setattr("scenarios.bench.worker_pool.ProcessPoolExecutor", Here)
+    monkeypatch.setattr("scenarios.bench.speed.QUICK_LAWS", ("LQR",))
+    monkeypatch.setattr("scenarios.papers.reproduction.fly_scenario", fly_known)
+    monkeypatch.setattr("scenarios.api.fly_scenario", fly_known)
 
 
 @pytest.fixture(scope="session")
@@ -129,7 +138,7 @@ def test_documented_scenarios_and_settings_are_valid(line: str) -> None:
         load_scenario(scenario, options.settings)
 
 
-@pytest.mark.usefixtures("workplace", "sketched")
+@pytest.mark.usefixtures("workplace", "undrawn", "recorded_here")
 @pytest.mark.parametrize("line", RUNNABLE)
 def test_documented_command_runs(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = arguments_of(line)

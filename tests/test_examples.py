@@ -65,6 +65,7 @@ def test_it_is_of_thirty_lines() -> None:
     assert law.end_lineno - law.lineno + 1 <= 30
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_lines_of_the_readme_are_those_of_the_example(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

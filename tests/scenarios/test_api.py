@@ -12,12 +12,12 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 import pytest
-from support import Here
 
 import mpc
 import quadsim
@@ -31,6 +31,7 @@ from quadsim.vehicle import Vehicle
 from scenarios.flight import Flight
 from scenarios.schema.scenario import Scenario
 
+Fly = Callable[..., Flight]
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
@@ -63,10 +64,10 @@ RENDERS = {"film", "draw_vehicle", "bench_render"}
 """Whose examples need a machine that renders."""
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn", "recorded_here", "cheap_benchmarks")
 @pytest.mark.parametrize("name", [*quadsim.__all__, *(f"gym.{name}" for name in quadsim.gym.__all__)])
 def test_every_docstring_has_an_example_that_runs(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str, fly_known: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if name in RENDERS:
         try:
@@ -74,7 +75,7 @@ def test_every_docstring_has_an_example_that_runs(
         except RenderingUnavailableError as error:
             pytest.skip(str(error))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("scenarios.bench.worker_pool.ProcessPoolExecutor", Here)
+    monkeypatch.setattr("scenarios.papers.reproduction.fly_scenario", fly_known)
     public = functools.reduce(getattr, name.split("."), quadsim)
     runner = doctest.DocTestRunner(verbose=False)
     for example in doctest.DocTestFinder().find(public, name, module=sys.modules[public.__module__]):
@@ -370,7 +371,7 @@ def test_a_campaign_of_a_scenario_judges_requirements(hover: Scenario, tmp_path:
         quadsim.campaign("paper-nominal", vary=[mass])
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_flights_are_compared(hover: Scenario, flight: Flight, tmp_path: Path) -> None:
     other = quadsim.fly(hover, progress=False)
     found = quadsim.compare(flight, other, progress=False)
@@ -396,10 +397,10 @@ def test_ctrl_c_ends_a_flight_in_order() -> None:
     assert flown.outcome == "lost"
 
 
-def test_a_script_without_a_terminal_sees_no_progress() -> None:
-    code = "import quadsim; quadsim.fly(quadsim.load('hover').replace({'duration': 1.0}))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == ("", "")
+def test_without_a_terminal_no_progress_is_printed(hover: Scenario, capfd: pytest.CaptureFixture[str]) -> None:
+    assert not sys.stderr.isatty()
+    quadsim.fly(hover)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_controllers_fly_without_a_simulator() -> None:
