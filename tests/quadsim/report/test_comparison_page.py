@@ -4,11 +4,13 @@ import dataclasses
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from browser import open_page
+from support import draw_nothing
 
 from quadsim.errors import OutputError, ParameterError
 from quadsim.flight.rundir import Run
@@ -38,6 +40,14 @@ PROBE = """<script>
   document.body.append(report);
 })();
 </script>"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _undrawn() -> Iterator[None]:
+    """Figures have tests of their own; pages show plots."""
+    with pytest.MonkeyPatch.context() as patch:
+        draw_nothing(patch)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +105,6 @@ def test_the_text_gives_outcomes_reasons_and_numbers(page_of_two: Path) -> None:
     assert "lost/flight.rrd" not in text
 
 
-@pytest.mark.usefixtures("sketched")
 def test_a_study_of_costs_has_a_section_and_files(
     short_run: Run, cost_study: CostStudy, page: Path, tmp_path: Path
 ) -> None:
@@ -122,7 +131,6 @@ def test_nothing_is_fetched(page: Path) -> None:
     assert "default-src 'none'" in text
 
 
-@pytest.mark.usefixtures("sketched")
 def test_hostile_names_are_text(short_run: Run, tmp_path: Path) -> None:
     page = write_comparison([renamed(short_run, HOSTILE), short_run], tmp_path / "out")
     text = page.read_text()
@@ -131,7 +139,6 @@ def test_hostile_names_are_text(short_run: Run, tmp_path: Path) -> None:
     assert (page.parent / "script-alert-1-script-more-quoted").is_dir()
 
 
-@pytest.mark.usefixtures("sketched")
 def test_runs_of_one_name_keep_their_files_apart(short_run: Run, tmp_path: Path) -> None:
     page = write_comparison([short_run, short_run, renamed(short_run, "!"), renamed(short_run, "?")], tmp_path / "out")
     folders = {path.name for path in page.parent.iterdir() if path.is_dir()}
@@ -139,7 +146,6 @@ def test_runs_of_one_name_keep_their_files_apart(short_run: Run, tmp_path: Path)
     assert {"run", "run-2"} <= folders
 
 
-@pytest.mark.usefixtures("sketched")
 def test_runs_without_a_period_or_constraints_are_compared(short_run: Run, empty_run: Run, tmp_path: Path) -> None:
     free = dataclasses.replace(short_run, limits=(), summary={**short_run.summary, "constraints": []})
     assert write_comparison([empty_run, free], tmp_path / "two").is_file()
@@ -148,7 +154,6 @@ def test_runs_without_a_period_or_constraints_are_compared(short_run: Run, empty
     assert "the command is not finite" in text
 
 
-@pytest.mark.usefixtures("sketched")
 def test_an_earlier_comparison_is_replaced_and_nothing_else(short_run: Run, tmp_path: Path) -> None:
     target = tmp_path / "out"
     write_comparison([renamed(short_run, "first")], target)
@@ -170,7 +175,6 @@ def test_a_place_that_holds_a_run_is_refused(short_run: Run) -> None:
     assert (short_run.directory / "summary.json").is_file()
 
 
-@pytest.mark.usefixtures("sketched")
 def test_nothing_is_left_of_a_comparison_that_fails(
     short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,7 +210,6 @@ def test_thinning_keeps_gaps() -> None:
     assert np.nanmax(values[thinned]) == np.nanmax(values)
 
 
-@pytest.mark.usefixtures("sketched")
 def test_the_page_shows_the_verdict_against_the_one_expected(short_run: Run, tmp_path: Path) -> None:
     summary = {**short_run.summary, "expected": "lost", "as_expected": False, "constraints": []}
     page = write_comparison([dataclasses.replace(short_run, summary=summary)], tmp_path / "out").read_text()
@@ -230,7 +233,7 @@ def test_plots_of_what_stands_still_have_a_least_span(short_run: Run) -> None:
 
 
 def test_many_runs_keep_the_page_small(short_run: Run) -> None:
-    t = np.linspace(0.0, 3600.0, 720_001)
+    t = np.linspace(0.0, 360.0, 72_001)
     rows = np.arange(t.size) % short_run.log.plant.t.size
     plant = dataclasses.replace(
         short_run.log.plant, t=t, state=short_run.log.plant.state[rows], speeds=short_run.log.plant.speeds[rows]
@@ -239,7 +242,6 @@ def test_many_runs_keep_the_page_small(short_run: Run) -> None:
     assert sum(len(plot.json) for plot in comparison_plots([long] * 10)) < 3e6
 
 
-@pytest.mark.usefixtures("sketched")
 def test_a_browser_draws_the_page_and_has_no_complaint(
     short_run: Run, aborted_run: Run, cost_study: CostStudy, tmp_path: Path
 ) -> None:

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from quadsim.errors import OutputError
 from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
+from quadsim.report.figures import flight_figures
 from quadsim.report.figures.canvas import write_drawings
 from quadsim.report.figures.flight_figures import comparison_figure, draw_effects, has_effects, write_figures
 from quadsim.report.palette import BOUND, line_colour
@@ -33,6 +33,11 @@ def lines_of_colour(svg: Path, colour: str) -> int:
     return svg.read_text().count(f"stroke: {colour}")
 
 
+def states_svg(run: Run, directory: Path) -> Path:
+    """The figure of the states alone, as text."""
+    return write_drawings({"states": lambda: flight_figures._draw_states(run)}, directory)[1]
+
+
 def named(run: Run, scenario: str) -> Run:
     return dataclasses.replace(run, summary={**run.summary, "scenario": scenario})
 
@@ -43,7 +48,7 @@ def test_the_papers_scenario_gives_the_papers_figure_numbers(figures: dict[str, 
     ]
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_another_scenario_gives_plain_names(short_run: Run, tmp_path: Path) -> None:
     stems = [path.stem for path in write_figures(named(short_run, "hover"), tmp_path)]
     assert stems == ["states", "states", "inputs", "inputs", "solve_times", "solve_times"]
@@ -77,9 +82,7 @@ def test_bounds_are_drawn_where_the_flight_has_them(short_run: Run, figures: dic
     bounds_and_legend = 2 * 2 + 1
     assert lines_of_colour(figures["figure4_states.svg"], BOUND) == bounds_and_legend
     assert lines_of_colour(figures["figure5_inputs.svg"], BOUND) == bounds_and_legend
-    free = dataclasses.replace(short_run, limits=())
-    states = tmp_path / "figure4_states.svg"
-    assert states in write_figures(free, tmp_path)
+    states = states_svg(dataclasses.replace(short_run, limits=()), tmp_path)
     assert lines_of_colour(states, BOUND) == 0
     assert "bound" not in texts(states)
 
@@ -87,8 +90,7 @@ def test_bounds_are_drawn_where_the_flight_has_them(short_run: Run, figures: dic
 @pytest.mark.usefixtures("sketched")
 def test_a_bound_that_begins_after_the_flight_is_left_out(short_run: Run, tmp_path: Path) -> None:
     late = dataclasses.replace(short_run, limits=(Limit(name="late", signal="roll", upper=5.0, start=100.0),))
-    write_figures(late, tmp_path)
-    assert lines_of_colour(tmp_path / "figure4_states.svg", BOUND) == 0
+    assert lines_of_colour(states_svg(late, tmp_path), BOUND) == 0
 
 
 def test_the_same_flight_gives_the_same_bytes(short_run: Run, figures: dict[str, Path], tmp_path: Path) -> None:
@@ -99,8 +101,8 @@ def test_the_same_flight_gives_the_same_bytes(short_run: Run, figures: dict[str,
 @pytest.mark.usefixtures("sketched")
 def test_an_aborted_flight_is_drawn_as_far_as_it_went(short_run: Run, tmp_path: Path) -> None:
     log = dataclasses.replace(short_run.log, reason="at t = 6.000 s: lost")
-    write_figures(dataclasses.replace(short_run, log=log), tmp_path)
-    assert "paper-constrained (aborted): position and attitude" in texts(tmp_path / "figure4_states.svg")
+    states = states_svg(dataclasses.replace(short_run, log=log), tmp_path)
+    assert "paper-constrained (aborted): position and attitude" in texts(states)
 
 
 def test_an_ideal_flight_has_no_figure_of_effects(figures: dict[str, Path]) -> None:
@@ -143,10 +145,15 @@ def test_effects_are_drawn_where_there_are_any(short_run: Run, tmp_path: Path, e
 
 def test_all_effects_are_drawn_together(short_run: Run, tmp_path: Path) -> None:
     run = with_effects(short_run, wrench=True, wind=True, lag=True, state=True)
-    assert tmp_path / "effects.png" in write_figures(run, tmp_path)
+    write_drawings({"effects": lambda: draw_effects(run)}, tmp_path)
     assert texts(tmp_path / "effects.svg") >= SPEEDS | FORCES | AIR | STATE
     picture = imread(tmp_path / "effects.png")[..., :3]
     assert 0.01 < np.mean(np.any(picture < 0.95, axis=-1)) < 0.5
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_effects_are_a_figure_of_the_run(short_run: Run, tmp_path: Path) -> None:
+    assert tmp_path / "effects.png" in write_figures(with_effects(short_run, wind=True), tmp_path)
 
 
 def test_no_figures_without_a_control_period(empty_run: Run, tmp_path: Path) -> None:
@@ -178,22 +185,17 @@ def standing(run: Run) -> Run:
 
 @pytest.mark.usefixtures("sketched")
 def test_rounding_is_drawn_as_a_level_line(short_run: Run, tmp_path: Path) -> None:
-    write_figures(standing(short_run), tmp_path)
-    found = texts(tmp_path / "figure4_states.svg")
+    found = texts(states_svg(standing(short_run), tmp_path))
     assert {"0.004", "0.04"} <= found, "metres and degrees"
     assert not any(text.startswith("1e") for text in found)
 
 
-def test_a_roll_that_wraps_is_no_line_across_the_panel(
-    short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_roll_that_wraps_is_no_line_across_the_panel(short_run: Run) -> None:
     state = short_run.log.plant.state.copy()
     state[:, INDEX["roll"]] = (4.0 * short_run.log.plant.t + np.pi) % (2.0 * np.pi) - np.pi
     log = dataclasses.replace(short_run.log, plant=dataclasses.replace(short_run.log.plant, state=state))
-    drawn: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, *_args, **_options: drawn.append(self))
-    write_figures(dataclasses.replace(short_run, log=log), tmp_path)
-    (roll,) = (axes for axes in drawn[0].axes if axes.get_ylabel() == "roll [deg]")
+    drawn = flight_figures._draw_states(dataclasses.replace(short_run, log=log))
+    (roll,) = (axes for axes in drawn.axes if axes.get_ylabel() == "roll [deg]")
     values = np.asarray(roll.get_lines()[0].get_ydata())
     assert np.nanmax(values) - np.nanmin(values) > 350.0
     assert np.nanmax(np.abs(np.diff(values))) < 10.0
@@ -204,9 +206,9 @@ def test_states_are_drawn_as_measured_beside_the_true_ones(
     short_run: Run, figures: dict[str, Path], tmp_path: Path
 ) -> None:
     assert "measured" not in texts(figures["figure4_states.svg"])
-    write_figures(with_effects(short_run, state=True), tmp_path)
-    assert {"flight", "measured"} <= texts(tmp_path / "figure4_states.svg")
-    drawn = lines_of_colour(tmp_path / "figure4_states.svg", line_colour(1))
+    states = states_svg(with_effects(short_run, state=True), tmp_path)
+    assert {"flight", "measured"} <= texts(states)
+    drawn = lines_of_colour(states, line_colour(1))
     assert drawn - lines_of_colour(figures["figure4_states.svg"], line_colour(1)) == 6 + 1, "six panels and the legend"
 
 

@@ -11,10 +11,12 @@ from typing import Any
 import fault_injection
 import make_robustness
 import pytest
+from support import Here
 
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight import metrics
 from quadsim.report.table import Mark
+from scenarios.bench import worker_pool
 from scenarios.bench.mismatch.benchmark import (
     Cell,
     fly_cell,
@@ -26,6 +28,7 @@ from scenarios.bench.mismatch.benchmark import (
 from scenarios.bench.mismatch.conditions import CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, VARIANTS, equip, tilt_bound
 from scenarios.bench.mismatch.survival import MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
+from scenarios.bench.worker_pool import answer_all
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.loading import load_scenario
@@ -179,14 +182,21 @@ def test_a_lost_first_period_has_no_numbers() -> None:
 
 @pytest.fixture(scope="module")
 def quick() -> MismatchBench:
-    return run_mismatch(settings=["controller.horizon=10"], quick=True, workers=2)
+    """Flown in this process, each step timed once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(worker_pool, "ProcessPoolExecutor", Here)
+        patch.setattr("scenarios.bench.mismatch.benchmark.TIMED", 1)
+        return run_mismatch(settings=["controller.horizon=10"], quick=True)
 
 
-def test_results_do_not_depend_on_processes(quick: MismatchBench) -> None:
-    name = ("PID", "mass +30 %")
-    alone = fly_cell(cell(*name, "controller.horizon=10", "duration=12.0"))
-    assert replace(quick.flights[name], step_p99=None) == replace(alone, step_p99=None)
-    assert len(quick.flights) == 9
+def test_results_do_not_depend_on_processes() -> None:
+    one = cell("PID", "mass +30 %", *SHORT)
+    (away,) = answer_all(fly_cell, [one], workers=1)
+    assert replace(away, step_p99=None) == replace(fly_cell(one), step_p99=None)
+
+
+def test_quick_flights_are_short_and_few(quick: MismatchBench) -> None:
+    assert (quick.duration, len(quick.flights)) == (12.0, 9)
     assert [*quick.flights] == [(a, b) for a in quick.controllers for b in quick.conditions]
 
 

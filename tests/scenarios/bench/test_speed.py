@@ -32,7 +32,10 @@ from scenarios.bench.speed import (
 from scenarios.bench.speed_figure import draw_speeds
 from scenarios.benchmarks import bench_speed
 from scenarios.design.first_scenario import first_scenario
+from scenarios.flight import Flight
 from scenarios.loading import parse_scenario
+from scenarios.run import fly_scenario
+from scenarios.schema.scenario import Scenario
 
 WELL = SpeedFlight(bound=40.0, reason=None, error=0.1, tilt=35.0, violated=0.0, saturated=0.2, fallback=0.0)
 FAR = replace(WELL, error=2.0 * NEAR)
@@ -89,7 +92,11 @@ def test_every_controller_is_one_that_a_scenario_may_have(world: str) -> None:
     assert types == ["lqr", "pid", "constrained", "robust", "geometric", "geometric", "nonlinear", "nonlinear"]
 
 
-def test_seeds_differ_and_are_merged_with_their_interval() -> None:
+def test_seeds_differ_and_are_merged_with_their_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fly(scenario: Scenario) -> Flight:
+        return fly_scenario(scenario.model_copy(update={"duration": 1.0}))
+
+    monkeypatch.setattr("scenarios.bench.speed.fly_scenario", fly)
     first, again, other = (fly_cell(("hummingbird, sensors", 6.0, "LQR", seed)) for seed in (0, 0, 1))
     assert first == again
     assert first.error != other.error

@@ -250,7 +250,7 @@ def test_a_run_without_a_readable_scenario_is_compared_all_the_same(runs: dict[s
         find_study(targets, requested=True)
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_compare_puts_the_study_on_the_page(
     runs: dict[str, str],
     study: CostStudy,

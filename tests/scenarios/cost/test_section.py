@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from quadsim.report.table import Cell, Grid, Mark
 from scenarios.cost.cost_curves import lost_at, step_curves, sweep_panels
@@ -142,7 +143,12 @@ def test_curves_are_the_studys_and_have_gaps_where_flights_were_lost(cost_study:
     assert lost_at(cost_study.horizons) == ([], [10])
 
 
-def test_figures_are_the_same_bytes_each_time_and_show_what_is_lost(cost_study: CostStudy, tmp_path: Path) -> None:
+def test_figures_are_the_same_bytes_each_time_and_show_what_is_lost(
+    cost_study: CostStudy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Coarse, and not laid out, which all figures are in the same way."""
+    monkeypatch.setattr("quadsim.report.figures.canvas.DPI", 20)
+    monkeypatch.setattr(Figure, "get_layout_engine", lambda _: None)
     first, second = (write_cost_figures(cost_study, tmp_path / name) for name in ("one", "two"))
     names = [f"cost_{what}.{kind}" for what in ("steps", "tilt", "horizon") for kind in ("png", "svg")]
     assert [path.name for path in first] == names
