@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import settings
-from support import Here, draw_nothing
+from support import Here, draw_nothing, take_long_steps
 
 from quadsim.controller import Controller
 from quadsim.flight import rundir
@@ -156,6 +156,15 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are not laid out, and their pictures have few pixels."""
+    from matplotlib.figure import Figure
+
+    monkeypatch.setattr("quadsim.report.figures.canvas.DPI", 30)
+    monkeypatch.setattr(Figure, "get_layout_engine", lambda _: None)
+
+
+@pytest.fixture
 def recorded_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Recordings are written in this process, which imports rerun once, not in one of their own each."""
 
@@ -174,6 +183,7 @@ def cheap_benchmarks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scenarios.bench.mismatch.benchmark.QUICK_DURATION", 1.0)
     monkeypatch.setattr("scenarios.bench.mismatch.benchmark.TIMED", 1)
     monkeypatch.setattr("scenarios.bench.speed.QUICK_SPEEDS", (6.0,))
+    take_long_steps(monkeypatch, "loop, drag")
     monkeypatch.setattr("scenarios.bench.film.WIDTH", 320)
     monkeypatch.setattr("scenarios.bench.film.HEIGHT", 180)
 

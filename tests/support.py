@@ -18,6 +18,7 @@ from mpc.ocp import Objective, Problem, Rest
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
+from scenarios.bench.speed import WORLDS
 from scenarios.build import build_problem
 from scenarios.courses.make import build_reference
 from scenarios.flight import Flight
@@ -46,6 +47,12 @@ def draw_nothing(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(Figure, "savefig", lambda *_arguments, **_options: None)
     patch.setattr(Figure, "get_layout_engine", lambda _: None)
+
+
+def take_long_steps(patch: pytest.MonkeyPatch, world: str) -> None:
+    """Fly a world of `quadsim bench speed` with five steps of the physics per control period instead of fifty."""
+    changes = WORLDS[world].changes
+    patch.setitem(changes, "plant", {**changes["plant"], "timestep": 0.005})
 
 
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:

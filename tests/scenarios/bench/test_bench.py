@@ -33,6 +33,7 @@ from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 
 SHORT = ("duration=3.0", "controller.horizon=10")
+BENCHED = ("duration=1.5", "controller.horizon=10")
 FILES = {"bench.json", "solvers.md", "solvers.png", "solvers.svg"}
 
 
@@ -53,7 +54,7 @@ class Answering:
 def bench() -> SolverBench:
     """A bench of two solvers, small in every respect."""
     return bench_solvers(
-        load_scenario("paper-constrained", SHORT),
+        load_scenario("paper-constrained", BENCHED),
         repeats=2,
         horizons=(5, 20, 24, 30),
         solvers=("piqp-multistage", "daqp"),
@@ -153,7 +154,7 @@ def test_between_steps_the_plant_flies_a_period() -> None:
 def test_a_time_stands_in_all_tables_once(bench: SolverBench) -> None:
     """Growth at the flight's own horizon is not measured again, nor are the steps in the study of cost."""
     flown = bench_solvers(
-        load_scenario("paper-constrained", SHORT), repeats=1, horizons=(10,), solvers=("piqp-multistage",)
+        load_scenario("paper-constrained", BENCHED), repeats=1, horizons=(10,), solvers=("piqp-multistage",)
     )
     alone, growth = flown.candidates[1], {each.name: each for each in flown.growth if not each.kind}
     assert growth[alone.name].p50 == (alone.quantiles["p50"],)
@@ -161,7 +162,7 @@ def test_a_time_stands_in_all_tables_once(bench: SolverBench) -> None:
     gain, shown, qp = make_cost.timed(bench)
     assert (gain.name, shown.name, qp.name) == ("unconstrained gain", "constrained, as flown", "QP by piqp-multistage")
     assert bench.gain_ms is not None
-    assert gain.step_ms.size == shown.step_ms.size == 60
+    assert gain.step_ms.size == shown.step_ms.size == 30
     np.testing.assert_array_equal(shown.step_ms, bench.default.step_ms)
     np.testing.assert_array_equal(qp.step_ms, bench.candidates[1].step_ms)
     assert np.count_nonzero(shown.shortcut) == bench.default.statuses["unconstrained"]
@@ -170,7 +171,7 @@ def test_a_time_stands_in_all_tables_once(bench: SolverBench) -> None:
 
 def test_the_median_of_the_repeats_and_the_longest_of_all(bench: SolverBench) -> None:
     for candidate in bench.candidates:
-        assert candidate.step_ms.shape == (60,)
+        assert candidate.step_ms.shape == (30,)
         assert candidate.raw_max_ms >= candidate.quantiles["max"] >= candidate.quantiles["p50"] > 0.0
         assert candidate.repeats == 2
 
@@ -178,8 +179,8 @@ def test_the_median_of_the_repeats_and_the_longest_of_all(bench: SolverBench) ->
 def test_candidates_are_the_default_each_solver_alone_and_daqp_both_ways(bench: SolverBench) -> None:
     names = [candidate.name for candidate in bench.candidates]
     assert names == ["piqp-multistage + shortcut", "piqp-multistage", "daqp", "daqp + shortcut"]
-    assert [sum(candidate.statuses.values()) for candidate in bench.candidates] == [60] * 4
-    assert bench.candidates[1].statuses == {"solved": 60}
+    assert [sum(candidate.statuses.values()) for candidate in bench.candidates] == [30] * 4
+    assert bench.candidates[1].statuses == {"solved": 30}
     assert bench.default.statuses.keys() <= {"solved", "unconstrained"}
 
 
@@ -250,13 +251,13 @@ def test_tables_are_complete(bench: SolverBench) -> None:
 
 
 def test_targets_compare_with_other_solvers_only(bench: SolverBench) -> None:
-    slow = replace(bench.candidates[2], step_ms=np.full(60, 1e3))
-    default = replace(bench.default, step_ms=np.full(60, 0.01))
+    slow = replace(bench.candidates[2], step_ms=np.full(30, 1e3))
+    default = replace(bench.default, step_ms=np.full(30, 0.01))
     won = replace(bench, candidates=(default, bench.candidates[1], slow))
     verdicts = {target.what: target for target in solver_targets(won)}
     assert verdicts["default, p99 below every other solver's"].met
     assert "daqp" in verdicts["default, p99 below every other solver's"].required
-    lost = replace(won, candidates=(replace(default, step_ms=np.full(60, 2e3), failures=1), *won.candidates[1:]))
+    lost = replace(won, candidates=(replace(default, step_ms=np.full(30, 2e3), failures=1), *won.candidates[1:]))
     missed = {target.what for target in solver_targets(lost) if not target.met}
     assert missed >= {"default, p50", "default, p99", "default, max below every other solver's"}
     assert "default, periods without an optimum" in missed
@@ -266,6 +267,7 @@ def test_targets_compare_with_other_solvers_only(bench: SolverBench) -> None:
     assert float(ratio.measured) == pytest.approx(1e5)
 
 
+@pytest.mark.usefixtures("coarse")
 def test_a_bench_is_written_whole_and_replaced_only_by_another(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -366,6 +368,7 @@ def test_a_minute_of_film_follows_from_a_short_one() -> None:
     assert [line[-1].text for line in render_tables(replace(profile, wall_s=5.0))[1].lines] == ["missed"]
 
 
+@pytest.mark.usefixtures("cheap_benchmarks")
 def test_bench_render_films_and_reports(capsys: pytest.CaptureFixture[str]) -> None:
     try:
         rendering_backend()
@@ -423,26 +426,26 @@ def test_what_cannot_be_timed_is_refused(
 def test_what_a_campaign_costs_is_measured_and_reported() -> None:
     reported: list[tuple[int, int]] = []
     profile = bench_campaign(
-        load_scenario("hover", ["duration=1.0", "controller.horizon=10"]),
-        flights=6,
+        load_scenario("hover", ["duration=0.5", "controller.horizon=10"]),
+        flights=3,
         rounds=1,
-        sizes=(3, 12),
+        sizes=(2, 4),
         progress=lambda stage, done, total: reported.append((done, total)),
     )
     assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
     one, two = profile.rounds[0]
-    assert (one.flights, one.workers, two.flights, two.workers) == (6, 1, 12, 2)
+    assert (one.flights, one.workers, two.flights, two.workers) == (3, 1, 6, 2)
     for run in (one, two, *profile.growing):
         assert 0.0 < run.busy_s < run.workers * run.wall_s
         assert run.bytes > 1000
         assert 0.0 < run.overhead < 1.0
-    assert [run.flights for run in profile.growing] == [3, 12]
+    assert [run.flights for run in profile.growing] == [2, 4]
     rounds, growth, targets = campaign_tables(profile)
     assert (len(rounds.lines), len(growth.lines), len(targets.lines)) == (2, 2, 4)
     assert len(campaign_tables(replace(profile, growing=()))) == 2
     slower = replace(one, wall_s=2.0 * one.wall_s)
     assert replace(profile, rounds=((slower, two), *profile.rounds)).per_core_hour == pytest.approx(2700.0 * one.rate)
-    assert one.flight_s == pytest.approx(one.busy_s / 6)
+    assert one.flight_s == pytest.approx(one.busy_s / 3)
 
 
 @pytest.mark.parametrize("options", [{"flights": 0}, {"rounds": 0}, {"sizes": (0, 3)}])

@@ -174,6 +174,12 @@ def test_numbers_are_those_of_the_flight() -> None:
     assert (found.flown, found.peak_tilt, found.fallbacks) == (3.0, metrics.peak_tilt(log.plant.state), 0)
 
 
+def test_steps_are_timed_in_flights_of_their_own() -> None:
+    taken = time_cell(cell("PID", "nominal", *SHORT))
+    assert taken is not None
+    assert 0.0 < taken < 1e3
+
+
 def test_a_lost_first_period_has_no_numbers() -> None:
     found = fly_cell(cell("paper", "nominal", "duration=1.0", "initial.euler=[40.0, 0.0, 0.0]"))
     assert (found.flown, found.rmse, found.end_error, found.peak_tilt, found.step_p99) == (0.0, None, None, None, None)
@@ -182,10 +188,10 @@ def test_a_lost_first_period_has_no_numbers() -> None:
 
 @pytest.fixture(scope="module")
 def quick() -> MismatchBench:
-    """Flown in this process, each step timed once."""
+    """Flown in this process, its times made up."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(worker_pool, "ProcessPoolExecutor", Here)
-        patch.setattr("scenarios.bench.mismatch.benchmark.TIMED", 1)
+        patch.setattr("scenarios.bench.mismatch.benchmark.time_cell", lambda cell: 2.0)
         return run_mismatch(settings=["controller.horizon=10"], quick=True)
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support import Here
+from support import Here, take_long_steps
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import ParameterError
@@ -57,6 +57,7 @@ def texts(grid: Grid) -> list[list[str]]:
 
 def test_quick_flies_two_controllers_at_two_speeds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scenarios.bench.worker_pool.ProcessPoolExecutor", Here)
+    take_long_steps(monkeypatch, QUICK_WORLD)
     found = bench_speed(quick=True, progress=False)
     assert list(found.flights) == [(QUICK_WORLD, speed, law) for speed in QUICK_SPEEDS for law in QUICK_LAWS]
     for speed in QUICK_SPEEDS:
@@ -74,7 +75,8 @@ def test_quick_flies_two_controllers_at_two_speeds(monkeypatch: pytest.MonkeyPat
     assert json.loads(json.dumps(found.to_json()))["flights"][0]["controller"] == QUICK_LAWS[0]
 
 
-def test_a_loss_is_a_result() -> None:
+def test_a_loss_is_a_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    take_long_steps(monkeypatch, "loop, drag")
     lost = fly_cell(("loop, drag", 14.0, "LQR", 0))
     assert lost.reason is not None
     assert "lost" in lost.reason

@@ -21,6 +21,7 @@ from scenarios.bench.queries import QueriedController, recorded
 from scenarios.build import build_controller
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
+from scenarios.cost import cost_flights
 from scenarios.cost.cost_flights import without_constraints
 from scenarios.cost.measure import find_study, fly_variations, study_cost
 from scenarios.cost.study import CostStudy
@@ -30,7 +31,7 @@ from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.scenario import Scenario
 
-SETTINGS = ["duration=4.0", "controller.horizon=10"]
+SETTINGS = ["duration=2.0", "controller.horizon=10"]
 SMALL: dict[str, Any] = {
     "tilts": (3.0,),
     "horizons": (8,),
@@ -48,9 +49,10 @@ def scenario(*settings: str, name: str = "paper-constrained") -> Scenario:
 
 @pytest.fixture(scope="module", autouse=True)
 def _here() -> Iterator[None]:
-    """Flights are flown in this process; one test compares that with several."""
+    """Flights are flown in this process, and steps timed once; one test compares that with another process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(worker_pool, "ProcessPoolExecutor", Here)
+        patch.setattr(cost_flights, "REPEATS", 1)
         yield
 
 
@@ -69,9 +71,10 @@ def untimed(study: CostStudy) -> dict[str, Any]:
     return data
 
 
-def test_the_study_is_the_same_however_many_processes_fly(study: CostStudy, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_study_is_the_same_where_other_processes_fly(study: CostStudy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All its flights; that answers come in their order is worker_pool's."""
     monkeypatch.setattr(worker_pool, "ProcessPoolExecutor", ProcessPoolExecutor)
-    again = study_cost(scenario(), [scenario(name="paper-unconstrained")], workers=2, **SMALL)
+    again = study_cost(scenario(), [scenario(name="paper-unconstrained")], workers=1, timed=study.candidates, **SMALL)
     assert untimed(again) == untimed(study)
 
 
@@ -102,7 +105,7 @@ def test_the_flight_is_the_scenarios_own(study: CostStudy) -> None:
 
 
 def test_the_counterpart_has_the_same_weights_and_no_constraints(study: CostStudy) -> None:
-    free = load_scenario("paper-unconstrained", ["duration=4.0", "controller.horizon=10"])
+    free = load_scenario("paper-unconstrained", SETTINGS)
     spec = scenario().controller
     same = free.controller.model_copy(
         update={"output_weights": spec.output_weights, "input_weights": spec.input_weights}
@@ -146,8 +149,8 @@ def test_candidates_answer_the_queries_of_the_flight(study: CostStudy) -> None:
     assert [candidate.name for candidate in study.candidates] == [
         *("unconstrained gain", "constrained, as flown", "QP by piqp-dense")
     ]
-    assert {candidate.step_ms.size for candidate in study.candidates} == {80}
-    assert 0 < flown.shortcut.sum() < 80
+    assert {candidate.step_ms.size for candidate in study.candidates} == {40}
+    assert 0 < flown.shortcut.sum() < 40
     assert int(flown.shortcut.sum()) == study.constrained.statuses["unconstrained"]
     assert not gain.shortcut.any()
     assert not dense.shortcut.any()
@@ -160,12 +163,12 @@ def test_a_replay_gives_the_commands_of_the_flight() -> None:
     flight = fly_scenario(own)
     queries = recorded(own, flight.log.control, 10)
     controller = build_controller(own, build_vehicle(own))
-    for k in range(80):
+    for k in range(40):
         controller.reset(queries.speeds_before[k])
         command = controller.step(Moment(time=queries.t[k]), queries.state[k], queries.reference[k + 1 : k + 11])
         np.testing.assert_allclose(command.speeds, flight.log.control.speeds[k], atol=1e-6)
     queried = QueriedController(controller, queries)
-    for k in range(80):
+    for k in range(40):
         queried.prepare(k)
         queried.answer()
     assert tuple(queried.statuses.values()) == flight.log.control.status
@@ -236,7 +239,7 @@ def test_a_study_is_made_where_its_question_is_posed(runs: dict[str, str]) -> No
 
 
 def test_a_long_course_is_studied_only_on_request(runs: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scenarios.cost.measure.LONGEST_UNREQUESTED", 3.0)
+    monkeypatch.setattr("scenarios.cost.measure.LONGEST_UNREQUESTED", 1.0)
     both = [runs["paper-constrained"], runs["paper-unconstrained"]]
     assert find_study(both, requested=None) == []
     assert len(find_study(both, requested=True)) == 2
