@@ -18,7 +18,6 @@ from mpc.ocp import Objective, Problem, Rest
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.bench.speed import WORLDS
 from scenarios.build import build_problem
 from scenarios.courses.make import build_reference
 from scenarios.flight import Flight
@@ -51,6 +50,8 @@ def draw_nothing(patch: pytest.MonkeyPatch) -> None:
 
 def take_long_steps(patch: pytest.MonkeyPatch, world: str) -> None:
     """Fly a world of `quadsim bench speed` with five steps of the physics per control period instead of fifty."""
+    from scenarios.bench.speed import WORLDS
+
     changes = WORLDS[world].changes
     patch.setitem(changes, "plant", {**changes["plant"], "timestep": 0.005})
 

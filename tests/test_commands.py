@@ -110,10 +110,10 @@ def workplace(
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 0.3 s, which is 9 frames of film."""
+    """A run of 0.1 s, which is 3 frames of film."""
     directory = tmp_path_factory.mktemp("flown") / "paper-constrained"
     tables = Outputs(video=False, recording=False, figures=False)
-    run_scenario(load_scenario("paper-constrained", ["duration=0.3"]), directory, tables)
+    run_scenario(load_scenario("paper-constrained", ["duration=0.1"]), directory, tables)
     return directory
 
 

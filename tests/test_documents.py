@@ -62,12 +62,15 @@ def test_targets_in_the_documents_are_met_and_todays(
     assert [line for line in stable if line not in page] == []
 
 
-def test_what_constraints_cost_is_what_the_flights_give(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_constraints_cost_is_what_the_flights_give(
+    fly_known: Callable[..., Flight], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All that no clock decides, of the flight and its counterpart; the sweeps are those of `make numbers`.
 
     What the steps take is made up.
     """
     monkeypatch.setattr(worker_pool, "ProcessPoolExecutor", Here)
+    monkeypatch.setattr(cost_flights, "fly_scenario", fly_known)
     steps: dict[str, Any] = {"step_ms": np.ones(1200), "statuses": ("solved",) * 1200, "repeats": 1}
     timed = [CandidateTimes(name=name, **steps) for name in ("gain", "as flown")]
     few = {"tilts": (), "horizons": (), "arm_lengths": (), "drags": (), "timed": timed}
