@@ -212,7 +212,8 @@ def test_systems_that_change_agree_with_a_peer(horizon: int, soft: bool | str, t
             np.testing.assert_allclose(solver.slacks(solution), peer.slacks, atol=2e-4)
             states = ocp_peer.trajectory(now, solver.plan(solution))[1:]
             np.testing.assert_allclose(solver.states(now, solution), states, atol=1e-6)
-            assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * max(1.0, float(np.abs(solution.point.z).max()))
+            size = max(1.0, float(np.abs(solution.point.z).max()))
+            assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * size
         if peer.solution.status != SOLVED:
             continue
         solved += 1

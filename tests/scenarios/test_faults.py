@@ -25,7 +25,6 @@ from fault_injection import (
     failing,
     faults,
     fly_with,
-    inject,
     judge,
     recorded,
 )
