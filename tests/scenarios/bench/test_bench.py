@@ -403,7 +403,7 @@ def test_every_solver_has_a_place_in_the_bench() -> None:
     installed = [name for name, entry in SOLVERS.items() if entry.installed]
     default = Entry(solver="piqp-multistage", shortcut=True)
     assert {entry.solver for entry in entries(default, tuple(SOLVERS))} == set(installed)
-    assert entries(replace(default, shortcut=False), ["piqp-multistage"]) == [replace(default, shortcut=False)]
+    assert entries(default._replace(shortcut=False), ["piqp-multistage"]) == [default._replace(shortcut=False)]
 
 
 @pytest.mark.parametrize(
