@@ -173,13 +173,8 @@ def draw(shown: dict[str, Any]) -> Callable[[], Any]:
             right.plot(plant["t"], lean, label=name)
             env.close()
         right.axhline(5.0, color="tab:red", linewidth=1.0, label="5 deg")
-        right.set(
-            xlabel="time [s]",
-            ylabel="tilt [deg]",
-            ylim=(0.0, 12.0),
-            xlim=(0.0, 15.0),
-            title="A random agent in turbulence",
-        )
+        right.set(xlabel="time [s]", ylabel="tilt [deg]", ylim=(0.0, 12.0), xlim=(0.0, 15.0))
+        right.set_title("A random agent in turbulence")
         right.legend(fontsize=8)
         return drawing
 

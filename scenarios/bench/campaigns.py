@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import multiprocessing
 import re
@@ -93,9 +94,8 @@ class CampaignProfile:
     @property
     def memory_mb(self) -> float | None:
         """Of the largest worker."""
-        sizes = [run.memory_mb for pair in self.rounds for run in pair if run.memory_mb is not None]
-        sizes += [run.memory_mb for run in self.growing if run.memory_mb is not None]
-        return max(sizes, default=None)
+        runs = itertools.chain(*self.rounds, self.growing)
+        return max((run.memory_mb for run in runs if run.memory_mb is not None), default=None)
 
     def to_json(self) -> dict[str, Any]:
         """Everything, as plain values."""
@@ -236,8 +236,8 @@ class _Memory:
         if self._since.elapsed < _LOOK_EVERY:
             return
         self._since = Stopwatch()
-        sizes = [size for child in multiprocessing.active_children() if (size := _proportional(child.pid)) is not None]
-        self.largest = max([*sizes, *([] if self.largest is None else [self.largest])], default=None)
+        sizes = [_proportional(child.pid) for child in multiprocessing.active_children()]
+        self.largest = max((size for size in (*sizes, self.largest) if size is not None), default=None)
 
 
 def _proportional(pid: int | None) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -40,17 +40,10 @@ def _draw_times(axes: Axes, bench: SolverBench) -> None:
         spread = row + rng.uniform(-0.28, 0.28, times.size)
         axes.plot(times, spread, ".", color=colour, markersize=2.0, alpha=0.35, rasterized=True)
         quantiles = candidate.quantiles
-        for name, marker in (("p50", "|"), ("p99", "D"), ("max", ">")):
-            axes.plot(
-                quantiles[name],
-                row,
-                marker,
-                color="#1c1e21",
-                markersize=11.0 if marker == "|" else 4.5,
-                markeredgewidth=1.8 if marker == "|" else 0.6,
-                markerfacecolor=colour,
-                label=name if row == 0 else None,
-            )
+        for name, marker, size, edge in (("p50", "|", 11.0, 1.8), ("p99", "D", 4.5, 0.6), ("max", ">", 4.5, 0.6)):
+            looks: Any = {"markersize": size, "markeredgewidth": edge, "markerfacecolor": colour}
+            label = name if row == 0 else None
+            axes.plot(quantiles[name], row, marker, color="#1c1e21", label=label, **looks)
     axes.axvline(bench.deadline_ms, color=BOUND, linestyle="--", linewidth=1.1)
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
@@ -80,13 +73,10 @@ def _draw_growth(axes: Axes, bench: SolverBench) -> None:
         )
     horizons = sorted({N for growth in bench.growth for N in growth.horizons})
     axes.axhline(bench.deadline_ms, color=BOUND, linestyle="--", linewidth=1.1)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
+    axes.set(xscale="log", yscale="log", xlabel="horizon N", ylabel="p99 of the step [ms]")
     axes.set_xticks(horizons, [str(N) for N in horizons])
     axes.set_xticks([], minor=True)
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.set_xlabel("horizon N")
-    axes.set_ylabel("p99 of the step [ms]")
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8.0)
 
 

@@ -50,25 +50,15 @@ QUICK_WORLD, QUICK_SPEEDS, QUICK_LAWS = "loop, drag", (4.0, 6.0), ("LQR", "nonli
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """A vehicle on a course, at several speeds.
+    """A vehicle on a course, at several speeds."""
 
-    Attributes:
-        about: what it is, for a person.
-        vehicle: its name.
-        size: of the course [m]; a vehicle farther off is lost.
-        speeds: to fly at [m/s].
-        course: the table `[reference]` and the duration [s] at a speed [m/s] and a control period [s].
-        changes: of the vehicle's first scenario, whose plant has lag, inertia and drag of the vehicle's file.
-        seeds: flights at each speed; 1 where nothing is random.
-    """
-
-    about: str
-    vehicle: str
-    size: float
-    speeds: tuple[float, ...]
-    course: Callable[[float, float], tuple[Table, float]]
-    changes: Table
-    seeds: int = 1
+    about: str  # what it is, for a person
+    vehicle: str  # its name
+    size: float  # of the course [m]; a vehicle farther off is lost
+    speeds: tuple[float, ...]  # to fly at [m/s]
+    course: Callable[[float, float], tuple[Table, float]]  # `[reference]` and duration [s] at a speed, for a period [s]
+    changes: Table  # of the vehicle's first scenario, whose plant has lag, inertia and drag of the vehicle's file
+    seeds: int = 1  # flights at each speed; 1 where nothing is random
 
 
 def _loop(speed: float, period: float) -> tuple[Table, float]:
@@ -231,31 +221,19 @@ LAWS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedFlight:
-    """One flight, or several seeds of it; numbers are over what was flown, and means over the seeds but for the tilt.
+    """One flight, or several seeds of it; numbers are of what was flown, and means over the seeds but for the tilt."""
 
-    Attributes:
-        bound: on roll and pitch [deg].
-        reason: why one ended early; None where all were completed.
-        error: mean distance from the reference [m]; None where a flight was lost.
-        tilt: largest angle between thrust axis and vertical at the physics rate [deg].
-        violated: share of the time, at the physics rate, with roll or pitch beyond the bound by more than `TOLERANCE`.
-        saturated: share of periods with a rotor commanded to its lowest or highest speed.
-        fallback: share of periods not flown by the controller's own answer.
-    """
-
-    bound: float
-    reason: str | None
-    error: float | None
-    tilt: float
-    violated: float
-    saturated: float
-    fallback: float
-    seeds: int = 1
-    """Flights."""
-    lost: int = 0
-    """How many of them ended early."""
+    bound: float  # on roll and pitch [deg]
+    reason: str | None  # why one ended early; None where all were completed
+    error: float | None  # mean distance from the reference [m]; None where a flight was lost
+    tilt: float  # largest angle between thrust axis and vertical at the physics rate [deg]
+    violated: float  # share of the time, at the physics rate, with roll or pitch more than `TOLERANCE` beyond the bound
+    saturated: float  # share of periods with a rotor commanded to its lowest or highest speed
+    fallback: float  # share of periods not flown by the controller's own answer
+    seeds: int = 1  # flights
+    lost: int = 0  # how many of them ended early
+    # half the 95 % interval of the mean error [m], Student's t; None of one flight, or where one was lost
     half: float | None = None
-    """Half the 95 % interval of the mean error [m], Student's t; None of one flight, or where one was lost."""
 
 
 def merged(flights: Sequence[SpeedFlight]) -> SpeedFlight:
@@ -282,13 +260,9 @@ def merged(flights: Sequence[SpeedFlight]) -> SpeedFlight:
 
 @dataclass(frozen=True, kw_only=True)
 class SpeedBench:
-    """Controllers by worlds and speeds.
+    """Controllers by worlds and speeds."""
 
-    Attributes:
-        flights: by world, speed [m/s] and controller.
-    """
-
-    flights: Mapping[tuple[str, float, str], SpeedFlight]
+    flights: Mapping[tuple[str, float, str], SpeedFlight]  # by world, speed [m/s] and controller
 
     @property
     def worlds(self) -> dict[str, list[float]]:

@@ -39,14 +39,8 @@ def draw_speeds(measured: SpeedBench) -> Figure:
             violations.plot(speeds, [100.0 * flight.violated for flight in flights], **style)
             lost = [speed for speed, flight in zip(speeds, flights, strict=True) if flight.error is None]
             row = 0.98 - 0.02 * measured.laws.index(law)
-            errors.plot(
-                lost,
-                [row] * len(lost),
-                "x",
-                markersize=5.0,
-                color=styles[law]["color"],
-                transform=errors.get_xaxis_transform(),
-            )
+            at_top = {"color": styles[law]["color"], "transform": errors.get_xaxis_transform()}
+            errors.plot(lost, [row] * len(lost), "x", markersize=5.0, **at_top)
         violations.set_xlabel("speed [m/s]")
     panels[0, 0].set_ylim(top=_TOP)
     panels[0, 0].set_ylabel("mean position error [m]; x: lost")

@@ -52,17 +52,9 @@ def _draw_panel(axes: Axes, measured: MismatchBench, panel: _Panel) -> None:
             flight = measured.flights[controller, condition]
             colour, text = _look(flight, panel)
             axes.add_patch(Rectangle((column, row), 1.0, 1.0, facecolor=colour, edgecolor="white", linewidth=1.2))
-            axes.text(
-                column + 0.5,
-                row + 0.5,
-                text,
-                ha="center",
-                va="center",
-                fontsize=7.5,
-                color="#1c1e21" if flight.survived else "white",
-            )
-    axes.set_xlim(0.0, len(measured.conditions))
-    axes.set_ylim(len(measured.controllers), 0.0)
+            dark = "#1c1e21" if flight.survived else "white"
+            axes.text(column + 0.5, row + 0.5, text, ha="center", va="center", fontsize=7.5, color=dark)
+    axes.set(xlim=(0.0, len(measured.conditions)), ylim=(len(measured.controllers), 0.0))
     positions = [column + 0.5 for column in range(len(measured.conditions))]
     axes.set_xticks(positions, [_broken(name) for name in measured.conditions], fontsize=7.5)
     axes.set_yticks([row + 0.5 for row in range(len(measured.controllers))], [*measured.controllers], fontsize=8.5)

@@ -135,11 +135,10 @@ def candidate_table(summary: Summary) -> Grid:
 def importance_table(summary: Summary) -> Grid:
     """How much each field matters to each objective."""
     found = summary["importance"]
-    names = [entry["name"] for entry in summary["search"]]
-    lines = [
-        line(name, *(f"{100.0 * shares[name]:.0f} %" if name in shares else ABSENT for shares in found.values()))
-        for name in names
-    ]
+    lines = []
+    for entry in summary["search"]:
+        shares = (each.get(entry["name"]) for each in found.values())
+        lines.append(line(entry["name"], *(ABSENT if share is None else f"{100.0 * share:.0f} %" for share in shares)))
     return Grid(
         key="importance",
         title="What matters",
