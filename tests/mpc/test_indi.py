@@ -54,7 +54,7 @@ def test_an_unknown_torque_is_made_up_for_within_the_filter_s_time(vehicle: Vehi
     np.testing.assert_allclose(later - modelled_later, rates - modelled, atol=0.1 * np.abs(gained).max())
 
 
-def flown(vehicle: Vehicle, effects: Effects, settings: INDISettings | None, periods: int = 100) -> FlightLog:
+def flown(vehicle: Vehicle, effects: Effects, settings: INDISettings | None, periods: int = 50) -> FlightLog:
     law = GeometricController(vehicle, geometric_settings(vehicle, period=0.05))
     controller = law if settings is None else Incremental(law, vehicle, settings, law.bounds)
     with Plant(vehicle, effects=effects, limit_speeds=True) as plant:

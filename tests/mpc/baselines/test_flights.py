@@ -66,7 +66,7 @@ def test_integrals_lift_a_heavier_vehicle_to_its_height(
 ) -> None:
     effects = Effects(load=Load(mass_factor=1.2))
     log = fly_from(
-        build(law, vehicle, **others), vehicle, make_state(), periods=500, course=np.zeros(4), effects=effects
+        build(law, vehicle, **others), vehicle, make_state(), periods=350, course=np.zeros(4), effects=effects
     ).control
     assert np.abs(log.truth[:, 4]).max() > 0.2
     assert abs(log.truth[-1, 4]) < 0.02

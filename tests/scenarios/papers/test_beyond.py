@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
+from quadsim.state import VELOCITIES
 from scenarios.flight import Flight
 
 Fly = Callable[..., Flight]
@@ -19,17 +21,20 @@ def error(flight: Flight) -> float:
 
 
 @pytest.mark.parametrize(
-    ("name", "settings"),
-    [("torrente-loop8-flatness", ()), ("torrente-loop8-all", ("controller.disturbance={}",))],
+    ("name", "settings", "share"),
+    [("torrente-loop8-flatness", (), 0.4), ("torrente-loop8-all", ("controller.disturbance={}",), 0.7)],
     ids=["flatness", "nonlinear"],
 )
 def test_the_circle_at_8_m_s_is_flown_better_than_by_learned_models(
-    fly_once: Fly, name: str, settings: tuple[str, ...]
+    fly_once: Fly, name: str, settings: tuple[str, ...], share: float
 ) -> None:
-    assert error(fly_once(name, *settings, "seed=3")) < LEARNED
+    """Ten seconds, in which it comes to its full speed, with a share of the published error; whole: make reproduce."""
+    flight = fly_once(name, *settings, "seed=3", "duration=10", "constraints=[]")
+    assert error(flight) < share * LEARNED
+    assert np.linalg.norm(flight.log.control.truth[:, VELOCITIES], axis=1).max() > 8.0
 
 
 def test_nonlinear_mpc_with_indi_hardly_feels_a_constant_torque(fly_once: Fly) -> None:
-    alone = error(fly_once("torrente-loop4-ideal", TORQUE))
+    alone = error(fly_once("torrente-loop4-ideal", TORQUE, "duration=3"))
     assert alone > 0.02
-    assert error(fly_once("torrente-loop4-ideal", TORQUE, "controller.indi={}")) < 0.02 * alone
+    assert error(fly_once("torrente-loop4-ideal", TORQUE, "controller.indi={}", "duration=3")) < 0.02 * alone

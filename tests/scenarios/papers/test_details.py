@@ -58,8 +58,8 @@ def test_a_window_one_sample_late(name: str, expected: float, digit: float) -> N
 
 def drag_in_world_axes(time: float, state: Array) -> Array:
     """The published drag of 1 kg, but by components of the velocity in the world frame."""
-    v = state[VELOCITIES]
-    return np.concatenate([-(0.08 * np.abs(v) + [0.3, 0.3, 0.0]) * v, np.zeros(3)])
+    x, y, z = state[VELOCITIES].tolist()
+    return np.array([-(0.08 * abs(x) + 0.3) * x, -(0.08 * abs(y) + 0.3) * y, -0.08 * abs(z) * z, 0.0, 0.0, 0.0])
 
 
 def test_drag_by_component_in_the_world_frame() -> None:

@@ -54,7 +54,7 @@ def test_without_disturbance_and_with_little_noise_the_estimate_becomes_the_trut
 
 
 def test_the_estimate_is_better_than_the_samples(gentle: Any, run_filter: SIMULATE) -> None:
-    errors = [run_filter(gentle, SENSORS, SETTINGS, seed=seed)[1][20:] for seed in range(6)]
+    errors = [run_filter(gentle, SENSORS, SETTINGS, seed=seed)[1][20:] for seed in range(4)]
     assert rms(errors, slice(0, 3)) < 0.5 * POSITION.noise[0]
     assert rms(errors, slice(6, 9)) < 0.5 * ATTITUDE.noise[0]
 
@@ -63,10 +63,10 @@ def test_late_samples_are_weighted_by_their_time_stamp(
     vehicle: Vehicle, simulate_motion: SIMULATE, run_filter: SIMULATE
 ) -> None:
     """Falling, a tenth of a second is worth many times the noise; the naive filter does not know the delay."""
-    motion = simulate_motion(SETTINGS, 0.9 * hover(vehicle, 2000), seeds=6, rng=np.random.default_rng(2))
+    motion = simulate_motion(SETTINGS, 0.9 * hover(vehicle, 2000), seeds=4, rng=np.random.default_rng(2))
     late = (replace(POSITION, delay=0.1), replace(VELOCITY, delay=0.1), ATTITUDE, RATES)
     prompt, fused, naive = (
-        rms([run_filter(motion, sensors, SETTINGS, seed=s, believed=believed)[1][20:] for s in range(6)], slice(0, 3))
+        rms([run_filter(motion, sensors, SETTINGS, seed=s, believed=believed)[1][20:] for s in range(4)], slice(0, 3))
         for sensors, believed in ((SENSORS, SENSORS), (late, late), (late, SENSORS))
     )
     assert fused < 1.5 * prompt
