@@ -16,8 +16,12 @@ PACKAGES: Final = ("mujoco", "numpy", "scipy", "piqp", "rerun-sdk", "imageio", "
 
 def versions() -> dict[str, str]:
     """Versions of what the numbers depend on."""
-    packages = {name: importlib.metadata.version(name) for name in PACKAGES}
-    return {"quadsim": __version__, "python": platform.python_version(), **packages}
+    return {"quadsim": __version__, "python": platform.python_version(), **_packages()}
+
+
+@cache
+def _packages() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in PACKAGES}
 
 
 def machine() -> dict[str, Any]:

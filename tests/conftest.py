@@ -10,12 +10,11 @@ import pickle
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import settings
-from support import Here, draw_nothing, take_long_steps
+from support import Here, draw_nothing, sketch_figures, take_long_steps
 
 from quadsim.controller import Controller
 from quadsim.flight import rundir
@@ -136,17 +135,8 @@ def short_run_directory(short_run: Run) -> Path:
 
 @pytest.fixture
 def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are not laid out, and their PNG files are empty: for tests of the SVG's text, or of other files."""
-    from matplotlib.figure import Figure
-
-    save = Figure.savefig
-
-    def sketch(figure: Figure, file: Any, *, format: str, **options: Any) -> None:
-        if format != "png":
-            save(figure, file, format=format, **options)
-
-    monkeypatch.setattr(Figure, "savefig", sketch)
-    monkeypatch.setattr(Figure, "get_layout_engine", lambda _: None)
+    """See `support.sketch_figures`."""
+    sketch_figures(monkeypatch)
 
 
 @pytest.fixture

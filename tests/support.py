@@ -25,6 +25,20 @@ from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 
 
+def sketch_figures(patch: pytest.MonkeyPatch) -> None:
+    """Lay no figures out, and leave their PNG files empty: for tests of the SVG's text, or of other files."""
+    from matplotlib.figure import Figure
+
+    save = Figure.savefig
+
+    def sketch(figure: Figure, file: Any, *, format: str, **options: Any) -> None:
+        if format != "png":
+            save(figure, file, format=format, **options)
+
+    patch.setattr(Figure, "savefig", sketch)
+    patch.setattr(Figure, "get_layout_engine", lambda _: None)
+
+
 class Here:
     """Stands in for a pool of processes: does what it is given at once, in this one, which takes no time to start."""
 

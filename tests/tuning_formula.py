@@ -36,7 +36,7 @@ TUNING: dict[str, Any] = {
     ],
     "campaign": {
         "scenario": "hover",
-        "set": {"duration": 0.5, "constraints": [], "controller": {"horizon": 10}},
+        "set": {"duration": 0.5, "constraints": [], "controller": {"horizon": 4}},
         "vary": [
             {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.9, "high": 1.1}
         ],

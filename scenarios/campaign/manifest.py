@@ -166,6 +166,8 @@ def controller_digest(scenario: Scenario) -> str | None:
     Raises:
         InputError: the controller cannot be made.
     """
+    if not isinstance(scenario.controller, PluginSpec):
+        return None
     controller = make_controller(scenario.controller, build_vehicle(scenario), scenario.control_period)
     if not isinstance(controller, PluginController):
         return None

@@ -34,7 +34,7 @@ CAMPAIGN: dict[str, Any] = {
     "flights": 12,
     "seed": 4,
     "failure": ["lost", "max_error.z > 0.2"],
-    "set": {"duration": 0.5, "constraints": [], "controller": {"horizon": 10}},
+    "set": {"duration": 0.5, "constraints": [], "controller": {"horizon": 4}},
     "vary": [
         {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
     ],

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
+from support import sketch_figures
 from tuning_formula import Formula, write_tuning
 
 from quadsim.report.table import Mark
@@ -19,10 +19,13 @@ OBJECTIVES = [
 ]
 
 
-@pytest.fixture
-def result(tmp_path: Path, sketched: None) -> TuningResult:
-    plan = load_tuning(str(write_tuning(tmp_path, objectives=OBJECTIVES, trials=12, description="a <b>bowl</b>")))
-    return tune(plan, tmp_path / "t", Formula())
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
+    here = tmp_path_factory.mktemp("tuning")
+    plan = load_tuning(str(write_tuning(here, objectives=OBJECTIVES, trials=12, description="a <b>bowl</b>")))
+    with pytest.MonkeyPatch.context() as patch:
+        sketch_figures(patch)
+        return tune(plan, here / "t", Formula())
 
 
 def test_the_page_links_to_what_is_there(result: TuningResult) -> None:
