@@ -64,6 +64,7 @@ def forked() -> Iterator[None]:
     server._stop()  # who had it before wanted other modules
     server.set_forkserver_preload(["distributed", "scenarios.campaign.engine.cluster", "scenarios.campaign.preload"])
     patch.setattr("distributed.utils._forkserver_preload_set", True)
+    patch.setattr(module, "_LOOK_S", 0.3)  # as long as nobody knows that a worker has come
     with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
         yield
     patch.undo()
@@ -294,7 +295,7 @@ def test_a_killed_scheduler_ends_the_campaign_with_what_was_answered(
 ) -> None:
     monkeypatch.setattr(module, "_CONNECT_S", 1.0)  # as long as it is called again
     scheduler = processes("scheduler", "--host", "127.0.0.1", "--port", "0")
-    processes("worker", "--nthreads", "1", "--nworkers", "2", "--death-timeout", "60")
+    processes("worker", "--nthreads", "1", "--no-nanny", "--death-timeout", "60")
     file = tmp_path / "scheduler.json"
     assert until(lambda: file.exists() and bool(file.read_text()), seconds=30.0), (
         tmp_path / "scheduler.log"
