@@ -34,8 +34,10 @@ from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from scenarios.cli import main
 
+MANY: Final = 700
+"""Below so many cases those that are let through are not drawn, which takes most of the time."""
 BARE: Final = ("--no-video", "--no-recording", "--no-figures")
-SHORT: Final = ("--set", "duration=0.5")
+SHORT: Final = ("--set", "duration=0.5", "--set", "controller.horizon=4")
 RACE: Final = ("run", "hover", *SHORT, *BARE, "--json")
 BROKEN: Final = ("--set", "constraints.speed.upper=150.0")
 """Makes the flight violate a constraint."""
@@ -278,7 +280,7 @@ def measure_summaries(count: int, seed: int = 0) -> dict[str, int]:
         Counts of `cases`, of those `refused`, of `tracebacks`, `false_verdicts` and `wrong_answers` (no clear message).
     """
     tally, rng = Tally(), random.Random(seed)
-    with tempfile.TemporaryDirectory() as folder, _away(Path(folder)) as here, _no_films():
+    with tempfile.TemporaryDirectory() as folder, _away(Path(folder)) as here, _no_pictures(count):
         bases = {}
         for name, settings in (("good", ()), ("bad", BROKEN)):
             call(*RACE, *settings, "--out", name)
@@ -352,7 +354,11 @@ CAMPAIGN: Final[dict[str, Any]] = {
     "scenario": "hover",
     "flights": 6,
     "failure": ["lost", "max_error.z > 0.2"],
-    "set": {"duration": 0.5, "constraints": [{"name": "roll", "signal": "roll", "lower": -5.0, "upper": 5.0}]},
+    "set": {
+        "duration": 0.5,
+        "constraints": [{"name": "roll", "signal": "roll", "lower": -5.0, "upper": 5.0}],
+        "controller": {"horizon": 4},
+    },
     "vary": [
         {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
     ],
@@ -462,7 +468,7 @@ def measure_campaigns(count: int, seed: int = 0) -> dict[str, int]:
         Counts, as of `measure_summaries`.
     """
     tally, rng = Tally(), random.Random(seed)
-    with tempfile.TemporaryDirectory() as folder, _away(Path(folder)) as here, _no_films():
+    with tempfile.TemporaryDirectory() as folder, _away(Path(folder)) as here, _no_pictures(count):
         for name in ("first", "second"):
             (here / f"{name}.toml").write_text(tomlkit.dumps({**CAMPAIGN, "name": name}), encoding="utf-8")
             call("campaign", f"{name}.toml", "--out", name, "--workers", "1", "--no-report", "--json")
@@ -536,8 +542,8 @@ def _away(folder: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def _no_films() -> Iterator[None]:
-    """Neither films nor windows: whatever gets as far has been let through."""
+def _no_pictures(count: int) -> Iterator[None]:
+    """Neither films nor windows, and of few cases no figures and plots: whatever gets as far has been let through."""
 
     def write(_: Path, path: Path, **__: object) -> None:
         put(path, b"film")
@@ -545,7 +551,10 @@ def _no_films() -> Iterator[None]:
     with (
         mock.patch("quadsim.report.film.video.render_video", write),
         mock.patch("quadsim.report.recording.open_viewer"),
+        contextlib.ExitStack() as stack,
     ):
+        for name in ("comparison_figure", "comparison_plots") if count < MANY else ():
+            stack.enter_context(mock.patch(f"quadsim.report.pages.comparison_page.{name}", return_value=[]))
         yield
 
 
