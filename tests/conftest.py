@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings
-from support import Here, draw_nothing, sketch_figures, take_long_steps
+from support import Here, draw_nothing, fly_campaigns_here, sketch_figures, take_long_steps
 
 from quadsim.controller import Controller
 from quadsim.flight import rundir
@@ -164,6 +164,12 @@ def recorded_here(monkeypatch: pytest.MonkeyPatch) -> None:
         write_recording(rundir.load_run(directory), directory / rundir.RECORDING_FILE)
 
     monkeypatch.setattr("quadsim.report.recording.recording_in_background", recording)
+
+
+@pytest.fixture
+def campaigns_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """See `support.fly_campaigns_here`."""
+    fly_campaigns_here(monkeypatch)
 
 
 @pytest.fixture

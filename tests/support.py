@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import Any
@@ -19,6 +19,8 @@ from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_problem
+from scenarios.campaign.engine.protocol import Pilot, fly_one
+from scenarios.campaign.results.table import Row
 from scenarios.courses.make import build_reference
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
@@ -52,6 +54,18 @@ class Here:
 
     def shutdown(self, **_: object) -> None:
         pass
+
+
+def fly_campaigns_here(patch: pytest.MonkeyPatch) -> None:
+    """Have campaigns and sweeps flown by this process, whose start takes no time, in the place of workers."""
+    from scenarios.campaign.engine.local import LocalEngine
+
+    def answers(engine: LocalEngine, pilot: Pilot, flights: Sequence[int]) -> Iterator[Row]:
+        pilot.prepare()
+        for flight in flights:
+            yield fly_one(pilot, flight).row
+
+    patch.setattr(LocalEngine, "answers", answers)
 
 
 def draw_nothing(patch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from support import fly_campaigns_here
 from tuning_formula import write_tuning
 
 import quadsim
@@ -121,7 +122,9 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The campaign of the README, shorter and of fewer flights."""
     directory = tmp_path_factory.mktemp("campaign") / "paper-robustness"
-    assert main(["campaign", "paper-robustness", *ADDED["campaign"][:-1], str(directory)]) == EXIT_DONE
+    with pytest.MonkeyPatch.context() as patch:
+        fly_campaigns_here(patch)
+        assert main(["campaign", "paper-robustness", *ADDED["campaign"][:-1], str(directory)]) == EXIT_DONE
     return directory
 
 
@@ -138,7 +141,7 @@ def test_documented_scenarios_and_settings_are_valid(line: str) -> None:
         load_scenario(scenario, options.settings)
 
 
-@pytest.mark.usefixtures("workplace", "undrawn", "recorded_here")
+@pytest.mark.usefixtures("workplace", "undrawn", "recorded_here", "campaigns_here")
 @pytest.mark.parametrize("line", RUNNABLE)
 def test_documented_command_runs(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = arguments_of(line)

@@ -122,6 +122,7 @@ def test_the_site_has_every_page() -> None:
     assert set(re.findall(r"[a-z-]+\.md", site)) == pages
 
 
+@pytest.mark.usefixtures("campaigns_here")
 @pytest.mark.parametrize("document", ["../README.md", *sorted(path.name for path in (ROOT / "docs").glob("*.md"))])
 def test_python_on_the_pages_runs(document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The blocks of a page in their order, as the notebook that it is too."""

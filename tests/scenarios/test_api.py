@@ -64,7 +64,7 @@ RENDERS = {"film", "draw_vehicle", "bench_render"}
 """Whose examples need a machine that renders."""
 
 
-@pytest.mark.usefixtures("undrawn", "recorded_here", "cheap_benchmarks")
+@pytest.mark.usefixtures("undrawn", "recorded_here", "cheap_benchmarks", "campaigns_here")
 @pytest.mark.parametrize("name", [*quadsim.__all__, *(f"gym.{name}" for name in quadsim.gym.__all__)])
 def test_every_docstring_has_an_example_that_runs(
     name: str, fly_known: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -270,6 +270,7 @@ def test_a_force_with_memory_is_seeded(hover: Scenario) -> None:
     assert not np.array_equal(first.plant["vz"], other.plant["vz"])
 
 
+@pytest.mark.usefixtures("campaigns_here")
 def test_a_force_of_a_file_acts_in_a_sweep(hover: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = "import numpy as np\ndef lift(time, state):\n    return np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])\n"
     (tmp_path / "my_forces.py").write_text(source)
@@ -349,6 +350,7 @@ def test_a_custom_law_is_sent_to_other_processes_by_its_place(
             quadsim.sweep(hover, {"vehicle.mass": [4.0]}, controller=law, workers=1)
 
 
+@pytest.mark.usefixtures("campaigns_here")
 def test_a_campaign_of_a_scenario_judges_requirements(hover: Scenario, tmp_path: Path) -> None:
     mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "uniform", "low": 4.0, "high": 4.4}
     found = quadsim.campaign(

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from quadsim.errors import printable
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 PAGE_FILE: Final = "index.html"
 
@@ -17,9 +21,14 @@ def render_page(template: str, kind: str, **context: Any) -> str:
 
     Whatever these hold is printable text, unless the template states otherwise.
     """
+    return _environment().get_template(template).render(kind=kind, **context)
+
+
+@functools.cache  # it compiles each template once
+def _environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    environment = Environment(
+    return Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
@@ -27,7 +36,6 @@ def render_page(template: str, kind: str, **context: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(template).render(kind=kind, **context)
 
 
 def _shown(value: Any) -> Any:

@@ -14,6 +14,7 @@ from support import draw_nothing
 
 from quadsim.errors import OutputError, ParameterError
 from quadsim.flight.rundir import Run
+from quadsim.report.pages import comparison_page
 from quadsim.report.pages.comparison_page import write_comparison
 from quadsim.report.plots.flight_plots import comparison_plots, thin
 from scenarios.cost.section import cost_section
@@ -48,6 +49,12 @@ def _undrawn() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         draw_nothing(patch)
         yield
+
+
+@pytest.fixture
+def unplotted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages without plots of the flights, for tests of all else."""
+    monkeypatch.setattr(comparison_page, "comparison_plots", lambda runs: [])
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +112,7 @@ def test_the_text_gives_outcomes_reasons_and_numbers(page_of_two: Path) -> None:
     assert "lost/flight.rrd" not in text
 
 
+@pytest.mark.usefixtures("unplotted")
 def test_a_study_of_costs_has_a_section_and_files(
     short_run: Run, cost_study: CostStudy, page: Path, tmp_path: Path
 ) -> None:
@@ -139,6 +147,7 @@ def test_hostile_names_are_text(short_run: Run, tmp_path: Path) -> None:
     assert (page.parent / "script-alert-1-script-more-quoted").is_dir()
 
 
+@pytest.mark.usefixtures("unplotted")
 def test_runs_of_one_name_keep_their_files_apart(short_run: Run, tmp_path: Path) -> None:
     page = write_comparison([short_run, short_run, renamed(short_run, "!"), renamed(short_run, "?")], tmp_path / "out")
     folders = {path.name for path in page.parent.iterdir() if path.is_dir()}
@@ -154,6 +163,7 @@ def test_runs_without_a_period_or_constraints_are_compared(short_run: Run, empty
     assert "the command is not finite" in text
 
 
+@pytest.mark.usefixtures("unplotted")
 def test_an_earlier_comparison_is_replaced_and_nothing_else(short_run: Run, tmp_path: Path) -> None:
     target = tmp_path / "out"
     write_comparison([renamed(short_run, "first")], target)
@@ -175,6 +185,7 @@ def test_a_place_that_holds_a_run_is_refused(short_run: Run) -> None:
     assert (short_run.directory / "summary.json").is_file()
 
 
+@pytest.mark.usefixtures("unplotted")
 def test_nothing_is_left_of_a_comparison_that_fails(
     short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -210,6 +221,7 @@ def test_thinning_keeps_gaps() -> None:
     assert np.nanmax(values[thinned]) == np.nanmax(values)
 
 
+@pytest.mark.usefixtures("unplotted")
 def test_the_page_shows_the_verdict_against_the_one_expected(short_run: Run, tmp_path: Path) -> None:
     summary = {**short_run.summary, "expected": "lost", "as_expected": False, "constraints": []}
     page = write_comparison([dataclasses.replace(short_run, summary=summary)], tmp_path / "out").read_text()
