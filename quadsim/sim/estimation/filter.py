@@ -2,8 +2,9 @@
 
 The filter stands at the fusion horizon, now less the largest delay: every sample taken before has arrived and has been
 used, in the order of the time stamps.  What has arrived since is stored, and each time an estimate is requested it is
-used on a copy that runs on to now; so a late sample corrects the past it belongs to.  Rotor speeds, and whether the
-vehicle stood, are stored likewise for each step since the horizon.
+used on copies that run on to now; so a late sample corrects the past it belongs to.  The copy after each of these
+samples is kept, and is where the next estimate goes on from, until a sample arrives that was taken before it.  Rotor
+speeds, and whether the vehicle stood, are stored likewise for each step since the horizon.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -34,7 +35,7 @@ _LARGEST: Final = 1e6  # A mean or a sample beyond this in magnitude [SI units],
 _LARGEST_VARIANCE: Final = 1e15  # the same for the trace of a covariance
 
 
-@dataclass(kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Tally:
     """What became of one sensor's samples."""
 
@@ -54,8 +55,16 @@ class _Track:
     tallies: dict[SensorName, Tally] = field(default_factory=dict)
 
     def branch(self) -> _Track:
-        tallies = {name: replace(tally) for name, tally in self.tallies.items()}
-        return replace(self, refused=dict(self.refused), tallies=tallies)
+        return _Track(
+            step=self.step, estimate=self.estimate, refused=dict(self.refused), tallies=dict(self.tallies)
+        )
+
+    def count(self, name: SensorName, *, accepted: int = 0, rejected: int = 0, nis: float = 0.0) -> None:
+        """Add to a sensor's tally."""
+        old = self.tallies[name]
+        self.tallies[name] = Tally(
+            accepted=old.accepted + accepted, rejected=old.rejected + rejected, nis=old.nis + nis
+        )
 
 
 class ErrorStateFilter:
@@ -109,6 +118,7 @@ class ErrorStateFilter:
         self._starts, self._speeds, self._standing = [0], speeds.copy(), False
         self._drives: list[Drive | None] = [drive(self._model, speeds)]
         self._waiting: list[Sample] = []
+        self._ahead: list[_Track] = []  # after each of the first that wait
 
     def _initial(self) -> Array:
         s = self.settings
@@ -118,7 +128,7 @@ class ErrorStateFilter:
     @property
     def tallies(self) -> dict[SensorName, Tally]:
         """What became of each sensor's samples, those after the fusion horizon not yet counted."""
-        return {name: replace(tally) for name, tally in self._track.tallies.items()}
+        return dict(self._track.tallies)
 
     def advance(self, commands: Array, samples: Iterable[Sample], first: int, *, standing: bool = False) -> None:
         """Take note of a segment of flight and run the filter on to the fusion horizon.
@@ -139,29 +149,40 @@ class ErrorStateFilter:
         if len(commands):
             self._speeds, self._standing = commands[-1].copy(), standing
         horizon = first + len(commands) - self._horizon
+        before = self._waiting.copy()
         for sample in samples:
             if np.abs(sample.value).max() < _LARGEST:  # as NaN is not
                 self._waiting.append(sample)
             else:
-                self._track.tallies[sample.sensor].rejected += 1
+                for track in (self._track, *self._ahead):
+                    track.count(sample.sensor, rejected=1)
         self._waiting.sort(key=lambda sample: (sample.taken, _NAMES.index(sample.sensor)))
+        moved = (i for i, (one, other) in enumerate(zip(before, self._waiting, strict=False)) if one is not other)
+        del self._ahead[next(moved, len(before)) :]
         ripe = bisect.bisect_right(self._waiting, horizon, key=lambda sample: sample.taken)
-        self._run(self._track, self._waiting[:ripe])
-        del self._waiting[:ripe]
+        used = min(ripe, len(self._ahead))
+        if used:
+            self._track = self._ahead[used - 1]
+        for sample in self._waiting[used:ripe]:
+            self._take(self._track, sample)
+        del self._waiting[:ripe], self._ahead[:ripe]
         first = bisect.bisect_right(self._starts, self._track.step) - 1
         del self._starts[:first], self._drives[:first]
 
     def estimate(self, step: int) -> Estimate:
         """The estimate at a physics step, no earlier than the last one that was given."""
-        track = self._track.branch()
-        self._run(track, self._waiting)
+        track = self._ahead[-1] if self._ahead else self._track
+        for sample in self._waiting[len(self._ahead) :]:
+            track = track.branch()
+            self._take(track, sample)
+            self._ahead.append(track)
+        track = track.branch()
         self._predict(track, step)
         return track.estimate
 
-    def _run(self, track: _Track, samples: list[Sample]) -> None:
-        for sample in samples:
-            self._predict(track, sample.taken)
-            self._use(track, sample)
+    def _take(self, track: _Track, sample: Sample) -> None:
+        self._predict(track, sample.taken)
+        self._use(track, sample)
 
     def _predict(self, track: _Track, step: int) -> None:
         while track.step < step:
@@ -179,16 +200,15 @@ class ErrorStateFilter:
             track.estimate, track.step = after, until
 
     def _use(self, track: _Track, sample: Sample) -> None:
-        name, tally = sample.sensor, track.tallies[sample.sensor]
+        name = sample.sensor
         refused = sample.taken - track.refused.get(name, sample.taken)
         if refused >= self._patience > 0.0:
             track.estimate = doubt(track.estimate, name, sample.value, refused * self._timestep)
         after, distance = update(track.estimate, name, sample.value, self._variances[name], self._gate)
         if after is track.estimate:
-            tally.rejected += 1
+            track.count(name, rejected=1)
             track.refused.setdefault(name, sample.taken)
             return
         track.estimate = after
         track.refused.pop(name, None)
-        tally.accepted += 1
-        tally.nis += distance
+        track.count(name, accepted=1, nis=distance)
