@@ -272,7 +272,7 @@ def test_most_of_what_is_drawn_is_accepted_and_some_is_refused() -> None:
     """Else the test above would hold little."""
     found = []
 
-    @settings(max_examples=100, derandomize=True, database=None)
+    @settings(max_examples=60, derandomize=True, database=None)
     @given(table=tables())
     def count(table: dict[str, Any]) -> None:
         found.append(accepted(table) is not None)

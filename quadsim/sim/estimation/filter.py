@@ -55,9 +55,7 @@ class _Track:
     tallies: dict[SensorName, Tally] = field(default_factory=dict)
 
     def branch(self) -> _Track:
-        return _Track(
-            step=self.step, estimate=self.estimate, refused=dict(self.refused), tallies=dict(self.tallies)
-        )
+        return _Track(step=self.step, estimate=self.estimate, refused=dict(self.refused), tallies=dict(self.tallies))
 
     def count(self, name: SensorName, *, accepted: int = 0, rejected: int = 0, nis: float = 0.0) -> None:
         """Add to a sensor's tally."""

@@ -109,12 +109,12 @@ def test_axis_by_axis_is_the_whole_where_and_only_where_inputs_stay_in_bounds(
 def test_every_way_is_taken_by_random_problems() -> None:
     """What the test above rests on."""
     methods = []
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         problem = random_axes(rng, horizon=6, room=float(rng.choice([1.0, 1000.0])))
         size, n = rng.choice([0.1, 2.0]), problem.model.n
         methods.append(shortcut(problem).solve(size * rng.normal(size=n), np.zeros((6, n)), problem.model.u_bar).method)
-    assert min(methods.count(method) for method in Method) >= 5
+    assert min(methods.count(method) for method in Method) >= 3
 
 
 @pytest.mark.parametrize("part", ["u_min", "u_max", "delta_min", "delta_max", "y_min", "y_max"])
@@ -340,8 +340,8 @@ def test_steps_leak_no_memory_and_allocate_nothing_large(sideways: float, height
     assert shortcut(problem).solve(np.zeros(12), reference, problem.model.u_bar).method is method
     state = np.zeros(12)
 
-    def take_50_steps() -> str:
-        for _ in range(50):
+    def take_25_steps() -> str:
+        for _ in range(25):
             status = controller.step(Moment(), state, reference).status
             controller.reset(problem.model.u_bar)
         return status
@@ -351,19 +351,19 @@ def test_steps_leak_no_memory_and_allocate_nothing_large(sideways: float, height
         list(map(tuple, np.zeros((3000, size))))
     tracemalloc.start()
     try:
-        status = take_50_steps()
+        status = take_25_steps()
         before, _ = tracemalloc.get_traced_memory()
         tracemalloc.reset_peak()
         held = [before]
         for _ in range(2):
-            take_50_steps()
+            take_25_steps()
             held.append(tracemalloc.get_traced_memory()[0])
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
         gc.enable()
     assert status == (UNCONSTRAINED if method is Method.FREE else SOLVED)
-    assert np.diff(held).min() < 2_000  # flat, less than 40 bytes a step; something may be loaded once
+    assert np.diff(held).min() < 1_000  # flat, less than 40 bytes a step; something may be loaded once
     # The condensed H alone has 320 kB; the whole QP's polish needs that for its active rows, twice.
     assert peak - before < (800_000 if method is Method.WHOLE else 80_000)
 

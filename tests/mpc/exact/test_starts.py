@@ -131,7 +131,7 @@ def test_bounds_that_only_some_steps_have(constrained_flight: Flight) -> None:
 def test_over_the_papers_flight(constrained_flight: Flight) -> None:
     problem = paper_problem()
     queries = [(*query, problem.rest) for query in flight_queries(constrained_flight, problem, stride=1)]
-    methods = agreed(problem, queries, stride=5)
+    methods = agreed(problem, queries, stride=12)
     assert min(methods.values()) > 10
     assert methods[Method.AXES] > 300
 
@@ -140,6 +140,6 @@ def test_over_a_robust_flight(robust_queries: tuple[Problem, list[Query]]) -> No
     problem, queries = robust_queries
     assert problem.rows.soft.size == 2
     assert len(queries) > 200
-    methods = agreed(problem, queries, stride=3)
+    methods = agreed(problem, queries, stride=6)
     assert methods[Method.FREE] > 20
     assert methods[Method.AXES] + methods[Method.WHOLE] > 20

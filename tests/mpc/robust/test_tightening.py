@@ -445,8 +445,6 @@ TURNS, ALL = alternating(3.0, 0.0), alternating(6.0, STATED.acceleration)
     ("course", "rotor_lag", "delay"),
     [
         (TURNS, 0.0, 0.0),
-        (TURNS, LAG, 0.0),
-        (TURNS, 0.0, 0.05),
         (TURNS, LAG, 0.05),
         (ALL, 0.0, 0.05),
         (ALL, LAG, 0.05),

@@ -21,8 +21,8 @@ from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.robust import RobustSpec
 
 ALL = {vehicle.name: vehicle for vehicle in vehicles()}
-HARDEST = ("random-08", "random-16", "random-17")
-"""The slowest rotors, 20 kg, and the one that strays most."""
+HARDEST = ("random-08", "random-17")
+"""The slowest rotors, and the one that strays most."""
 
 
 @cache

@@ -91,7 +91,7 @@ def test_a_tilt_grows_in_the_air_by_munks_moment() -> None:
 
 def test_a_figure_eight_keeps_below_the_speed_at_which_the_air_turns_the_vehicle() -> None:
     """Its speed, by the course that is flown, is 60 % of that at which p = w; else its acceleration is that of tilt."""
-    for vehicle in ALL:
+    for vehicle in [each for each in ALL if each.name == "random-16"] + ALL[::3]:
         tuning = tune(vehicle)
         reference = first_scenario(vehicle, vehicle.name, course="figure-eight").to_data()["reference"]
         speed = math.sqrt(0.5) * reference["length"] * math.tau / reference["period"]
