@@ -309,6 +309,7 @@ def test_junit_reports_an_aborted_flight_with_its_reason(here: Path, capsys: pyt
 # --- compare, video, view ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("sketched")
 def test_compare_makes_a_page_and_prints_a_table(
     hover_directory: Path, short_run_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -308,6 +308,7 @@ def test_a_defect_of_our_own_is_not_taken_for_a_flight(tmp_path: Path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize("cores", [1, 2])
 def test_a_recording_that_cannot_be_made_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
@@ -319,6 +320,7 @@ def test_a_recording_that_cannot_be_made_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize("cores", [1, 2])
 def test_outputs_are_made_as_requested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int) -> None:
     """Where there are cores for it, the recording by a process of its own."""
