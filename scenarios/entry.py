@@ -93,6 +93,7 @@ def main() -> int:
     except (KeyboardInterrupt, ImportError, SystemError) as error:
         if not (isinstance(error, KeyboardInterrupt) or handler.heard):
             raise
+        signal.setitimer(signal.ITIMER_REAL, 0.0)  # a stop that was to be raised after an import is answered here
         with contextlib.suppress(OSError):  # the terminal may be gone
             print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
         return 1
