@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 from mpc.answer import Answer
 from mpc.exact.shortcut import Shortcut
 from mpc.fallback.contract import Guarded
+from mpc.qp import Point
 from mpc.solvers import piqp_backends
 from quadsim.controller import SOLVED, Command, Controller, Moment
 from quadsim.flight.log import FlightLog
@@ -287,8 +288,8 @@ class _FailingSolver:
         answer = real(solver, vectors, **matrices)
         if self.status == SOLVED:
             return answer
-        spoilt = {name: np.full_like(getattr(answer, name), np.nan) for name in ("x", "y", "z", "z_box")}
-        return answer._replace(**spoilt, status=self.status)
+        nowhere = Point(*(np.full_like(part, np.nan) for part in answer.point))
+        return answer._replace(made=nowhere, status=self.status)
 
 
 @contextlib.contextmanager

@@ -260,9 +260,10 @@ def sketched() -> Iterator[None]:
     def save(_: Figure, file: IO[bytes], **__: object) -> None:
         file.write(b"picture")
 
-    def work(tasks: Sequence[Sequence[str]], *_: object) -> None:
-        for _, _, path, *_ in tasks:
-            Path(path).write_bytes(b"film")
+    def work(commands: Sequence[Sequence[str]], *_: object) -> None:
+        for command in commands:  # a renderer's file comes after its task and what that is about, ffmpeg's last
+            renders = tuple(command[: len(video._WORKER)]) == video._WORKER
+            Path(command[len(video._WORKER) + 2 if renders else -1]).write_bytes(b"film")
 
     with (
         mock.patch.object(Figure, "savefig", save),
