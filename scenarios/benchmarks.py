@@ -55,7 +55,7 @@ def bench_solvers(
 
     Examples:
         >>> import quadsim
-        >>> short = quadsim.load("paper-constrained").replace({"duration": 1.0})
+        >>> short = quadsim.load("paper-constrained").replace({"duration": 1.0, "controller.horizon": 20})
         >>> found = quadsim.bench_solvers(short, solvers=["piqp-multistage"], repeats=1, horizons=[], stride=2)
         >>> found.deadline_ms
         50.0
