@@ -23,18 +23,20 @@ from make_outside import TITLE as NEXT
 TITLE: Final = "## A step of the robust controller"
 RUNS: Final = 5
 FLIGHTS: Final = range(4)
+PAPER: Final = -1  # stands for the paper's own flight
 COLUMNS: Final = {"p50": "ms", "p99": "ms", "max": "ms", "flight": "s"}
 TEXT: Final = """\
-Flights of `paper-robustness-robust`, 60 s each, by two checkouts in turns, `{before}` and `{after}`: the median over
-runs of each ({runs}), processor time, at a load average of {load:.0f} on {cores} cores. A step is
-the whole of it, fallback contract included, between two periods of flight. `python docs/make_robust_step.py BEFORE`
-remakes this section, with a checkout of the former in the directory BEFORE.
+Flights of `paper-robustness-robust`, and the paper's controller in `paper-constrained`, 60 s each, by two checkouts in
+turns, `{before}` and `{after}`: the median over runs of each ({runs}), processor time, at a load average of {load:.0f}
+on {cores} cores. A step is the whole of it, the robust one's fallback contract included, between two periods of flight.
+`python docs/make_robust_step.py BEFORE` remakes this section, with a checkout of the former in the directory BEFORE.
 
 {table}
 
-- In {free:.0%} of these periods the unconstrained optimum is the answer, and the rest of the step is what counts: one
-  state is integrated, compared and turned in plain numbers, where arrays of three took several times as long, and what
-  does not change from one period to the next is computed once.
+- In {free:.0%} of the robust flights' periods the unconstrained optimum is the answer, and the rest of the step counts.
+  One state is integrated, compared and turned in plain numbers, where arrays of three took several times as long. What
+  does not change from one period to the next is computed once, and what nobody looks at in flight, the QP's own
+  multipliers of a shortcut's optimum, is not computed.
 - Where bounds on tilt are active, the search starts from the last period's active rows moved one step earlier, those
   of the horizon's last step held.
 - Lagging rotors' speeds as collective, roll, pitch and yaw parts were tried, and are not done: the axes come apart, and
@@ -44,15 +46,18 @@ remakes this section, with a checkout of the former in the directory BEFORE.
 
 def measure(flight: int) -> dict[str, float]:
     """Processor time of one flight [s], its steps' p50, p99 and maximum [ms], and the share without active rows."""
+    from mpc.constrained import ConstrainedMPC
     from mpc.fallback.contract import Guarded
     from scenarios.campaign.plan import load_plan
+    from scenarios.loading import load_scenario
     from scenarios.run import fly_scenario
 
-    scenario = load_plan("paper-robustness-robust").of(flight)
+    paper = flight == PAPER
+    scenario = load_scenario("paper-constrained") if paper else load_plan("paper-robustness-robust").of(flight)
     # the harness is this checkout's, whichever one is measured
     stopwatch: Any = runpy.run_path(str(ROOT / "scenarios" / "bench" / "timing.py"))["Stopwatch"]
     watch = stopwatch(clock.thread_time)
-    watch.watch(Guarded, "step", "step")
+    watch.watch(ConstrainedMPC if paper else Guarded, "step", "step")
     fly_scenario(scenario.model_copy(update={"duration": 1.0}))  # loads what is loaded late
     watch.clear()
     started = clock.thread_time()
@@ -75,13 +80,15 @@ def compare(before: Path, runs: int) -> tuple[list[tuple[str, ...]], float]:
 
     rows: list[tuple[str, ...]] = [("flight", *(f"{key}, {unit}" for key, unit in COLUMNS.items()), "p50, as a ratio")]
     free = []
-    for flight in FLIGHTS:
+    for flight in (*FLIGHTS, PAPER):
         trees = {"before": partial(once, before, flight), "after": partial(once, ROOT, flight)}
         earlier, now = in_turns(trees, runs).values()
         medians = [[statistics.median(run[key] for run in of) for of in (earlier, now)] for key in COLUMNS]
         ratio = statistics.median(after["p50"] / then["p50"] for then, after in zip(earlier, now, strict=True))
-        rows.append((str(flight), *(f"{then:.2f} → {after:.2f}" for then, after in medians), f"{ratio:.2f}"))
-        free.append(now[0]["free"])
+        name = "paper-constrained" if flight == PAPER else str(flight)
+        rows.append((name, *(f"{then:.3g} → {after:.3g}" for then, after in medians), f"{ratio:.2f}"))
+        if flight != PAPER:
+            free.append(now[0]["free"])
     return rows, statistics.mean(free)
 
 
