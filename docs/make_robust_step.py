@@ -86,7 +86,7 @@ def compare(before: Path, runs: int) -> tuple[list[tuple[str, ...]], float]:
         medians = [[statistics.median(run[key] for run in of) for of in (earlier, now)] for key in COLUMNS]
         ratio = statistics.median(after["p50"] / then["p50"] for then, after in zip(earlier, now, strict=True))
         name = "paper-constrained" if flight == PAPER else str(flight)
-        rows.append((name, *(f"{then:.3g} → {after:.3g}" for then, after in medians), f"{ratio:.2f}"))
+        rows.append((name, *(f"{then:#.3g} → {after:#.3g}" for then, after in medians), f"{ratio:.2f}"))
         if flight != PAPER:
             free.append(now[0]["free"])
     return rows, statistics.mean(free)
