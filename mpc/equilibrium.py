@@ -17,7 +17,7 @@ import numpy as np
 
 from mpc.nonlinear.model import NonlinearModel
 from quadsim.errors import ParameterError
-from quadsim.state import INDEX, N_STATES, Array
+from quadsim.state import INDEX, N_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
 
 LEAST_LIFT: Final = 0.1  # share of the weight that thrust holds at least: no rest is upside down
@@ -38,11 +38,11 @@ class Trim:
     twist: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        if np.shape(self.speeds) != (N_ROTORS,) or not all(map(math.isfinite, self.speeds.tolist())):
+        if np.shape(self.speeds) != (N_ROTORS,) or not all_true(np.isfinite(self.speeds)):
             raise ParameterError("trim", "speeds", self.speeds, f"{N_ROTORS} finite numbers")
-        if np.shape(self.lift) != (3,) or not (all(map(math.isfinite, self.lift.tolist())) and self.lift[2] > 0.0):
+        if np.shape(self.lift) != (3,) or not (all_true(np.isfinite(self.lift)) and self.lift[2] > 0.0):
             raise ParameterError("trim", "lift", self.lift, "three finite numbers, the last one positive")
-        if np.shape(self.twist) != (3,) or not all(map(math.isfinite, self.twist.tolist())):
+        if np.shape(self.twist) != (3,) or not all_true(np.isfinite(self.twist)):
             raise ParameterError("trim", "twist", self.twist, "three finite numbers")
 
     def lean(self, yaw: float) -> tuple[float, float]:

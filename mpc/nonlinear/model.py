@@ -214,7 +214,7 @@ def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:
 def _rotor_speeds(model: NonlinearModel, step: float, rotors: Array, inputs: Array) -> tuple[Array, Array]:
     """(K, 4, ...) speeds of rotors (4, ...) under inputs (4, ...) at the instants of a `Passage`, and its `decay`.
 
-    `step` is of Runge and Kutta [s].
+    `step` is that of the Runge-Kutta method [s].
     """
     instants = _instants(model.substeps)
     if model.rotor_lag is None:
