@@ -14,7 +14,6 @@ from pathlib import Path
 from make_numbers import copy_figure, write_page
 
 from quadsim.report.table import Grid, line, section
-from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.manifest import stored_plan
 from scenarios.campaign.plan import load_plan
 from scenarios.campaign.report import campaign_tables, campaign_text
@@ -36,7 +35,7 @@ def fly(name: str, *, there: bool) -> Result:
     directory = Path("runs") / "campaigns" / name
     plan = stored_plan(directory) if there else load_plan(name)
     with progress(enabled=True) as watch:
-        return fly_campaign(plan, directory, LocalEngine(), resume=True, watch=watch)
+        return fly_campaign(plan, directory, resume=True, watch=watch)
 
 
 def violations(results: list[Result]) -> Grid:

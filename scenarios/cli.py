@@ -151,8 +151,7 @@ def _add_campaign(campaign: argparse.ArgumentParser) -> None:
     add("file", metavar="FILE", help=_SCENARIO)
     add("--out", metavar="DIR", help="campaign's directory (default: runs/campaigns/NAME)")
     add("--workers", **_NUMBER, help="processes (default: one per core)")
-    scheduler = "a scheduler's address, tcp://HOST:PORT, or a TOML file that describes a batch system's jobs"
-    add("--cluster", metavar="ADDRESS", help=f"fly on a Dask cluster: {scheduler}")
+    add("--cluster", metavar="ADDRESS", help="fly on a Dask cluster: its scheduler's address, tcp://HOST:PORT")
     add("--resume", action="store_true", help="continue what is there")
     add("--flights", **_NUMBER, help="number of flights, instead of the file's")
     width = "stop once the 95 %% interval of the failure probability is as narrow as this, e.g. 0.05"

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import InputError
 from quadsim.outputs import real_path
 from scenarios.api import as_scenario, named_by
 from scenarios.flight import Outputs
@@ -18,7 +18,6 @@ from scenarios.schema.scenario import Scenario
 from scenarios.shipped import paper_names
 
 if TYPE_CHECKING:
-    from scenarios.campaign.engine.protocol import Engine
     from scenarios.campaign.replay import Replay
     from scenarios.campaign.run import Result
     from scenarios.campaign.sweep import Sweep
@@ -62,7 +61,7 @@ def sweep(
 
     scenario = as_scenario(scenario)
     with reporting(progress) as report:
-        return fly_sweep(flown_by(scenario, controller, forces), values, make_engine(workers, None), report)
+        return fly_sweep(flown_by(scenario, controller, forces), values, workers, report)
 
 
 def campaign(
@@ -97,7 +96,7 @@ def campaign(
         forces: of a scenario: what acts on it, as of `sweep`.
         require: requirements as texts, e.g. `P(failure) < 0.02`, that `judgements` judges.
         workers: processes that fly; one per usable core where absent.
-        cluster: a dask cluster that flies instead, as of `--cluster`.
+        cluster: the address of a Dask scheduler whose workers fly instead, as of `--cluster`.
         resume: whether to continue what the directory holds.
         until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
         report: whether to write the page and its figure.
@@ -127,8 +126,6 @@ def campaign(
     from scenarios.campaign.statistics.requirement import judge, parse_requirement
     from scenarios.commands.campaign_console import progress as bar
 
-    if cluster is not None and workers is not None:
-        raise ParameterError("", "--workers", workers, "absent with --cluster")
     requirements = [parse_requirement(text) for text in require]
     if isinstance(campaign, Scenario):
         requested = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
@@ -141,11 +138,17 @@ def campaign(
     for requirement in requirements:
         parse_event(requirement.event.text, plan.columns)
     target = real_path(Path("runs") / "campaigns" / plan.spec.name if out is None else out)
-    engine = make_engine(workers, cluster)
     try:
         with bar(enabled=bool(progress), lines=progress == "lines") as watch:
             result = fly_campaign(
-                plan, target, engine, resume=resume, until_width=until_width, report=report, watch=watch
+                plan,
+                target,
+                workers=workers,
+                cluster=cluster,
+                resume=resume,
+                until_width=until_width,
+                report=report,
+                watch=watch,
             )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{target} has what was flown") from None
@@ -172,7 +175,7 @@ def tune(
         trials: candidates, instead of the file's.
         seed: of the search and its draws, instead of the file's.
         workers: processes that fly; one per usable core where absent.
-        cluster: a dask cluster that flies instead, as of `--cluster`.
+        cluster: the address of a Dask scheduler whose workers fly instead, as of `--cluster`.
         resume: whether to continue what the directory holds.
         report: whether to write the pages and their figures.
         progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
@@ -217,14 +220,12 @@ def tune(
     from scenarios.tuning.run import tune as carry_out
     from scenarios.tuning.search import require_optuna
 
-    if cluster is not None and workers is not None:
-        raise ParameterError("", "--workers", workers, "absent with --cluster")
     require_optuna()
     plan = load_tuning(str(tuning), trials=trials, seed=seed)
     target = real_path(Path("runs") / "tunings" / plan.spec.name if out is None else out)
     try:
         with bar(enabled=bool(progress), lines=progress == "lines") as watch:
-            return carry_out(plan, target, make_engine(workers, cluster), resume=resume, report=report, watch=watch)
+            return carry_out(plan, target, workers=workers, cluster=cluster, resume=resume, report=report, watch=watch)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{target} has what was flown") from None
 
@@ -289,17 +290,6 @@ def flown_by(scenario: Scenario, controller: object, forces: Sequence[object] = 
     for force in forces:
         require_importable(force, "forces")
     return named_by(scenario, controller, forces)
-
-
-def make_engine(workers: int | None, cluster: str | None) -> Engine:
-    """The workers of a campaign: processes of this machine, or a dask cluster."""
-    if cluster is None:
-        from scenarios.campaign.engine.local import LocalEngine
-
-        return LocalEngine(workers)
-    from scenarios.campaign.engine.cluster import DaskEngine
-
-    return DaskEngine(cluster)
 
 
 def reproduce(paper: str | Path | None = None, *, progress: Progress | bool = True) -> tuple[Reproduction, ...]:

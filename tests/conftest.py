@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings
-from support import Here, draw_nothing, fly_campaigns_here, sketch_figures, take_long_steps
+from support import draw_nothing, fly_here, sketch_figures, take_long_steps
 
 from quadsim.controller import Controller
 from quadsim.flight import rundir
@@ -45,11 +45,11 @@ settings.load_profile("quadsim")
 
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
 LONG = (
-    *("scenarios/campaign/engine/test_cluster.py", "scenarios/campaign/test_survival.py", "scenarios/test_library.py"),
+    *("scenarios/test_many.py", "scenarios/test_library.py"),
     *("test_safety.py", "scenarios/campaign/test_run.py", "test_commands.py", "scenarios/bench/test_bench.py"),
     *("scenarios/campaign/report/test_campaign_page.py", "quadsim/report/film/test_video.py"),
     *("quadsim/report/test_comparison_page.py", "scenarios/design/test_first_flights.py"),
-    *("scenarios/campaign/test_kills.py", "scenarios/campaign/engine/test_local.py", "scenarios/test_process.py"),
+    "scenarios/test_process.py",
     *("test_documents.py", "scenarios/cost/test_measure.py", "scenarios/test_diagnosis.py", "scenarios/test_api.py"),
     *("scenarios/test_faults.py", "quadsim/report/test_figures.py", "scenarios/bench/test_mismatch.py"),
     *("mpc/robust/test_robust.py", "scenarios/test_reaudit.py", "scenarios/test_run.py", "scenarios/test_cli.py"),
@@ -171,14 +171,14 @@ def recorded_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def campaigns_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """See `support.fly_campaigns_here`."""
-    fly_campaigns_here(monkeypatch)
+    """See `support.fly_here`."""
+    fly_here(monkeypatch)
 
 
 @pytest.fixture
 def cheap_benchmarks(monkeypatch: pytest.MonkeyPatch) -> None:
     """`bench ladder` and `bench speed` with `--quick` fly here, less; small films: that they run is what is tested."""
-    monkeypatch.setattr("scenarios.bench.worker_pool.ProcessPoolExecutor", Here)
+    fly_here(monkeypatch)
     monkeypatch.setattr("scenarios.bench.mismatch.benchmark.QUICK_DURATION", 1.0)
     monkeypatch.setattr("scenarios.bench.mismatch.benchmark.TIMED", 1)
     monkeypatch.setattr("scenarios.bench.speed.QUICK_SPEEDS", (6.0,))

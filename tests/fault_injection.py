@@ -27,7 +27,7 @@ from quadsim.state import POSITION, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.bench.mismatch.conditions import CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, equip
-from scenarios.bench.worker_pool import answer_all
+from scenarios.many import answers
 from scenarios.build import build_controller, build_plant, build_problem
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
@@ -176,8 +176,8 @@ def draw_flight(controller: str, condition: str, count: int, *, seed: int) -> li
 
 
 def inject_all(injections: list[Injection], **options: Any) -> list[Consequence]:
-    """Fly all of them, over processes; options are those of `answer_all`."""
-    return answer_all(inject, injections, **options)
+    """Fly all of them, over processes; options are those of `answers`."""
+    return answers(inject, injections, **options)
 
 
 def inject(injection: Injection, *, longest: float = LAST) -> Consequence:

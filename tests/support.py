@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -18,8 +17,8 @@ from mpc.ocp import Objective, Problem, Rest
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
+from scenarios import many
 from scenarios.build import build_problem
-from scenarios.campaign.engine.protocol import Pilot, fly_one
 from scenarios.campaign.results.table import Row
 from scenarios.courses.make import build_reference
 from scenarios.flight import Flight
@@ -41,31 +40,18 @@ def sketch_figures(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Figure, "get_layout_engine", lambda _: None)
 
 
-class Here:
-    """Stands in for a pool of processes: does what it is given at once, in this one, which takes no time to start."""
+def fly_here(patch: pytest.MonkeyPatch) -> None:
+    """Have this process fly many flights, in the place of workers: starting them takes time."""
 
-    def __init__(self, *_: object, **__: object) -> None:
-        pass
+    def fly_many(flights: Iterable[Any], fly: Callable[[Any], Any], **_: object) -> Iterator[tuple[int, Row]]:
+        for place, flight in enumerate(flights):
+            try:
+                yield place, fly(flight)
+            except Exception as error:
+                yield place, {"verdict": many.ERROR, "reason": many.describe(error)}
 
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        future.set_result(function(*arguments))
-        return future
-
-    def shutdown(self, **_: object) -> None:
-        pass
-
-
-def fly_campaigns_here(patch: pytest.MonkeyPatch) -> None:
-    """Have campaigns and sweeps flown by this process, whose start takes no time, in the place of workers."""
-    from scenarios.campaign.engine.local import LocalEngine
-
-    def answers(engine: LocalEngine, pilot: Pilot, flights: Sequence[int]) -> Iterator[Row]:
-        pilot.prepare()
-        for flight in flights:
-            yield fly_one(pilot, flight).row
-
-    patch.setattr(LocalEngine, "answers", answers)
+    for user in ("scenarios.many", "scenarios.campaign.pilot"):
+        patch.setattr(f"{user}.fly_many", fly_many)
 
 
 def draw_nothing(patch: pytest.MonkeyPatch) -> None:

@@ -36,7 +36,6 @@ OF_ONE_ROOM = (
     "imageio_ffmpeg",
     "jinja2",
     "dask",
-    "dask_jobqueue",
     "distributed",
     "optuna",
 )

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support import fly_campaigns_here
+from support import fly_here
 from tuning_formula import write_tuning
 
 import quadsim
@@ -123,7 +123,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The campaign of the README, shorter and of fewer flights."""
     directory = tmp_path_factory.mktemp("campaign") / "paper-robustness"
     with pytest.MonkeyPatch.context() as patch:
-        fly_campaigns_here(patch)
+        fly_here(patch)
         assert main(["campaign", "paper-robustness", *ADDED["campaign"][:-1], str(directory)]) == EXIT_DONE
     return directory
 

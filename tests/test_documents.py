@@ -14,10 +14,9 @@ import make_numbers as numbers
 import matplotlib as mpl
 import numpy as np
 import pytest
-from support import Here
+from support import fly_here
 
 from quadsim.report.table import grid_to_markdown
-from scenarios.bench import worker_pool
 from scenarios.cost import cost_flights
 from scenarios.cost.cost_tables import cost_tables
 from scenarios.cost.measure import study_cost
@@ -69,7 +68,7 @@ def test_what_constraints_cost_is_what_the_flights_give(
 
     What the steps take is made up.
     """
-    monkeypatch.setattr(worker_pool, "ProcessPoolExecutor", Here)
+    fly_here(monkeypatch)
     monkeypatch.setattr(cost_flights, "fly_scenario", fly_known)
     steps: dict[str, Any] = {"step_ms": np.ones(1200), "statuses": ("solved",) * 1200, "repeats": 1}
     timed = [CandidateTimes(name=name, **steps) for name in ("gain", "as flown")]

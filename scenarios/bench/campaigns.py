@@ -19,7 +19,6 @@ from quadsim.report.table import ABSENT, Grid, line
 from scenarios.bench.bench_results import Target
 from scenarios.bench.bench_tables import targets_table
 from scenarios.bench.timing import Stopwatch
-from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
 from scenarios.campaign.results.table import read_table
@@ -210,7 +209,7 @@ def _timed(scenario: Scenario, flights: int, workers: int, *, report: bool) -> C
     with tempfile.TemporaryDirectory() as scratch:
         directory = Path(scratch) / "campaign"
         stopwatch = Stopwatch()
-        result = fly_campaign(plan, directory, LocalEngine(workers), report=report, watch=memory.look)
+        result = fly_campaign(plan, directory, workers=workers, report=report, watch=memory.look)
         whole = stopwatch.elapsed
         busy = sum(read_table(directory / TIMES_FILE)["wall_s"].to_pylist())
         wall = float(result.manifest["sessions"][-1]["wall_s"])

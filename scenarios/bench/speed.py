@@ -23,10 +23,10 @@ from quadsim.flight import metrics
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
 from quadsim.state import INDEX, tilt
 from quadsim.vehicle import Vehicle, load_vehicle
-from scenarios.bench.worker_pool import answer_all
 from scenarios.courses.feasibility_check import report
 from scenarios.design.first_scenario import first_scenario
 from scenarios.loading import parse_scenario
+from scenarios.many import answers
 from scenarios.progress import Progress, silent
 from scenarios.run import fly_scenario
 
@@ -305,7 +305,7 @@ def run_speeds(*, quick: bool = False, workers: int | None = None, progress: Pro
     if quick:
         cells = [cell for cell in cells if cell[0] == QUICK_WORLD and cell[1] in QUICK_SPEEDS and cell[2] in QUICK_LAWS]
     flown = [(*cell, seed) for cell in cells for seed in range(WORLDS[cell[0]].seeds)]
-    found = answer_all(fly_cell, flown, workers=workers, progress=lambda done, total: progress("flights", done, total))
+    found = answers(fly_cell, flown, workers=workers, progress=lambda done, total: progress("flights", done, total))
     flights = iter(found)
     return SpeedBench(flights={cell: merged(list(itertools.islice(flights, WORLDS[cell[0]].seeds))) for cell in cells})
 

@@ -1,68 +1,90 @@
-"""One flight of a campaign, from its number to its row of the results."""
+"""One flight of a campaign, from its number to its row of the results; and many of them."""
 
 from __future__ import annotations
 
-import contextlib
 import time as clock
+from collections.abc import Generator, Sequence
+from contextlib import closing
+from typing import Protocol
 
 from quadsim.errors import QuadsimError
-from scenarios.campaign.engine.protocol import describe
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.table import Row, failed_row, flown_row
-from scenarios.campaign.results.verdicts import ERROR, MEMORY
-from scenarios.campaign.spec import LimitsSpec
 from scenarios.flight import Flight
 from scenarios.machine import processor_name
-from scenarios.parts.plugin import import_plugin
-from scenarios.progress import Progress, silent
+from scenarios.many import fly_many
 from scenarios.run import fly_scenario
-from scenarios.schema.plugin import PluginSpec
+
+
+class Pilot(Protocol):
+    """Flies flights, known by their numbers; pickled, and sent to each process once."""
+
+    @property
+    def plan(self) -> Plan:
+        """Whose limits hold, and whose code flies."""
+
+    def fly(self, flight: int) -> Row:
+        """The row of a flight."""
+
+    def failed(self, flight: int, reason: str, verdict: str) -> Row:
+        """The row of a flight that raised, met a limit, or whose process died."""
+
+
+def fly_flights(
+    pilot: Pilot, flights: Sequence[int], *, workers: int | None = None, cluster: str | None = None
+) -> Generator[Row]:
+    """The rows of a pilot's flights, each once, in whatever order they come; closing the iterator stops all work.
+
+    Args:
+        pilot: flies them.
+        flights: their numbers.
+        workers: see `scenarios.many.fly_many`.
+        cluster: the same.
+
+    Raises:
+        QuadsimError: see `scenarios.many.fly_many`.
+    """
+    limits = pilot.plan.spec.limits
+    answers = fly_many(
+        flights,
+        pilot.fly,
+        workers=workers,
+        timeout=limits.flight,
+        memory=limits.memory,
+        isolate=pilot.plan.flies_user_code,
+        cluster=cluster,
+    )
+    with closing(answers):
+        for place, row in answers:
+            yield row if "flight" in row else pilot.failed(flights[place], row["reason"], row["verdict"])
 
 
 class CampaignPilot:
-    """Flies the flights of a campaign; sent to each process once."""
+    """Flies the flights of a campaign."""
 
     def __init__(self, plan: Plan) -> None:
-        self._plan = plan
+        self.plan = plan
 
-    @property
-    def limits(self) -> LimitsSpec:
-        """See `Pilot`."""
-        return self._plan.spec.limits
-
-    def prepare(self) -> None:
-        """Import a plug-in controller, and what draws need."""
-        self._plan.identity(0)
-        controller = self._plan.scenario.controller
-        if isinstance(controller, PluginSpec):
-            with contextlib.suppress(Exception):
-                import_plugin(controller)
-
-    def fly(self, flight: int, progress: Progress = silent) -> Row:
-        """The row of a flight; one that raises is a result too, with its reason."""
+    def fly(self, flight: int) -> Row:
+        """The row of a flight; one that cannot be flown has one too, with its reason."""
         started = clock.perf_counter()
         try:
-            flown = fly_scenario(self._plan.of(flight), progress)
+            flown = fly_scenario(self.plan.of(flight))
         except QuadsimError as error:
             return self._row(flight, failed_row(str(error)))
-        except MemoryError as error:
-            most = f"limits.memory is {self.limits.memory:g} MB"
-            return self._row(flight, failed_row(f"{describe(error)} ({most})", MEMORY))
-        except Exception as error:  # e.g. of a user-defined controller: the campaign continues without it
-            return self._row(flight, failed_row(describe(error)))
         return self._row(flight, _recorded(flown, clock.perf_counter() - started))
 
     def row_of(self, flight: int, flown: Flight) -> Row:
         """The row of a flight that was flown elsewhere; it has no clock times of its own."""
         return self._row(flight, _recorded(flown, 0.0))
 
-    def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
-        """The row of a flight that no process came back from."""
+    def failed(self, flight: int, reason: str, verdict: str) -> Row:
+        """See `Pilot`."""
         return self._row(flight, failed_row(reason, verdict))
 
     def _row(self, flight: int, came_of_it: Row) -> Row:
-        row = dict.fromkeys(self._plan.schema.names) | self._plan.identity(flight) | came_of_it
-        return row | {"failed": any(event.holds(row) for event in self._plan.failure)}
+        row = dict.fromkeys(self.plan.schema.names) | self.plan.identity(flight) | came_of_it
+        return row | {"failed": any(event.holds(row) for event in self.plan.failure)}
 
 
 def _recorded(flight: Flight, wall_s: float) -> Row:

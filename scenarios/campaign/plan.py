@@ -21,6 +21,7 @@ from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
 from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.schema.bases import locate_files, merge, read_scenario
+from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting, get_field, set_field
@@ -48,6 +49,13 @@ class Plan:
         """The columns of its results."""
         kinds = {entry.name: (column_type(entry), entry.unit) for entry in self.spec.vary}
         return make_schema(kinds, build_limits(self.scenario))
+
+    @property
+    def flies_user_code(self) -> bool:
+        """Whether a controller or a force of the user's flies, in some flight at least."""
+        drawn = {field for entry in self.spec.vary for field in entry.fields}
+        chosen = not drawn.isdisjoint(("controller", "controller.type", "forces"))
+        return chosen or isinstance(self.scenario.controller, PluginSpec) or bool(self.scenario.forces)
 
     @property
     def columns(self) -> dict[str, pa.DataType]:

@@ -13,9 +13,9 @@ from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, read_flights
 from scenarios.campaign.results.table import make_table
-from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
 from scenarios.campaign.statistics.estimates import worst_flight
 from scenarios.flight import Flight, Outputs
+from scenarios.many import MEMORY, TIMEOUT
 from scenarios.progress import Progress, silent
 from scenarios.run import run_scenario
 from scenarios.schema.scenario import Scenario

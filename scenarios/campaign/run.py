@@ -1,4 +1,4 @@
-"""Fly a campaign: an engine flies what is missing, its answers are saved as they come, the whole is summed up."""
+"""Fly a campaign: what is missing is flown, rows are saved as they come, the whole is summed up."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ import pyarrow.compute as pc
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.outputs import Growing, digest_of, growing, to_json
 from scenarios.campaign import manifest as records
-from scenarios.campaign.engine.protocol import Engine
-from scenarios.campaign.pilot import CampaignPilot
+from scenarios.campaign.pilot import CampaignPilot, fly_flights
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.report.campaign_page import write_report
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE, Store
@@ -30,6 +29,7 @@ from scenarios.campaign.statistics.estimates import estimate
 from scenarios.campaign.statistics.inference import proportion
 from scenarios.campaign.statistics.requirement import Judgement
 from scenarios.flight import to_pandas
+from scenarios.many import count_workers
 
 SUMMARY_FILE: Final = "summary.json"
 REPORT_FILES: Final = ("index.html", "campaign.png", "campaign.svg")
@@ -92,8 +92,9 @@ class Result:
 def fly_campaign(
     plan: Plan,
     directory: Path,
-    engine: Engine,
     *,
+    workers: int | None = None,
+    cluster: str | None = None,
     resume: bool = False,
     until_width: float | None = None,
     report: bool = True,
@@ -107,7 +108,8 @@ def fly_campaign(
     Args:
         plan: the campaign.
         directory: where its results go.
-        engine: flies them.
+        workers: see `scenarios.many.fly_many`.
+        cluster: the same.
         resume: whether to continue what the directory holds; without it there must be nothing there.
         until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
         report: whether to write the page and its figure.
@@ -120,7 +122,7 @@ def fly_campaign(
     """
     if until_width is not None and not 0.0 < until_width < 1.0:
         raise ParameterError("", "--until-width", until_width, "between 0 and 1")
-    session: dict[str, Any] = {"engine": engine.name, "workers": engine.workers, "flights": 0, "wall_s": None}
+    session = new_session(workers, cluster)
     if records.is_campaign(directory) and not resume:
         raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
     with growing(directory, records.KIND) as files:
@@ -133,7 +135,7 @@ def fly_campaign(
         manifest["sessions"].append(session)
         records.write(manifest, files)
         try:
-            progress.fly(engine)
+            progress.fly(workers, cluster)
         except BaseException:
             manifest["status"] = "interrupted"
             raise
@@ -142,6 +144,16 @@ def fly_campaign(
             manifest["flown"] = progress.done
             records.write(manifest, files)
         return _conclude(plan, files, progress, manifest, report=report)
+
+
+def new_session(workers: int | None, cluster: str | None) -> dict[str, Any]:
+    """What a manifest has of a session, before its first flight.
+
+    Raises:
+        QuadsimError: nobody can fly so; see `scenarios.many.fly_many`.
+    """
+    engine = "local" if cluster is None else "dask"
+    return {"engine": engine, "workers": count_workers(workers, cluster), "flights": 0, "wall_s": None}
 
 
 class _Progress:
@@ -168,7 +180,7 @@ class _Progress:
     def done(self) -> int:
         return int(np.count_nonzero(self._outcomes[: self.wanted] >= 0))
 
-    def fly(self, engine: Engine) -> None:
+    def fly(self, workers: int | None, cluster: str | None) -> None:
         """Fly what is missing, until nothing is, or the interval is narrow enough.
 
         Raises:
@@ -181,9 +193,8 @@ class _Progress:
             return
         missing = np.flatnonzero(self._outcomes < 0).tolist()
         try:
-            answers = engine.answers(CampaignPilot(self._plan), missing)
-            with closing(answers):
-                for row in answers:
+            with closing(fly_flights(CampaignPilot(self._plan), missing, workers=workers, cluster=cluster)) as rows:
+                for row in rows:
                     self._keep(row)
                     if self._is_sure():
                         return

@@ -159,9 +159,8 @@ class LimitsSpec(Spec):
     """What one flight may take before it is ended, as a result with the verdict `timeout` or `memory`."""
 
     flight: Positive = Field(default=600.0, description="[s] wall clock of a flight")
-    step: Positive = Field(default=60.0, description="[s] wall clock of a control period, with its controller's step")
     memory: Annotated[float, Field(ge=100.0, le=1e9)] = Field(
-        default=2000.0, description="[MB] of the flight's process, with whatever it starts"
+        default=2000.0, description="[MB] of the flight's process, beyond what it starts with"
     )
 
 
@@ -187,8 +186,8 @@ class CampaignSpec(Spec):
     )
     failure: Annotated[list[str], MinLen(1), MaxLen(MOST_ENTRIES)] = Field(
         default=["violated"],
-        description="a flight fails when any of these events happens: lost, violated, crashed, error, timeout, memory, "
-        "or a column of the results compared with a number, e.g. rmse.z > 0.5",
+        description="a flight fails when any of these events happens: lost, violated, crashed, error, died, timeout, "
+        "memory, or a column of the results compared with a number, e.g. rmse.z > 0.5",
     )
     limits: LimitsSpec = LimitsSpec()
     vary: Annotated[list[VarySpec], MaxLen(MOST_ENTRIES)] = Field(default=[], description="what varies")

@@ -12,8 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import ParameterError, UnknownNameError
-from scenarios.campaign.engine.protocol import Engine
-from scenarios.campaign.pilot import CampaignPilot
+from scenarios.campaign.pilot import CampaignPilot, fly_flights
 from scenarios.campaign.plan import Plan, parse_campaign
 from scenarios.campaign.results.table import DRAW, make_table
 from scenarios.flight import to_pandas
@@ -71,14 +70,14 @@ class Sweep:
 
 
 def fly_sweep(
-    scenario: Scenario, values: Mapping[str, Sequence[Any]], engine: Engine, progress: Progress = silent
+    scenario: Scenario, values: Mapping[str, Sequence[Any]], workers: int | None = None, progress: Progress = silent
 ) -> Sweep:
     """Fly every combination, the last field varying fastest.
 
     Args:
         scenario: what is flown.
         values: what to try, by dotted path.
-        engine: flies them.
+        workers: processes that fly; one per usable core where absent.
         progress: called with (what, done, total).
 
     Raises:
@@ -99,8 +98,8 @@ def fly_sweep(
     plan.check()
     progress("sweep", 0, count)
     rows = []
-    with closing(engine.answers(CampaignPilot(plan), range(count))) as answers:
-        for row in answers:
+    with closing(fly_flights(CampaignPilot(plan), range(count), workers=workers)) as flown:
+        for row in flown:
             rows.append(row)
             progress("sweep", len(rows), count)
     table = make_table(rows, plan.schema).drop_columns(["flight", "seed", "failed"])

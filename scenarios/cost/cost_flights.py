@@ -18,10 +18,10 @@ from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.state import REFERENCE_STATES
 from scenarios.bench.queries import QueriedController, flight_between, recorded
 from scenarios.bench.timing import StepTimes, segments, time_in_turns
-from scenarios.bench.worker_pool import answer_all
 from scenarios.build import build_controller, build_problem
 from scenarios.cost.study import CandidateTimes, Outcome
 from scenarios.courses.make import build_course_steps
+from scenarios.many import answers
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress
 from scenarios.run import fly_scenario
@@ -147,7 +147,7 @@ def fly_all(
     """Fly what was not flown yet, over processes; results, with those given, by `key`."""
     results = dict(flown)
     wanted = {name: scenario for scenario in scenarios if (name := key(scenario)) not in results}
-    done = answer_all(fly, [*wanted.values()], workers=workers, progress=functools.partial(progress, "flights"))
+    done = answers(fly, [*wanted.values()], workers=workers, progress=functools.partial(progress, "flights"))
     results |= zip(wanted, done, strict=True)
     return results
 

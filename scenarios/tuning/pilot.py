@@ -7,10 +7,9 @@ from typing import Any
 
 from quadsim.errors import InputError
 from scenarios.campaign.pilot import CampaignPilot
+from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.table import Row
-from scenarios.campaign.results.verdicts import ERROR
-from scenarios.campaign.spec import LimitsSpec
-from scenarios.progress import Progress, silent
+from scenarios.many import ERROR
 from scenarios.tuning.plan import TuningPlan, Values
 
 
@@ -26,26 +25,22 @@ class TuningPilot:
         self._pilots: dict[int, CampaignPilot] = {}
 
     @property
-    def limits(self) -> LimitsSpec:
-        """See `scenarios.campaign.engine.protocol.Pilot`."""
-        return self._start.limits
+    def plan(self) -> Plan:
+        """See `scenarios.campaign.pilot.Pilot`."""
+        return self._plan.start
 
-    def prepare(self) -> None:
-        """Import a plug-in controller, and what draws need."""
-        self._start.prepare()
-
-    def fly(self, flight: int, progress: Progress = silent) -> Row:
+    def fly(self, flight: int) -> Row:
         """The row of a flight; a candidate that is no scenario fails it."""
         candidate, draw = divmod(flight, self._plan.most)
         try:
             pilot = self._pilot(candidate)
         except InputError as error:
-            return self._row(flight, self._start.lost(draw, str(error)))
-        return self._row(flight, pilot.fly(draw, progress))
+            return self.failed(flight, str(error), ERROR)
+        return self._row(flight, pilot.fly(draw))
 
-    def lost(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
-        """The row of a flight that no process came back from."""
-        return self._row(flight, self._start.lost(flight % self._plan.most, reason, verdict))
+    def failed(self, flight: int, reason: str, verdict: str) -> Row:
+        """See `scenarios.campaign.pilot.Pilot`."""
+        return self._row(flight, self._start.failed(flight % self._plan.most, reason, verdict))
 
     def _pilot(self, candidate: int) -> CampaignPilot:
         if candidate not in self._pilots:

@@ -18,11 +18,11 @@ from quadsim.errors import InputError, OutputError
 from quadsim.flight.form import Optional, read_json
 from quadsim.outputs import Growing, digest, digest_of, growing, to_json
 from scenarios.campaign import manifest as records
-from scenarios.campaign.engine.protocol import Engine
+from scenarios.campaign.pilot import fly_flights
 from scenarios.campaign.report.campaign_page import write_comparison_report
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE, Store
 from scenarios.campaign.results.table import Row
-from scenarios.campaign.run import Standing, Watch, fly_campaign, put_report
+from scenarios.campaign.run import Standing, Watch, fly_campaign, new_session, put_report
 from scenarios.campaign.statistics.comparison import Comparison, compare
 from scenarios.schema.scenario import Scenario
 from scenarios.tuning.outcome import NAMES, Found, summarise
@@ -78,8 +78,9 @@ class TuningResult:
 def tune(
     plan: TuningPlan,
     directory: Path,
-    engine: Engine,
     *,
+    workers: int | None = None,
+    cluster: str | None = None,
     resume: bool = False,
     report: bool = True,
     watch: Watch = lambda standing: None,
@@ -93,7 +94,8 @@ def tune(
     Args:
         plan: the tuning.
         directory: where its results go.
-        engine: flies them.
+        workers: see `scenarios.many.fly_many`.
+        cluster: the same.
         resume: whether to continue what the directory holds, perhaps with more trials.
         report: whether to write the pages and their figures.
         watch: called with the progress, as answers come.
@@ -104,7 +106,7 @@ def tune(
         OutputError: the directory cannot be written, or another process writes there.
         KeyboardInterrupt: a person stopped it; what was flown is there.
     """
-    session: dict[str, Any] = {"engine": engine.name, "workers": engine.workers, "flights": 0, "wall_s": None}
+    session = new_session(workers, cluster)
     going_on = (directory / MANIFEST_FILE).is_file()
     if going_on and not resume:
         raise OutputError(directory, "a tuning is already there; continue it with --resume, or choose another --out")
@@ -115,7 +117,7 @@ def tune(
         manifest["files"] |= {name: digest(text) for name, text in texts.items()}
         manifest["sessions"].append(session)
         files.write({**texts, MANIFEST_FILE: to_json(manifest).encode()})
-        flights = _Flights(plan, files, engine, watch)
+        flights = _Flights(plan, files, workers, cluster, watch)
         started = clock.perf_counter()
         try:
             search = Search(plan, files)
@@ -124,7 +126,7 @@ def tune(
             found = _conclude(plan, search, flights)
             files.remove(path.name for path in sorted(directory.glob("front-*.toml")))
             files.write({ANSWER_FILE: found.best.to_toml().encode(), **_front(plan, found)})
-            result = _validate(plan, files, engine, found, table, report=report, watch=watch)
+            result = _validate(plan, files, found, table, workers=workers, cluster=cluster, report=report, watch=watch)
             manifest["status"] = "complete"
         except BaseException:
             manifest["status"] = "interrupted"
@@ -138,10 +140,12 @@ def tune(
 
 
 class _Flights:
-    """The flights of the search: those that are there, and an engine for those that are missing."""
+    """The flights of the search: those that are there, and who flies those that are missing."""
 
-    def __init__(self, plan: TuningPlan, files: Growing, engine: Engine, watch: Watch) -> None:
-        self._plan, self._engine, self._watch = plan, engine, watch
+    def __init__(
+        self, plan: TuningPlan, files: Growing, workers: int | None, cluster: str | None, watch: Watch
+    ) -> None:
+        self._plan, self._workers, self._cluster, self._watch = plan, workers, cluster, watch
         self._store = Store(files, plan.schema)
         self._rows: dict[int, Row] = {row["flight"]: row for row in self._store.table().to_pylist()}
         self._started = clock.perf_counter()
@@ -159,8 +163,9 @@ class _Flights:
         if not missing:
             return
         try:
-            with closing(self._engine.answers(TuningPilot(self._plan, candidates), missing)) as answers:
-                for row in answers:
+            pilot = TuningPilot(self._plan, candidates)
+            with closing(fly_flights(pilot, missing, workers=self._workers, cluster=self._cluster)) as rows:
+                for row in rows:
                     self._store.add(row)
                     self._rows[row["flight"]] = row
                     self.flown += 1
@@ -239,7 +244,15 @@ def _front(plan: TuningPlan, found: Found) -> dict[str, bytes]:
 
 
 def _validate(
-    plan: TuningPlan, files: Growing, engine: Engine, found: Found, table: pa.Table, *, report: bool, watch: Watch
+    plan: TuningPlan,
+    files: Growing,
+    found: Found,
+    table: pa.Table,
+    *,
+    workers: int | None,
+    cluster: str | None,
+    report: bool,
+    watch: Watch,
 ) -> TuningResult:
     """Fly the start and the answer on fresh draws, compare them, and write what came of it all."""
     best = found.answer.candidate
@@ -250,7 +263,10 @@ def _validate(
         directory = files.path / folder
         folders.append(folder)
         resume = records.is_campaign(directory)
-        tables.append(fly_campaign(campaign, directory, engine, resume=resume, report=report, watch=watch).table)
+        flown = fly_campaign(
+            campaign, directory, workers=workers, cluster=cluster, resume=resume, report=report, watch=watch
+        )
+        tables.append(flown.table)
     comparison = None
     if best != START:
         comparison = compare(tables[0], tables[1], NAMES)

@@ -23,11 +23,11 @@ from scenarios.bench.mismatch.conditions import CONDITIONS, QUICK_CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, QUICK_VARIANTS, VARIANTS, equip, tilt_bound
 from scenarios.bench.mismatch.survival import MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
 from scenarios.bench.timing import Stopwatch
-from scenarios.bench.worker_pool import answer_all
 from scenarios.build import build_controller, build_plant
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
 from scenarios.machine import machine
+from scenarios.many import answers
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent
@@ -95,10 +95,8 @@ def run_mismatch(
     def report_stage(stage: str) -> Callable[[int, int], None]:
         return lambda done, total: progress(stage, done, total)
 
-    flights = dict(
-        zip(cells, answer_all(fly_cell, cells, workers=workers, progress=report_stage("flights")), strict=True)
-    )
-    alone = dict(zip(timed, answer_all(time_cell, timed, workers=1, progress=report_stage("step times")), strict=True))
+    flights = dict(zip(cells, answers(fly_cell, cells, workers=workers, progress=report_stage("flights")), strict=True))
+    alone = dict(zip(timed, answers(time_cell, timed, workers=1, progress=report_stage("step times")), strict=True))
     return MismatchBench(
         scenario=flown.name,
         duration=flown.duration,

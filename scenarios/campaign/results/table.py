@@ -22,7 +22,8 @@ from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
 from scenarios.campaign.results.events import Flags
-from scenarios.campaign.results.verdicts import ERROR, VERDICTS
+from scenarios.campaign.results.verdicts import VERDICTS
+from scenarios.many import ERROR
 
 Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
 DRAW: Final = "draw."  # how the columns of drawn values begin

@@ -5,10 +5,8 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from quadsim.report.palette import BOUND, LINES, REFERENCE
+from scenarios.many import DIED, ERROR, MEMORY, TIMEOUT
 
-ERROR: Final = "error"  # status and verdict of a flight that raised, or whose process died
-TIMEOUT: Final = "timeout"  # those of a flight that was ended since it, or a step of its controller, took too long
-MEMORY: Final = "memory"  # those of a flight that needed too much memory
 HARMLESS: Final = "satisfied"
 
 
@@ -30,6 +28,7 @@ VERDICTS: Final = {
     "violated": Verdict(1, _VIOLATED, _VIOLATED, LINES[1], "D", "diamond"),
     "lost": Verdict(5, "were lost", "was lost", BOUND, "x", "x"),
     ERROR: Verdict(4, _RAISED, _RAISED, REFERENCE, "s", "square"),
+    DIED: Verdict(4, "ended with their process", "ended with its process", LINES[3], "P", "cross"),
     TIMEOUT: Verdict(
         3, "were ended since they took too long", "was ended since it took too long", LINES[4], "^", "triangle-up"
     ),

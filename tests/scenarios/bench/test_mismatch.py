@@ -11,12 +11,11 @@ from typing import Any
 import fault_injection
 import make_robustness
 import pytest
-from support import Here
+from support import fly_here
 
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight import metrics
 from quadsim.report.table import Mark
-from scenarios.bench import worker_pool
 from scenarios.bench.mismatch.benchmark import (
     Cell,
     fly_cell,
@@ -28,7 +27,7 @@ from scenarios.bench.mismatch.benchmark import (
 from scenarios.bench.mismatch.conditions import CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, VARIANTS, equip, tilt_bound
 from scenarios.bench.mismatch.survival import MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
-from scenarios.bench.worker_pool import answer_all
+from scenarios.many import answers
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.loading import load_scenario
@@ -190,14 +189,14 @@ def test_a_lost_first_period_has_no_numbers() -> None:
 def quick() -> MismatchBench:
     """Flown in this process, its times made up."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worker_pool, "ProcessPoolExecutor", Here)
+        fly_here(patch)
         patch.setattr("scenarios.bench.mismatch.benchmark.time_cell", lambda cell: 2.0)
         return run_mismatch(settings=["controller.horizon=10"], quick=True)
 
 
 def test_results_do_not_depend_on_processes() -> None:
     one = cell("PID", "mass +30 %", *SHORT)
-    (away,) = answer_all(fly_cell, [one], workers=1)
+    (away,) = answers(fly_cell, [one], workers=1)
     assert replace(away, step_p99=None) == replace(fly_cell(one), step_p99=None)
 
 
@@ -214,7 +213,7 @@ def test_steps_are_timed_of_the_full_controller_and_in_the_first_condition(monke
         calls.append((workers, len(cells)))
         return [float(workers or 0) for _ in cells] if function is time_cell else [WELL for _ in cells]
 
-    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.answer_all", answer)
+    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.answers", answer)
     measured = run_mismatch(workers=2)
     assert calls == [(2, len(VARIANTS) * len(CONDITIONS)), (1, len(VARIANTS) + len(CONDITIONS) - 1)]
     for (controller, condition), flight in measured.flights.items():

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support import Here, take_long_steps
+from support import fly_here, take_long_steps
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import ParameterError
@@ -56,7 +56,7 @@ def texts(grid: Grid) -> list[list[str]]:
 
 
 def test_quick_flies_two_controllers_at_two_speeds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scenarios.bench.worker_pool.ProcessPoolExecutor", Here)
+    fly_here(monkeypatch)
     take_long_steps(monkeypatch, QUICK_WORLD)
     found = bench_speed(quick=True, progress=False)
     assert list(found.flights) == [(QUICK_WORLD, speed, law) for speed in QUICK_SPEEDS for law in QUICK_LAWS]

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support import Here
+from support import fly_here
 
 from mpc.solvers import SOLVERS
 from quadsim.controller import Moment
 from quadsim.errors import InputError, MissingPackageError
 from quadsim.flight.metrics import percentiles
-from scenarios.bench import worker_pool
+from scenarios import many
 from scenarios.bench.queries import QueriedController, recorded
 from scenarios.build import build_controller
 from scenarios.cli import main
@@ -40,6 +39,7 @@ SMALL: dict[str, Any] = {
     "solvers": ("piqp-dense",),
 }
 
+FLY_MANY = many.fly_many  # by processes
 FLIGHTS_ALONE: dict[str, Any] = {**SMALL, "tilts": (), "horizons": (), "arm_lengths": (), "solvers": ()}
 
 
@@ -51,7 +51,7 @@ def scenario(*settings: str, name: str = "paper-constrained") -> Scenario:
 def _here() -> Iterator[None]:
     """Flights are flown in this process, and steps timed once; one test compares that with another process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(worker_pool, "ProcessPoolExecutor", Here)
+        fly_here(patch)
         patch.setattr(cost_flights, "REPEATS", 1)
         yield
 
@@ -72,8 +72,8 @@ def untimed(study: CostStudy) -> dict[str, Any]:
 
 
 def test_the_study_is_the_same_where_other_processes_fly(study: CostStudy, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All its flights; that answers come in their order is worker_pool's."""
-    monkeypatch.setattr(worker_pool, "ProcessPoolExecutor", ProcessPoolExecutor)
+    """All its flights; that answers come in their order is `scenarios.many`'s."""
+    monkeypatch.setattr("scenarios.many.fly_many", FLY_MANY)
     again = study_cost(scenario(), [scenario(name="paper-unconstrained")], workers=1, timed=study.candidates, **SMALL)
     assert untimed(again) == untimed(study)
 

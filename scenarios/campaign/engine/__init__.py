@@ -1,1 +1,0 @@
-"""The workers of a campaign: processes on this machine, or a cluster."""

@@ -1,0 +1,368 @@
+"""Many flights: a map over them on processes of this machine, or beside the workers of a Dask cluster.
+
+Each flight gives one row, whatever it does: one that raises, hangs, dies or takes too much memory costs itself alone.
+A worker is a process with a pipe of its own, forked in milliseconds from a server that has the libraries loaded.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import functools
+import gc
+import multiprocessing
+import os
+import pickle
+import re
+import resource
+import signal
+import sys
+import threading
+import time as clock
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from multiprocessing import connection, resource_tracker
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+from quadsim.errors import MissingPackageError, ParameterError, QuadsimError, printable
+from scenarios.gc_tuning import collect_rarely, freeze_for_good
+from scenarios.machine import usable_cores, versions
+
+Row = dict[str, Any]
+Rows = Generator[tuple[int, Row]]
+Fly = Callable[[Any], Row]
+ERROR, TIMEOUT, MEMORY, DIED = "error", "timeout", "memory", "died"
+"""Verdicts of flights that gave no row: it raised, took too long or too much memory, or its process died."""
+_ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_PRELOAD: Final = (
+    *("scenarios.many", "scenarios.campaign.pilot"),
+    *("mpc.constrained", "mpc.robust.controller", "mpc.unconstrained"),
+)
+"""Loaded once, by the server that workers are forked from."""
+_STARTING: Final = threading.Lock()  # a Dask worker may have several threads
+_ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
+_DECIDE_NUMBERS: Final = ("mujoco", "numpy", "scipy", "piqp")
+_CONNECT_S: Final = 10.0
+_PATIENCE_S: Final = 60.0  # for the first worker of a cluster
+
+
+class ClusterError(QuadsimError):
+    """A cluster cannot fly, or no longer; the rows that it gave stand."""
+
+
+def fly_many(
+    flights: Iterable[Any],
+    fly: Fly,
+    *,
+    workers: int | None = None,
+    timeout: float = 600.0,
+    memory: float = 2000.0,
+    isolate: bool = False,
+    cluster: str | None = None,
+) -> Rows:
+    """The row of each flight with its place among them, as they come; closing the iterator, or Ctrl-C, ends all work.
+
+    The row of a flight that has none of its own has a `verdict` (error, timeout, memory, died) and a `reason`.
+
+    Args:
+        flights: what to fly, anything that pickles: scenarios, or numbers of a plan.
+        fly: gives a flight's row; it pickles as well.
+        workers: processes; one per usable core where absent.
+        timeout: wall clock of one flight [s].
+        memory: that a worker may take beyond what it starts with [MB].
+        isolate: whether each flight gets a fresh process: for code of users, whose flights could change each other.
+        cluster: address of a Dask scheduler; a process beside each of its workers flies.
+
+    Raises:
+        ParameterError: no worker is wanted, or the address is none.
+        MissingPackageError: the extra `cluster` is not installed.
+        ClusterError: the scheduler does not answer, or its workers cannot fly.
+    """
+    _require(workers, cluster)
+    pickled = pickle.dumps(fly)
+    if cluster is not None:
+        return _on_cluster(cluster, flights, pickled, timeout, memory)
+    return _here(flights, pickled, workers or usable_cores(), timeout, memory, isolate)
+
+
+def answers(
+    function: Callable[[Any], Any],
+    questions: Sequence[Any],
+    *,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Any]:
+    """What a function of a module answers to each question, in their order, by processes.
+
+    Raises:
+        ParameterError: no worker is wanted.
+        QuadsimError: one has no answer.
+    """
+    found: dict[int, Any] = {}
+    with closing(fly_many(questions, functools.partial(_answer, function), workers=workers)) as rows:
+        for place, row in rows:
+            if "answer" not in row:
+                raise QuadsimError(f"{questions[place]}: {row['verdict']} ({row['reason']})")
+            found[place] = row["answer"]
+            progress(len(found), len(questions))
+    return [found[place] for place in range(len(questions))]
+
+
+def _answer(function: Callable[[Any], Any], question: Any) -> Row:
+    return {"answer": function(question)}
+
+
+def count_workers(workers: int | None, cluster: str | None) -> int:
+    """How many flights `fly_many` flies at the same time; what it refuses is refused here.
+
+    Raises:
+        See `fly_many`.
+    """
+    _require(workers, cluster)
+    if cluster is None:
+        return workers or usable_cores()
+    with _client(cluster) as client:
+        return _threads(client)
+
+
+def describe(error: BaseException) -> str:
+    """An exception in one printable line."""
+    return printable(" ".join(f"{type(error).__name__}: {error}".split()))
+
+
+def _require(workers: int | None, cluster: str | None) -> None:
+    if workers is not None and (workers < 1 or cluster is not None):
+        raise ParameterError("", "--workers", workers, "1 or more" if cluster is None else "absent with --cluster")
+    if cluster is not None and not _ADDRESS.fullmatch(cluster):
+        rule = "the address of a Dask scheduler, e.g. tcp://10.0.0.1:8786"
+        raise ParameterError("", "--cluster", cluster, rule)
+
+
+# --- on this machine -------------------------------------------------------------------------------------------------
+
+
+def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory: float, isolate: bool) -> Rows:
+    todo, workers = enumerate(flights), list[_Worker]()
+    try:
+        flight = next(todo, None)
+        while flight is not None or workers:
+            while flight is not None and len(workers) < count:
+                workers.append(_Worker(fly, timeout, memory))
+                workers[-1].hand(*flight)
+                flight = next(todo, None)
+            ready, rows = _wait(workers), []
+            for worker in workers[:]:
+                if (row := worker.row(ready)) is None:
+                    continue
+                rows.append((worker.place, row))
+                if flight is not None and worker.usable and not isolate:
+                    worker.hand(*flight)
+                    flight = next(todo, None)
+                else:
+                    workers.remove(worker)
+                    worker.end()
+            yield from rows  # not before every worker has its next flight: the caller may take its time
+    finally:
+        for worker in workers:
+            worker.end()
+
+
+def _wait(workers: Sequence[_Worker]) -> Sequence[object]:
+    """What has something to say, or has ended, before the next deadline."""
+    left = min(worker.deadline for worker in workers) - clock.monotonic()
+    return connection.wait([end for each in workers for end in (each.pipe, each.process.sentinel)], max(left, 0.0))
+
+
+class _Worker:
+    """A process that flies one flight at a time."""
+
+    def __init__(self, fly: bytes, timeout: float, memory: float) -> None:
+        self._timeout, self.place, self.usable, self.deadline = timeout, -1, True, 0.0
+        context = multiprocessing.get_context("forkserver")
+        draws = [name for name in ("scipy.stats",) if name in sys.modules]  # half a second; draws of some campaigns
+        context.set_forkserver_preload([*_PRELOAD, *draws])
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs, fly, memory), daemon=True)
+        with closing(theirs), _starting():
+            self.process.start()
+
+    def hand(self, place: int, flight: Any) -> None:
+        self.place, self.deadline = place, clock.monotonic() + self._timeout
+        with suppress(OSError):  # it is dead already, which its sentinel shows
+            self.pipe.send(flight)
+
+    def row(self, ready: Sequence[object]) -> Row | None:
+        """What came of its flight; None while it flies."""
+        if self.pipe in ready:
+            with suppress(Exception):  # it died while it sent it
+                row = self.pipe.recv()
+                if isinstance(row, dict):
+                    self.usable = row.get("verdict") != MEMORY
+                    return row
+        self.usable = False
+        if self.pipe in ready or self.process.sentinel in ready:
+            self.process.join(0.5)
+            code = self.process.exitcode
+            how = "without a row" if code is None else f"by signal {-code}" if code < 0 else f"with exit status {code}"
+            return {"verdict": DIED, "reason": f"its process ended {how}"}
+        if clock.monotonic() >= self.deadline:
+            return {"verdict": TIMEOUT, "reason": f"it took longer than {self._timeout:g} s"}
+        self.usable = True
+        return None
+
+    def end(self) -> None:
+        """End it, and what it started in its process group."""
+        for kill in (os.killpg, os.kill):  # the second where it has no group yet
+            with suppress(OSError):
+                kill(self.process.pid or 0, signal.SIGKILL)
+        self.process.join(5.0)
+        self.pipe.close()
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    """What starts here has one thread for linear algebra, does not see Ctrl-C, nor runs the caller's script again."""
+    with _STARTING:
+        resource_tracker.ensure_running()  # it lets signals through when it starts
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        before = {name: os.environ.get(name) for name in _ONE_THREAD}
+        os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+        script, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = script
+            for name, value in before.items():
+                os.environ.pop(name) if value is None else os.environ.update({name: value})
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def _serve(pipe: connection.Connection, fly: bytes, memory: float) -> None:
+    """Fly what comes, until the caller goes."""
+    os.setpgid(0, 0)  # Ctrl-C is for the caller alone; and all that a flight starts ends with one signal
+    _die_with_caller()
+    os.dup2(2, 1)  # what controllers print is no part of the caller's output
+    _limit_memory(memory)
+    collect_rarely()
+    freeze_for_good()
+    with suppress(EOFError, OSError):
+        while True:
+            pipe.send_bytes(_row(lambda flight: _loaded(fly)(flight), pipe.recv(), memory))
+            gc.collect()  # a flight may leave a dozen megabytes in cycles
+
+
+def _die_with_caller() -> None:
+    """Have the system kill this group once the caller is gone, even while a controller holds the interpreter."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    fcntl.fcntl(parent.sentinel, fcntl.F_SETOWN, -os.getpgrp())
+    fcntl.fcntl(parent.sentinel, fcntl.F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(parent.sentinel, fcntl.F_SETFL, fcntl.fcntl(parent.sentinel, fcntl.F_GETFL) | os.O_ASYNC)
+    if connection.wait([parent.sentinel], 0.0):
+        os.killpg(0, signal.SIGKILL)
+
+
+def _row(fly: Fly, flight: Any, memory: float) -> bytes:
+    """The pickled row of a flight, whatever it raises."""
+    try:
+        return pickle.dumps(fly(flight))
+    except MemoryError as error:
+        return pickle.dumps({"verdict": MEMORY, "reason": f"{describe(error)} (it may take {memory:g} MB)"})
+    except BaseException as error:  # a user's controller may exit, too
+        return pickle.dumps({"verdict": ERROR, "reason": describe(error)})
+
+
+@functools.lru_cache(maxsize=1)
+def _loaded(fly: bytes) -> Fly:
+    loaded: Fly = pickle.loads(fly)
+    return loaded
+
+
+def _limit_memory(megabytes: float) -> None:
+    """Have the system refuse this process more than so much memory; where the machine has none left, it goes first."""
+    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    held = next(1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith("VmData:"))
+    most = int(held + megabytes * 1e6)
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
+
+
+# --- on a cluster ----------------------------------------------------------------------------------------------------
+
+
+def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float, memory: float) -> Rows:
+    todo, places = enumerate(flights), dict[str, int]()
+    with _client(address) as client:
+        distributed = _distributed()
+        work = distributed.as_completed(loop=client.loop)
+
+        def submit() -> None:
+            """Two flights for each thread there is by now, so that none waits for its next one."""
+            for place, flight in todo:
+                future = client.submit(_beside, fly, flight, timeout, memory, _code(), pure=False)
+                places[future.key] = place
+                work.add(future)
+                if len(places) >= 2 * _threads(client):
+                    break
+
+        submit()
+        for future in work:
+            try:
+                row = future.result()
+            except distributed.KilledWorker as error:  # several Dask workers died with it
+                row = {"verdict": DIED, "reason": describe(error)}
+            except distributed.CancelledError as error:
+                raise ClusterError(f"the scheduler at {address} is gone; continue with --resume") from error
+            except Exception as error:
+                rule = "every worker, and the scheduler, needs the quadsim, and the packages, that are here"
+                raise ClusterError(f"{address}: a worker cannot fly ({describe(error)}); {rule}") from error
+            place = places.pop(future.key)
+            submit()
+            yield place, row
+
+
+def _beside(fly: bytes, flight: Any, timeout: float, memory: float, code: Mapping[str, str]) -> Row:
+    """In a Dask worker: fly in a process beside it, so that no flight can harm it."""
+    other = [f"{name} {value}, not {code.get(name)}" for name, value in _code().items() if code.get(name) != value]
+    if other:
+        raise ClusterError(f"it has {', '.join(other)}")
+    multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # it may have children
+    with closing(_here([flight], fly, 1, timeout, memory, isolate=True)) as rows:
+        return next(rows)[1]
+
+
+@contextmanager
+def _client(address: str) -> Iterator[Any]:
+    """A client of a scheduler that has a worker."""
+    distributed = _distributed()
+    try:
+        client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, ImportError) as error:
+        raise ClusterError(f"the scheduler at {address} does not answer ({describe(error)})") from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_PATIENCE_S)
+        except TimeoutError as error:
+            raise ClusterError(f"the scheduler at {address} has no worker; start one: dask worker {address}") from error
+        yield client
+
+
+def _threads(client: Any) -> int:
+    return sum(worker["nthreads"] for worker in client.scheduler_info(n_workers=-1)["workers"].values())
+
+
+@functools.cache
+def _code() -> dict[str, str]:
+    """Versions of the packages that decide a flight's numbers, our own by the digest of its code."""
+    from scenarios.campaign.manifest import code_digest
+
+    return {**{name: versions()[name] for name in _DECIDE_NUMBERS}, "quadsim": code_digest()[:19]}
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ModuleNotFoundError as error:
+        raise MissingPackageError("a cluster", "distributed", extra="cluster") from error
+    return distributed
