@@ -43,6 +43,7 @@ _PRELOAD: Final = (
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
 _DECIDE_NUMBERS: Final = ("mujoco", "numpy", "scipy", "piqp")
+_START_S: Final = 60.0  # at most, for a worker to start; no part of a flight's time
 _CONNECT_S: Final = 10.0
 _PATIENCE_S: Final = 60.0  # for the first worker of a cluster
 
@@ -179,6 +180,7 @@ class _Worker:
 
     def __init__(self, fly: bytes, timeout: float, memory: float) -> None:
         self._timeout, self.place, self.usable, self.deadline = timeout, -1, True, 0.0
+        self._start_s = _START_S
         context = multiprocessing.get_context("forkserver")
         draws = [name for name in ("scipy.stats",) if name in sys.modules]  # half a second; draws of some campaigns
         context.set_forkserver_preload([*_PRELOAD, *draws])
@@ -188,7 +190,7 @@ class _Worker:
             self.process.start()
 
     def hand(self, place: int, flight: Any) -> None:
-        self.place, self.deadline = place, clock.monotonic() + self._timeout
+        self.place, self.deadline = place, clock.monotonic() + self._timeout + self._start_s
         with suppress(OSError):  # it is dead already, which its sentinel shows
             self.pipe.send(flight)
 
@@ -197,6 +199,9 @@ class _Worker:
         if self.pipe in ready:
             with suppress(Exception):  # it died while it sent it
                 row = self.pipe.recv()
+                if row is None:  # it has started: its first flight begins now
+                    self._start_s, self.deadline = 0.0, clock.monotonic() + self._timeout
+                    return None
                 if isinstance(row, dict):
                     self.usable = row.get("verdict") != MEMORY
                     return row
@@ -247,6 +252,7 @@ def _serve(pipe: connection.Connection, fly: bytes, memory: float) -> None:
     collect_rarely()
     freeze_for_good()
     with suppress(EOFError, OSError):
+        pipe.send(None)
         while True:
             pipe.send_bytes(_row(lambda flight: _loaded(fly)(flight), pipe.recv(), memory))
             gc.collect()  # a flight may leave a dozen megabytes in cycles

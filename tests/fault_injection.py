@@ -27,10 +27,10 @@ from quadsim.state import POSITION, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.bench.mismatch.conditions import CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, equip
-from scenarios.many import answers
 from scenarios.build import build_controller, build_plant, build_problem
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.many import answers
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_once

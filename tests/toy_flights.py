@@ -5,6 +5,7 @@ It stands alone: workers import it.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import signal
@@ -43,10 +44,23 @@ def fly_and_note(flight: tuple[Path, str]) -> dict[str, Any]:
     return fly((0, kind))
 
 
-def place(_: object) -> dict[str, Any]:
-    """Where and how a flight is flown."""
+def report(_: object) -> dict[str, Any]:
+    """The row of a flight that prints: where it is flown, and with how many threads."""
     print("printed by a controller")
-    return {"folder": str(Path.cwd()), "threads": os.environ["OMP_NUM_THREADS"], "script": "started" in sys.argv}
+    return {"folder": str(Path.cwd()), "threads": os.environ["OMP_NUM_THREADS"]}
+
+
+class Unwelcome:
+    """Something that flies, but that no worker can load."""
+
+    def __call__(self, flight: object) -> dict[str, Any]:
+        return {}
+
+    def __setstate__(self, state: object) -> None:
+        raise RuntimeError("not here")
+
+    def __getstate__(self) -> object:
+        return "a state"
 
 
 def _raises() -> NoReturn:
@@ -63,12 +77,13 @@ def _hangs() -> NoReturn:
         time.sleep(1.0)
 
 
-def _takes_memory() -> object:
-    return [np.ones(1 << 20) for _ in range(1 << 20)]
+def _leaves_a_command() -> int:
+    return subprocess.Popen(["sleep", "1000"]).pid
 
 
-def _leaves_a_command() -> None:
-    subprocess.Popen(["sleep", "1000"])
+def _hangs_with_a_command() -> None:
+    _leaves_a_command()
+    ctypes.PyDLL(None).sleep(1000)  # holds the interpreter
 
 
 KINDS: dict[str, Callable[[], object]] = {
@@ -80,9 +95,9 @@ KINDS: dict[str, Callable[[], object]] = {
     "crashes": lambda: ctypes.string_at(0),
     "stops": lambda: os.kill(os.getpid(), signal.SIGSTOP),
     "hangs": _hangs,
-    "holds the interpreter": lambda: ctypes.PyDLL(None).sleep(1000),
-    "takes memory": _takes_memory,
-    "gives no row": lambda: sys.stdout,
+    "holds the interpreter": _hangs_with_a_command,
+    "takes memory": lambda: np.ones(1 << 30),
+    "gives no row": lambda: sys.stderr,
     "leaves a command": _leaves_a_command,
 }
 
@@ -103,12 +118,9 @@ def living(pids: Iterable[int]) -> set[int]:
 
 
 def below() -> set[int]:
-    """The processes that this one has started, and these, without the server of workers."""
-    return {each.pid for each in psutil.Process().children(recursive=True) if "from multiprocessing" not in _line(each)}
-
-
-def _line(process: psutil.Process) -> str:
-    try:
-        return " ".join(process.cmdline()) if process.parent().pid == os.getpid() else ""  # type: ignore[union-attr]
-    except (psutil.NoSuchProcess, AttributeError):
-        return ""
+    """The workers of this process: what a process that it started has started."""
+    found = set()
+    for each in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.NoSuchProcess):
+            found |= {each.pid} if each.ppid() != os.getpid() else set()
+    return found

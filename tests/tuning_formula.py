@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import tomlkit
 
 from scenarios.campaign.pilot import CampaignPilot
@@ -16,6 +17,8 @@ from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.table import Row
 from scenarios.schema.scenario import Scenario
 from scenarios.tuning.pilot import TuningPilot
+from scenarios.tuning.plan import TuningPlan
+from scenarios.tuning.run import TuningResult, tune
 
 BEST_SPEED, BEST_Z = 0.05, 300.0  # where the formula is smallest
 TUNING: dict[str, Any] = {
@@ -54,7 +57,7 @@ def error_of(scenario: Scenario) -> float:
 
 @dataclass
 class Formula:
-    """An engine that flies nothing: `violated` decides for which scenarios a constraint does not hold.
+    """Flies nothing: `violated` decides for which scenarios a constraint does not hold.
 
     In order or backwards, and stopped by an exception after so many flights.
     """
@@ -64,17 +67,15 @@ class Formula:
     stops_after: int | None = None
     stopped_by: type[BaseException] = KeyboardInterrupt
     flown: list[int] = field(default_factory=list)
-    name: str = "formula"
-    workers: int = 1
 
-    def answers(self, pilot: Any, flights: Sequence[int]) -> Generator[Row, None, None]:
+    def fly(self, pilot: Any, flights: Sequence[int], **_: object) -> Generator[Row, None, None]:
         for flight in reversed(flights) if self.backwards else flights:
             if len(self.flown) == self.stops_after:
                 raise self.stopped_by
             self.flown.append(flight)
             scenario = self._plan(pilot, flight).of(flight % pilot._plan.most if self._tuning(pilot) else flight)
             violated = self.violated(scenario)
-            row = pilot.lost(flight, "", "violated" if violated else "satisfied")
+            row = pilot.failed(flight, "", "violated" if violated else "satisfied")
             yield {**row, "status": "completed", "violated": violated, "failed": violated, "rmse.x": error_of(scenario)}
 
     @staticmethod
@@ -84,7 +85,15 @@ class Formula:
     def _plan(self, pilot: Any, flight: int) -> Plan:
         found = pilot._pilot(flight // pilot._plan.most) if self._tuning(pilot) else pilot
         assert isinstance(found, CampaignPilot)
-        return found._plan
+        return found.plan
+
+
+def tune_by(formula: Formula, plan: TuningPlan, directory: Path, **options: Any) -> TuningResult:
+    """A tuning whose rows come from a formula."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("scenarios.tuning.run", "scenarios.campaign.run"):
+            patch.setattr(f"{module}.fly_flights", formula.fly)
+        return tune(plan, directory, **options)
 
 
 def write_tuning(directory: Path, **changes: Any) -> Path:

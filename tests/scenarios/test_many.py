@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import json
 import os
 import random
 import signal
@@ -20,7 +21,7 @@ import dask
 import distributed
 import psutil
 import pytest
-from toy_flights import Toy, below, fly, fly_and_note, fly_slowly, living, place, until
+from toy_flights import Toy, Unwelcome, below, fly, fly_slowly, living, report, until
 
 from quadsim.errors import MissingPackageError, ParameterError, QuadsimError
 from scenarios import many
@@ -60,9 +61,9 @@ BAD = {
     "exits": ("died", "its process ended with exit status 0"),
     "is killed": ("died", "its process ended by signal 9"),
     "crashes": ("died", "its process ended by signal 11"),
-    "stops": ("timeout", "it took longer than 1.5 s"),
-    "hangs": ("timeout", "it took longer than 1.5 s"),
-    "holds the interpreter": ("timeout", "it took longer than 1.5 s"),
+    "stops": ("timeout", "it took longer than 3 s"),
+    "hangs": ("timeout", "it took longer than 3 s"),
+    "holds the interpreter": ("timeout", "it took longer than 3 s"),
     "takes memory": ("memory", "MemoryError: "),
 }
 
@@ -74,14 +75,15 @@ def test_a_bad_flight_is_one_row_and_changes_no_other(isolate: bool) -> None:
     for number, kind in bad.items():
         flights[number] = (number, kind)
     flights[1] = (1, "leaves a command")
-    rows = rows_of(flights, workers=3, timeout=1.5, memory=300.0, isolate=isolate)
+    rows = rows_of(flights, workers=3, timeout=3.0, memory=300.0, isolate=isolate)
     for number, row in enumerate(rows):
         if number in bad:
             verdict, reason = BAD[bad[number]]
             assert (row["verdict"], reason in row["reason"]) == (verdict, True), (bad[number], row)
         else:
             assert row["value"] == EXPECTED[number]
-    assert until(lambda: not below(), 5.0)
+    assert not living({rows[1]["left"]})
+    assert not below()
 
 
 def test_a_worker_that_ran_out_of_memory_flies_no_more() -> None:
@@ -130,25 +132,15 @@ def test_a_worker_is_where_its_caller_is_and_prints_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    (row,) = rows_of([None], place, workers=1)
-    assert (row["folder"], row["threads"]) == (str(tmp_path), os.environ["OMP_NUM_THREADS"]) or row["threads"] == "1"
+    (row,) = rows_of([None], report, workers=1)
+    assert row == {"folder": str(tmp_path), "threads": "1"}
     assert os.environ["OMP_NUM_THREADS"] == "7"
     assert capfd.readouterr().out == ""
 
 
-class _Unwelcome:
-    """Something that flies, and that no worker can load."""
-
-    def __call__(self, flight: object) -> dict[str, Any]:
-        return {}
-
-    def __reduce__(self) -> Any:
-        return _refuse, ()
-
-
-def _refuse() -> None:
-    if "pytest" not in sys.argv[0]:
-        raise RuntimeError("not here")
+def test_what_a_worker_cannot_load_is_the_reason_of_each_row() -> None:
+    rows = rows_of([0, 1], Unwelcome(), workers=1)
+    assert rows == 2 * [{"verdict": "error", "reason": "RuntimeError: not here"}]
 
 
 @pytest.mark.parametrize(
@@ -156,7 +148,10 @@ def _refuse() -> None:
     [
         ({"workers": 0}, "--workers must be 1 or more; got 0"),
         ({"workers": 2, "cluster": "tcp://a:1"}, "--workers must be absent with --cluster; got 2"),
-        ({"cluster": "slurm.toml"}, r"--cluster must be the address of a Dask scheduler, e.g. tcp://10.0.0.1:8786; got"),
+        (
+            {"cluster": "slurm.toml"},
+            "--cluster must be the address of a Dask scheduler, e.g. tcp://",
+        ),
     ],
 )
 def test_workers_that_cannot_be_are_refused_at_once(options: dict[str, Any], message: str) -> None:
@@ -171,7 +166,7 @@ def test_answers_come_in_the_order_of_their_questions() -> None:
     found = answers(abs, [-3, 2, -1], workers=2, progress=lambda done, total: heard.append((done, total)))
     assert found == [3, 2, 1]
     assert heard == [(1, 3), (2, 3), (3, 3)]
-    with pytest.raises(QuadsimError, match=r"0: error \(ZeroDivisionError: "):
+    with pytest.raises(QuadsimError, match=r"-1: error \(ZeroDivisionError: "):
         answers(functools.partial(pow, 0), [1, -1], workers=1)
 
 
@@ -198,7 +193,7 @@ def parent(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[str], set[int]]]:
     script, diary = tmp_path / "parent.py", tmp_path / "diary"
     script.write_text(PARENT)
     diary.touch()
-    kinds = ["leaves a command", "holds the interpreter", "hangs", "hangs"]
+    kinds = ["holds the interpreter", "hangs", "stops"]
     process = subprocess.Popen(
         [sys.executable, str(script), str(diary), *kinds],
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT / "tests"), str(ROOT)])},
@@ -219,7 +214,7 @@ def test_no_process_outlives_a_caller_that_is_killed(
     parent: tuple[subprocess.Popen[str], set[int]], number: signal.Signals
 ) -> None:
     process, family = parent
-    assert len(living(family)) >= 4
+    assert len(living(family)) >= 5  # with the server of workers, and a command of the first
     process.send_signal(number)
     assert until(lambda: not living(family), 5.0)
     assert process.communicate()[0] == "started\n"
@@ -254,32 +249,26 @@ def address(cluster: distributed.LocalCluster) -> str:
 
 
 def test_a_cluster_gives_the_same_rows_and_one_for_each_bad_flight(address: str) -> None:
-    flights = [*CALM]
-    for number, kind in {3: "raises", 7: "is killed", 11: "hangs", 20: "takes memory"}.items():
+    flights = CALM[:12]
+    for number, kind in {3: "raises", 5: "is killed", 7: "hangs", 8: "takes memory"}.items():
         flights[number] = (number, kind)
-    rows = rows_of(flights, timeout=1.5, memory=300.0, cluster=address)
+    rows = rows_of(flights, timeout=3.0, memory=300.0, cluster=address)
     bad = {number: row["verdict"] for number, row in enumerate(rows) if "value" not in row}
-    assert bad == {3: "error", 7: "died", 11: "timeout", 20: "memory"}
-    assert [row.get("value", EXPECTED[number]) for number, row in enumerate(rows)] == EXPECTED
+    assert bad == {3: "error", 5: "died", 7: "timeout", 8: "memory"}
+    assert [row.get("value", EXPECTED[number]) for number, row in enumerate(rows)] == EXPECTED[:12]
     assert many.count_workers(None, address) == 2
 
 
-def test_a_dask_worker_that_is_killed_costs_nothing_but_time(
-    address: str, cluster: distributed.LocalCluster
-) -> None:
-    rows, killed = {}, set[int]()
-    for at, row in fly_many(range(40), fly_slowly, cluster=address):
+def test_a_dask_worker_that_is_killed_costs_nothing_but_time(address: str) -> None:
+    rows, killed = dict[int, Any](), 0
+    for at, row in fly_many(range(12), fly_slowly, cluster=address):
         rows[at] = row
-        if len(rows) == 10:
-            killed = {psutil.Process(row["process"]).ppid() for row in ()} | {_some_worker(address)}
-            os.kill(next(iter(killed)), signal.SIGKILL)
-    assert [rows[at]["value"] for at in range(40)] == [at * at / 7.0 for at in range(40)]
-    assert until(lambda: not living(killed))
-
-
-def _some_worker(address: str) -> int:
-    with distributed.Client(address, set_as_default=False) as client:
-        return next(iter(client.run(os.getpid).values()))
+        if len(rows) == 3:
+            with distributed.Client(address, set_as_default=False) as client:
+                killed = next(iter(client.run(os.getpid).values()))
+            os.kill(killed, signal.SIGKILL)
+    assert [rows[at]["value"] for at in range(12)] == [at * at / 7.0 for at in range(40)]
+    assert not living({killed})
 
 
 def test_other_code_on_a_worker_is_refused(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -322,7 +311,7 @@ def test_a_scheduler_that_is_gone_ends_the_rows_with_a_message(tmp_path: Path) -
     ]
     try:
         assert until(lambda: file.exists() and "address" in file.read_text())
-        address = __import__("json").loads(file.read_text())["address"]
+        address = json.loads(file.read_text())["address"]
         rows = fly_many(range(400), fly_slowly, cluster=address)
         next(rows)
         started[0].kill()

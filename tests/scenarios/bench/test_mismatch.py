@@ -27,10 +27,10 @@ from scenarios.bench.mismatch.benchmark import (
 from scenarios.bench.mismatch.conditions import CONDITIONS
 from scenarios.bench.mismatch.controllers import FULL, VARIANTS, equip, tilt_bound
 from scenarios.bench.mismatch.survival import MismatchBench, MismatchFlight, mismatch_legend, mismatch_tables
-from scenarios.many import answers
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.loading import load_scenario
+from scenarios.many import answers
 from scenarios.run import fly_scenario
 from scenarios.schema.robust import RobustSpec
 

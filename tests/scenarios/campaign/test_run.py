@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 import json
+import os
+import random
 import shutil
+import subprocess
+import sys
 from collections.abc import Generator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +21,8 @@ from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.outputs import Growing, growing
 from scenarios.campaign import manifest as records
 from scenarios.campaign import run as module
-from scenarios.campaign.engine.local import LocalEngine
-from scenarios.campaign.engine.protocol import Pilot
 from scenarios.campaign.manifest import read_manifest
-from scenarios.campaign.pilot import CampaignPilot
+from scenarios.campaign.pilot import Pilot
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.replay import recorded_flight, replay_flight
 from scenarios.campaign.results.table import Row, read_table
@@ -41,25 +43,29 @@ CAMPAIGN: dict[str, Any] = {
 }
 
 
-fly_campaign = functools.partial(module.fly_campaign, report=False)
-
-
 @dataclass
 class Alone:
-    """An engine of this process: backwards or not, and stopped by an exception after so many flights."""
+    """Flies in this process: backwards or not, and stopped by an exception after so many flights."""
 
     backwards: bool = False
     stops_after: int | None = None
     stopped_by: type[BaseException] = KeyboardInterrupt
-    name: str = "alone"
-    workers: int = 1
 
-    def answers(self, pilot: Pilot, flights: Sequence[int]) -> Generator[Row, None, None]:
+    def fly(self, pilot: Pilot, flights: Sequence[int], **_: object) -> Generator[Row, None, None]:
         ordered = list(reversed(flights)) if self.backwards else list(flights)
         for i, flight in enumerate(ordered):
             if i == self.stops_after:
                 raise self.stopped_by
             yield pilot.fly(flight)
+
+
+def fly_campaign(plan: Plan, directory: Path, by: Alone | int, *, report: bool = False, **options: Any) -> Result:
+    """Flown in this process, or by so many workers."""
+    with pytest.MonkeyPatch.context() as patch:
+        if isinstance(by, Alone):
+            patch.setattr(module, "fly_flights", by.fly)
+        workers = None if isinstance(by, Alone) else by
+        return module.fly_campaign(plan, directory, workers=workers, report=report, **options)
 
 
 def make_plan(directory: Path, **changes: Any) -> Plan:
@@ -84,7 +90,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Result:
 def by_two(tmp_path_factory: pytest.TempPathFactory) -> Result:
     """The same, flown by two processes."""
     here = tmp_path_factory.mktemp("two")
-    return fly_campaign(make_plan(here), here / "c", LocalEngine(2))
+    return fly_campaign(make_plan(here), here / "c", 2)
 
 
 @pytest.fixture
@@ -98,7 +104,7 @@ def content(result: Result) -> tuple[bytes, bytes]:
 
 
 def test_results_are_the_same_bytes_with_any_worker(plan: Plan, whole: Result, by_two: Result, tmp_path: Path) -> None:
-    engines = {"backwards": Alone(backwards=True), "one": LocalEngine(1)}
+    engines = {"backwards": Alone(backwards=True), "one": 1}
     results = [whole, by_two, *(fly_campaign(plan, tmp_path / name, engine) for name, engine in engines.items())]
     assert len({content(result) for result in results}) == 1
     assert results[0].table.num_rows == 12
@@ -120,14 +126,6 @@ def test_what_was_flown_stays_and_the_rest_follows(
     assert [session["flights"] for session in resumed.manifest["sessions"]] == [5, 7]
 
 
-def test_what_draws_need_is_loaded_before_a_flight(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half a second for statistics is no part of a flight's time."""
-    drawn: list[int] = []
-    monkeypatch.setattr(Plan, "identity", lambda _, flight: drawn.append(flight))
-    CampaignPilot(plan).prepare()
-    assert drawn == [0]
-
-
 def test_resuming_a_finished_campaign_flies_nothing(plan: Plan, whole: Result, flown: Path) -> None:
     assert content(fly_campaign(plan, flown, Alone(stops_after=0), resume=True)) == content(whole)
 
@@ -139,25 +137,103 @@ def test_more_flights_may_follow(flown: Path, tmp_path: Path) -> None:
     assert grown.manifest["flights"] == grown.manifest["flown"] == 15
 
 
-def test_a_flight_that_raises_is_a_result(tmp_path: Path) -> None:
-    (tmp_path / "fails.py").write_text(
-        "class Fails:\n"
-        "    def __init__(self, vehicle, **numbers):\n        pass\n"
-        "    def step(self, now, state, reference):\n        raise ZeroDivisionError('of its\\n\\x1b own')\n",
-        encoding="utf-8",
-    )
-    plan = make_plan(tmp_path, set={"duration": 0.5, "constraints": [], "controller": "fails:Fails"})
-    table = fly_campaign(plan, tmp_path / "c", Alone()).table
-    assert set(table["verdict"].to_pylist()) == {"error"}
-    assert set(table["reason"].to_pylist()) == {"ZeroDivisionError: of its \\x1b own"}
-    assert all(table["failed"].to_pylist())
+CONTROLLER = """
+import ctypes, os, signal, sys, time
+
+class Mine:
+    warm = []
+
+    def __init__(self, vehicle, period, horizon, kind="calm"):
+        self.speeds, self.kind = [vehicle.hover_speed] * 4, kind
+
+    def step(self, now, state, reference):
+        if self.kind == "warms":
+            self.warm.append(1)
+            return [speed + 0.1 * len(self.warm) for speed in self.speeds]
+        if self.kind == "sleeps":
+            time.sleep(0.03)
+        if self.kind == "raises":
+            raise ZeroDivisionError("of its\\n\\x1b own")
+        if self.kind == "dies":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.kind == "hangs":
+            ctypes.PyDLL(None).sleep(1000)
+        if self.kind == "takes memory":
+            bytearray(1 << 33)
+        return self.speeds
+"""
+"""A controller of the user's; `kind` is what it does beside hovering."""
+
+
+def plan_of_kinds(directory: Path, *kinds: str, **changes: Any) -> Plan:
+    """A flight for each kind of the controller."""
+    module = f"mine_{abs(hash(directory))}"  # one name is imported from one place, in a process
+    (directory / f"{module}.py").write_text(CONTROLLER, encoding="utf-8")
+    entry = {"name": "kind", "fields": ["controller.settings.kind"], "distribution": "grid", "values": [*kinds]}
+    controller = {"type": f"{module}:Mine", "settings": {"kind": "calm"}, "folder": "."}
+    flown = {"duration": 0.5, "constraints": [], "controller": controller}
+    return make_plan(directory, **{"vary": [entry], "flights": len(kinds), "set": flown, **changes})
+
+
+def test_a_bad_flight_is_a_row_with_its_verdict_and_reason(tmp_path: Path) -> None:
+    kinds = ("calm", "raises", "dies", "hangs", "takes memory")
+    plan = plan_of_kinds(tmp_path, *kinds, limits={"flight": 4.0, "memory": 500.0}, failure=["violated"])
+    result = fly_campaign(plan, tmp_path / "c", 2)
+    table = result.table
+    assert table["verdict"].to_pylist() == ["satisfied", "error", "died", "timeout", "memory"]
+    assert table["reason"].to_pylist()[1:] == [
+        "ZeroDivisionError: of its \\x1b own",
+        "its process ended by signal 9",
+        "it took longer than 4 s",
+        "MemoryError (it may take 500 MB)",
+    ]
+    assert table["failed"].to_pylist() == [False, True, True, True, True]
+    assert [result.summary["events"][name]["count"] for name in ("failure", "died", "lost")] == [4, 1, 0]
+
+
+def test_flights_of_a_users_controller_do_not_change_each_other(tmp_path: Path) -> None:
+    """A list of the class grows with every step: in one process, the second flight would be another one."""
+    plan = plan_of_kinds(tmp_path, "warms", vary=[CAMPAIGN["vary"][0]], flights=6)
+    results = [fly_campaign(plan, tmp_path / f"by-{workers}", workers) for workers in (1, 2)]
+    assert content(results[0]) == content(results[1])
+    (alone,) = fly_campaign(
+        plan_of_kinds(tmp_path, "warms", vary=[CAMPAIGN["vary"][0]], flights=1), tmp_path / "a", 1
+    ).table["rmse.z"]
+    assert results[0].table["rmse.z"][0] == alone
+
+
+def test_code_of_the_user_is_known_wherever_a_campaign_names_it(tmp_path: Path) -> None:
+    assert not make_plan(tmp_path).flies_user_code
+    assert plan_of_kinds(tmp_path, "calm").flies_user_code
+    choice = {"name": "law", "fields": ["controller.type"], "distribution": "choice", "values": ["robust"]}
+    assert make_plan(tmp_path, vary=[choice]).flies_user_code
+
+
+def test_a_campaign_that_is_killed_resumes_to_the_same_bytes(tmp_path: Path) -> None:
+    plan = plan_of_kinds(tmp_path, "sleeps", vary=[CAMPAIGN["vary"][0]], flights=16)
+    command = [sys.executable, "-m", "scenarios.cli", "campaign", "little.toml", "--out", "c", "--workers", "2"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    dice, times = random.Random(2), 0
+    while not (tmp_path / "c" / "summary.json").exists():
+        process = subprocess.Popen(
+            [*command, "--no-report", "--resume"], cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
+        )
+        with suppress(subprocess.TimeoutExpired):
+            assert process.wait(dice.uniform(2.0, 5.0) if times < 3 else None) == 0, process.stderr
+        times += process.returncode is None
+        process.kill()
+        process.communicate()
+    assert times >= 2
+    again = fly_campaign(plan, tmp_path / "whole", 2)
+    for name in ("flights.parquet", SUMMARY_FILE):
+        assert (tmp_path / "c" / name).read_bytes() == (again.directory / name).read_bytes()
 
 
 def test_it_stops_when_the_interval_is_narrow_enough_at_the_same_flight(tmp_path: Path) -> None:
     plan = make_plan(tmp_path, flights=40)
     results = [
         fly_campaign(plan, tmp_path / name, engine, until_width=0.5)
-        for name, engine in {"one": Alone(), "two": LocalEngine(2)}.items()
+        for name, engine in {"one": Alone(), "two": 2}.items()
     ]
     assert content(results[0]) == content(results[1])
     flown = results[0].table.num_rows
@@ -178,7 +254,7 @@ def test_a_width_that_is_no_share_is_refused(plan: Plan, tmp_path: Path, width: 
 
 @pytest.mark.usefixtures("sketched")
 def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
-    result = module.fly_campaign(plan, tmp_path / "c", Alone())
+    result = fly_campaign(plan, tmp_path / "c", Alone(), report=True)
     manifest = read_manifest(result.directory)
     assert manifest == result.manifest
     assert (manifest["name"], manifest["status"], manifest["flights"]) == ("little", "complete", 12)
@@ -297,7 +373,7 @@ def test_files_of_the_user_are_not_written_over(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("sketched")
 def test_a_report_of_fewer_flights_goes(plan: Plan, tmp_path: Path) -> None:
-    module.fly_campaign(plan, tmp_path / "c", Alone())
+    fly_campaign(plan, tmp_path / "c", Alone(), report=True)
     fly_campaign(make_plan(tmp_path, flights=14), tmp_path / "c", Alone(), resume=True)
     assert not (tmp_path / "c" / "index.html").exists()
 

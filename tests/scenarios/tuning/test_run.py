@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import importlib
 import json
 import os
@@ -15,10 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tuning_formula import BEST_SPEED, BEST_Z, Formula, error_of, write_tuning
+from tuning_formula import BEST_SPEED, BEST_Z, Formula, error_of, tune_by, write_tuning
 
 from quadsim.errors import InputError, MissingPackageError, OutputError
-from scenarios.campaign.engine.local import LocalEngine
 from scenarios.campaign.results.table import read_table
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
@@ -27,7 +25,12 @@ from scenarios.tuning.plan import TuningPlan, load_tuning
 from scenarios.tuning.run import SUMMARY_FILE, TuningResult
 from scenarios.tuning.spec import START
 
-tune = functools.partial(module.tune, report=False)
+
+def tune(plan: TuningPlan, directory: Path, by: Formula | int, **options: Any) -> TuningResult:
+    """Without a report; flown by a formula, or by so many workers."""
+    if isinstance(by, Formula):
+        return tune_by(by, plan, directory, report=False, **options)
+    return module.tune(plan, directory, workers=by, report=False, **options)
 
 
 @pytest.fixture
@@ -127,16 +130,15 @@ KILLED = """
 import sys, time
 from pathlib import Path
 from scenarios.tuning.plan import load_tuning
-from scenarios.tuning.run import tune
-from tuning_formula import Formula
+from tuning_formula import Formula, tune_by
 
 class Slow(Formula):
-    def answers(self, pilot, flights):
-        for row in super().answers(pilot, flights):
+    def fly(self, pilot, flights, **_):
+        for row in super().fly(pilot, flights):
             time.sleep(0.01)
             yield row
 
-tune(load_tuning(sys.argv[1]), Path(sys.argv[2]), Slow(), report=False)
+tune_by(Slow(), load_tuning(sys.argv[1]), Path(sys.argv[2]), report=False)
 """
 
 
@@ -217,7 +219,7 @@ def test_processes_fly_the_same_search(tmp_path: Path) -> None:
     """Real flights, by one process and by two: the same bytes."""
     changes: dict[str, Any] = {"trials": 4, "batch": 4, "flights": [1, 2], "fresh": {"flights": 2, "seed": 1}}
     plan = load_tuning(str(write_tuning(tmp_path, **changes)))
-    results = [tune(plan, tmp_path / f"{workers}", LocalEngine(workers)) for workers in (1, 2)]
+    results = [tune(plan, tmp_path / f"{workers}", workers) for workers in (1, 2)]
     assert content(results[0]) == content(results[1])
     assert results[0].table["status"].to_pylist() == ["completed"] * results[0].table.num_rows
 

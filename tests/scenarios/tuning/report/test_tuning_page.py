@@ -6,12 +6,12 @@ import re
 
 import pytest
 from support import sketch_figures
-from tuning_formula import Formula, write_tuning
+from tuning_formula import Formula, tune_by, write_tuning
 
 from quadsim.report.table import Mark
 from scenarios.tuning.plan import load_tuning
 from scenarios.tuning.report.tuning_tables import candidate_table, objective_table, sentences, verdict_sentence
-from scenarios.tuning.run import TuningResult, tune
+from scenarios.tuning.run import TuningResult
 
 OBJECTIVES = [
     {"name": "error", "expression": "rmse.x", "unit": "m"},
@@ -25,7 +25,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
     plan = load_tuning(str(write_tuning(here, objectives=OBJECTIVES, trials=12, description="a <b>bowl</b>")))
     with pytest.MonkeyPatch.context() as patch:
         sketch_figures(patch)
-        return tune(plan, here / "t", Formula())
+        return tune_by(Formula(), plan, here / "t")
 
 
 def test_the_page_links_to_what_is_there(result: TuningResult) -> None:
