@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights gym reproduce speed soak campaigns live tuning kills safety firmware export-numbers pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights gym reproduce speed soak campaigns live tuning safety firmware export-numbers pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -46,9 +46,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OMP_NUM_THREADS := 1
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export OPENBLAS_NUM_THREADS := 1
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning kills safety: export MKL_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning safety: export OMP_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning safety: export OPENBLAS_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning safety: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -128,9 +128,6 @@ live: setup $(VENV)/.browser  ## film a session and remake the numbers of docs/l
 
 safety: setup  ## attack all that writes or reads files, and remake the counts on docs/safety.md: some forty minutes
 	@PYTHONPATH=tests $(PY) docs/make_safety.py
-
-kills: setup  ## kill a campaign's processes a hundred times: nothing may be lost, or there twice
-	@$(PY) tests/campaign_kills.py
 
 pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constraints.txt
 	@fresh=$$(mktemp -d) && trap 'rm -rf "$$fresh"' EXIT && fresh_python="$$fresh/bin/python" && \

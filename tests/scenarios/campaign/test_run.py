@@ -27,6 +27,7 @@ from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.replay import recorded_flight, replay_flight
 from scenarios.campaign.results.table import Row, read_table
 from scenarios.campaign.run import SUMMARY_FILE, Result, Standing
+from scenarios.campaign.spec import ChoiceSpec
 from scenarios.flight import Outputs
 from scenarios.machine import processor_name
 
@@ -185,7 +186,7 @@ def test_a_bad_flight_is_a_row_with_its_verdict_and_reason(tmp_path: Path) -> No
         "ZeroDivisionError: of its \\x1b own",
         "its process ended by signal 9",
         "it took longer than 4 s",
-        "MemoryError (it may take 500 MB)",
+        "MemoryError: (it may take 500 MB)",
     ]
     assert table["failed"].to_pylist() == [False, True, True, True, True]
     assert [result.summary["events"][name]["count"] for name in ("failure", "died", "lost")] == [4, 1, 0]
@@ -205,8 +206,9 @@ def test_flights_of_a_users_controller_do_not_change_each_other(tmp_path: Path) 
 def test_code_of_the_user_is_known_wherever_a_campaign_names_it(tmp_path: Path) -> None:
     assert not make_plan(tmp_path).flies_user_code
     assert plan_of_kinds(tmp_path, "calm").flies_user_code
-    choice = {"name": "law", "fields": ["controller.type"], "distribution": "choice", "values": ["robust"]}
-    assert make_plan(tmp_path, vary=[choice]).flies_user_code
+    drawn = ChoiceSpec(name="law", fields=["controller"], distribution="choice", values=["mine:Mine"])
+    plan = make_plan(tmp_path)
+    assert replace(plan, spec=plan.spec.model_copy(update={"vary": [drawn]})).flies_user_code
 
 
 def test_a_campaign_that_is_killed_resumes_to_the_same_bytes(tmp_path: Path) -> None:
