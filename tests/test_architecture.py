@@ -35,7 +35,6 @@ OF_ONE_ROOM = (
     "imageio",
     "imageio_ffmpeg",
     "jinja2",
-    "dask",
     "distributed",
     "optuna",
 )

@@ -45,9 +45,17 @@ def small() -> pa.Table:
 def test_events_and_verdicts_are_counted(small: pa.Table) -> None:
     found = estimate(small)
     assert found["flights"] == 8
-    assert found["verdicts"] == {"satisfied": 3, "violated": 2, "lost": 2, "error": 1, "timeout": 0, "memory": 0}
+    assert found["verdicts"] == {
+        "satisfied": 3,
+        "violated": 2,
+        "lost": 2,
+        "error": 1,
+        "died": 0,
+        "timeout": 0,
+        "memory": 0,
+    }
     counts = {name: event["count"] for name, event in found["events"].items()}
-    expected = {"failure": 6, "violation": 5, "lost": 2, "crash": 1, "error": 1, "timeout": 0, "memory": 0}
+    expected = {"failure": 6, "violation": 5, "lost": 2, "crash": 1, "error": 1, "died": 0, "timeout": 0, "memory": 0}
     assert counts == expected
     failure = found["events"]["failure"]
     exact = stats.binomtest(6, 8).proportion_ci(0.95)
