@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from quadsim.controller import MISSED, Command, Controller, InnerLoop, Moment, Phase
-from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError
+from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.flight.lost import check_loss
 from quadsim.motion import Motion
@@ -155,6 +155,7 @@ class ClosedLoop:
         self.reason: str | None = None
         self._criterion: str | None = None
         self._interrupted = False
+        self._traceback: tuple[str, ...] = ()
         self._yaw = float(initial_state[INDEX["yaw"]])
         if navigation is not None:
             navigation.reset(plant.physics, initial_speeds, yaw=self._yaw)
@@ -283,6 +284,7 @@ class ClosedLoop:
             predicted=_joined([*self._predicted, *([self._predict()] if self.k > self._switched else [])]),
             reason=self.reason,
             interrupted=self._interrupted,
+            traceback=self._traceback,
             lost=self._criterion,
         )
 
@@ -294,6 +296,7 @@ class ClosedLoop:
         """Note why the flight ended; not the error itself, which would hold all that was flown in a cycle."""
         self.reason = str(error)
         self._criterion = error.criterion if isinstance(error, LostError) else None
+        self._traceback = error.traceback if isinstance(error, RaisedError) else ()
 
     def _observe(self) -> Observation:
         k, plant, navigation = self.k, self._plant, self._navigation
@@ -335,7 +338,12 @@ class ClosedLoop:
         step_s, command = 0.0, given
         if command is None:
             started = clock.perf_counter()
-            command = self.controller.step(now, observed.state, observed.preview)
+            try:
+                command = self.controller.step(now, observed.state, observed.preview)
+            except FlightError:
+                raise
+            except (Exception, SystemExit) as error:
+                raise RaisedError("the controller", error, time=now.time) from error
             step_s = clock.perf_counter() - started
         delay = 0.0 if computation is None else computation.taken(now.time, command, self._draws)
         self.answered = max(self.answered, now.time + delay)

@@ -46,11 +46,19 @@ class CampaignPilot:
         except QuadsimError as error:
             return self._row(flight, failed_row(str(error)))
         except MemoryError as error:
-            most = f"limits.memory is {self.limits.memory:g} MB"
-            return self._row(flight, failed_row(f"{describe(error)} ({most})", MEMORY))
+            return self._row(flight, failed_row(f"{describe(error)} ({self._most})", MEMORY))
         except Exception as error:  # e.g. of a user-defined controller: the campaign continues without it
             return self._row(flight, failed_row(describe(error)))
+        if raised := flown.log.traceback:  # no more of such a flight is kept than that it raised
+            reason = str(flown.log.reason)
+            short = raised[-1].startswith(MemoryError.__name__)
+            row = failed_row(f"{reason} ({self._most})", MEMORY) if short else failed_row(reason)
+            return self._row(flight, row)
         return self._row(flight, _recorded(flown, clock.perf_counter() - started))
+
+    @property
+    def _most(self) -> str:
+        return f"limits.memory is {self.limits.memory:g} MB"
 
     def row_of(self, flight: int, flown: Flight) -> Row:
         """The row of a flight that was flown elsewhere; it has no clock times of its own."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
+from pathlib import Path
 from typing import Any
 
 from scenarios.api import load as load_scenario
@@ -27,3 +28,8 @@ def print_summary(summary: dict[str, Any], options: Namespace, where: str | None
         print(json.dumps(summary, indent=2))
     else:
         console.print_summary(summary, where)
+
+
+def shown(path: Path) -> str:
+    """A path for a person: relative to the current directory where it is in there."""
+    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)

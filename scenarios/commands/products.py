@@ -12,7 +12,7 @@ from scenarios.commands import EXIT_DONE
 
 def video(options: Namespace) -> int:
     """`quadsim video`."""
-    path = film(options.run, options.out, workers=options.workers)
+    path = film(options.run, options.out, overwrite=options.overwrite, workers=options.workers)
     print(f"written to {printable(str(path))}")
     return EXIT_DONE
 

@@ -22,6 +22,7 @@ def tune(options: Namespace) -> int:
             workers=options.workers,
             cluster=options.cluster,
             resume=options.resume,
+            overwrite=options.overwrite,
             report=options.report,
             progress=False if options.json else "lines",
         )
