@@ -22,7 +22,6 @@ from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT, campaign_console, co
 from scenarios.commands.console import stdout, styled
 from scenarios.junit import write_cases
 from scenarios.parts.plugin import PluginController
-from tests.safety_mutations import unseal
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
 NASTY = (
@@ -99,7 +98,6 @@ def test_a_reason_in_a_run_of_others_is_shown_as_text(
 ) -> None:
     """An aborted flight of an older version, whose reason someone wrote."""
     run = shutil.copytree(short_run_directory, tmp_path / "run")
-    unseal(run)
     summary = json.loads((run / "summary.json").read_text())
     summary |= {"status": "aborted", "reason": nasty, "satisfied": False, "as_expected": False}
     (run / "summary.json").write_text(json.dumps(summary))
