@@ -82,13 +82,14 @@ def reserving(path: Path | str, *, overwrite: bool = False, free: bool = False) 
         with _errors(target):
             made += [parent for parent in target.parents if not parent.exists()]
             target.parent.mkdir(parents=True, exist_ok=True)
-            names = itertools.chain([target], (target.with_name(f"{target.name}-{i}") for i in itertools.count(2)))
-            for target in names:
+            first = target
+            for i in itertools.count(2):
                 with contextlib.suppress(FileExistsError):
                     target.mkdir()
                     made.insert(0, target)
                 if not free or target in made:
                     break
+                target = first.with_name(f"{first.name}-{i}")
             _require_replaceable(target, overwrite=overwrite)
             if shutil.disk_usage(target).free < _FREE_BYTES_NEEDED:
                 raise OutputError(target, "the disk is full")

@@ -365,7 +365,7 @@ def check(directory: str | Path) -> Reaudit:
         >>> found.satisfied, found.notes
         (True, ())
     """
-    return reaudit(absolute(directory))
+    return reaudit(Path(directory))
 
 
 def film(
@@ -403,8 +403,8 @@ def film(
     """
     from quadsim.report.film.video import render_gif, render_video
 
+    reaudit(Path(directory), products=False)
     directory = absolute(directory)
-    reaudit(directory, products=False)
     path = absolute(directory / rundir.VIDEO_FILE if out is None else out)
     if workers is not None and workers < 1:
         raise ParameterError("", "--workers", workers, "at least 1")

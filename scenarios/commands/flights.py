@@ -7,7 +7,7 @@ from pathlib import Path
 
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.flight import rundir
-from quadsim.outputs import absolute, reserving
+from quadsim.outputs import reserving
 from scenarios import api
 from scenarios.api import feasibility, fitting, fly
 from scenarios.campaign.manifest import is_campaign
@@ -48,7 +48,7 @@ def check(options: Namespace) -> int:
     if options.junit is not None:
         options.junit = junit_file(options.junit)
     found: Flight | Reaudit
-    directory = absolute(options.target)
+    directory = Path(options.target)
     if directory.is_dir():
         if options.settings or options.seed is not None:
             option, value = ("--set", options.settings) if options.settings else ("--seed", options.seed)

@@ -182,9 +182,12 @@ def test_any_horizon_flies(name: str, horizon: int) -> None:
     assert flight.log.predicted.shape == (10, horizon, 3)
 
 
-def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
+def test_a_second_run_replaces_the_first_only_on_request(tmp_path: Path) -> None:
     run(tmp_path / "run", SHORT)
-    assert run(tmp_path / "run", SHORT, "seed=1").summary["seed"] == 1
+    with pytest.raises(OutputError, match="it is not empty"):
+        run(tmp_path / "run", SHORT, "seed=1")
+    run_scenario(load_scenario("hover", [SHORT, "seed=1"]), tmp_path / "run", TABLES, overwrite=True)
+    assert rundir.read_summary(tmp_path / "run")["seed"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
@@ -219,7 +222,7 @@ def test_a_flight_lost_on_the_way_is_recorded_up_to_there(tmp_path: Path) -> Non
 def test_a_flight_that_was_interrupted_is_not_what_any_scenario_expects(tmp_path: Path) -> None:
     scenario = load_scenario("hover", [SHORT, "expect=lost"])
     flight = run_scenario(scenario, tmp_path / "run", TABLES, interrupt_after(3))
-    assert flight.outcome == "lost"
+    assert flight.outcome == "aborted"
     assert rundir.read_summary(tmp_path / "run")["as_expected"] is False
 
 
