@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,13 @@ def write(target: Path, text: str = "one", *, overwrite: bool = False) -> None:
         (work / "figures" / "a.png").write_text(text)
 
 
+def fail(making: AbstractContextManager[Path], error: BaseException) -> None:
+    """Make half of something."""
+    with making as place:
+        (place / "half" if place.is_dir() else place).write_text("half")
+        raise error
+
+
 @pytest.fixture
 def output(tmp_path: Path) -> Path:
     write(tmp_path / "place" / "run")
@@ -51,9 +59,8 @@ def test_a_directory_lists_its_files_with_their_digests(output: Path) -> None:
 
 @pytest.mark.parametrize("error", [ValueError(), KeyboardInterrupt(), OSError(28, "No space left on device")])
 def test_what_fails_leaves_nothing_and_takes_its_new_parents_along(tmp_path: Path, error: BaseException) -> None:
-    with pytest.raises((type(error), OutputError)), writing(tmp_path / "a" / "b" / "run") as work:
-        (work / "half").write_text("x")
-        raise error
+    with pytest.raises((type(error), OutputError)):
+        fail(writing(tmp_path / "a" / "b" / "run"), error)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -155,10 +162,13 @@ def test_only_what_is_below_is_ever_unlinked(output: Path) -> None:
 
 
 def test_what_comes_in_while_it_is_made_stays_and_so_does_what_was_made(output: Path) -> None:
-    with pytest.raises(OutputError, match=r"does not list mine; .*; what was made is in (\S+)") as caught:
+    def others_come_in() -> None:
         with writing(output, overwrite=True) as work:
             (work / "new").write_text("new")
             (output / "mine").write_text("mine")
+
+    with pytest.raises(OutputError, match=r"does not list mine; .*; what was made is in (\S+)") as caught:
+        others_come_in()
     assert (output / "mine").read_text() == "mine"
     assert (output / "table").read_text() == "one"
     assert (Path(caught.value.problem.rpartition(" ")[2]) / "new").read_text() == "new"
@@ -175,9 +185,8 @@ def test_the_current_directory_is_refused(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_what_is_added_is_listed_and_nothing_is_where_it_fails(output: Path) -> None:
     before = tree(output.parent)
-    with pytest.raises(KeyboardInterrupt), adding(output) as folder:
-        (folder / "film").write_text("half")
-        raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt):
+        fail(adding(output), KeyboardInterrupt())
     assert tree(output.parent) == before
     with adding(output, note="x") as folder:
         (folder / "film").write_text("whole")
@@ -192,9 +201,8 @@ def test_a_file_is_written_whole_and_replaced_only_on_request(tmp_path: Path) ->
         new.write_text("one")
     with pytest.raises(OutputError, match="it is already there; choose another file"), writing_file(path):
         pytest.fail("not to be reached")
-    with pytest.raises(ValueError, match="half"), writing_file(path, overwrite=True) as new:
-        new.write_text("two")
-        raise ValueError("half")
+    with pytest.raises(ValueError, match="half"):
+        fail(writing_file(path, overwrite=True), ValueError("half"))
     assert tree(tmp_path) == {"film.mp4": b"one"}
     with writing_file(path, overwrite=True) as new:
         new.write_text("two")
@@ -251,9 +259,9 @@ def test_one_process_at_a_time_writes(tmp_path: Path) -> None:
         assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         for overwrite in (False, True):
-            with pytest.raises(OutputError, match="another process is writing there"):
-                with growing(target, "manifest.json", overwrite=overwrite):
-                    pass
+            again = growing(target, "manifest.json", overwrite=overwrite)
+            with pytest.raises(OutputError, match="another process is writing there"), again:
+                pass
         with pytest.raises(OutputError, match="another process is writing there"):
             write(target, overwrite=True)
     write(target, overwrite=True)

@@ -1,4 +1,4 @@
-"""A flight that was flown is never lost, whatever its controller, its film or its pilot do: through the real command."""
+"""A flight that was flown is never lost, whatever controller, film or pilot do: through the real command."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_a_film_asked_for_later_that_fails_is_status_2_and_leaves_the_run(tmp_pa
     before = summary_of(tmp_path / "runs" / "hover")
     assert quadsim_command("video", "runs/hover", here=tmp_path, IMAGEIO_FFMPEG_EXE="/bin/false").returncode == 2
     assert summary_of(tmp_path / "runs" / "hover") == before
-    assert sorted(os.listdir(tmp_path / "runs")) == ["hover"]
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["hover"]
 
 
 @pytest.mark.parametrize("film", [True, False])
@@ -153,7 +153,7 @@ def test_ctrl_c_keeps_what_was_flown(tmp_path: Path, film: bool) -> None:
             os.killpg(process.pid, signal.SIGINT)
         process.communicate(timeout=120)
     found = summary_of(summary.parent)
-    assert sorted(os.listdir(tmp_path / "runs")) == ["hover"]
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["hover"]
     if film:
         assert (process.returncode, found["outcome"]) == (0, "satisfied")
         assert found["products"]["flight.mp4"].startswith(("interrupted (Ctrl-C)", "failed: "))
