@@ -1,9 +1,8 @@
-"""The one place that writes, replaces and removes files.
+"""The one place that replaces and removes files.
 
-An output directory that is there and not empty is refused.  A new one is built beside its place and renamed into it; in
-its `summary.json`, `files` has the SHA-256 of every other file.  To overwrite it is to unlink, by name, the regular
-files on that list; anything else in it is refused before.  A directory that grows in place, as a campaign's does, is
-locked by the process that writes there.
+An output directory that is there and not empty is refused.  A new one is built beside its place and renamed into it;
+`files` in its `summary.json` has the SHA-256 of every other file.  To overwrite it is to unlink, by name, the regular
+files on that list; anything else in it is refused before.  One that grows in place, as a campaign's does, is locked.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ from quadsim.errors import OutputError, printable
 
 SUMMARY_FILE: Final = "summary.json"
 LOCK_FILE: Final = ".lock"  # of a directory that grows
-_UNLISTED: Final = (SUMMARY_FILE, LOCK_FILE)
 _FREE_BYTES_NEEDED: Final = 16 * 1024 * 1024
 
 
@@ -57,32 +55,25 @@ def digest_of(path: Path) -> str:
 
 def file_hashes(directory: Path) -> dict[str, str]:
     """SHA-256 of every regular file below a directory but its summary and its lock, by relative path, sorted."""
-    names = sorted(name for name, mode in _below(directory).items() if S_ISREG(mode) and name not in _UNLISTED)
-    return {name: digest_of(directory / name) for name in names}
+    names = {name for name, mode in _below(directory).items() if S_ISREG(mode)} - {SUMMARY_FILE, LOCK_FILE}
+    return {name: digest_of(directory / name) for name in sorted(names)}
 
 
 @contextlib.contextmanager
 def reserving(path: Path | str, *, overwrite: bool = False, free: bool = False) -> Iterator[Path]:
-    """The place of an output directory, made before the work for it begins; gone again if the block leaves it empty.
+    """The absolute place of an output directory, made before the work for it; gone again if the block leaves it empty.
 
-    Args:
-        path: of the directory.
-        overwrite: whether an earlier output there may be replaced.
-        free: whether to take the next free name where it is taken: NAME, NAME-2, ...
-
-    Yields:
-        Its absolute path.
+    `overwrite` allows an earlier output there; `free` takes the next free name instead: NAME, NAME-2, ...
 
     Raises:
         OutputError: it cannot be made, or holds something that must not be replaced.
     """
-    target = absolute(path)
+    first = target = absolute(path)
     made: list[Path] = []
     try:
         with _errors(target):
             made += [parent for parent in target.parents if not parent.exists()]
             target.parent.mkdir(parents=True, exist_ok=True)
-            first = target
             for i in itertools.count(2):
                 with contextlib.suppress(FileExistsError):
                     target.mkdir()
@@ -123,14 +114,10 @@ def writing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def adding(directory: Path, **changes: Any) -> Iterator[Path]:
-    """A folder to fill; when the block ends well its files go into a finished directory, and into its list.
-
-    Args:
-        directory: a listed file of the same name is replaced.
-        changes: what else changes in its summary, see `amend`.
+    """A folder to fill; when the block ends well its files go into a finished directory, and `changes` into its summary.
 
     Raises:
-        OutputError: they cannot be written, or what has their names is not listed.
+        OutputError: they cannot be written, or something that the summary does not list has their names.
     """
     with _beside(directory) as work:
         yield work
@@ -151,7 +138,8 @@ def amend(directory: Path, changes: Mapping[str, Any]) -> None:
     for key, value in changes.items():
         summary[key] = {**summary.get(key, {}), **value} if isinstance(value, Mapping) else value
     summary["files"] = dict(sorted(summary.pop("files", {}).items()))
-    _replace(path, to_json(summary).encode())
+    with writing_file(path, overwrite=True) as new:
+        new.write_text(to_json(summary), encoding="utf-8")
 
 
 def require_file(path: Path | str, *, overwrite: bool = False) -> Path:
@@ -184,17 +172,18 @@ class Growing:
         self.path = path
 
     def write(self, files: Mapping[str, bytes]) -> None:
-        """Write or replace files, by their relative paths; each is on the disk, whole, when this returns."""
+        """Write or replace files by their relative paths, each in one step."""
         for name, content in files.items():
             with _errors(self.path / name):
                 (self.path / name).parent.mkdir(exist_ok=True)
-                _replace(self.path / name, content)
+                with writing_file(self.path / name, overwrite=True) as new:
+                    new.write_bytes(content)
 
     def remove(self, names: Sequence[str]) -> None:
         """Remove files, and folders that are empty then."""
         with _errors(self.path):
-            for path in [self.path / name for name in names]:
-                path.unlink(missing_ok=True)
+            for name in names:
+                (self.path / name).unlink(missing_ok=True)
         for folder in {(self.path / name).parent for name in names} - {self.path}:
             with contextlib.suppress(OSError):
                 folder.rmdir()
@@ -214,8 +203,7 @@ def growing(path: Path | str, mark: str, *, overwrite: bool = False) -> Iterator
     directory = absolute(path)
     goes_on = (directory / mark).is_file() and not overwrite
     with contextlib.nullcontext() if goes_on else reserving(directory, overwrite=overwrite), _locked(directory):
-        odd = [name for name, mode in _below(directory).items() if not (S_ISREG(mode) or S_ISDIR(mode))]
-        if odd:
+        if odd := [name for name, mode in _below(directory).items() if not (S_ISREG(mode) or S_ISDIR(mode))]:
             raise OutputError(directory, f"{_few(odd)}: links are refused; move them away first")
         if not goes_on:
             _clear(directory, keep=LOCK_FILE)
@@ -234,13 +222,12 @@ def _require_replaceable(target: Path, *, overwrite: bool) -> None:
         if target.samefile(Path.cwd()):
             raise OutputError(target, "it is the current directory; name one to be made")
     there, listed = _below(target), _listed(target)
-    if not there:
-        return
-    if not overwrite:
-        raise OutputError(target, f"it is not empty ({_few(there)}); choose another --out, or add --overwrite")
-    if listed is None:
+    if there and not overwrite:
+        raise OutputError(target, f"it is not empty ({_few([*there])}); choose another --out, or add --overwrite")
+    if there and listed is None:
         raise OutputError(target, f"it has no {SUMMARY_FILE} that lists its files; choose another --out")
-    files, folders = {*listed, *_UNLISTED}, {str(parent) for name in listed for parent in Path(name).parents}
+    files = {*(listed or ()), SUMMARY_FILE, LOCK_FILE}
+    folders = {str(parent) for name in files for parent in Path(name).parents}
     others = [n for n, mode in there.items() if n not in (files if S_ISREG(mode) else folders if S_ISDIR(mode) else ())]
     if others:
         raise OutputError(target, f"its {SUMMARY_FILE} does not list {_few(others)}; move that away first")
@@ -273,15 +260,8 @@ def _below(directory: Path) -> dict[str, int]:
     return {path.relative_to(directory).as_posix(): path.lstat().st_mode for path in paths}
 
 
-def _few(names: Sequence[str] | Mapping[str, int]) -> str:
-    shown = ", ".join(map(printable, itertools.islice(names, 3)))
-    return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Write or replace a regular file in one step."""
-    with writing_file(path, overwrite=True) as new:
-        new.write_bytes(content)
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(map(printable, names[:3])) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 @contextlib.contextmanager

