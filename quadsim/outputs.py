@@ -114,7 +114,7 @@ def writing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def adding(directory: Path, **changes: Any) -> Iterator[Path]:
-    """A folder to fill; when the block ends well its files go into a finished directory, and `changes` into its summary.
+    """A folder to fill; when the block ends well its files go into a finished directory, `changes` into its summary.
 
     Raises:
         OutputError: they cannot be written, or something that the summary does not list has their names.
