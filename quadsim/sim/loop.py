@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time as clock
 from collections.abc import Callable, Iterator, Mapping
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from quadsim.sim.phase import PhaseMonitor
 
 _BODY_RATES: Final = slice(11, 14)  # in the plant's own state; see `quadsim.sim.physics.physics_to_state`
+_log: Final = logging.getLogger("quadsim")
 _HEIGHT: Final = REFERENCE_NAMES.index("z")
 
 
@@ -324,13 +326,17 @@ class ClosedLoop:
         return Observation(k=k, state=state, truth=truth, reference=row, preview=preview, moment=now)
 
     def _predict(self) -> Array | None:
-        """Positions (K, N, 3) [m] that the controller predicted in its periods; None where it has no model."""
+        """Predicted positions (K, N, 3) [m] of the controller's periods; None where it has no model, or raised."""
         predict = getattr(self.controller, "predict", None)
         samples = (self._samples or [])[self._switched :]
         if predict is None or not samples:
             return None
         states = np.stack([sample.observation.state for sample in samples])
-        found: Array = predict(states, np.stack([sample.command.plan for sample in samples]))[:, :, [0, 2, 4]]
+        try:
+            found: Array = predict(states, np.stack([sample.command.plan for sample in samples]))[:, :, [0, 2, 4]]
+        except (Exception, SystemExit) as error:  # after the flight, which is not to be lost by it
+            _log.warning("no predictions are kept: predict raised %s: %s", type(error).__name__, error)
+            return None
         return found
 
     def _fly(self, observed: Observation, given: Command | None) -> Sample:

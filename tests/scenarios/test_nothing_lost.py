@@ -18,6 +18,7 @@ import pytest
 import quadsim
 from quadsim.errors import OutputError
 from quadsim.flight import rundir
+from quadsim.vehicle import Vehicle
 
 LAW = """
 import os, signal, sys, time
@@ -90,6 +91,21 @@ def test_a_force_that_raises_ends_the_flight_likewise(tmp_path: Path) -> None:
     flown = quadsim.fly(quadsim.load("hover", {"duration": 1.0}), forces=[force], progress=False)
     assert (flown.outcome, flown.time.size) == ("aborted", 8)
     assert str(flown.log.reason).endswith("the force force raised KeyError: 'gone'")
+
+
+def test_a_prediction_that_raises_after_the_flight_loses_nothing_else() -> None:
+    class Law:
+        def __init__(self, vehicle: Vehicle, **settings: object) -> None:
+            self.speeds = [vehicle.hover_speed] * 4
+
+        def step(self, now: object, state: object, reference: object) -> list[float]:
+            return self.speeds
+
+        def predict(self, states: object, plans: object) -> object:
+            raise IndexError("too far")
+
+    flown = quadsim.fly(quadsim.load("hover", {"duration": 1.0}), controller=Law, progress=False)
+    assert (flown.outcome, flown.time.size, flown.log.predicted) == ("satisfied", 20, None)
 
 
 def test_a_controller_that_changes_the_directory_moves_no_output(tmp_path: Path) -> None:
