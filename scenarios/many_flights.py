@@ -131,6 +131,8 @@ def campaign(
 
     if cluster is not None and workers is not None:
         raise ParameterError("", "--workers", workers, "absent with --cluster")
+    if resume and overwrite:
+        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
     requirements = [parse_requirement(text) for text in require]
     if isinstance(campaign, Scenario):
         requested = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
@@ -230,6 +232,8 @@ def tune(
 
     if cluster is not None and workers is not None:
         raise ParameterError("", "--workers", workers, "absent with --cluster")
+    if resume and overwrite:
+        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
     require_optuna()
     plan = load_tuning(str(tuning), trials=trials, seed=seed)
     target = absolute(Path("runs") / "tunings" / plan.spec.name if out is None else out)

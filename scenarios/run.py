@@ -6,7 +6,7 @@ import contextlib
 import math
 import os
 import time as clock
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -373,9 +373,20 @@ def fly_scenario(
         law: flies it, instead of what is built from the scenario's `controller`.
         forces: what acts on it, instead of what is built from the scenario's `forces`.
     """
-    with contextlib.chdir(os.curdir), start(scenario, law, forces) as started:
+    with _staying(), start(scenario, law, forces) as started:
         started.complete(progress)
         return started.flight()
+
+
+@contextlib.contextmanager
+def _staying() -> Iterator[None]:
+    """Come back to the working directory, even if it is gone by then."""
+    here = os.open(os.curdir, getattr(os, "O_PATH", os.O_RDONLY))
+    try:
+        yield
+    finally:
+        os.fchdir(here)
+        os.close(here)
 
 
 def run_scenario(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from argparse import Namespace
 from pathlib import Path
@@ -32,4 +33,6 @@ def print_summary(summary: dict[str, Any], options: Namespace, where: str | None
 
 def shown(path: Path) -> str:
     """A path for a person: relative to the current directory where it is in there."""
-    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
+    with contextlib.suppress(ValueError, OSError):  # it is not in there; the current directory is gone
+        return str(path.relative_to(Path.cwd()))
+    return str(path)
