@@ -35,9 +35,10 @@ def absolute(path: Path | str) -> Path:
     """
     try:
         real = Path(os.path.realpath(Path(path).expanduser()))
-    except (ValueError, RuntimeError) as error:  # a null byte; a user without a home
-        raise OutputError(ascii(str(path)), str(error)) from error
-    if real.is_symlink():
+        circular = real.is_symlink()
+    except (ValueError, RuntimeError, OSError) as error:  # a null byte; a user without a home; too long a name
+        raise OutputError(ascii(str(path))[1:-1], getattr(error, "strerror", None) or str(error)) from error
+    if circular:
         raise OutputError(path, "a symbolic link leads back to itself")
     return real
 
@@ -73,6 +74,8 @@ def reserving(path: Path | str, *, overwrite: bool = False, free: bool = False) 
     try:
         with _errors(target):
             made += [parent for parent in target.parents if not parent.exists()]
+            if made == [] and not target.parent.is_dir():
+                raise OutputError(target, f"{target.parent} is a file")
             target.parent.mkdir(parents=True, exist_ok=True)
             for i in itertools.count(2):
                 with contextlib.suppress(FileExistsError):

@@ -367,7 +367,7 @@ WRONG: dict[str, tuple[list[str], str]] = {
     ),
     "a setting without a value": ([*RUN, "--set", "duration"], "--set must be of the form dotted.path=value"),
     "a negative seed": ([*RUN, "--seed", "-1"], "seed must be >= 0; got -1"),
-    "out below a file": ([*RUN, "--out", "file/run"], "/file/run: Not a directory"),
+    "out below a file": ([*RUN, "--out", "file/run"], "/file is a file"),
     "out is a file": ([*RUN, "--out", "file"], "file: a file is already there; choose another --out"),
     "out is no run": ([*RUN, "--out", "folder"], "it is not empty ("),
     "out cannot be written": ([*RUN, "--out", "/proc/quadsim/run"], "cannot write /proc/quadsim/run: "),
