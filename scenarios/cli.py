@@ -278,7 +278,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except QuadsimError as error:
         print(f"quadsim: {printable(str(error), keep=_LINES)}", file=sys.stderr)
         return error.exit_status
-    except SystemExit as error:  # of none of ours: a flight would have ended by it as aborted
+    except SystemExit as error:  # of code that was imported: a flight would have ended by it as aborted
+        if isinstance(error.__context__, BrokenPipeError):  # rich's way to end
+            return EXIT_FAILED
         print(f"quadsim: code that was loaded asks Python to exit (status {error.code!r:.80})", file=sys.stderr)
         return EXIT_WRONG_INPUT
     except KeyboardInterrupt:

@@ -372,10 +372,18 @@ def write_run(
     def wall_s() -> dict[str, float]:
         return {"simulate": flight.simulate_s, "total": clock.perf_counter() - started}
 
-    with writing(directory, overwrite=overwrite) as partial:
-        (partial / rundir.SCENARIO_FILE).write_text(flight.scenario.to_toml(), encoding="utf-8")
-        write_log(partial, flight.log, plant_stride=flight.scenario.plant_stride, metadata=flight.metadata)
-        (partial / rundir.SUMMARY_FILE).write_text(to_json({**flight.summary, "wall_s": wall_s()}), encoding="utf-8")
+    def write_tables(*, overwrite: bool) -> None:
+        with writing(directory, overwrite=overwrite) as partial:
+            (partial / rundir.SCENARIO_FILE).write_text(flight.scenario.to_toml(), encoding="utf-8")
+            write_log(partial, flight.log, plant_stride=flight.scenario.plant_stride, metadata=flight.metadata)
+            summary = to_json({**flight.summary, "wall_s": wall_s()})
+            (partial / rundir.SUMMARY_FILE).write_text(summary, encoding="utf-8")
+
+    try:
+        write_tables(overwrite=overwrite)
+    except KeyboardInterrupt:  # no flight that was flown is lost by it
+        write_tables(overwrite=True)
+        outputs = Outputs(video=False, recording=False, figures=False)
     failed = _add_products(flight, directory, outputs, progress)
     amend(directory, {"wall_s": wall_s()})
     for name, problem in failed.items():

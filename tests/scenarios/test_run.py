@@ -284,6 +284,21 @@ def test_a_disk_that_fills_up_while_a_table_is_written_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_ctrl_c_while_tables_are_written_loses_no_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_table, stops = pq.write_table, [KeyboardInterrupt()]
+
+    def stopped(*arguments: Any, **options: Any) -> None:
+        write_table(*arguments, **options)
+        if stops:
+            raise stops.pop()
+
+    monkeypatch.setattr(pq, "write_table", stopped)
+    flown = run(tmp_path / "run", SHORT)
+    assert (flown.summary["outcome"], flown.summary["satisfied"]) == ("satisfied", True)
+    assert rundir.damaged_files(flown.directory, flown.summary) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
 @pytest.mark.parametrize(
     "error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt(), ValueError("no")]
 )
