@@ -50,7 +50,7 @@ def campaign(options: Namespace) -> int:
         gate = [judgement.to_json() for judgement in judgements]
         print(json.dumps({**result.summary, "requirements": gate}, indent=2))
     else:
-        print_campaign(result.summary, result.failure, judgements, str(result.directory))
+        print_campaign(result.summary, result.failure, judgements, shown(result.directory))
     return EXIT_DONE if all(judgement.holds for judgement in judgements) else EXIT_FAILED
 
 

@@ -145,7 +145,7 @@ def test_two_campaigns_are_compared_flight_by_flight(
         (["campaign", "little.toml", "--require", "P(lost) < 2 @ 95%"], "requirement 'P(lost) < 2 @ 95%'"),
         (["campaign", "little.toml", "--require", "P(rmse.q > 1) < 0.1 @ 95%"], "no column named 'rmse.q'"),
         (["campaign", "little.toml", "--require", "lost < 1%"], "must read P(EVENT) OP SHARE @ CONFIDENCE%"),
-        (["campaign", "little.toml", "--require", "P(lost) < 1% @ 95%", "--junit", "."], "cannot write .: is a folder"),
+        (["campaign", "little.toml", "--require", "P(lost) < 1% @ 95%", "--junit", "."], ": is a folder"),
         (
             ["campaign", "little.toml", "--require", "P(lost) < 1% @ 95%", "--junit", "gone/v.xml"],
             "gone/v.xml: No such",
@@ -181,7 +181,7 @@ def test_ctrl_c_keeps_what_was_flown(file: Path) -> None:
         campaign.send_signal(signal.SIGINT)
         _, output = campaign.communicate(timeout=30.0)
         assert campaign.returncode == EXIT_FAILED
-    assert "interrupted (Ctrl-C); c has what was flown, --resume continues it" in output
+    assert "/c has what was flown, --resume continues it" in output
     assert "Traceback" not in output
     manifest = json.loads((file.parent / "c" / "manifest.json").read_text())
     assert manifest["status"] == "interrupted"
