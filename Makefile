@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights gym reproduce speed soak campaigns live tuning safety firmware export-numbers pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights gym reproduce speed soak campaigns live tuning firmware export-numbers pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -41,14 +41,14 @@ help:  ## list these targets
 setup: $(VENV)/.installed $(VENV)/.renders  ## make .venv with everything pinned, ready for the others
 
 demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIONS=--no-video to do without films)
-	@$(QUADSIM) run paper-unconstrained --out $(RUNS)/paper-unconstrained $(OPTIONS)
-	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained $(OPTIONS)
-	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison
+	@$(QUADSIM) run paper-unconstrained --out $(RUNS)/paper-unconstrained --overwrite $(OPTIONS)
+	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained --overwrite $(OPTIONS)
+	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning safety: export OMP_NUM_THREADS := 1
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning safety: export OPENBLAS_NUM_THREADS := 1
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning safety: export MKL_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning: export OMP_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning: export OPENBLAS_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -126,8 +126,6 @@ tuning: setup  ## carry out the tunings that ship and remake docs/tuning.md, up 
 live: setup $(VENV)/.browser  ## film a session and remake the numbers of docs/live.md: load, latency and bandwidth; a minute
 	@$(PY) docs/make_live.py
 
-safety: setup  ## attack all that writes or reads files, and remake the counts on docs/safety.md: some forty minutes
-	@PYTHONPATH=tests $(PY) docs/make_safety.py
 
 pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constraints.txt
 	@fresh=$$(mktemp -d) && trap 'rm -rf "$$fresh"' EXIT && fresh_python="$$fresh/bin/python" && \

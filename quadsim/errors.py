@@ -7,11 +7,14 @@ that happened in flight: it ends the flight, is recorded with it as its reason, 
 from __future__ import annotations
 
 import difflib
+import traceback
 import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
+_TRACEBACK_LINES: Final = 20  # that are kept of what ended a flight
+_LONGEST: Final = 500  # characters of its message
 _HIDDEN: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 """Unicode categories that steer what is shown, or show nothing: controls, formats such as direction, surrogates."""
 
@@ -196,6 +199,20 @@ class ForceError(FlightError):
 
 class PlanExhaustedError(FlightError):
     """The solver failed and no step of the last good plan is left to hold."""
+
+
+class RaisedError(FlightError):
+    """The controller or a force raised something, or asked Python to exit.
+
+    Attributes:
+        traceback: its last lines.
+    """
+
+    def __init__(self, what: str, error: BaseException, *, time: float) -> None:
+        lines = "".join(traceback.format_exception(error)).splitlines()
+        text = "".join(traceback.format_exception_only(error)).split("\n")[0]
+        super().__init__(f"{what} raised {text}"[:_LONGEST], time=time)
+        self.traceback = tuple(printable(line)[:_LONGEST] for line in lines[-_TRACEBACK_LINES:])
 
 
 class InterruptedFlightError(FlightError):

@@ -5,7 +5,6 @@ Beside it: `scenarios.many_flights`, `vehicles`, `catalogue`, `benchmarks`, `sel
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from quadsim.controller import Controller
 from quadsim.errors import FileError, InputError, ParameterError
 from quadsim.flight import rundir
-from quadsim.outputs import real_path
-from quadsim.outputs.paths import require_inside
+from quadsim.flight.summary import require_inside
+from quadsim.outputs import absolute, adding
 from quadsim.sim.effects import Force
 from scenarios.build import build_controller
 from scenarios.build import resolve as write_out
@@ -152,14 +151,16 @@ def fly(
     controller: object = None,
     forces: Sequence[object] = (),
     out: str | Path | None = None,
-    video: bool = True,
-    recording: bool = True,
-    figures: bool = True,
+    overwrite: bool = False,
+    video: bool | None = None,
+    recording: bool | None = None,
+    figures: bool | None = None,
     progress: Progress | bool = True,
 ) -> Flight:
     """Fly a scenario and audit it.
 
-    Ctrl-C ends the flight in order: it is returned as far as it came, with the reason.
+    Ctrl-C, or a controller or force that raises, ends the flight in order: it is returned as far as it came, with the
+    reason, and its outcome is `aborted`.
 
     Args:
         scenario: what is flown, or its name or file.
@@ -170,16 +171,18 @@ def fly(
         forces: forces of one's own that act on the vehicle, besides the scenario's effects: functions
             `force(time, state)`, called once per physics step, that give force x, y, z in the world frame [N] and
             torque in the body frame [N m]; or classes called as MyForce(vehicle, rng=...) whose objects are called so.
-        out: the run directory to write, complete or not at all; nothing is written where absent (`Flight.save` can).
-        video: whether to film it, where it is written.
-        recording: whether to write `flight.rrd`, where it is written.
-        figures: whether to draw it, where it is written.
+        out: the run directory to write; nothing is written where absent (`Flight.save` can).
+        overwrite: whether to replace an earlier output there.
+        video: whether to film it, where it is written; None for where that can be done, True to raise where it fails.
+        recording: whether to write `flight.rrd`, where it is written; likewise.
+        figures: whether to draw it, where it is written; likewise.
         progress: called with (what, done, total); True for bars on a terminal, False for none.
 
     Raises:
         InputError: the scenario cannot be flown, or the controller cannot be set up.
-        RenderingUnavailableError: a video is wanted and cannot be made; nothing was flown.
-        OutputError: the directory cannot be written; nothing is left there.
+        RenderingUnavailableError: a video is asked for and cannot be made; nothing was flown.
+        OutputError: the directory cannot be written, and nothing was flown; or what was asked for failed: the tables
+            and the summary are there then.
 
     Examples:
         >>> import numpy as np
@@ -201,7 +204,7 @@ def fly(
         if out is None:
             return fly_scenario(referring, report, law, own)
         outputs = Outputs(video=video, recording=recording, figures=figures)
-        return run_scenario(referring, real_path(out), outputs, report, law, own)
+        return run_scenario(referring, absolute(out), outputs, report, law, own, overwrite=overwrite)
 
 
 def start(
@@ -309,6 +312,7 @@ def make_controller(scenario: Scenario | str | Path) -> Controller:
 def compare(
     *targets: Flight | Scenario | str | Path,
     out: str | Path | None = None,
+    overwrite: bool = False,
     cost: bool | None = None,
     progress: Progress | bool = True,
 ) -> Comparison | CampaignComparison:
@@ -318,6 +322,7 @@ def compare(
         targets: flights, run directories, or scenarios to fly, by themselves or by name; or the directories of two
             campaigns.
         out: where to write the page, its figures and its table; nothing is written where absent.
+        overwrite: whether to replace an earlier output there.
         cost: whether to study what constraints cost; None: on a page, where a constrained and an unconstrained
             controller fly the same course of at most 120 s.
         progress: as of `fly`.
@@ -335,17 +340,19 @@ def compare(
     """
     from scenarios.comparison import compare_campaigns, compare_flights, is_campaign
 
-    target = None if out is None else real_path(out)
+    target = None if out is None else absolute(out)
     if any(isinstance(each, str | Path) and is_campaign(Path(each)) for each in targets):
         if cost:
             raise ParameterError("", "--cost", True, "absent when campaigns are compared")
-        return compare_campaigns([Path(str(each)) for each in targets], target)
+        return compare_campaigns([Path(str(each)) for each in targets], target, overwrite=overwrite)
     with reporting(progress) as report:
-        return compare_flights(targets, target, cost, report)
+        return compare_flights(targets, target, cost, report, overwrite=overwrite)
 
 
 def check(directory: str | Path) -> Reaudit:
     """Audit a finished run again from its tables, and hold its summary and its files' hashes against that.
+
+    It finds damage and mistakes: integrity, not authenticity.  Who writes every file anew can make them agree.
 
     Raises:
         FileError: a file is missing, changed or damaged, or the summary contradicts the tables.
@@ -365,6 +372,7 @@ def film(
     directory: str | Path,
     out: str | Path | None = None,
     *,
+    overwrite: bool = False,
     workers: int | None = None,
     progress: Progress | bool = True,
 ) -> Path:
@@ -372,7 +380,8 @@ def film(
 
     Args:
         directory: of the run.
-        out: an MP4 or GIF file; `flight.mp4` in the run's directory where absent, with its hash in the summary.
+        out: an MP4 or GIF file; `flight.mp4` in the run's directory where absent, replacing an earlier one.
+        overwrite: whether to replace another file that is there.
         workers: rendering processes; one per usable core where absent.
         progress: as of `fly`.
 
@@ -394,22 +403,27 @@ def film(
     """
     from quadsim.report.film.video import render_gif, render_video
 
-    directory = Path(directory)
-    reaudit(directory, products=False)
-    path = real_path(directory / rundir.VIDEO_FILE if out is None else out)
+    reaudit(Path(directory), products=False)
+    directory = absolute(directory)
+    path = absolute(directory / rundir.VIDEO_FILE if out is None else out)
     if workers is not None and workers < 1:
         raise ParameterError("", "--workers", workers, "at least 1")
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
-    own = path.resolve().parent == directory.resolve()
-    with (
-        reporting(progress) as report,
-        rundir.adding(directory, path.name) if own else contextlib.nullcontext(path) as file,
-    ):
+
+    def render(file: Path, *, overwrite: bool) -> None:
         if path.suffix == ".gif":
-            render_gif(directory, file, workers=workers)
-        else:
-            render_video(directory, file, workers=workers, progress=lambda done, total: report("video", done, total))
+            render_gif(directory, file, workers=workers, overwrite=overwrite)
+            return
+        watch = lambda done, total: report("video", done, total)  # noqa: E731
+        render_video(directory, file, workers=workers, progress=watch, overwrite=overwrite)
+
+    with reporting(progress) as report:
+        if path.parent != directory:
+            render(path, overwrite=overwrite)
+        else:  # a product of the run, which its summary lists
+            with adding(directory, products={path.name: "made"}) as folder:
+                render(folder / path.name, overwrite=False)
     return path
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mpc.solvers import SOLVERS
-from quadsim.outputs import real_path, writing
+from quadsim.outputs import writing
 from scenarios.api import as_scenario
 from scenarios.progress import Progress, reporting
 from scenarios.schema.scenario import Scenario
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from scenarios.bench.speed import SpeedBench
 
 
-def _beginning(out: str | Path | None, kind: str) -> AbstractContextManager[Path | None]:
+def _beginning(out: str | Path | None) -> AbstractContextManager[Path | None]:
     """The directory of the results, refused before anything is measured where it cannot be; None for none."""
-    return nullcontext() if out is None else writing(real_path(out), kind)
+    return nullcontext() if out is None else writing(out, overwrite=True)
 
 
 def bench_solvers(
@@ -64,7 +64,7 @@ def bench_solvers(
 
     options: dict[str, Any] = {"solvers": tuple(solvers or SOLVERS), "repeats": repeats, "stride": stride}
     scenario = as_scenario(scenario)
-    with _beginning(out, bench.KIND) as directory, reporting(progress) as report:
+    with _beginning(out) as directory, reporting(progress) as report:
         found = bench.bench_solvers(scenario, horizons=horizons, progress=report, **options)
         if directory is not None:
             bench.write_bench(found, directory)
@@ -167,7 +167,7 @@ def bench_ladder(
     """
     from scenarios.bench.mismatch import benchmark
 
-    with _beginning(out, benchmark.KIND) as directory, reporting(progress) as report:
+    with _beginning(out) as directory, reporting(progress) as report:
         found = benchmark.run_mismatch(str(scenario), changes, quick=quick, workers=workers, progress=report)
         if directory is not None:
             benchmark.write_mismatch(found, directory)

@@ -22,6 +22,10 @@ from scenarios.gc_tuning import collect_rarely
 _LINES = "\n"  # what a message of ours may be made of besides text: one with many problems has a line for each
 _SCENARIO: Final = "library name, or path to a TOML file"
 _NUMBER: Final[dict[str, Any]] = {"type": int, "metavar": "N"}
+_OVERWRITE: Final[dict[str, Any]] = {
+    "action": "store_true",
+    "help": "replace an earlier output there, if its summary.json lists all that the directory holds",
+}
 _SUMMARY: Final[dict[str, Any]] = {"action": "store_true", "help": "print the summary alone, as JSON on stdout"}
 
 
@@ -49,12 +53,18 @@ def make_parser() -> argparse.ArgumentParser:
 
     run = command("run", help="fly one scenario and write its run directory")
     run.add_argument("scenario", metavar="SCENARIO", help=_SCENARIO)
-    run.add_argument("--out", metavar="DIR", help="run directory, replacing an earlier run (default: runs/SCENARIO)")
+    run.add_argument("--out", metavar="DIR", help="run directory (default: runs/SCENARIO, or the next free name)")
+    run.add_argument("--overwrite", **_OVERWRITE)
     _add_settings(run)
     _add_products(run)
     run.add_argument("--json", **_SUMMARY)
 
-    check = command("check", help="audit a scenario (flown first) or a finished run; exit 1 if it fails")
+    integrity = (
+        "Audit a scenario, which is flown first, or a finished run again from its tables: integrity, not authenticity."
+    )
+    check = command(
+        "check", help="audit a scenario (flown first) or a finished run; exit 1 if it fails", description=integrity
+    )
     check.add_argument("target", metavar="SCENARIO_OR_RUN", help="library name, TOML file, or run directory")
     _add_settings(check)
     check.add_argument("--junit", metavar="FILE", help="also write the verdicts as JUnit XML")
@@ -64,6 +74,7 @@ def make_parser() -> argparse.ArgumentParser:
     targets = "run directories, scenarios to fly, or the directories of two campaigns"
     compare.add_argument("targets", metavar="RUN_OR_SCENARIO", nargs="+", help=targets)
     compare.add_argument("--out", metavar="DIR", required=True, help="directory of the page")
+    compare.add_argument("--overwrite", **_OVERWRITE)
     cost = (
         "study what constraints cost; takes a minute (default: where a constrained and an unconstrained controller fly "
         "the same course of at most 120 s)"
@@ -76,6 +87,7 @@ def make_parser() -> argparse.ArgumentParser:
     video = command("video", help="film a finished run")
     video.add_argument("run", metavar="RUN", help="run directory")
     video.add_argument("--out", metavar="FILE", help="MP4 or GIF file (default: RUN/flight.mp4)")
+    video.add_argument("--overwrite", action="store_true", help="replace a file that is there")
     video.add_argument("--workers", **_NUMBER, help="rendering processes (default: one per core)")
 
     view = command("view", help="open a run's recording in the rerun viewer")
@@ -97,6 +109,7 @@ def make_parser() -> argparse.ArgumentParser:
     vehicle.add_argument("--template", action="store_true", help="print a commented vehicle file to fill in instead")
     vehicle.add_argument("--scenario", metavar="SCENARIO", help="report which of its bounds the vehicle cannot meet")
     vehicle.add_argument("--out", metavar="FILE", help="PNG file to draw it to, on a floor of 10 cm squares")
+    vehicle.add_argument("--overwrite", action="store_true", help="replace a file that is there")
     vehicle.add_argument("--json", action="store_true", help="as JSON on stdout")
 
     _add_campaign(command("campaign", help="fly a scenario many times, what may vary drawn at random"))
@@ -106,7 +119,8 @@ def make_parser() -> argparse.ArgumentParser:
     which = replay.add_mutually_exclusive_group()
     which.add_argument("--worst", action="store_true", help="the worst flight (the default)")
     which.add_argument("--flight", **_NUMBER, help="that flight")
-    replay.add_argument("--out", metavar="DIR", help="run directory (default: runs/CAMPAIGN-N)")
+    replay.add_argument("--out", metavar="DIR", help="run directory (default: runs/CAMPAIGN-N, or the next free name)")
+    replay.add_argument("--overwrite", **_OVERWRITE)
     _add_products(replay)
     replay.add_argument("--json", **_SUMMARY)
 
@@ -117,7 +131,8 @@ def make_parser() -> argparse.ArgumentParser:
 
     export = command("export", help="write a scenario's controller as self-contained C99, with its recorded periods")
     export.add_argument("scenario", metavar="SCENARIO", help=_SCENARIO)
-    export.add_argument("--out", metavar="DIR", required=True, help="directory, replacing an earlier export")
+    export.add_argument("--out", metavar="DIR", required=True, help="directory")
+    export.add_argument("--overwrite", **_OVERWRITE)
     export.add_argument("--precision", default="double", help="of all numbers: double or float (default: double)")
     machine = "what its programs are for: posix, cortex-m7 or cortex-m4f (default: posix)"
     export.add_argument("--target", metavar="NAME", default="posix", help=machine)
@@ -137,7 +152,8 @@ def _add_live(live: argparse.ArgumentParser) -> None:
     add = live.add_argument
     add("scenario", metavar="SCENARIO_OR_RUN", help=f"{_SCENARIO}, or the directory of a run to fly on from")
     add("--against", metavar="SCENARIO", help="a second vehicle, flown by the controller of this scenario")
-    add("--out", metavar="DIR", help="run directory (default: runs/SCENARIO-live)")
+    add("--out", metavar="DIR", help="run directory (default: runs/SCENARIO-live, or the next free name)")
+    add("--overwrite", **_OVERWRITE)
     add("--script", metavar="FILE", help="TOML file of inputs and times: no browser, as fast as it goes")
     add("--port", **_NUMBER, default=0, help="to listen on (default: any free one)")
     add("--host", metavar="ADDRESS", default="127.0.0.1", help="other than this machine: for a network that you trust")
@@ -150,6 +166,7 @@ def _add_campaign(campaign: argparse.ArgumentParser) -> None:
     add = campaign.add_argument
     add("file", metavar="FILE", help=_SCENARIO)
     add("--out", metavar="DIR", help="campaign's directory (default: runs/campaigns/NAME)")
+    add("--overwrite", **_OVERWRITE)
     add("--workers", **_NUMBER, help="processes (default: one per core)")
     add("--cluster", metavar="ADDRESS", help="fly on a Dask cluster: its scheduler's address, tcp://HOST:PORT")
     add("--resume", action="store_true", help="continue what is there")
@@ -168,6 +185,7 @@ def _add_tune(tune: argparse.ArgumentParser) -> None:
     add = tune.add_argument
     add("file", metavar="FILE", help="name of a tuning that ships, or path to a TOML file")
     add("--out", metavar="DIR", help="tuning's directory (default: runs/tunings/NAME)")
+    add("--overwrite", **_OVERWRITE)
     add("--trials", **_NUMBER, help="number of candidates, instead of the file's")
     add("--seed", **_NUMBER, help="replace the seed, of the search and of its draws")
     add("--workers", **_NUMBER, help="processes (default: one per core)")
@@ -232,7 +250,9 @@ def _whole_numbers(text: str) -> list[int]:
 
 def _add_products(parser: argparse.ArgumentParser) -> None:
     for name in ("video", "recording", "figures"):
-        parser.add_argument(f"--{name}", action=argparse.BooleanOptionalAction, default=True, help=f"make the {name}")
+        parser.add_argument(
+            f"--{name}", action=argparse.BooleanOptionalAction, help=f"make the {name} (default: where possible)"
+        )
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
@@ -257,6 +277,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except QuadsimError as error:
         print(f"quadsim: {printable(str(error), keep=_LINES)}", file=sys.stderr)
         return error.exit_status
+    except SystemExit as error:  # of code that was imported: a flight would have ended by it as aborted
+        if isinstance(error.__context__, BrokenPipeError):  # rich's way to end
+            return EXIT_FAILED
+        print(f"quadsim: code that was loaded asks Python to exit (status {error.code!r:.80})", file=sys.stderr)
+        return EXIT_WRONG_INPUT
     except KeyboardInterrupt:
         print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
         return EXIT_FAILED

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from quadsim.errors import InputError
 from quadsim.flight import rundir
-from quadsim.outputs import require_directory
+from quadsim.outputs import reserving
 from quadsim.report.table import Row
 from scenarios.campaign.manifest import is_campaign as is_campaign
 from scenarios.campaign.manifest import stored_plan
@@ -50,7 +51,12 @@ class Comparison:
 
 
 def compare_flights(
-    targets: Sequence[Target], out: Path | None = None, cost: bool | None = None, progress: Progress = silent
+    targets: Sequence[Target],
+    out: Path | None = None,
+    cost: bool | None = None,
+    progress: Progress = silent,
+    *,
+    overwrite: bool = False,
 ) -> Comparison:
     """Compare flights, and write the page where a directory is given.
 
@@ -60,27 +66,29 @@ def compare_flights(
         cost: whether to study what constraints cost; None: where a constrained and an unconstrained controller fly the
             same course of at most 120 s.
         progress: called with (what, done, total).
+        overwrite: whether to replace an earlier output in the page's place.
 
     Raises:
         InputError: something is no flight and no scenario; nothing was flown.
         OutputError: the directory cannot be written.
     """
     from quadsim.report.comparison import comparison_rows, run_names
-    from quadsim.report.pages.comparison_page import KIND, write_comparison
+    from quadsim.report.pages.comparison_page import write_comparison
     from scenarios.cost.measure import find_study, study_cost
     from scenarios.cost.section import cost_section
 
-    if out is not None:
-        require_directory(out, KIND)
     notes = [note for target in targets for note in _checked(target)]
     named = [_name_of(target) for target in targets]
     studied = find_study(named, requested=cost) if out is not None else []
-    with tempfile.TemporaryDirectory() as scratch:
+    with contextlib.ExitStack() as stack:
+        scratch = stack.enter_context(tempfile.TemporaryDirectory())
+        if out is not None:
+            stack.enter_context(reserving(out, overwrite=overwrite))
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
         runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
         study = study_cost(studied[0], studied[1:], progress=progress) if studied else None
         section = None if study is None else cost_section(study)
-        page = None if out is None else write_comparison(runs, out, section)
+        page = None if out is None else write_comparison(runs, out, section, overwrite=overwrite)
     return Comparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page, notes=tuple(notes))
 
 
@@ -105,30 +113,33 @@ def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool)
     if isinstance(target, Flight):
         if target.directory is not None or not pictures:
             return target.run
-        return rundir.load_run(target.save(beside / target.scenario.name, progress=progress))
+        with reserving(beside / target.scenario.name, free=True) as place:
+            return rundir.load_run(target.save(place, progress=progress))
     if not isinstance(target, Scenario) and Path(target).is_dir():
         return rundir.load_run(Path(target))
     scenario = target if isinstance(target, Scenario) else load_scenario(str(target))
-    outputs = Outputs(video=pictures, recording=pictures, figures=pictures)
-    run_scenario(scenario, beside / scenario.name, outputs, progress)
-    return rundir.load_run(beside / scenario.name)
+    wanted = None if pictures else False
+    outputs = Outputs(video=wanted, recording=wanted, figures=wanted)
+    with reserving(beside / scenario.name, free=True) as place:
+        run_scenario(scenario, place, outputs, progress)
+        return rundir.load_run(place)
 
 
-def compare_campaigns(directories: Sequence[Path], out: Path | None = None) -> CampaignComparison:
+def compare_campaigns(
+    directories: Sequence[Path], out: Path | None = None, *, overwrite: bool = False
+) -> CampaignComparison:
     """Compare two campaigns flight by flight, and write the report where a directory is given.
 
     Raises:
         InputError: they are not two finished campaigns.
         OutputError: the directory cannot be written.
     """
-    from scenarios.campaign.report.campaign_page import KIND, write_comparison_report
+    from scenarios.campaign.report.campaign_page import write_comparison_report
     from scenarios.campaign.results.store import FLIGHTS_FILE, read_flights
     from scenarios.campaign.statistics.comparison import compare
 
     if len(directories) != 2:
         raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")
-    if out is not None:
-        require_directory(out, KIND)
     first, second = directories
     plans = (stored_plan(first), stored_plan(second))
     names = (plans[0].spec.name, plans[1].spec.name)
@@ -136,5 +147,5 @@ def compare_campaigns(directories: Sequence[Path], out: Path | None = None) -> C
     a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
     comparison = compare(a, b, names, failures)
     if out is not None:
-        write_comparison_report(comparison, out)
+        write_comparison_report(comparison, out, overwrite=overwrite)
     return comparison

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import time as clock
 from base64 import b64encode
 from collections.abc import Iterator, Mapping
@@ -11,16 +12,16 @@ from functools import cached_property
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from quadsim.errors import MissingPackageError, OutputError, UnknownNameError
+from quadsim.errors import MissingPackageError, OutputError, QuadsimError, UnknownNameError, printable
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import SIGNALS, Finding, margins_at, margins_sampled
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import log_tables, write_log
-from quadsim.outputs import write_json, write_text, writing
+from quadsim.outputs import absolute, adding, amend, to_json, writing
 from quadsim.sim.airframe import outline
 from quadsim.sim.estimation.filter import Tally
 from quadsim.sim.sensing.sensor import SensorName
@@ -39,17 +40,24 @@ if TYPE_CHECKING:
 
     from mpc.ocp import Unanswered
 
+_LONGEST: Final = 500  # characters of why a product failed
+_log: Final = logging.getLogger("quadsim")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Outputs:
-    """Which files a run makes besides its summary, scenario and Parquet tables."""
+    """Which products a run gets besides its summary, scenario and Parquet tables.
 
-    video: bool = True
-    recording: bool = True
-    figures: bool = True
+    None is yes where it can be made: a failure is named in the summary.  True asks for it by name: a failure is an
+    error, after all else is made.
+    """
+
+    video: bool | None = None
+    recording: bool | None = None
+    figures: bool | None = None
 
     def check(self) -> None:
-        """Refuse a video that cannot be made here, before anything is flown.
+        """Refuse a video that is asked for by name and cannot be made here, before anything is flown.
 
         Raises:
             RenderingUnavailableError: so it is.
@@ -77,7 +85,7 @@ class Flight:
         solver: name of its QP solver; empty for a closed form.
         simulate_s: wall time of the closed loop alone [s].
         tallies: what became of each sensor's samples in the estimator; empty without one.
-        directory: where it was read from; None for one that was flown.
+        directory: where it was read from or written to; None where it is in memory alone.
         recorded: `summary.json` of one that was read; None for one that was flown.
         unanswered: the first period whose QP had no answer; None where all had, there is no QP, or it was read.
 
@@ -114,7 +122,9 @@ class Flight:
 
     @property
     def outcome(self) -> Verdict:
-        """The verdict in one word; `lost` is a flight that was aborted, by any cause."""
+        """The verdict in one word: `aborted` by Ctrl-C or code that raised, `lost` where anything else ended it."""
+        if self.log.aborted:
+            return "aborted"
         if self.log.reason is not None:
             return "lost"
         return "satisfied" if self.satisfied else "violated"
@@ -258,33 +268,35 @@ class Flight:
         self,
         directory: str | Path,
         *,
-        video: bool = True,
-        recording: bool = True,
-        figures: bool = True,
+        overwrite: bool = False,
+        video: bool | None = None,
+        recording: bool | None = None,
+        figures: bool | None = None,
         progress: Progress = silent,
     ) -> Path:
-        """Write the run directory, as `quadsim run` does; it appears complete or not at all.
+        """Write the run directory, as `quadsim run` does: tables and summary first, then what is made from them.
 
         Args:
-            directory: where; an earlier run there is replaced.
-            video: whether to film it.
-            recording: whether to write `flight.rrd` for the rerun viewer.
-            figures: whether to draw it.
+            directory: where.
+            overwrite: whether to replace an earlier output there.
+            video: whether to film it; None for where that can be done, True to raise where it fails.
+            recording: whether to write `flight.rrd` for the rerun viewer; likewise.
+            figures: whether to draw it; likewise.
             progress: called with (what, done, total).
 
         Returns:
             The directory.
 
         Raises:
-            RenderingUnavailableError: a video is wanted and cannot be made.
-            OutputError: the directory cannot be written, or the flight was read from a directory.
+            RenderingUnavailableError: a video is asked for and cannot be made.
+            OutputError: the directory cannot be written or holds something else, the flight was read from a directory,
+                or what was asked for failed; the tables and the summary are there then.
         """
         if self.recorded is not None:
             raise OutputError(directory, f"this flight is on disk already, in {self.directory}; copy that directory")
         outputs = Outputs(video=video, recording=recording, figures=figures)
         outputs.check()
-        with writing(Path(directory), rundir.KIND) as partial:
-            write_run(self, partial, outputs, progress)
+        write_run(self, absolute(directory), outputs, progress, overwrite=overwrite)
         return Path(directory)
 
     def _repr_html_(self) -> str:
@@ -334,25 +346,48 @@ def _numbers(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def write_run(
-    flight: Flight, directory: Path, outputs: Outputs, progress: Progress = silent, *, since: float | None = None
+    flight: Flight,
+    directory: Path,
+    outputs: Outputs,
+    progress: Progress = silent,
+    *,
+    overwrite: bool = False,
+    since: float | None = None,
 ) -> None:
-    """Write a run directory: scenario, Parquet tables, what pictures are wanted, and the summary that seals it.
+    """Write a run directory: scenario, Parquet tables and summary at once, then its products, one by one.
 
     Args:
         flight: as it was flown.
-        directory: one that is being made.
-        outputs: which pictures.
+        directory: its absolute path.
+        outputs: which products.
         progress: called with (what, done, total).
+        overwrite: whether to replace an earlier output there.
         since: clock reading at which the flight's work began [s], for the summary's total.
+
+    Raises:
+        OutputError: the directory cannot be written, or a product that was asked for by name failed.
     """
     started = clock.perf_counter() - flight.simulate_s if since is None else since
-    summary = flight.summary
-    write_text(directory / rundir.SCENARIO_FILE, flight.scenario.to_toml())
-    write_log(directory, flight.log, plant_stride=flight.scenario.plant_stride, metadata=flight.metadata)
-    write_json(directory / rundir.SUMMARY_FILE, summary)
-    _write_products(flight, directory, outputs, progress)
-    total = {**summary["wall_s"], "total": clock.perf_counter() - started}
-    rundir.seal(directory, {**summary, "wall_s": total})
+
+    def wall_s() -> dict[str, float]:
+        return {"simulate": flight.simulate_s, "total": clock.perf_counter() - started}
+
+    def write_tables(*, overwrite: bool) -> None:
+        with writing(directory, overwrite=overwrite) as partial:
+            (partial / rundir.SCENARIO_FILE).write_text(flight.scenario.to_toml(), encoding="utf-8")
+            write_log(partial, flight.log, plant_stride=flight.scenario.plant_stride, metadata=flight.metadata)
+            summary = to_json({**flight.summary, "wall_s": wall_s()})
+            (partial / rundir.SUMMARY_FILE).write_text(summary, encoding="utf-8")
+
+    try:
+        write_tables(overwrite=overwrite)
+    except KeyboardInterrupt:  # no flight that was flown is lost by it
+        write_tables(overwrite=True)
+        outputs = Outputs(video=False, recording=False, figures=False)
+    failed = _add_products(flight, directory, outputs, progress)
+    amend(directory, {"wall_s": wall_s()})
+    for name, problem in failed.items():
+        raise OutputError(directory / name, f"{problem}; all else is there")
 
 
 def summarise(flight: Flight) -> dict[str, Any]:
@@ -366,12 +401,14 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "scenario": scenario.name,
         "description": scenario.description,
         "status": log.status,
+        "outcome": flight.outcome,
         "reason": log.reason,
+        **({"traceback": [*log.traceback]} if log.traceback else {}),
         "lost": log.lost,
         "satisfied": flight.satisfied,
         "group": scenario.group,
         "expected": scenario.expect,
-        "as_expected": flight.outcome == scenario.expect and not log.interrupted,
+        "as_expected": flight.outcome == scenario.expect,
         "duration": round(log.control.t.size * scenario.control_period, 9),
         "seed": scenario.seed,
         "course": asdict(report(scenario, flight.vehicle)),
@@ -393,6 +430,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "wall_s": {"simulate": flight.simulate_s, "total": flight.simulate_s},
         "versions": versions(),
         "machine": machine(),
+        "products": {},
         "files": {},
     }
 
@@ -402,32 +440,57 @@ def _estimation(flight: Flight) -> dict[str, Any]:
     return {**metrics.estimation(flight.log.control), "samples": samples}
 
 
-def _write_products(flight: Flight, directory: Path, outputs: Outputs, progress: Progress) -> None:
-    """Recording, figures and video, each made from the files that are already there."""
-    run = rundir.load_run(directory)
-    flown = bool(run.log.control.t.size)
+def _add_products(flight: Flight, directory: Path, outputs: Outputs, progress: Progress) -> dict[str, str]:
+    """Recording, figures and video, each made from the files that are there; of those asked for, which failed and why.
+
+    Ctrl-C ends the one that is being made, and skips the others.
+    """
+    run, failed = rundir.load_run(directory), dict[str, str]()
+    flown, interrupted = bool(run.log.control.t.size), flight.log.interrupted
+
+    @contextlib.contextmanager
+    def product(name: str, asked: bool | None) -> Iterator[Path]:
+        nonlocal interrupted
+        try:
+            with adding(directory, products={name: "made"}) as folder:
+                yield folder
+        except KeyboardInterrupt:
+            interrupted, problem = True, "interrupted (Ctrl-C)"
+        except Exception as error:
+            what = str(error) if isinstance(error, QuadsimError) else f"{type(error).__name__}: {error}"
+            problem = f"failed: {' '.join(printable(what).split())}"[:_LONGEST]
+            if asked:
+                failed[name] = problem
+        else:
+            return
+        amend(directory, {"products": {name: problem}})
+        _log.warning("%s %s", name, problem)
+
     with contextlib.ExitStack() as beside:
-        if outputs.recording:
+        if outputs.recording is not False:
             from quadsim.report.recording import recording_in_background, write_recording
 
             progress("recording", 0, 1)
-            if outputs.figures and flown and usable_cores() > 1:  # while the figures are drawn: a tenth of a short run
-                beside.enter_context(recording_in_background(directory))
+            if outputs.figures is not False and flown and usable_cores() > 1:  # while the figures are drawn
+                folder = beside.enter_context(product(rundir.RECORDING_FILE, outputs.recording))
+                beside.enter_context(recording_in_background(directory, folder / rundir.RECORDING_FILE))
             else:
-                write_recording(run, directory / rundir.RECORDING_FILE)
-        if outputs.figures and flown:
-            from quadsim.report.figures.flight_figures import write_figures
+                with product(rundir.RECORDING_FILE, outputs.recording) as folder:
+                    write_recording(run, folder / rundir.RECORDING_FILE)
+        if outputs.figures is not False and flown:
+            with product(rundir.FIGURES_DIR, outputs.figures) as folder:
+                from quadsim.report.figures.flight_figures import write_figures
 
-            progress("figures", 0, 1)
-            write_figures(run, directory / rundir.FIGURES_DIR)
-            progress("figures", 1, 1)
-    if outputs.recording:
+                progress("figures", 0, 1)
+                write_figures(run, folder / rundir.FIGURES_DIR)
+                progress("figures", 1, 1)
+    if outputs.recording is not False:
         progress("recording", 1, 1)
-    if outputs.video and flown and not flight.log.interrupted:
-        from quadsim.report.film.video import render_video
+    if outputs.video is not False and flown and not interrupted:
+        with product(rundir.VIDEO_FILE, outputs.video) as folder:
+            from quadsim.report.film.video import render_video
 
-        render_video(
-            directory,
-            directory / rundir.VIDEO_FILE,
-            progress=lambda done, total: progress("video", done, total),
-        )
+            render_video(
+                directory, folder / rundir.VIDEO_FILE, progress=lambda done, total: progress("video", done, total)
+            )
+    return failed

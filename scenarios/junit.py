@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 from xml.etree import ElementTree
 
 from quadsim.errors import printable
-from quadsim.outputs import writing_file
+from quadsim.outputs import absolute, require_file, writing_file
 from quadsim.report.comparison import failure_sentences
 
 if TYPE_CHECKING:
@@ -19,6 +19,23 @@ if TYPE_CHECKING:
     from scenarios.reaudit import Reaudit
 
 
+_HEAD: Final = b"<?xml version='1.0' encoding='utf-8'?>\n<testsuite name=\"quadsim."
+
+
+def junit_file(path: str | Path) -> Path:
+    """The absolute path of a file for verdicts, which may hold earlier ones of quadsim's, and nothing else.
+
+    Raises:
+        OutputError: it cannot be written, or holds something else.
+    """
+    path = absolute(path)
+    ours = False
+    if path.is_file():
+        with path.open("rb") as file:
+            ours = file.read(len(_HEAD)) == _HEAD
+    return require_file(path, overwrite=ours)
+
+
 def write_junit(result: Flight | Reaudit | Result | Sequence[Reproduction], path: str | Path) -> Path:
     """Write verdicts as JUnit XML: a test case per constraint and one for the flight; per requirement; or per number.
 
@@ -26,7 +43,7 @@ def write_junit(result: Flight | Reaudit | Result | Sequence[Reproduction], path
 
     Args:
         result: of `fly`, `read` or `check`, of a `campaign` with requirements, or of `reproduce`.
-        path: an XML file.
+        path: an XML file; one with earlier verdicts is replaced.
 
     Returns:
         The file.
@@ -74,7 +91,7 @@ def write_cases(suite: str, cases: Sequence[tuple[str, bool, str]], path: Path) 
             ElementTree.SubElement(case, "system-out").text = printable(sentence)
         else:
             ElementTree.SubElement(case, "failure", message=printable(sentence))
-    with writing_file(path, ".xml") as file:
+    with writing_file(junit_file(path), overwrite=True) as file:
         file.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
     return path
 

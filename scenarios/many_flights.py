@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from quadsim.errors import InputError
-from quadsim.outputs import real_path
+from quadsim.errors import InputError, ParameterError
+from quadsim.outputs import absolute, reserving
 from scenarios.api import as_scenario, named_by
 from scenarios.flight import Outputs
 from scenarios.parts.user_code import require_importable
@@ -78,6 +78,7 @@ def campaign(
     workers: int | None = None,
     cluster: str | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     until_width: float | None = None,
     report: bool = True,
     progress: bool | Literal["lines"] = True,
@@ -98,6 +99,7 @@ def campaign(
         workers: processes that fly; one per usable core where absent.
         cluster: the address of a Dask scheduler whose workers fly instead, as of `--cluster`.
         resume: whether to continue what the directory holds.
+        overwrite: whether to replace an earlier output there.
         until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
         report: whether to write the page and its figure.
         progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
@@ -126,6 +128,8 @@ def campaign(
     from scenarios.campaign.statistics.requirement import judge, parse_requirement
     from scenarios.commands.campaign_console import progress as bar
 
+    if resume and overwrite:
+        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
     requirements = [parse_requirement(text) for text in require]
     if isinstance(campaign, Scenario):
         requested = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
@@ -137,7 +141,7 @@ def campaign(
         plan = load_plan(str(campaign), changes, flights=flights, seed=seed)
     for requirement in requirements:
         parse_event(requirement.event.text, plan.columns)
-    target = real_path(Path("runs") / "campaigns" / plan.spec.name if out is None else out)
+    target = absolute(Path("runs") / "campaigns" / plan.spec.name if out is None else out)
     try:
         with bar(enabled=bool(progress), lines=progress == "lines") as watch:
             result = fly_campaign(
@@ -146,6 +150,7 @@ def campaign(
                 workers=workers,
                 cluster=cluster,
                 resume=resume,
+                overwrite=overwrite,
                 until_width=until_width,
                 report=report,
                 watch=watch,
@@ -164,6 +169,7 @@ def tune(
     workers: int | None = None,
     cluster: str | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     report: bool = True,
     progress: bool | Literal["lines"] = True,
 ) -> TuningResult:
@@ -177,6 +183,7 @@ def tune(
         workers: processes that fly; one per usable core where absent.
         cluster: the address of a Dask scheduler whose workers fly instead, as of `--cluster`.
         resume: whether to continue what the directory holds.
+        overwrite: whether to replace an earlier output there.
         report: whether to write the pages and their figures.
         progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
 
@@ -220,12 +227,23 @@ def tune(
     from scenarios.tuning.run import tune as carry_out
     from scenarios.tuning.search import require_optuna
 
+    if resume and overwrite:
+        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
     require_optuna()
     plan = load_tuning(str(tuning), trials=trials, seed=seed)
-    target = real_path(Path("runs") / "tunings" / plan.spec.name if out is None else out)
+    target = absolute(Path("runs") / "tunings" / plan.spec.name if out is None else out)
     try:
         with bar(enabled=bool(progress), lines=progress == "lines") as watch:
-            return carry_out(plan, target, workers=workers, cluster=cluster, resume=resume, report=report, watch=watch)
+            return carry_out(
+                plan,
+                target,
+                workers=workers,
+                cluster=cluster,
+                resume=resume,
+                overwrite=overwrite,
+                report=report,
+                watch=watch,
+            )
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{target} has what was flown") from None
 
@@ -235,9 +253,10 @@ def replay(
     flight: int | None = None,
     *,
     out: str | Path | None = None,
-    video: bool = True,
-    recording: bool = True,
-    figures: bool = True,
+    overwrite: bool = False,
+    video: bool | None = None,
+    recording: bool | None = None,
+    figures: bool | None = None,
     progress: Progress | bool = True,
 ) -> Replay:
     """Fly one flight of a finished campaign again, with everything that a run directory has.
@@ -245,10 +264,11 @@ def replay(
     Args:
         campaign: its directory.
         flight: which; the worst where absent.
-        out: the run directory, `runs/CAMPAIGN-N` where absent.
-        video: whether to film it.
-        recording: whether to write `flight.rrd`.
-        figures: whether to draw it.
+        out: the run directory; `runs/CAMPAIGN-N`, or the next free name, where absent.
+        overwrite: whether to replace an earlier output there.
+        video: as of `fly`.
+        recording: as of `fly`.
+        figures: as of `fly`.
         progress: as of `fly`.
 
     Returns:
@@ -273,10 +293,10 @@ def replay(
     recorded = recorded_flight(Path(campaign), flight)
     for note in recorded.notes:
         logging.getLogger("quadsim").info(note)
-    target = real_path(Path("runs") / recorded.scenario.name if out is None else out)
+    target, free = (Path("runs") / recorded.scenario.name, not overwrite) if out is None else (Path(out), False)
     outputs = Outputs(video=video, recording=recording, figures=figures)
-    with reporting(progress) as report:
-        return replay_flight(recorded, target, outputs, report)
+    with reporting(progress) as report, reserving(target, overwrite=overwrite, free=free) as directory:
+        return replay_flight(recorded, directory, outputs, report, overwrite=overwrite)
 
 
 def flown_by(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:

@@ -1,5 +1,6 @@
 """A finished run held against itself: its files as they were written, its verdict as its tables give it again.
 
+It finds damage and mistakes, ours too: integrity, not authenticity.  The tables have to be consistent among themselves.
 Nothing in `summary.json` about the verdict is relied on.  The limits come from the run's `scenario.toml`, the values
 from `flight.parquet` and `plant.parquet`.  The recorded audit saw every physics step, the tables have the plant at the
 log rate, so at the physics rate the recorded margin may be the smaller one, and never the larger.  At the control
@@ -21,9 +22,13 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
+from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
+from quadsim.vehicle import N_ROTORS
+from scenarios.courses.make import build_course_steps
 from scenarios.limits import build_limits
 from scenarios.loading import parse_scenario
 from scenarios.schema.bases import read_whole
+from scenarios.schema.events import RotorLagEvent
 from scenarios.schema.plugin import LAWS, is_plugin
 from scenarios.schema.scenario import Scenario
 
@@ -34,6 +39,10 @@ ROUNDING: Final = 1e-9
 """By how much numbers may differ that another machine's arithmetic made, of 1 or of the larger number."""
 ROUNDING_TILT: Final = 1e-6  # the same for the tilt: near level an arc cosine has half of a number's digits
 MOST_REPORTED: Final = 6  # differences that one message names
+_HOLDING: Final = ("unconstrained", "constrained", "robust", "nonlinear", "lqr", "geometric")
+"""Laws that command rotor speeds for a whole period, unless INDI goes between."""
+_COMMANDED: Final = tuple(f"u{i}" for i in range(1, N_ROTORS + 1))
+_TURNING: Final = tuple(f"w{i}" for i in range(1, N_ROTORS + 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,18 +75,17 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
     summary = rundir.read_summary(directory)
     differing = list(_changed(directory, summary, products=products))
     try:
-        sealed = rundir.is_sealed(directory, summary)
-        if sealed is False:
-            differing.append(f"{rundir.SUMMARY_FILE} is not the one that was written, by its digest in {TIMING_FILE}")
         scenario = stored_scenario(directory)
-        log = rundir.load_run(directory).log
+        run = rundir.load_run(directory)
+        log = run.log
         findings = audit(log, build_limits(scenario))
     except InputError as error:
         raise _contradiction(directory, differing or [f"it cannot be audited again: {error}"]) from error
+    differing += _inconsistencies(scenario, run)
     differing += _differences(summary, scenario, log, findings)
     if differing:
         raise _contradiction(directory, differing)
-    notes = [] if sealed else ["its summary has no digest, as those of older versions: changes of it may not show"]
+    notes = []
     if others := _unlisted(directory, summary):
         shown = ", ".join(others[:MOST_REPORTED]) + (" ..." if len(others) > MOST_REPORTED else "")
         notes.append(f"not of this run: {printable(shown)}")
@@ -129,9 +137,59 @@ def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> 
 
 def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     """Files in a run's directory that its summary does not list, but for our own bookkeeping, sorted."""
-    listed = {*rundir.UNLISTED, *summary["files"]}
+    listed = {rundir.SUMMARY_FILE, *summary["files"]}
     found = (path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir())
     return sorted(name for name in found if name not in listed)
+
+
+def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
+    """Where a run's tables contradict each other, or the scenario's rates."""
+    control, timing, plant = run.log.control, run.log.timing, run.log.plant
+    for name, columns, rows, t in (
+        (FLIGHT_FILE, STATE_NAMES, control.truth, control.t),
+        (FLIGHT_FILE, REFERENCE_NAMES, control.reference, control.t),
+        (FLIGHT_FILE, _COMMANDED, control.speeds, control.t),
+        (PLANT_FILE, STATE_NAMES, plant.state, plant.t),
+        (PLANT_FILE, _TURNING, plant.speeds, plant.t),
+    ):
+        yield from _where(~np.isfinite(rows), columns, t, f"of {name} is no finite number")
+    stride, steps, count = scenario.plant_stride, scenario.steps_per_period, control.t.size
+    period, row = scenario.control_period, stride * scenario.plant.timestep
+    for name, t, spacing, expected in (
+        (FLIGHT_FILE, control.t, period, count),
+        (TIMING_FILE, timing.t, period, count),
+        (PLANT_FILE, plant.t, row, count * steps // stride + 1),
+    ):
+        if t.size != expected or (np.abs(t - spacing * np.arange(t.size)) > ROUNDING).any():
+            yield f"{name} does not have the {expected} times k * {spacing:g} s"
+            return
+    both = np.flatnonzero(np.arange(count) * steps % stride == 0)  # control periods that begin with a row of the plant
+    apart = control.truth[both] - plant.state[both * steps // stride]
+    apart[:, ANGLES] = (apart[:, ANGLES] + np.pi) % (2.0 * np.pi) - np.pi
+    yield from _where(
+        np.abs(apart) > ROUNDING_TILT, STATE_NAMES, control.t[both], f"differs between {FLIGHT_FILE} and {PLANT_FILE}"
+    )
+    if _holds_commands(scenario):
+        k = np.minimum(np.arange(plant.t.size - 1) * stride // steps, max(count - 1, 0))  # the last row ends the flight
+        limits = (run.vehicle.speed_min, run.vehicle.speed_max) if scenario.plant.limit_speeds else (0.0, None)
+        applied = np.clip(control.speeds[k], *limits)
+        wrong = (np.abs(applied - plant.speeds[:-1]) > ROUNDING * np.maximum(1.0, applied)) & (control.delay[k] == 0.0)[
+            :, None
+        ]
+        yield from _where(wrong, _TURNING, plant.t, f"of {PLANT_FILE} is not the speed that {FLIGHT_FILE} commands")
+
+
+def _where(wrong: np.ndarray[Any, np.dtype[np.bool_]], columns: Sequence[str], t: Array, what: str) -> Iterator[str]:
+    """The columns in which anything is wrong, each with its first time."""
+    for i in np.flatnonzero(wrong.any(axis=0)).tolist():
+        yield f"{columns[i]} at t = {t[np.argmax(wrong[:, i])]:g} s {what}"
+
+
+def _holds_commands(scenario: Scenario) -> bool:
+    """Whether the rotors turn at the commanded speeds throughout each period that begins with its command."""
+    laws = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
+    held = all(spec.type in _HOLDING and getattr(spec, "indi", None) is None for spec in laws)
+    return held and scenario.effects.rotors is None and not any(isinstance(e, RotorLagEvent) for e in scenario.events)
 
 
 def _differences(
@@ -150,6 +208,14 @@ def _differences(
             yield f"{key} is recorded as {summary[key]!r:.80}, and the run's files give {value!r:.80}"
     if summary["status"] == "completed" and not whole:
         yield f"status is recorded as 'completed', and {log.control.t.size} of {scenario.periods} periods were flown"
+    deadline_ms = 1e3 * scenario.control_period
+    numbers = metrics.flight_numbers(log, deadline_ms=deadline_ms, course=build_course_steps(scenario))
+    recorded = dict(_leaves({key: summary[key] for key in numbers}))
+    for key, value in _leaves(numbers):
+        before = recorded.get(key, value)
+        alike = _is_close(before, value, ROUNDING) if isinstance(value, float) else before == value
+        if not alike:
+            yield f"{key} is recorded as {before!r:.80}, and the tables give {value!r:.80}"
     entries = summary["constraints"]
     names, wanted = [entry["name"] for entry in entries], [finding.limit.name for finding in findings]
     if names != wanted:
@@ -159,15 +225,24 @@ def _differences(
         yield from (f"{finding.limit.name}: {what}" for what in _constraint_differences(entry, finding, scenario, log))
     required = all(entry["satisfied"] for entry in entries if entry["required"])
     unrecovered = metrics.unrecovered(log.control)
-    if summary["tracking"] and summary["controller"].get("unrecovered", 0) != unrecovered:
-        recorded = summary["controller"].get("unrecovered", 0)
-        yield f"controller.unrecovered is recorded as {recorded}, and the tables give {unrecovered}"
     satisfied = summary["reason"] is None and not log.control.crashed and not unrecovered and required
     if summary["satisfied"] != satisfied:
         yield f"satisfied is recorded as {summary['satisfied']}, and its audit and outcome make it {satisfied}"
-    outcome = "lost" if summary["reason"] is not None else "satisfied" if satisfied else "violated"
+    ended = "aborted" if log.aborted else "lost"
+    outcome = ended if summary["reason"] is not None else "satisfied" if satisfied else "violated"
+    if summary.get("outcome", outcome) != outcome:
+        yield f"outcome is recorded as {summary['outcome']!r:.80}, and its audit and reason make it {outcome!r}"
     if summary.get("as_expected") and outcome != scenario.expect:
         yield f"as_expected is recorded as True, and the flight is {outcome} where {scenario.expect} is expected"
+
+
+def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """What nested tables hold, by dotted path."""
+    if not isinstance(value, Mapping):
+        yield path, value
+        return
+    for key, inner in value.items():
+        yield from _leaves(inner, f"{path}.{key}" if path else key)
 
 
 _DEMANDS: Final = (

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import os
 import time as clock
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +15,9 @@ import numpy as np
 
 from quadsim.controller import Command, Controller
 from quadsim.errors import InputError, ParameterError
-from quadsim.flight import rundir
 from quadsim.flight.audit import audit, smallest_margins
 from quadsim.flight.log import FlightLog
-from quadsim.outputs import writing
+from quadsim.outputs import reserving
 from quadsim.sim.effects import Force
 from quadsim.sim.loop import ClosedLoop, Observation, Reference, Sample, complete, one_period
 from quadsim.sim.navigation import Navigation
@@ -362,7 +364,8 @@ def fly_scenario(
 ) -> Flight:
     """Fly a scenario and audit it, writing nothing.
 
-    Linear algebra is held to one thread: the matrices are small, and results do not depend on the core count.
+    Linear algebra is held to one thread: the matrices are small, and results do not depend on the core count.  A
+    controller that changes the working directory changes it for the flight alone.
 
     Args:
         scenario: what is flown.
@@ -370,9 +373,20 @@ def fly_scenario(
         law: flies it, instead of what is built from the scenario's `controller`.
         forces: what acts on it, instead of what is built from the scenario's `forces`.
     """
-    with start(scenario, law, forces) as started:
+    with _staying(), start(scenario, law, forces) as started:
         started.complete(progress)
         return started.flight()
+
+
+@contextlib.contextmanager
+def _staying() -> Iterator[None]:
+    """Come back to the working directory, even if it is gone by then."""
+    here = os.open(os.curdir, getattr(os, "O_PATH", os.O_RDONLY))
+    try:
+        yield
+    finally:
+        os.fchdir(here)
+        os.close(here)
 
 
 def run_scenario(
@@ -382,26 +396,32 @@ def run_scenario(
     progress: Progress = silent,
     law: Controller | None = None,
     forces: Sequence[Force] | None = None,
+    *,
+    overwrite: bool = False,
 ) -> Flight:
-    """Fly a scenario and write its run directory, which appears complete or not at all.
+    """Fly a scenario and write its run directory: tables and summary first, then its products.
 
     A flight that its pilot interrupted is written without its video.
 
     Args:
         scenario: what is flown.
-        target: the run directory; an earlier run there is replaced.
-        outputs: which pictures.
+        target: the run directory.
+        outputs: which products.
         progress: called with (what, done, total).
         law: see `fly_scenario`.
         forces: see `fly_scenario`.
+        overwrite: whether to replace an earlier output in its place.
+
+    Returns:
+        The flight, with its directory.
 
     Raises:
-        RenderingUnavailableError: a video is wanted and cannot be made; nothing was flown.
-        OutputError: the directory cannot be written; nothing is left there.
+        RenderingUnavailableError: a video is asked for by name and cannot be made; nothing was flown.
+        OutputError: the directory cannot be written, and nothing was flown; or see `scenarios.flight.write_run`.
     """
     started = clock.perf_counter()
     outputs.check()
-    with writing(target, rundir.KIND) as directory:
-        flight = fly_scenario(scenario, progress, law, forces)
-        write_run(flight, directory, outputs, progress, since=started)
+    with reserving(target, overwrite=overwrite) as directory:
+        flight = replace(fly_scenario(scenario, progress, law, forces), directory=directory)
+        write_run(flight, directory, outputs, progress, overwrite=overwrite, since=started)
     return flight

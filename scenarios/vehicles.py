@@ -91,12 +91,13 @@ def vehicle_template() -> str:
     return template()
 
 
-def draw_vehicle(name: str | Path, out: str | Path) -> Path:
+def draw_vehicle(name: str | Path, out: str | Path, *, overwrite: bool = False) -> Path:
     """Draw a vehicle on a floor of 10 cm squares.
 
     Args:
         name: of one that ships, or a path ending in `.toml`.
         out: a PNG file.
+        overwrite: whether to replace a file that is there.
 
     Returns:
         The file.
@@ -118,7 +119,7 @@ def draw_vehicle(name: str | Path, out: str | Path) -> Path:
     loaded = load_vehicle(name)
     if Path(out).suffix != ".png":
         raise ParameterError("", "--out", str(out), "a file ending in .png")
-    render_portrait(loaded, Path(out))
+    render_portrait(loaded, Path(out), overwrite=overwrite)
     return Path(out)
 
 

@@ -46,14 +46,14 @@ settings.load_profile("quadsim")
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
 LONG = (
     *("scenarios/test_many.py", "scenarios/test_library.py"),
-    *("test_safety.py", "scenarios/campaign/test_run.py", "test_commands.py", "scenarios/bench/test_bench.py"),
+    *("scenarios/campaign/test_run.py", "test_commands.py", "scenarios/bench/test_bench.py"),
     *("scenarios/campaign/report/test_campaign_page.py", "quadsim/report/film/test_video.py"),
     *("quadsim/report/test_comparison_page.py", "scenarios/design/test_first_flights.py"),
     "scenarios/test_process.py",
     *("test_documents.py", "scenarios/cost/test_measure.py", "scenarios/test_diagnosis.py", "scenarios/test_api.py"),
     *("scenarios/test_faults.py", "quadsim/report/test_figures.py", "scenarios/bench/test_mismatch.py"),
     *("mpc/robust/test_robust.py", "scenarios/test_reaudit.py", "scenarios/test_run.py", "scenarios/test_cli.py"),
-    *("mpc/test_staged.py", "scenarios/campaign/test_commands.py", "scenarios/test_mutations.py"),
+    *("mpc/test_staged.py", "scenarios/campaign/test_commands.py"),
     *("test_packaging.py", "mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
     *("scenarios/gym/test_environment.py", "test_learning_examples.py"),
     *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py"),
@@ -162,9 +162,9 @@ def recorded_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Recordings are written in this process, which imports rerun once, not in one of their own each."""
 
     @contextlib.contextmanager
-    def recording(directory: Path) -> Iterator[None]:
+    def recording(directory: Path, path: Path) -> Iterator[None]:
         yield
-        write_recording(rundir.load_run(directory), directory / rundir.RECORDING_FILE)
+        write_recording(rundir.load_run(directory), path)
 
     monkeypatch.setattr("quadsim.report.recording.recording_in_background", recording)
 

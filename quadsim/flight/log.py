@@ -121,7 +121,13 @@ class FlightLog:
     controllers; None where one of them has no model."""
     reason: str | None = None  # why the flight ended early; None when it was completed
     interrupted: bool = False  # whether the person flying ended it
+    traceback: tuple[str, ...] = ()  # last lines of what the controller or a force raised, which ended the flight
     lost: str | None = None  # which of the loss criteria ended it, e.g. `tilt`; None where none did
+
+    @property
+    def aborted(self) -> bool:
+        """Whether the flight was ended by its pilot or by code that raised, not by the vehicle."""
+        return self.interrupted or bool(self.traceback)
 
     @property
     def status(self) -> str:

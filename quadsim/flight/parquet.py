@@ -7,7 +7,7 @@ Three tables, as in the file contract: what happened once per control period (`f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -116,27 +116,6 @@ def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: M
         _write(table, directory / f"{name}.parquet")
 
 
-def add_metadata(path: Path, texts: Mapping[str, str]) -> None:
-    """Add texts to those that a table of quadsim's keeps in its schema.
-
-    Raises:
-        FileError: it cannot be read.
-    """
-    table = read_parquet(path)
-    named = {**(table.schema.metadata or {}), **{key.encode(): text.encode() for key, text in texts.items()}}
-    _write(table.replace_schema_metadata(named), path)
-
-
-def read_metadata(path: Path) -> dict[str, str]:
-    """The texts that a table of quadsim's keeps in its schema.
-
-    Raises:
-        FileError: it cannot be read.
-    """
-    metadata = _read(path, lambda file: file.schema_arrow).metadata or {}
-    return {key.decode(errors="replace"): text.decode(errors="replace") for key, text in metadata.items()}
-
-
 def _write(table: pa.Table, path: Path) -> None:
     with path.open("wb") as file:  # Arrow by itself takes no path that is no Unicode
         pq.write_table(table, file, compression="zstd")
@@ -151,15 +130,11 @@ def read_parquet(path: Path) -> pa.Table:
     Raises:
         FileError: it is missing, no file, or damaged.
     """
-    return _read(path, lambda file: file.read(use_threads=False))
-
-
-def _read(path: Path, read: Callable[[pq.ParquetFile], Any]) -> Any:
     if not path.is_file():  # reading a pipe would not end
         raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
     try:
         with path.open("rb") as file:  # Arrow by itself takes no path that is no Unicode
-            return read(pq.ParquetFile(file, pre_buffer=False))
+            return pq.ParquetFile(file, pre_buffer=False).read(use_threads=False)
     except (OSError, ValueError, pa.ArrowException) as error:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
 

@@ -1,9 +1,8 @@
-"""`summary.json` of a run: its form, whether it agrees with itself, and the digest that seals it."""
+"""`summary.json` of a run: its form, and whether it agrees with itself."""
 
 from __future__ import annotations
 
-import hashlib
-import json
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -11,10 +10,8 @@ from typing import Any, Final
 from quadsim.errors import FileError, printable
 from quadsim.flight.audit import CLEARANCE, SIGNALS, SUM, TERMS, sum_signal
 from quadsim.flight.form import MAYBE_NUMBER, MAYBE_TEXT, NUMBER, Each, Optional, misfits, read_json
-from quadsim.outputs.paths import require_inside
+from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES
-
-SUMMARY_FILE: Final = "summary.json"
 
 _WHAT: Final = "a run's summary"
 _COURSE: Final = dict.fromkeys(
@@ -93,6 +90,8 @@ _TOUCHDOWN: Final = dict.fromkeys(("time", "speed", "horizontal_speed", "tilt"),
 FORM: Final = {
     **dict.fromkeys(("scenario", "status"), str),
     "reason": MAYBE_TEXT,
+    "traceback": Optional([str]),
+    "outcome": Optional(str),
     "satisfied": bool,
     "duration": NUMBER,
     **dict.fromkeys(("description", "group", "expected"), Optional(str)),
@@ -127,6 +126,7 @@ FORM: Final = {
     "wall_s": {"simulate": NUMBER, "total": NUMBER},
     "versions": Optional(Each(str)),
     "machine": Optional({"system": str, "processor": str, "cores": (int, type(None))}),
+    "products": Optional(Each(str)),
     "files": Each(str),
 }
 FLOWN_FORM: Final = FORM | _FLOWN  # of a flight that came to its first period
@@ -152,6 +152,19 @@ def read_summary(directory: Path) -> dict[str, Any]:
     if problem := next(contradictions(summary), None):
         raise FileError(path, f"contradicts itself: {printable(problem)}")
     return summary
+
+
+def require_inside(directory: Path) -> None:
+    """Refuse to read a directory that holds a link out of it; links within it are no harm.
+
+    Raises:
+        FileError: naming the first such link.
+    """
+    home = directory.resolve()
+    for folder, folders, files in os.walk(directory):  # which follows no link to a folder
+        for path in (Path(folder, name) for name in sorted((*folders, *files))):
+            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(home):
+                raise FileError(path, f"is a link that leads out of {directory}; nothing is read through it")
 
 
 def contradictions(summary: Mapping[str, Any]) -> Iterator[str]:
@@ -191,15 +204,3 @@ def is_satisfied(entry: Mapping[str, Any]) -> bool:
     if at_physics_rate is None or at_physics_rate < -entry["tolerance"]:
         return False
     return at_samples is None or bool(at_samples >= -entry["tolerance_sampled"])
-
-
-def summary_digest(summary: Mapping[str, Any], fixed: Mapping[str, str]) -> str:
-    """SHA-256 of a summary without its table of files, and of the hashes of those files that are made once.
-
-    Args:
-        summary: `summary.json`.
-        fixed: hashes by file; a film, say, is made again, and is none of them.
-    """
-    hashed = {key: value for key, value in summary.items() if key != "files"}
-    text = json.dumps([hashed, dict(fixed)], sort_keys=True, allow_nan=False)
-    return "sha256:" + hashlib.sha256(text.encode()).hexdigest()

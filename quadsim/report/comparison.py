@@ -25,6 +25,7 @@ _VERDICTS: Final = {
     "satisfied": "holds every required constraint",
     "violated": "does not hold every required constraint",
     "lost": "is lost",
+    "aborted": "is aborted",
 }
 FOR_GOOD: Final = "ends in permanent fallback"
 """Of a flight whose verdict rests on that alone; see `quadsim.flight.metrics.unrecovered`."""
@@ -93,9 +94,9 @@ def outcome(summary: Summary) -> Cell:
 
 
 def verdict(summary: Summary) -> str:
-    """The verdict on a flight in one word: satisfied, violated, or lost."""
+    """The verdict on a flight in one word: satisfied, violated, lost, or aborted."""
     if summary["status"] != "completed":
-        return "lost"
+        return "aborted" if summary.get("outcome") == "aborted" else "lost"
     whole = not (summary["controller"].get("unrecovered") or nested(summary, "ground", "crashed"))
     return "satisfied" if whole and _all_held(summary) else "violated"
 
@@ -140,8 +141,6 @@ def verdict_cell(summary: Summary) -> Cell:
         return Cell(text=found)
     if summary.get("as_expected"):
         return Cell(text=f"{found}, as expected", mark=Mark.GOOD if found == "satisfied" else Mark.NONE)
-    if found == expected:
-        return Cell(text=f"{found}, but interrupted", mark=Mark.BAD)
     return Cell(text=f"{found}, expected: {expected}", mark=Mark.BAD)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time as clock
 from collections.abc import Callable, Iterator, Mapping
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from quadsim.controller import MISSED, Command, Controller, InnerLoop, Moment, Phase
-from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError
+from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.flight.lost import check_loss
 from quadsim.motion import Motion
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from quadsim.sim.phase import PhaseMonitor
 
 _BODY_RATES: Final = slice(11, 14)  # in the plant's own state; see `quadsim.sim.physics.physics_to_state`
+_log: Final = logging.getLogger("quadsim")
 _HEIGHT: Final = REFERENCE_NAMES.index("z")
 
 
@@ -155,6 +157,7 @@ class ClosedLoop:
         self.reason: str | None = None
         self._criterion: str | None = None
         self._interrupted = False
+        self._traceback: tuple[str, ...] = ()
         self._yaw = float(initial_state[INDEX["yaw"]])
         if navigation is not None:
             navigation.reset(plant.physics, initial_speeds, yaw=self._yaw)
@@ -283,6 +286,7 @@ class ClosedLoop:
             predicted=_joined([*self._predicted, *([self._predict()] if self.k > self._switched else [])]),
             reason=self.reason,
             interrupted=self._interrupted,
+            traceback=self._traceback,
             lost=self._criterion,
         )
 
@@ -294,6 +298,7 @@ class ClosedLoop:
         """Note why the flight ended; not the error itself, which would hold all that was flown in a cycle."""
         self.reason = str(error)
         self._criterion = error.criterion if isinstance(error, LostError) else None
+        self._traceback = error.traceback if isinstance(error, RaisedError) else ()
 
     def _observe(self) -> Observation:
         k, plant, navigation = self.k, self._plant, self._navigation
@@ -321,13 +326,17 @@ class ClosedLoop:
         return Observation(k=k, state=state, truth=truth, reference=row, preview=preview, moment=now)
 
     def _predict(self) -> Array | None:
-        """Positions (K, N, 3) [m] that the controller predicted in its periods; None where it has no model."""
+        """Predicted positions (K, N, 3) [m] of the controller's periods; None where it has no model, or raised."""
         predict = getattr(self.controller, "predict", None)
         samples = (self._samples or [])[self._switched :]
         if predict is None or not samples:
             return None
         states = np.stack([sample.observation.state for sample in samples])
-        found: Array = predict(states, np.stack([sample.command.plan for sample in samples]))[:, :, [0, 2, 4]]
+        try:
+            found: Array = predict(states, np.stack([sample.command.plan for sample in samples]))[:, :, [0, 2, 4]]
+        except (Exception, SystemExit) as error:  # after the flight, which is not to be lost by it
+            _log.warning("no predictions are kept: predict raised %s: %s", type(error).__name__, error)
+            return None
         return found
 
     def _fly(self, observed: Observation, given: Command | None) -> Sample:
@@ -335,7 +344,12 @@ class ClosedLoop:
         step_s, command = 0.0, given
         if command is None:
             started = clock.perf_counter()
-            command = self.controller.step(now, observed.state, observed.preview)
+            try:
+                command = self.controller.step(now, observed.state, observed.preview)
+            except FlightError:
+                raise
+            except (Exception, SystemExit) as error:
+                raise RaisedError("the controller", error, time=now.time) from error
             step_s = clock.perf_counter() - started
         delay = 0.0 if computation is None else computation.taken(now.time, command, self._draws)
         self.answered = max(self.answered, now.time + delay)

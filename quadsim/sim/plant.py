@@ -16,7 +16,7 @@ import numpy as np
 from mujoco.rollout import Rollout
 
 from quadsim.controller import check_command
-from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError
+from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError, RaisedError
 from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
 from quadsim.sim.effects import (
     LOADING,
@@ -412,13 +412,17 @@ class Plant:
 
         Raises:
             ForceError: one is not six finite numbers.
+            RaisedError: one raised.
         """
         physics, time = np.array([0.0, *motion]), self.time + since
         state, total = physics_to_state(physics[None])[0], np.zeros(6)
         for force in self._own:
-            wrench = np.asarray(force(time, state.copy()), float)
+            name = getattr(force, "__name__", type(force).__name__)
+            try:
+                wrench = np.asarray(force(time, state.copy()), float)
+            except (Exception, SystemExit) as error:
+                raise RaisedError(f"the force {name}", error, time=time) from error
             if wrench.shape != (6,) or not np.all(np.isfinite(wrench)):
-                name = getattr(force, "__name__", type(force).__name__)
                 given = f"{wrench.tolist()!r:.80}"
                 raise ForceError(f"the force {name} must give six finite numbers [N, N m]; got {given}", time=time)
             total += wrench

@@ -14,9 +14,9 @@ import numpy as np
 from mpc.ocp import Problem
 from mpc.solvers import SOLVERS, Method
 from mpc.unconstrained import UnconstrainedMPC
-from quadsim import outputs
 from quadsim.controller import ACCEPTED
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.outputs import to_json
 from quadsim.report.figures.canvas import write_drawings
 from quadsim.report.table import section
 from quadsim.state import Array
@@ -37,7 +37,6 @@ from scenarios.schema.scenario import Scenario
 RESULTS_FILE: Final = "bench.json"
 TABLES_FILE: Final = "solvers.md"
 FORMAT: Final = "quadsim bench solvers"  # the `format` of `bench.json`
-KIND: Final = "bench of solvers"  # what `quadsim.outputs` calls its directory
 
 REPEATS: Final = 3
 HORIZONS: Final = (10, 20, 50, 100, 200)
@@ -129,8 +128,9 @@ def write_bench(bench: SolverBench, directory: Path) -> None:
     """
     from scenarios.bench.solver_figure import draw_solvers
 
-    outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **bench.to_json()})
-    outputs.write_text(directory / TABLES_FILE, bench_markdown(bench))
+    results = to_json({"format": FORMAT, **bench.to_json()})
+    (directory / RESULTS_FILE).write_text(results, encoding="utf-8")
+    (directory / TABLES_FILE).write_text(bench_markdown(bench), encoding="utf-8")
     write_drawings({"solvers": lambda: draw_solvers(bench)}, directory)
 
 

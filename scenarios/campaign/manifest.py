@@ -11,8 +11,8 @@ from typing import Any, Final
 from quadsim.assets import models_dir
 from quadsim.errors import FileError, InputError
 from quadsim.flight.form import MAYBE_TEXT, Each, Optional, read_json
-from quadsim.outputs import Growing, digest, digest_of, to_json
-from quadsim.outputs.paths import require_inside
+from quadsim.flight.summary import require_inside
+from quadsim.outputs import SUMMARY_FILE, Growing, digest_of, to_json
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
 from scenarios.campaign.spec import CampaignSpec
@@ -29,18 +29,13 @@ MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
 SCENARIO_FILE: Final = "scenario.toml"
 FORMAT: Final = "quadsim campaign"
-KIND: Final = "campaign"  # what `quadsim.outputs` calls a campaign's directory
 _FORM: Final = {
     **dict.fromkeys(("format", "name", "status"), str),
     **dict.fromkeys(("flights", "flown"), int),
-    "files": Each(str),
-    "files_before": Optional(Each(str)),
     "sessions": [dict],
     **dict.fromkeys(("controller", "controller_code"), Optional(MAYBE_TEXT)),
 }
 _ROOT: Final = Path(__file__).resolve().parents[2]
-_FINISHED: Final = ("complete", "stopped")
-"""Status of a campaign that nothing has written to since its manifest has the hashes of its tables."""
 
 
 def begin(plan: Plan, files: Growing) -> dict[str, Any]:
@@ -49,8 +44,7 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
     Raises:
         OutputError: they cannot be written, or files of these names that we did not write are there.
     """
-    texts = _texts(plan)
-    files.write(texts)
+    files.write(_texts(plan))
     manifest: dict[str, Any] = {
         "format": FORMAT,
         "name": plan.spec.name,
@@ -59,7 +53,6 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
         "status": "running",
         "flights": plan.spec.flights,
         "flown": 0,
-        "files": {name: digest(text) for name, text in texts.items()},
         **flown_by(plan),
         **controller_code(plan),
         "sessions": [],
@@ -85,12 +78,9 @@ def go_on(plan: Plan, files: Growing, *, flying: bool) -> dict[str, Any]:
                 f"first flights ({', '.join(differing)}): half of the numbers would be another program's; choose "
                 "another --out"
             )
-    texts = _texts(plan)
-    after = {**manifest["files"], **{name: digest(text) for name, text in texts.items()}}
-    manifest |= {"status": "running", "flights": plan.spec.flights, "files": after, "files_before": manifest["files"]}
-    write(manifest, files)
-    files.write(texts)
-    del manifest["files_before"]
+    manifest |= {"status": "running", "flights": plan.spec.flights}
+    files.remove([SUMMARY_FILE])  # which is there, with the hashes of all others, while nothing is being flown
+    files.write(_texts(plan))
     write(manifest, files)
     return manifest
 
@@ -209,16 +199,25 @@ def stored_plan(directory: Path) -> Plan:
     Raises:
         FileError: it is none, or a file is missing or not the one that was flown.
     """
-    manifest = read_manifest(directory)
-    before = manifest.get("files_before", {})  # where a process died while it made a campaign grow
-    tables = [name for name in (FLIGHTS_FILE, TIMES_FILE) if manifest["status"] in _FINISHED]
-    for name in (CAMPAIGN_FILE, SCENARIO_FILE, *tables):
+    read_manifest(directory)
+    known = _listed(directory)
+    for name in (CAMPAIGN_FILE, SCENARIO_FILE, *known):
         path = directory / name
-        known = [files[name] for files in (manifest["files"], before) if name in files]
-        if not path.is_file() or digest_of(path) not in known:
-            what = "flown" if name not in tables else "written"
-            raise FileError(path, f"is missing or not the file that was {what}")
+        if not path.is_file() or (name in known and digest_of(path) != known[name]):
+            raise FileError(path, "is missing or not the file that was written")
     return load_plan(str(directory / CAMPAIGN_FILE))
+
+
+def _listed(directory: Path) -> dict[str, str]:
+    """The digests of what a finished campaign was and found; none of one that is being flown.
+
+    Raises:
+        FileError: its summary is damaged.
+    """
+    path = directory / SUMMARY_FILE
+    summary = read_json(path, {"files": Optional(Each(str))}, "a campaign's summary") if path.exists() else {}
+    ours = (CAMPAIGN_FILE, SCENARIO_FILE, FLIGHTS_FILE, TIMES_FILE)
+    return {name: digest for name, digest in summary.get("files", {}).items() if name in ours}
 
 
 def _texts(plan: Plan) -> Mapping[str, bytes]:

@@ -12,7 +12,7 @@ from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.table import Row, failed_row, flown_row
 from scenarios.flight import Flight
 from scenarios.machine import processor_name
-from scenarios.many import fly_many
+from scenarios.many import MEMORY, fly_many
 from scenarios.run import fly_scenario
 
 
@@ -72,6 +72,11 @@ class CampaignPilot:
             flown = fly_scenario(self.plan.of(flight))
         except QuadsimError as error:
             return self._row(flight, failed_row(str(error)))
+        if raised := flown.log.traceback:  # no more of such a flight is kept than that it raised
+            reason = str(flown.log.reason)
+            short = raised[-1].startswith(MemoryError.__name__)
+            memory = f"{reason} (it may take {self.plan.spec.limits.memory:g} MB)"
+            return self._row(flight, failed_row(memory, MEMORY) if short else failed_row(reason))
         return self._row(flight, _recorded(flown, clock.perf_counter() - started))
 
     def row_of(self, flight: int, flown: Flight) -> Row:

@@ -81,7 +81,9 @@ class Replay:
     differing: Sequence[str]
 
 
-def replay_flight(recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent) -> Replay:
+def replay_flight(
+    recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent, *, overwrite: bool = False
+) -> Replay:
     """Fly it again and write its run directory.
 
     Args:
@@ -89,8 +91,9 @@ def replay_flight(recorded: Recorded, target: Path, outputs: Outputs, progress: 
         target: the run directory.
         outputs: see `scenarios.run.run_scenario`.
         progress: see `scenarios.run.run_scenario`.
+        overwrite: see `scenarios.run.run_scenario`.
     """
-    flight = run_scenario(recorded.scenario, target, outputs, progress)
+    flight = run_scenario(recorded.scenario, target, outputs, progress, overwrite=overwrite)
     row = CampaignPilot(recorded.plan).row_of(recorded.number, flight)
     (again,) = make_table([row], recorded.plan.schema).to_pylist()
     differing = [name for name, value in recorded.row.items() if name not in again or again[name] != value]

@@ -18,12 +18,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.outputs import Growing, digest_of, growing, to_json
+from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
+from quadsim.outputs import Growing, growing
 from scenarios.campaign import manifest as records
 from scenarios.campaign.pilot import CampaignPilot, fly_flights
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.report.campaign_page import write_report
-from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE, Store
+from scenarios.campaign.results.store import TIMES_FILE, Store
 from scenarios.campaign.results.table import Row, read_table
 from scenarios.campaign.statistics.estimates import estimate
 from scenarios.campaign.statistics.inference import proportion
@@ -31,18 +32,7 @@ from scenarios.campaign.statistics.requirement import Judgement
 from scenarios.flight import to_pandas
 from scenarios.many import count_workers
 
-SUMMARY_FILE: Final = "summary.json"
 REPORT_FILES: Final = ("index.html", "campaign.png", "campaign.svg")
-ALL_FILES: Final = (
-    records.CAMPAIGN_FILE,
-    records.SCENARIO_FILE,
-    records.MANIFEST_FILE,
-    SUMMARY_FILE,
-    FLIGHTS_FILE,
-    TIMES_FILE,
-    *REPORT_FILES,
-)
-"""What a campaign's directory holds in the end."""
 CHECK_EVERY: Final = 10
 """Flights after which the interval is looked at again, where it decides when to stop; of grids, whole turns."""
 
@@ -96,6 +86,7 @@ def fly_campaign(
     workers: int | None = None,
     cluster: str | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     until_width: float | None = None,
     report: bool = True,
     watch: Watch = lambda standing: None,
@@ -111,6 +102,7 @@ def fly_campaign(
         workers: see `scenarios.many.fly_many`.
         cluster: the same.
         resume: whether to continue what the directory holds; without it there must be nothing there.
+        overwrite: whether to replace an earlier output there.
         until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
         report: whether to write the page and its figure.
         watch: called with the progress, as answers come.
@@ -123,13 +115,12 @@ def fly_campaign(
     if until_width is not None and not 0.0 < until_width < 1.0:
         raise ParameterError("", "--until-width", until_width, "between 0 and 1")
     session = new_session(workers, cluster)
-    if records.is_campaign(directory) and not resume:
+    if records.is_campaign(directory) and not (resume or overwrite):
         raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
-    with growing(directory, records.KIND) as files:
+    with growing(directory, records.MANIFEST_FILE, overwrite=overwrite) as files:
         going_on = records.is_campaign(directory)
         if going_on:
             records.require_same(plan, directory)
-        files.require(ALL_FILES)
         progress = _Progress(plan, files, until_width=until_width, watch=watch)
         manifest = records.go_on(plan, files, flying=progress.missing) if going_on else records.begin(plan, files)
         manifest["sessions"].append(session)
@@ -239,7 +230,6 @@ def _conclude(plan: Plan, files: Growing, progress: _Progress, manifest: dict[st
     directory = files.path
     table = progress.store.close(progress.wanted)
     summary = {"campaign": plan.spec.name, "scenario": plan.scenario.name, **estimate(table)}
-    files.write({SUMMARY_FILE: to_json(summary).encode()})
     write = partial(
         write_report,
         campaign=directory,
@@ -251,13 +241,12 @@ def _conclude(plan: Plan, files: Growing, progress: _Progress, manifest: dict[st
         failure=plan.spec.failure,
     )
     put_report(files, REPORT_FILES, write if report else None)
-    ours = [name for name in ALL_FILES if name != records.MANIFEST_FILE and (directory / name).is_file()]
     # flights by the processor that flew them; those that raised, or that no process came back from, have none
     processors = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
     manifest["machines"] = dict(sorted(Counter(processors).items()))
-    manifest["files"] = {name: digest_of(directory / name) for name in ours}
     manifest["status"] = "complete" if progress.wanted == plan.spec.flights else "stopped"
     records.write(manifest, files)
+    files.finish(summary)
     return Result(
         directory=directory, manifest=manifest, table=table, summary=summary, failure=tuple(plan.spec.failure)
     )

@@ -6,7 +6,7 @@ import json
 from argparse import Namespace
 from typing import Any
 
-from quadsim.outputs import real_path
+from quadsim.outputs import absolute
 from quadsim.report.table import Grid
 from scenarios import benchmarks
 from scenarios.commands import EXIT_DONE, console
@@ -19,7 +19,7 @@ def bench(options: Namespace) -> int:
     if options.json:
         print(json.dumps(measured.to_json(), indent=2))
     else:
-        console.print_grids(tables, str(real_path(options.out)) if "out" in options else None)
+        console.print_grids(tables, str(absolute(options.out)) if "out" in options else None)
     return EXIT_DONE
 
 

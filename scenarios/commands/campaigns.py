@@ -7,10 +7,9 @@ from argparse import Namespace
 
 from quadsim.errors import ParameterError
 from quadsim.flight import rundir
-from quadsim.outputs import require_file
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
-from scenarios.commands.common import print_summary
-from scenarios.junit import write_junit
+from scenarios.commands.common import print_summary, shown
+from scenarios.junit import junit_file, write_junit
 from scenarios.many_flights import campaign as fly_campaign
 from scenarios.many_flights import replay as fly_again
 
@@ -22,7 +21,7 @@ def campaign(options: Namespace) -> int:
     if options.junit is not None and not options.requirements:
         raise ParameterError("", "--junit", options.junit, "given with --require, whose verdicts it is to hold")
     if options.junit is not None:
-        require_file(options.junit, ".xml")
+        options.junit = junit_file(options.junit)
     try:
         result = fly_campaign(
             options.file,
@@ -34,6 +33,7 @@ def campaign(options: Namespace) -> int:
             workers=options.workers,
             cluster=options.cluster,
             resume=options.resume,
+            overwrite=options.overwrite,
             until_width=options.until_width,
             report=options.report,
             progress=False if options.json else "lines",
@@ -50,7 +50,7 @@ def campaign(options: Namespace) -> int:
         gate = [judgement.to_json() for judgement in judgements]
         print(json.dumps({**result.summary, "requirements": gate}, indent=2))
     else:
-        print_campaign(result.summary, result.failure, judgements, str(result.directory))
+        print_campaign(result.summary, result.failure, judgements, shown(result.directory))
     return EXIT_DONE if all(judgement.holds for judgement in judgements) else EXIT_FAILED
 
 
@@ -62,12 +62,13 @@ def replay(options: Namespace) -> int:
         options.campaign,
         options.flight,
         out=options.out,
+        overwrite=options.overwrite,
         video=options.video,
         recording=options.recording,
         figures=options.figures,
         progress=not options.json,
     )
-    print_summary(rundir.read_summary(found.directory), options, where=str(found.directory))
+    print_summary(rundir.read_summary(found.directory), options, where=shown(found.directory))
     if not options.json:
         print_replay(found.recorded.number, found.recorded.row, found.differing)
     return EXIT_FAILED if found.differing else EXIT_DONE

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from argparse import Namespace
+from pathlib import Path
 from typing import Any
 
 from scenarios.api import load as load_scenario
@@ -27,3 +29,10 @@ def print_summary(summary: dict[str, Any], options: Namespace, where: str | None
         print(json.dumps(summary, indent=2))
     else:
         console.print_summary(summary, where)
+
+
+def shown(path: Path) -> str:
+    """A path for a person: relative to the current directory where it is in there."""
+    with contextlib.suppress(ValueError, OSError):  # it is not in there; the current directory is gone
+        return str(path.relative_to(Path.cwd()))
+    return str(path)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from pathlib import Path
 
-from quadsim.outputs import real_path
 from scenarios.api import compare as compare_all
 from scenarios.commands import EXIT_DONE, console
 from scenarios.comparison import Comparison
@@ -12,7 +12,7 @@ from scenarios.comparison import Comparison
 
 def compare(options: Namespace) -> int:
     """`quadsim compare`."""
-    found = compare_all(*options.targets, out=options.out, cost=options.cost)
+    found = compare_all(*options.targets, out=options.out, overwrite=options.overwrite, cost=options.cost)
     if isinstance(found, Comparison):
         for note in found.notes:
             console.say(note)
@@ -27,5 +27,5 @@ def compare(options: Namespace) -> int:
     if options.markdown:
         print(comparison_markdown(found))
     else:
-        print_comparison(found, str(real_path(options.out) / "index.html"))
+        print_comparison(found, str(Path(options.out) / "index.html"))
     return EXIT_DONE

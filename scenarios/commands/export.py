@@ -7,22 +7,23 @@ from argparse import Namespace
 from pathlib import Path
 
 from quadsim.flight import rundir
-from quadsim.outputs import real_path
+from quadsim.outputs import reserving
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
-from scenarios.commands.common import load
+from scenarios.commands.common import load, shown
 from scenarios.export.exporter import export as write_export
 
 
 def export(options: Namespace) -> int:
     """`quadsim export`."""
     scenario = load(options.scenario, options)
-    directory = write_export(scenario, Path(options.out), precision=options.precision, target=options.target)
+    machine = {"precision": options.precision, "target": options.target}
+    directory = write_export(scenario, Path(options.out), overwrite=options.overwrite, **machine)
     print(f"Wrote {directory}: make -C {shlex.quote(str(directory))} check compiles it and runs its recorded periods")
     if not options.fly:
         return EXIT_DONE
     from scenarios.export.in_the_loop import fly_exported
 
-    run = real_path(Path("runs") / f"{scenario.name}-{options.target}")
-    flight = fly_exported(scenario, run, precision=options.precision, target=options.target)
-    console.print_summary(rundir.read_summary(run), str(run))
+    with reserving(Path("runs") / f"{scenario.name}-{options.target}", free=True) as run:
+        flight = fly_exported(scenario, run, **machine)
+    console.print_summary(rundir.read_summary(run), shown(run))
     return EXIT_DONE if flight.satisfied else EXIT_FAILED

@@ -5,15 +5,16 @@ from __future__ import annotations
 from argparse import Namespace
 from pathlib import Path
 
-from quadsim.errors import ParameterError
+from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.flight import rundir
-from quadsim.outputs import real_path, require_file
-from scenarios.api import check as check_run
+from quadsim.outputs import reserving
+from scenarios import api
 from scenarios.api import feasibility, fitting, fly
+from scenarios.campaign.manifest import is_campaign
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
-from scenarios.commands.common import load, print_summary
+from scenarios.commands.common import load, print_summary, shown
 from scenarios.flight import Flight
-from scenarios.junit import write_junit
+from scenarios.junit import junit_file, write_junit
 from scenarios.reaudit import Reaudit
 from scenarios.schema.scenario import Scenario
 
@@ -21,30 +22,44 @@ from scenarios.schema.scenario import Scenario
 def run(options: Namespace) -> int:
     """`quadsim run`."""
     scenario = load(options.scenario, options)
-    target = real_path(Path("runs") / scenario.name if options.out is None else options.out)
     _announce(scenario, options)
-    flight = fly(
-        scenario,
-        out=target,
-        video=options.video,
-        recording=options.recording,
-        figures=options.figures,
-        progress=not options.json,
-    )
-    print_summary(rundir.read_summary(target), options, where=str(target))
-    return EXIT_DONE if flight.satisfied else EXIT_FAILED
+    out = Path("runs") / scenario.name if options.out is None else options.out
+    with reserving(out, overwrite=options.overwrite, free=options.out is None and not options.overwrite) as target:
+        try:
+            satisfied = fly(
+                scenario,
+                out=target,
+                overwrite=options.overwrite,
+                video=options.video,
+                recording=options.recording,
+                figures=options.figures,
+                progress=not options.json,
+            ).satisfied
+        except OutputError as error:
+            if error.path.parent == target:  # a product that was asked for by name; the flight is there
+                print_summary(rundir.read_summary(target), options, where=shown(target))
+            raise
+    print_summary(rundir.read_summary(target), options, where=shown(target))
+    return EXIT_DONE if satisfied else EXIT_FAILED
 
 
 def check(options: Namespace) -> int:
     """`quadsim check`."""
     if options.junit is not None:
-        require_file(options.junit, ".xml")
+        options.junit = junit_file(options.junit)
     found: Flight | Reaudit
-    if Path(options.target).is_dir():
+    directory = Path(options.target)
+    if directory.is_dir():
         if options.settings or options.seed is not None:
             option, value = ("--set", options.settings) if options.settings else ("--seed", options.seed)
             raise ParameterError("", option, value, "absent when a finished run is checked")
-        found = check_run(options.target)
+        if is_campaign(directory):
+            name = options.target
+            raise InputError(
+                f"{name} is a campaign, not a run: quadsim replay {name} --worst makes a run of its worst flight; "
+                "quadsim campaign --require judges them all"
+            )
+        found = api.check(directory)
         summary = {**found.summary, "reaudit": found.to_json()}
         for note in found.notes:
             console.say(f"{options.target}: {note}")

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import webbrowser
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
-from quadsim.errors import OutputError, ParameterError
-from quadsim.flight.rundir import KIND
-from quadsim.outputs import real_path, require_directory
+from quadsim.errors import ParameterError
+from quadsim.outputs import reserving
 from scenarios.api import load as load_scenario
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
-from scenarios.commands.common import load
+from scenarios.commands.common import load, shown
 from scenarios.live.guard import LOOPBACK
 from scenarios.live.pacing import Pace
 from scenarios.live.script import play, read_script
@@ -38,43 +36,35 @@ def live(options: Namespace) -> int:
         from scenarios.live.page import require_server
 
         require_server(options.host, options.port)
-    target = real_path(Path("runs") / f"{scenario.name}-live" if options.out is None else options.out)
-    _require_writable(target)
-    session = Session(scenario, against)
+    out = Path("runs") / f"{scenario.name}-live" if options.out is None else options.out
+    free = options.out is None and not options.overwrite
+    with reserving(out, overwrite=options.overwrite, free=free) as target:
+        session = Session(scenario, against)
+        replaced = options.overwrite
 
-    def save(session: Session) -> str:
-        session.flight().save(target, video=options.video)
-        return str(target)
+        def save(session: Session) -> str:
+            nonlocal replaced
+            session.flight().save(target, overwrite=replaced, video=options.video)
+            replaced = True  # the next time it is this session's own
+            return shown(target)
 
-    try:
         try:
-            if finished:  # to where it ended
-                while session.reason is None and session.k < scenario.periods:
-                    session.advance()
-            if script is not None:
-                for reason in play(session, script):
-                    console.say(f"refused: {reason}")
-            else:
-                _serve(session, options, save)
-        except KeyboardInterrupt:  # what was flown is saved
-            print(file=sys.stderr)
-        if session.k:
-            print(f"{save(session)}: {session.k * session.period:.2f} s, {session.flight().outcome}")
-        return EXIT_DONE if session.reason is None else EXIT_FAILED
-    finally:
-        session.close()
-
-
-def _require_writable(target: Path) -> None:
-    """Refuse, before anything is flown, a place that could not be written.
-
-    Raises:
-        OutputError: it could not.
-    """
-    require_directory(target, KIND)
-    parent = next(each for each in target.parents if each.exists())
-    if not os.access(parent, os.W_OK | os.X_OK):
-        raise OutputError(target, f"{parent} is not writable")
+            try:
+                if finished:  # to where it ended
+                    while session.reason is None and session.k < scenario.periods:
+                        session.advance()
+                if script is not None:
+                    for reason in play(session, script):
+                        console.say(f"refused: {reason}")
+                else:
+                    _serve(session, options, save)
+            except KeyboardInterrupt:  # what was flown is saved
+                print(file=sys.stderr)
+            if session.k:
+                print(f"{save(session)}: {session.k * session.period:.2f} s, {session.flight().outcome}")
+            return EXIT_DONE if session.reason is None else EXIT_FAILED
+        finally:
+            session.close()
 
 
 def _serve(session: Session, options: Namespace, save: Callable[[Session], str]) -> None:

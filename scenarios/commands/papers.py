@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 from argparse import Namespace
 
-from quadsim.outputs import require_file
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
-from scenarios.junit import write_junit
+from scenarios.junit import junit_file, write_junit
 from scenarios.many_flights import reproduce as reproduce_papers
 
 
 def reproduce(options: Namespace) -> int:
     """`quadsim reproduce`."""
     if options.junit is not None:
-        require_file(options.junit, ".xml")
+        options.junit = junit_file(options.junit)
     found = reproduce_papers(options.paper, progress=not options.json)
     if options.junit is not None:
         write_junit(found, options.junit)

@@ -8,12 +8,13 @@ from quadsim.errors import printable
 from scenarios.api import film
 from scenarios.api import view as view_run
 from scenarios.commands import EXIT_DONE
+from scenarios.commands.common import shown
 
 
 def video(options: Namespace) -> int:
     """`quadsim video`."""
-    path = film(options.run, options.out, workers=options.workers)
-    print(f"written to {printable(str(path))}")
+    path = film(options.run, options.out, overwrite=options.overwrite, workers=options.workers)
+    print(f"written to {printable(shown(path))}")
     return EXIT_DONE
 
 

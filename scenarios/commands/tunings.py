@@ -6,6 +6,7 @@ import json
 from argparse import Namespace
 
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
+from scenarios.commands.common import shown
 from scenarios.many_flights import tune as carry_out
 
 
@@ -22,6 +23,7 @@ def tune(options: Namespace) -> int:
             workers=options.workers,
             cluster=options.cluster,
             resume=options.resume,
+            overwrite=options.overwrite,
             report=options.report,
             progress=False if options.json else "lines",
         )
@@ -37,5 +39,5 @@ def tune(options: Namespace) -> int:
         out.print(console.styled((result.summary["tuning"], "bold"), f": {verdict_sentence(result.summary)}"))
         for sentence in sentences(result.summary):
             out.print(sentence, soft_wrap=True)
-        console.print_grids(tables(result.summary), str(result.directory), prose=("fields",))
+        console.print_grids(tables(result.summary), shown(result.directory), prose=("fields",))
     return EXIT_DONE if result.holds else EXIT_FAILED

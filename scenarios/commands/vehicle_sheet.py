@@ -24,7 +24,7 @@ def vehicle(options: Namespace) -> int:
         names = ", ".join(vehicle_names())
         raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
     if options.out is not None:
-        draw_vehicle(options.vehicle, options.out)
+        draw_vehicle(options.vehicle, options.out, overwrite=options.overwrite)
     found = vehicle_report(options.vehicle, scenario=options.scenario)
     if options.json:
         print(json.dumps(found.to_json(), indent=2))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from quadsim.flight.metrics import percentiles
-from quadsim.outputs import write_json, write_text
+from quadsim.outputs import to_json
 from quadsim.report.pages.comparison_page import CostSection
 from quadsim.report.table import format_number
 from scenarios.campaign.statistics.wording import listing
@@ -28,9 +28,9 @@ def cost_section(study: CostStudy) -> Callable[[Path], CostSection]:
 
     def write(directory: Path) -> CostSection:
         sentences = cost_sentences(study)
-        write_json(directory / COST_FILE, study.to_json())
+        (directory / COST_FILE).write_text(to_json(study.to_json()), encoding="utf-8")
         text = f"# What do constraints cost?\n\n{cost_markdown(study, sentences)}"
-        write_text(directory / COST_TABLES_FILE, text)
+        (directory / COST_TABLES_FILE).write_text(text, encoding="utf-8")
         figures = [path for path in write_cost_figures(study, directory) if path.suffix == ".svg"]
         return CostSection(
             name=study.name,

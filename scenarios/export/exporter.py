@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from mpc.export.ctext import number
 from mpc.export.source import DATA, HEADER, SOURCE, Exportable, Precision, part, sources
 from mpc.export.targets import TARGETS, Target
 from quadsim.errors import ParameterError
-from quadsim.outputs import real_path, require_directory, write_text, writing
+from quadsim.outputs import absolute, reserving, writing
 from quadsim.state import Array
 from scenarios.api import as_scenario
 from scenarios.export.record import Recording, record
@@ -19,11 +19,14 @@ from scenarios.parts.controllers import exportable
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 
-KIND: Final = "export"  # what `quadsim.outputs` calls such a directory
-
 
 def export(
-    scenario: Scenario | str | Path, out: str | Path, *, precision: Precision = "double", target: str = "posix"
+    scenario: Scenario | str | Path,
+    out: str | Path,
+    *,
+    overwrite: bool = False,
+    precision: Precision = "double",
+    target: str = "posix",
 ) -> Path:
     """Write a scenario's controller as self-contained C99, with the periods of the scenario's flight as test vectors.
 
@@ -32,7 +35,8 @@ def export(
 
     Args:
         scenario: it, or its name or file.
-        out: the directory; an earlier export there is replaced.
+        out: the directory.
+        overwrite: whether to replace an earlier output there.
         precision: of all numbers, `double` or `float`.
         target: the machine that its programs are for: `posix`, or `cortex-m7` or `cortex-m4f` on a board that QEMU
             emulates.
@@ -53,14 +57,13 @@ def export(
         if value not in allowed:
             raise ParameterError("", f"--{name}", value, f"one of {', '.join(allowed)}")
     scenario = as_scenario(scenario)
-    directory = real_path(out)
-    require_directory(directory, KIND)
-    files = controller_files(scenario, precision) | vector_files(record(scenario))
-    files |= {"README.md": _readme(scenario, precision), **programs(TARGETS[target])}
-    with writing(directory, KIND) as partial:
-        for name, text in files.items():
-            write_text(partial / name, text)
-    return directory
+    with reserving(out, overwrite=overwrite) as directory:
+        files = controller_files(scenario, precision) | vector_files(record(scenario))
+        files |= {"README.md": _readme(scenario, precision), **programs(TARGETS[target])}
+        with writing(directory, overwrite=overwrite) as partial:
+            for name, text in files.items():
+                (partial / name).write_text(text, encoding="utf-8")
+    return absolute(out)
 
 
 def controller_files(scenario: Scenario, precision: Precision) -> dict[str, str]:

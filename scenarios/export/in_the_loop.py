@@ -15,7 +15,7 @@ from mpc.export.source import Precision
 from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
 from quadsim.controller import GROUNDED, SOLVED, Command, Moment, stopped
-from quadsim.outputs import real_path, write_text
+from quadsim.outputs import absolute
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.api import as_scenario
@@ -111,14 +111,14 @@ def fly_exported(
     with tempfile.TemporaryDirectory(prefix="quadsim-") as scratch, reporting(progress) as report:
         directory = Path(scratch)
         for name, text in files.items():
-            write_text(directory / name, text)
+            (directory / name).write_text(text, encoding="utf-8")
         image = build(directory, "serial.elf", "CPPFLAGS=-DWATCHDOG_MS=0")  # the emulated clock is not the flight's
         with Program(machine, image) as line:
             serial = SerialMPC(line, precision, problem.horizon)
             law = MPCInTheLoop(serial, problem, scenario.controller.type, machine)
             if out is None:
                 return fly_scenario(scenario, report, law)
-            return run_scenario(scenario, real_path(out), Outputs(video=False), report, law)
+            return run_scenario(scenario, absolute(out), Outputs(video=False), report, law)
 
 
 def _allowing(scenario: Scenario, spacing: float) -> Scenario:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadsim.errors import FlightError, ParameterError
-from quadsim.outputs import require_new, write_new
+from quadsim.outputs import require_file, writing_file
 from quadsim.state import Array
 from scenarios.gym.actions import Action
 from scenarios.gym.registration import make_env
@@ -63,7 +63,7 @@ def expert(
     if episodes < 1:
         raise ParameterError("", "episodes", episodes, "at least 1")
     if out is not None:
-        require_new(out)
+        require_file(out)
     env = make_env(scenario, **options)
     base = env.unwrapped
     rows: dict[str, list[Any]] = {
@@ -96,5 +96,6 @@ def expert(
     if out is not None:
         buffer = pa.BufferOutputStream()
         pq.write_table(table, buffer, compression="zstd")
-        write_new(Path(out), buffer.getvalue().to_pybytes())
+        with writing_file(out) as file:
+            file.write_bytes(buffer.getvalue().to_pybytes())
     return table

@@ -15,7 +15,7 @@ from typing import Final
 from mpc.export.compiled import CompiledMPC
 from mpc.export.source import Exportable, part, sources
 from quadsim.errors import CompilerError, OutputError
-from quadsim.outputs import write_new
+from quadsim.outputs import writing_file
 
 FLAGS: Final = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 """Without contraction all processors, and all levels of optimisation, have the same bits."""
@@ -72,7 +72,8 @@ def compiled(files: Mapping[str, str], room: int | None = None, changes: int | N
     if not library.exists():
         content = _compile(compiler, flags, sources)
         try:
-            write_new(library, content)
+            with writing_file(library) as file:
+                file.write_bytes(content)
         except OutputError:
             if not library.exists():  # else another process was sooner
                 raise

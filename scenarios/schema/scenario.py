@@ -144,7 +144,7 @@ MOST_STEPS: Final = 10_000_000
 """Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
 
 
-Verdict = Literal["satisfied", "violated", "lost"]
+Verdict = Literal["satisfied", "violated", "lost", "aborted"]
 
 
 class Scenario(Spec):

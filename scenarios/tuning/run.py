@@ -16,11 +16,12 @@ import tomlkit
 
 from quadsim.errors import InputError, OutputError
 from quadsim.flight.form import Optional, read_json
-from quadsim.outputs import Growing, digest, digest_of, growing, to_json
+from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
+from quadsim.outputs import Growing, growing, to_json
 from scenarios.campaign import manifest as records
 from scenarios.campaign.pilot import fly_flights
 from scenarios.campaign.report.campaign_page import write_comparison_report
-from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE, Store
+from scenarios.campaign.results.store import Store
 from scenarios.campaign.results.table import Row
 from scenarios.campaign.run import Standing, Watch, fly_campaign, new_session, put_report
 from scenarios.campaign.statistics.comparison import Comparison, compare
@@ -30,24 +31,17 @@ from scenarios.tuning.pilot import TuningPilot
 from scenarios.tuning.plan import TuningPlan, Values
 from scenarios.tuning.ranking import Score, answer, pareto, ranked, score
 from scenarios.tuning.report.tuning_page import write_report
-from scenarios.tuning.search import JOURNAL_FILE, Search, require_optuna
+from scenarios.tuning.search import Search, require_optuna
 from scenarios.tuning.spec import START
 
-KIND: Final = "tuning"  # what `quadsim.outputs` calls a tuning's directory
 FORMAT: Final = "quadsim tuning"
 MANIFEST_FILE: Final = "manifest.json"
 TUNING_FILE: Final = "tuning.toml"
 SCENARIO_FILE: Final = "scenario.toml"
 ANSWER_FILE: Final = "best.toml"
-SUMMARY_FILE: Final = "summary.json"
 REPORT_FILES: Final = ("index.html", "tuning.png", "tuning.svg")
-ALL_FILES: Final = (
-    *(TUNING_FILE, SCENARIO_FILE, MANIFEST_FILE, JOURNAL_FILE, ANSWER_FILE),
-    *(SUMMARY_FILE, FLIGHTS_FILE, TIMES_FILE, *REPORT_FILES),
-)
-"""What a tuning's directory holds in the end; see also `tune`."""
 START_DIR, ANSWER_DIR, COMPARISON_DIR = "start", "candidate-{}", "comparison"
-_FORM: Final = {"format": str, "status": str, "files": dict, "sessions": [dict], "optuna": Optional(str)}
+_FORM: Final = {"format": str, "status": str, "sessions": [dict], "optuna": Optional(str)}
 _MAY_GROW: Final = ("trials", "fresh", "description")
 
 
@@ -82,12 +76,13 @@ def tune(
     workers: int | None = None,
     cluster: str | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     report: bool = True,
     watch: Watch = lambda standing: None,
 ) -> TuningResult:
     """Search, or continue it, and hold the answer against the start.
 
-    The same file gives the same answer with any workers and order, interrupted or not.  Beside `ALL_FILES`, the
+    The same file gives the same answer with any workers and order, interrupted or not.  Besides its own files, the
     directory has the campaigns on fresh draws, `start/` and `candidate-N/`, their `comparison/`, and of two objectives
     `front-N.toml` for each point of the Pareto front.
 
@@ -97,6 +92,7 @@ def tune(
         workers: see `scenarios.many.fly_many`.
         cluster: the same.
         resume: whether to continue what the directory holds, perhaps with more trials.
+        overwrite: whether to replace an earlier output there.
         report: whether to write the pages and their figures.
         watch: called with the progress, as answers come.
 
@@ -107,16 +103,14 @@ def tune(
         KeyboardInterrupt: a person stopped it; what was flown is there.
     """
     session = new_session(workers, cluster)
-    going_on = (directory / MANIFEST_FILE).is_file()
+    going_on = (directory / MANIFEST_FILE).is_file() and not overwrite
     if going_on and not resume:
         raise OutputError(directory, "a tuning is already there; continue it with --resume, or choose another --out")
-    with growing(directory, KIND) as files:
-        files.require(ALL_FILES)
+    with growing(directory, MANIFEST_FILE, overwrite=overwrite) as files:
         manifest = _go_on(plan, files) if going_on else _begin(plan)
-        texts = _texts(plan)
-        manifest["files"] |= {name: digest(text) for name, text in texts.items()}
+        files.remove([SUMMARY_FILE])
         manifest["sessions"].append(session)
-        files.write({**texts, MANIFEST_FILE: to_json(manifest).encode()})
+        files.write({**_texts(plan), MANIFEST_FILE: to_json(manifest).encode()})
         flights = _Flights(plan, files, workers, cluster, watch)
         started = clock.perf_counter()
         try:
@@ -124,7 +118,7 @@ def tune(
             _search(plan, search, flights)
             table = flights.close()
             found = _conclude(plan, search, flights)
-            files.remove(path.name for path in sorted(directory.glob("front-*.toml")))
+            files.remove([path.name for path in sorted(files.path.glob("front-*.toml"))])
             files.write({ANSWER_FILE: found.best.to_toml().encode(), **_front(plan, found)})
             result = _validate(plan, files, found, table, workers=workers, cluster=cluster, report=report, watch=watch)
             manifest["status"] = "complete"
@@ -133,9 +127,8 @@ def tune(
             raise
         finally:
             session |= {"flights": flights.flown, "wall_s": clock.perf_counter() - started}
-            ours = [name for name in ALL_FILES if name != MANIFEST_FILE and (directory / name).is_file()]
-            manifest["files"] = {name: digest_of(directory / name) for name in ours}
             files.write({MANIFEST_FILE: to_json(manifest).encode()})
+        files.finish(result.summary)
     return result
 
 
@@ -271,9 +264,8 @@ def _validate(
     if best != START:
         comparison = compare(tables[0], tables[1], NAMES)
     if comparison is not None and report:
-        write_comparison_report(comparison, files.path / COMPARISON_DIR)
+        write_comparison_report(comparison, files.path / COMPARISON_DIR, overwrite=True)
     summary = summarise(plan, found, tables[0], tables[-1])
-    files.write({SUMMARY_FILE: to_json(summary).encode()})
     write = partial(write_report, summary=summary, tables=tables, campaigns=folders)
     put_report(files, REPORT_FILES, write if report else None)
     return TuningResult(directory=files.path, best=found.best, table=table, summary=summary, comparison=comparison)
@@ -287,7 +279,6 @@ def _begin(plan: TuningPlan) -> dict[str, Any]:
         "description": plan.spec.description,
         "scenario": plan.scenario.name,
         "status": "running",
-        "files": {},
         "optuna": require_optuna().__version__,
         **records.flown_by(plan.start),
         **records.controller_code(plan.start),

@@ -301,7 +301,7 @@ def test_a_force_that_fails_ends_the_flight_with_its_reason(hover: Scenario) -> 
         return np.zeros(6) if time < 0.5 else np.full(5, np.nan)
 
     flown = quadsim.fly(hover, forces=[bad], progress=False)
-    assert flown.outcome == "lost"
+    assert flown.outcome == "aborted"
     assert "at t = 0.500 s: the force bad must give six finite numbers" in str(flown.log.reason)
 
 
@@ -396,7 +396,7 @@ def test_ctrl_c_ends_a_flight_in_order() -> None:
     signal.signal(signal.SIGINT, before)
     assert flown.log.interrupted
     assert 0.0 < flown.time[-1] < 599.0
-    assert flown.outcome == "lost"
+    assert flown.outcome == "aborted"
 
 
 def test_without_a_terminal_no_progress_is_printed(hover: Scenario, capfd: pytest.CaptureFixture[str]) -> None:

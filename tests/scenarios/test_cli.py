@@ -367,16 +367,16 @@ WRONG: dict[str, tuple[list[str], str]] = {
     ),
     "a setting without a value": ([*RUN, "--set", "duration"], "--set must be of the form dotted.path=value"),
     "a negative seed": ([*RUN, "--seed", "-1"], "seed must be >= 0; got -1"),
-    "out below a file": ([*RUN, "--out", "file/run"], "cannot write file/run: file is a file"),
-    "out is a file": ([*RUN, "--out", "file"], "cannot write file: something else is already there"),
-    "out is no run": ([*RUN, "--out", "folder"], "cannot write folder: something else is already there"),
+    "out below a file": ([*RUN, "--out", "file/run"], "/file is a file"),
+    "out is a file": ([*RUN, "--out", "file"], "file: a file is already there; choose another --out"),
+    "out is no run": ([*RUN, "--out", "folder"], "it is not empty ("),
     "out cannot be written": ([*RUN, "--out", "/proc/quadsim/run"], "cannot write /proc/quadsim/run: "),
     "out has too long a name": ([*RUN, "--out", "x" * 300], ": File name too long"),
     "check of nothing": (["check", "gone"], "no scenario named 'gone'"),
     "check of no run": (["check", "folder"], "folder: is not a run directory"),
     "check of a run with settings": (["check", "folder", "--seed", "1"], "absent when a finished run is checked"),
-    "junit below a file": (["check", "hover", *SHORT, "--junit", "file/v.xml"], "cannot write file/v.xml: "),
-    "junit is a folder": (["check", "hover", *SHORT, "--junit", "folder"], "cannot write folder: is a folder"),
+    "junit below a file": (["check", "hover", *SHORT, "--junit", "file/v.xml"], "/file/v.xml: Not a directory"),
+    "junit is a folder": (["check", "hover", *SHORT, "--junit", "folder"], "/folder: is a folder"),
     "compare of nothing": (["compare", "gone", "--out", "page"], "no scenario named 'gone'"),
     "compare of no run": (["compare", "folder", "--out", "page"], "folder: is not a run directory"),
     "video of nothing": (["video", "gone"], "gone: is not a run directory"),
@@ -471,7 +471,7 @@ def test_check_finds_a_damaged_file(
     assert printed.out == ""
 
 
-def test_a_run_that_needs_a_film_is_refused_before_it_is_flown_where_nothing_renders(
+def test_a_film_asked_for_by_name_is_refused_before_anything_is_flown_where_nothing_renders(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def nothing_renders() -> str:
@@ -483,14 +483,15 @@ def test_a_run_that_needs_a_film_is_refused_before_it_is_flown_where_nothing_ren
     monkeypatch.setattr("quadsim.report.film.video.rendering_backend", nothing_renders)
     with monkeypatch.context() as grounded:
         grounded.setattr("scenarios.run.fly_scenario", flown)
-        assert main(["run", "hover"]) == EXIT_WRONG_INPUT
+        assert main(["run", "hover", "--video"]) == EXIT_WRONG_INPUT
     printed = capsys.readouterr()
     assert printed.err.startswith(
         "quadsim: no off-screen OpenGL on this machine (egl: no libEGL; osmesa: no libOSMesa)"
     )
     assert "or run with --no-video" in printed.err
     assert left_in(here) == []
-    assert main(["run", "hover", *SHORT, *TABLES, "--json"]) == EXIT_DONE  # which works
+    assert main(["run", "hover", *SHORT, "--no-recording", "--no-figures", "--json"]) == EXIT_DONE
+    assert "no libEGL" in rundir.read_summary(here / "runs" / "hover")["products"]["flight.mp4"]
 
 
 @pytest.mark.parametrize("free", [0, 2**20])
@@ -499,7 +500,7 @@ def test_a_full_disk_is_status_2_and_leaves_nothing(
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2**30, 2**30 - free, free))
     assert main([*RUN, "--out", "new/run"]) == EXIT_WRONG_INPUT
-    assert capsys.readouterr().err == "quadsim: cannot write new/run: the disk is full\n"
+    assert capsys.readouterr().err == f"quadsim: cannot write {here.resolve()}/new/run: the disk is full\n"
     assert left_in(here) == []
 
 
@@ -511,20 +512,20 @@ def test_a_disk_that_fills_up_in_the_writing_is_status_2_and_leaves_nothing(
 
     monkeypatch.setattr("pyarrow.parquet.write_table", full)
     assert main([*RUN, "--out", "new/run"]) == EXIT_WRONG_INPUT
-    assert capsys.readouterr().err == "quadsim: cannot write new/run: No space left on device\n"
+    assert capsys.readouterr().err == f"quadsim: cannot write {here.resolve()}/new/run: No space left on device\n"
     assert left_in(here) == []
 
 
-def test_ctrl_c_outside_a_flight_is_status_1_and_leaves_nothing(
+def test_ctrl_c_while_figures_are_drawn_keeps_the_flight_and_its_status(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("quadsim.report.figures.flight_figures.write_figures", interrupted)
-    assert main(["run", "hover", *SHORT, "--no-video", "--no-recording"]) == EXIT_FAILED
-    assert capsys.readouterr().err == "quadsim: interrupted (Ctrl-C); nothing half written was left behind\n"
-    assert left_in(here) == []
+    assert main(["run", "hover", *SHORT, "--no-recording"]) == EXIT_DONE
+    assert capsys.readouterr().err == "quadsim: figures interrupted (Ctrl-C)\n"
+    assert rundir.read_summary(here / "runs" / "hover")["products"] == {"figures": "interrupted (Ctrl-C)"}
 
 
 def test_a_defect_of_our_own_shows_its_traceback(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,7 @@ from scenarios.flight import Outputs
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.machine import PACKAGES
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.reaudit import reaudit
 from scenarios.run import fly_scenario, run_scenario
 
 TABLES = Outputs(video=False, recording=False, figures=False)
@@ -181,9 +182,12 @@ def test_any_horizon_flies(name: str, horizon: int) -> None:
     assert flight.log.predicted.shape == (10, horizon, 3)
 
 
-def test_a_second_run_replaces_the_first(tmp_path: Path) -> None:
+def test_a_second_run_replaces_the_first_only_on_request(tmp_path: Path) -> None:
     run(tmp_path / "run", SHORT)
-    assert run(tmp_path / "run", SHORT, "seed=1").summary["seed"] == 1
+    with pytest.raises(OutputError, match="it is not empty"):
+        run(tmp_path / "run", SHORT, "seed=1")
+    run_scenario(load_scenario("hover", [SHORT, "seed=1"]), tmp_path / "run", TABLES, overwrite=True)
+    assert rundir.read_summary(tmp_path / "run")["seed"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
@@ -218,7 +222,7 @@ def test_a_flight_lost_on_the_way_is_recorded_up_to_there(tmp_path: Path) -> Non
 def test_a_flight_that_was_interrupted_is_not_what_any_scenario_expects(tmp_path: Path) -> None:
     scenario = load_scenario("hover", [SHORT, "expect=lost"])
     flight = run_scenario(scenario, tmp_path / "run", TABLES, interrupt_after(3))
-    assert flight.outcome == "lost"
+    assert flight.outcome == "aborted"
     assert rundir.read_summary(tmp_path / "run")["as_expected"] is False
 
 
@@ -280,19 +284,38 @@ def test_a_disk_that_fills_up_while_a_table_is_written_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
-def test_a_run_whose_products_cannot_be_finished_leaves_the_earlier_one(
+def test_ctrl_c_while_tables_are_written_loses_no_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_table, stops = pq.write_table, [KeyboardInterrupt()]
+
+    def stopped(*arguments: Any, **options: Any) -> None:
+        write_table(*arguments, **options)
+        if stops:
+            raise stops.pop()
+
+    monkeypatch.setattr(pq, "write_table", stopped)
+    flown = run(tmp_path / "run", SHORT)
+    assert flown.summary["status"] == "completed"
+    assert rundir.damaged_files(flown.directory, flown.summary) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt(), ValueError("no")]
+)
+def test_a_run_whose_product_fails_keeps_all_else_and_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
-    earlier = run(tmp_path / "run", SHORT)
-
     def failing(*_: object) -> None:
         raise error
 
     monkeypatch.setattr("quadsim.report.figures.flight_figures.write_figures", failing)
-    with pytest.raises((OutputError, KeyboardInterrupt)):
-        run_scenario(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
-    assert rundir.read_summary(tmp_path / "run") == earlier.summary
+    run_scenario(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
+    summary = rundir.read_summary(tmp_path / "run")
+    assert summary["products"].keys() == {"figures", "flight.rrd"}
+    assert summary["products"]["figures"].startswith(
+        "interrupted" if isinstance(error, KeyboardInterrupt) else "failed: "
+    )
+    assert rundir.damaged_files(tmp_path / "run", summary) == []
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
@@ -310,14 +333,16 @@ def test_a_defect_of_our_own_is_not_taken_for_a_flight(tmp_path: Path, monkeypat
 
 @pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize("cores", [1, 2])
-def test_a_recording_that_cannot_be_made_leaves_nothing(
+def test_a_recording_that_was_asked_for_and_cannot_be_made_is_an_error_and_all_else_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
 ) -> None:
     monkeypatch.setattr("scenarios.flight.usable_cores", lambda: cores)
     monkeypatch.setenv("RERUN", "off")
-    with pytest.raises(OutputError, match=r"run/flight\.rrd: rerun is switched off by the environment variable RERUN$"):
-        run_scenario(load_scenario("hover", [SHORT]), tmp_path / "new" / "run", Outputs(video=False))
-    assert list(tmp_path.iterdir()) == []
+    scenario, target = load_scenario("hover", [SHORT]), tmp_path / "new" / "run"
+    with pytest.raises(OutputError, match=r"run/flight\.rrd: failed: .*rerun is switched off by .* RERUN; all else is"):
+        run_scenario(scenario, target, Outputs(video=False, recording=True))
+    assert reaudit(target).summary["products"]["figures"] == "made"
+    assert "flight.rrd" not in reaudit(target).summary["files"]
 
 
 @pytest.mark.usefixtures("sketched")
@@ -329,7 +354,6 @@ def test_outputs_are_made_as_requested(tmp_path: Path, monkeypatch: pytest.Monke
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {
         "summary.json", "scenario.toml", FLIGHT_FILE, TIMING_FILE, PLANT_FILE, HORIZON_FILE, "flight.rrd", "figures",
-        ".quadsim.json",
     }  # fmt: skip
     assert list((tmp_path / "run" / "figures").glob("*.png"))
     assert rundir.damaged_files(tmp_path / "run", rundir.read_summary(tmp_path / "run")) == []

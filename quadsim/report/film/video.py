@@ -87,12 +87,13 @@ def render_video(
     start: float = 0.0,
     stop: float | None = None,
     speed: float = 1.0,
+    overwrite: bool = False,
 ) -> None:
     """Film a run as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all.
 
     Args:
         run_directory: a run with its summary and Parquet files.
-        path: the MP4 to write; an earlier one is replaced, if it is as we wrote it.
+        path: the MP4 to write.
         workers: rendering processes, at most; the machine's cores when None.
         progress: called with frames done and frames in all, in the caller's thread.
         width: [pixels], even.
@@ -101,6 +102,7 @@ def render_video(
         start: first simulated time shown [s].
         stop: last simulated time shown [s]; the flight's end when None.
         speed: simulated seconds per second of film.
+        overwrite: whether to replace a file that is there.
 
     Raises:
         FileError: the run cannot be read, or holds nothing to film.
@@ -111,7 +113,7 @@ def render_video(
     shot = _plan(load_run(run_directory), start, stop, Shot(
         run=str(run_directory), width=width, height=height, fps=fps, speed=speed, count=1
     ))  # fmt: skip
-    with _making(path, ".mp4") as new:
+    with _making(path, overwrite) as new:
         _film(shot, new, workers, progress)
 
 
@@ -125,6 +127,7 @@ def render_gif(
     stop: float | None = None,
     speed: float = 6.0,
     workers: int | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Film a run as a small looping GIF in 16:9, a time-lapse by default; arguments and errors as `render_video`.
 
@@ -134,15 +137,17 @@ def render_gif(
         run=str(run_directory), width=2 * width, height=2 * round(width * 9 / 16), fps=fps, speed=speed, count=1,
         compact=True,
     ))  # fmt: skip
-    with _making(path, ".gif") as new:
+    with _making(path, overwrite) as new:
         film = new.with_suffix(".mp4")
         backend = _film(shot, film, workers, None)
         _work([_to_gif(film, new, width)], backend, new.parent)
 
 
-def render_portrait(vehicle: Vehicle, path: Path, *, width: int = 1280, height: int = 720) -> None:
+def render_portrait(
+    vehicle: Vehicle, path: Path, *, width: int = 1280, height: int = 720, overwrite: bool = False
+) -> None:
     """Draw a vehicle standing on a floor of 10 cm squares, as a PNG of so many pixels; errors as `render_video`."""
-    with _making(path, ".png") as new:
+    with _making(path, overwrite) as new:
         command = (*_WORKER, "portrait", json.dumps(asdict(vehicle)), str(new), str(width), str(height))
         _work([command], rendering_backend(), new.parent)
 
@@ -197,10 +202,10 @@ class _WorkerFailure(Exception):
 
 
 @contextlib.contextmanager
-def _making(path: Path, form: str) -> Iterator[Path]:
+def _making(path: Path, overwrite: bool) -> Iterator[Path]:
     """A file to be made in a folder of its own; see `writing_file`.  A worker's failure becomes an `OutputError`."""
     try:
-        with writing_file(path, form) as new:
+        with writing_file(path, overwrite=overwrite) as new:
             yield new
     except _WorkerFailure as failure:
         raise OutputError(path, f"the renderer failed: {failure}") from failure

@@ -14,8 +14,8 @@ from urllib.parse import quote
 from quadsim.errors import OutputError, ParameterError
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import FIGURES_DIR, RECORDING_FILE, SCENARIO_FILE, SUMMARY_FILE, VIDEO_FILE, Run
-from quadsim.outputs import write_text, writing
-from quadsim.outputs.paths import require_inside
+from quadsim.flight.summary import require_inside
+from quadsim.outputs import writing
 from quadsim.report.comparison import comparison_rows, outcome, required, run_names, verdict_cell
 from quadsim.report.figures.flight_figures import comparison_figure
 from quadsim.report.narrative import comparison_sentences
@@ -27,7 +27,6 @@ from quadsim.report.table import Grid, to_markdown
 
 TABLE_FILE: Final = "comparison.md"
 
-KIND: Final = "comparison"  # what `quadsim.outputs` calls such a directory
 _FILES: Final = {
     SUMMARY_FILE: "summary (JSON)",
     SCENARIO_FILE: "scenario (TOML)",
@@ -51,7 +50,13 @@ class CostSection:
     files: tuple[tuple[str, str], ...]
 
 
-def write_comparison(runs: Sequence[Run], directory: Path, cost: Callable[[Path], CostSection] | None = None) -> Path:
+def write_comparison(
+    runs: Sequence[Run],
+    directory: Path,
+    cost: Callable[[Path], CostSection] | None = None,
+    *,
+    overwrite: bool = False,
+) -> Path:
     """Write a comparison of runs, which appears complete or not at all.
 
     The directory holds `index.html`, the overlay `comparison.png` and `.svg`, the table `comparison.md`, and of each
@@ -59,8 +64,9 @@ def write_comparison(runs: Sequence[Run], directory: Path, cost: Callable[[Path]
 
     Args:
         runs: one or more; aborted ones, and ones without video, recording or constraints, are welcome.
-        directory: what to write; an earlier comparison or an empty directory there is replaced.
+        directory: what to write.
         cost: writes the files of a study of what constraints cost into a directory, and gives the page's section.
+        overwrite: whether to replace an earlier output there.
 
     Returns:
         The page, `directory/index.html`.
@@ -79,9 +85,9 @@ def write_comparison(runs: Sequence[Run], directory: Path, cost: Callable[[Path]
             raise OutputError(directory, f"it holds the run {run.directory}, which must stay; choose another --out")
     names = run_names(runs)
     rows = comparison_rows(runs)
-    with writing(directory, KIND) as partial:
+    with writing(directory, overwrite=overwrite) as partial:
         comparison_figure(runs, partial)
-        write_text(partial / TABLE_FILE, to_markdown(rows, names))
+        (partial / TABLE_FILE).write_text(to_markdown(rows, names), encoding="utf-8")
         views = [
             _place(run, name, folder, line_colour(i), partial)
             for i, (run, name, folder) in enumerate(zip(runs, names, _folder_names(names), strict=True))
@@ -89,7 +95,7 @@ def write_comparison(runs: Sequence[Run], directory: Path, cost: Callable[[Path]
         plots = comparison_plots(runs)
         page = render_page(
             "comparison.html.j2",
-            KIND,
+            "comparison",
             title=" and ".join(names) if len(names) < 3 else f"{len(names)} runs: {', '.join(names)}",
             runs=views,
             sentences=comparison_sentences(runs),
@@ -100,7 +106,7 @@ def write_comparison(runs: Sequence[Run], directory: Path, cost: Callable[[Path]
             figure="comparison.svg",
             table=TABLE_FILE,
         )
-        write_text(partial / PAGE_FILE, page)
+        (partial / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
 
 

@@ -31,8 +31,8 @@ import numpy as np
 
 from quadsim.assets import own_packages
 from quadsim.errors import FileError, OutputError, ViewerUnavailableError
-from quadsim.flight.rundir import RECORDING_FILE, Run
-from quadsim.outputs import write_new
+from quadsim.flight.rundir import Run
+from quadsim.outputs import writing_file
 from quadsim.report.palette import line_colour
 from quadsim.report.recording.layout import blueprint
 from quadsim.report.recording.signals import send_effects, send_limit, send_signals, send_solver
@@ -52,8 +52,8 @@ def write_recording(run: Run, path: Path) -> None:
     Raises:
         OutputError: the file cannot be written or is there already, or the environment switches rerun off.
     """
-    path = Path(path)
-    write_new(path, _encode(run, path))
+    with writing_file(path) as new:
+        new.write_bytes(_encode(run, path))
 
 
 def _encode(run: Run, path: Path) -> bytes:
@@ -94,8 +94,8 @@ def _identity(run: Run) -> str:
 
 
 @contextlib.contextmanager
-def recording_in_background(directory: Path) -> Iterator[None]:
-    """Write a run directory's recording while the block runs; it is complete once the block is left.
+def recording_in_background(directory: Path, path: Path) -> Iterator[None]:
+    """Write the recording of a run directory to a file while the block runs; it is complete once the block is left.
 
     A Ctrl-C does not reach the process, which has no terminal of its own: whatever ends the block early ends it too,
     and what it wrote until then is not under the recording's name.
@@ -104,7 +104,7 @@ def recording_in_background(directory: Path) -> Iterator[None]:
         OutputError: the file cannot be written, as from `write_recording`.
     """
     with subprocess.Popen(
-        [sys.executable, "-m", "quadsim.report.recording", str(directory)],
+        [sys.executable, "-m", "quadsim.report.recording", str(directory), str(path)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env={**os.environ, **own_packages()},
@@ -119,7 +119,7 @@ def recording_in_background(directory: Path) -> Iterator[None]:
         raise pickle.loads(raised)
     if process.returncode:
         last = output.decode(errors="replace").strip().rpartition("\n")[2]
-        raise OutputError(directory / RECORDING_FILE, last or f"its process ended with status {process.returncode}")
+        raise OutputError(path, last or f"its process ended with status {process.returncode}")
 
 
 def viewer_problem() -> str | None:

@@ -1,4 +1,4 @@
-"""`python -m quadsim.report.recording RUN`: what `recording_in_background` starts; an error goes to stdout, pickled."""
+"""`python -m quadsim.report.recording RUN FILE`: what `recording_in_background` starts; stdout has a pickled error."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import sys
 import traceback
 from pathlib import Path
 
-from quadsim.flight.rundir import RECORDING_FILE, load_run
+from quadsim.flight.rundir import load_run
 from quadsim.report.recording import write_recording
 
 
-def main(directory: Path) -> int:
-    """Write the recording of a run directory; returns the exit status."""
+def main(directory: Path, path: Path) -> int:
+    """Write the recording of a run directory to a file; returns the exit status."""
     try:
-        write_recording(load_run(directory), directory / RECORDING_FILE)
+        write_recording(load_run(directory), path)
     except Exception as error:
         error.add_note(traceback.format_exc())
         sys.stdout.buffer.write(pickle.dumps(error))
@@ -23,4 +23,4 @@ def main(directory: Path) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    sys.exit(main(Path(sys.argv[1]), Path(sys.argv[2])))

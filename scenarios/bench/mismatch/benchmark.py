@@ -12,10 +12,10 @@ from typing import Final
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from quadsim import outputs
 from quadsim.errors import ParameterError
 from quadsim.flight import metrics
 from quadsim.flight.log import FlightLog
+from quadsim.outputs import to_json
 from quadsim.report.figures.canvas import write_drawings
 from quadsim.report.table import section
 from quadsim.state import INDEX, POSITION, Array
@@ -35,7 +35,6 @@ from scenarios.run import fly_once
 from scenarios.schema.scenario import Scenario
 
 FORMAT: Final = "quadsim bench ladder"
-KIND: Final = "bench ladder"  # what `quadsim.outputs` calls its directory
 RESULTS_FILE: Final = "ladder.json"
 TABLES_FILE: Final = "ladder.md"
 TIMED: Final = 3  # flights that steps are timed in: the machine's own slow spells are not the controller's
@@ -174,8 +173,9 @@ def write_mismatch(measured: MismatchBench, directory: Path) -> None:
     """
     from scenarios.bench.mismatch.survival_figure import draw_mismatch
 
-    outputs.write_json(directory / RESULTS_FILE, {"format": FORMAT, **measured.to_json()})
-    outputs.write_text(directory / TABLES_FILE, mismatch_markdown(measured))
+    results = to_json({"format": FORMAT, **measured.to_json()})
+    (directory / RESULTS_FILE).write_text(results, encoding="utf-8")
+    (directory / TABLES_FILE).write_text(mismatch_markdown(measured), encoding="utf-8")
     write_drawings({"ladder": lambda: draw_mismatch(measured)}, directory)
 
 

@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 import pyarrow as pa
 
-from quadsim.outputs import write_json, write_text, writing
+from quadsim.outputs import to_json, writing
 from quadsim.report.figures.canvas import write_drawings
 from quadsim.report.pages.page import PAGE_FILE, render_page
 from quadsim.report.plots.panels import plotly_script
@@ -36,7 +36,6 @@ _FILES: Final = {
 """What the page links to, where it is there, and under which name."""
 COMPARISON_FILE: Final = "comparison.json"
 TABLE_FILE: Final = "comparison.md"
-KIND: Final = "campaign comparison"  # what `quadsim.outputs` calls such a directory
 
 
 def write_report(
@@ -89,7 +88,7 @@ def write_report(
         ],
         plotly=plotly_script() if plots else "",
     )
-    write_text(directory / PAGE_FILE, page)
+    (directory / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
 
 
@@ -99,21 +98,19 @@ def _mark(summary: Summary) -> Mark:
     return Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
 
 
-def write_comparison_report(comparison: Comparison, directory: Path) -> Path:
+def write_comparison_report(comparison: Comparison, directory: Path, *, overwrite: bool = False) -> Path:
     """Write `index.html`, `comparison.json` and `comparison.md`, which appear together or not at all; the page.
-
-    An earlier comparison of campaigns or an empty directory there is replaced.
 
     Raises:
         OutputError: the directory cannot be written, or holds something else.
     """
     plot = comparison_margins_plot(comparison)
-    with writing(directory, KIND) as partial:
-        write_json(partial / COMPARISON_FILE, comparison.to_json())
-        write_text(partial / TABLE_FILE, comparison_markdown(comparison))
+    with writing(directory, overwrite=overwrite) as partial:
+        (partial / COMPARISON_FILE).write_text(to_json(comparison.to_json()), encoding="utf-8")
+        (partial / TABLE_FILE).write_text(comparison_markdown(comparison), encoding="utf-8")
         page = render_page(
             "campaign_comparison.html.j2",
-            KIND,
+            "campaign comparison",
             title=f"{comparison.names[1]} against {comparison.names[0]}",
             comparison=comparison,
             pairing=pairing(comparison),
@@ -122,5 +119,5 @@ def write_comparison_report(comparison: Comparison, directory: Path) -> Path:
             files=(COMPARISON_FILE, TABLE_FILE),
             plotly=plotly_script() if plot else "",
         )
-        write_text(partial / PAGE_FILE, page)
+        (partial / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE

@@ -90,9 +90,7 @@ class Store:
 
         Raises:
             FileError: a file is damaged or of another campaign.
-            OutputError: a part is not as it was written.
         """
-        self._files.require(self._parts())
         tables = [self._read(self._directory / name) for name in self._parts()]
         if (self._directory / FLIGHTS_FILE).is_file():
             tables.insert(0, self._finished())

@@ -8,7 +8,6 @@ from typing import Final
 
 import pyarrow as pa
 
-from quadsim.outputs import write_text
 from quadsim.report.figures.canvas import write_drawings
 from quadsim.report.pages.page import PAGE_FILE, render_page
 from quadsim.report.plots.panels import plotly_script
@@ -71,5 +70,5 @@ def write_report(
         files={**_FILES, **(fronts if len(summary["objectives"]) == 2 else {})},
         plotly=plotly_script() if plots else "",
     )
-    write_text(directory / PAGE_FILE, page)
+    (directory / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE

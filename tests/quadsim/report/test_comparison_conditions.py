@@ -97,7 +97,6 @@ def test_a_flight_that_never_touches_the_ground_or_crashes_on_it(bare_run: Run) 
         ("completed", True, "satisfied", True, "satisfied, as expected", Mark.GOOD, None),
         ("completed", False, "violated", True, "violated, as expected", Mark.NONE, ", as its scenario states."),
         ("aborted", False, "lost", True, "lost, as expected", Mark.NONE, "flight is lost, as its scenario states."),
-        ("aborted", False, "lost", False, "lost, but interrupted", Mark.BAD, "; its scenario states the verdict lost."),
         ("completed", True, "lost", False, "satisfied, expected: lost", Mark.BAD, "; its scenario states the verdict"),
     ],
 )

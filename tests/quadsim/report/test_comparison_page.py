@@ -94,7 +94,7 @@ def test_the_page_stands_beside_its_files(page_of_two: Path) -> None:
     assert (page.parent.name, page.name) == ("out", "index.html")
     assert page.stat().st_size < 8e6
     assert {path.name for path in page.parent.iterdir()} == {
-        *("index.html", "comparison.png", "comparison.svg", "comparison.md", ".quadsim.json"),
+        *("index.html", "comparison.png", "comparison.svg", "comparison.md", "summary.json"),
         *("paper-constrained.mp4", "paper-constrained", "lost"),
     }
     assert (page.parent / "paper-constrained.mp4").read_bytes() == b"film"
@@ -167,13 +167,13 @@ def test_runs_without_a_period_or_constraints_are_compared(short_run: Run, empty
 def test_an_earlier_comparison_is_replaced_and_nothing_else(short_run: Run, tmp_path: Path) -> None:
     target = tmp_path / "out"
     write_comparison([renamed(short_run, "first")], target)
-    write_comparison([renamed(short_run, "second")], target)
+    write_comparison([renamed(short_run, "second")], target, overwrite=True)
     assert not (target / "first").exists()
     assert (target / "second").is_dir()
     theirs = tmp_path / "theirs"
     theirs.mkdir()
     (theirs / "index.html").write_text("<html>mine</html>")
-    with pytest.raises(OutputError, match="something else is already there"):
+    with pytest.raises(OutputError, match="it is not empty"):
         write_comparison([short_run], theirs)
     assert (theirs / "index.html").read_text() == "<html>mine</html>"
 

@@ -128,9 +128,15 @@ def test_ctrl_c_is_recorded(vehicle: Vehicle, speeds: Array) -> None:
     assert log.control.t.size == 4
 
 
-def test_a_bug_in_a_controller_is_not_swallowed(vehicle: Vehicle, speeds: Array) -> None:
-    with pytest.raises(ZeroDivisionError):
-        fly_scripted(vehicle, Scripted(speeds, raises={2: ZeroDivisionError()}))
+@pytest.mark.parametrize("error", [ZeroDivisionError("by 0"), SystemExit(0), MemoryError()], ids=repr)
+def test_a_controller_that_raises_ends_the_flight_with_its_traceback(
+    vehicle: Vehicle, speeds: Array, error: BaseException
+) -> None:
+    log = fly_scripted(vehicle, Scripted(speeds, raises={2: error}))
+    assert str(log.reason).startswith(f"at t = 0.100 s: the controller raised {type(error).__name__}")
+    assert (log.control.t.size, log.aborted, log.interrupted) == (2, True, False)
+    assert log.traceback[-1].startswith(type(error).__name__)
+    assert any("in step" in line for line in log.traceback)
 
 
 def test_a_flight_that_ended_early_is_let_go_at_once(vehicle: Vehicle, speeds: Array) -> None:

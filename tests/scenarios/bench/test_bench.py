@@ -276,7 +276,7 @@ def test_a_bench_is_written_whole_and_replaced_only_by_another(
     command = ["bench", "solvers", *short, "--solver", "daqp", "--horizons", "5", "--out", str(target)]
     assert main(command) == EXIT_DONE
     assert "daqp + shortcut" in capsys.readouterr().out
-    assert {path.name for path in target.iterdir()} == {*FILES, ".quadsim.json"}
+    assert {path.name for path in target.iterdir()} == {*FILES, "summary.json"}
     saved = json.loads((target / "bench.json").read_text())
     assert saved["asked"] == len(saved["contenders"][0]["step_ms_by_period"]) == 40
     assert saved["machine"]["cores"] >= 1
@@ -288,8 +288,8 @@ def test_a_bench_is_written_whole_and_replaced_only_by_another(
 
     (target / "mine.txt").write_text("not to be lost")
     assert main(command) == EXIT_WRONG_INPUT
-    assert "it holds mine.txt, not as quadsim wrote it; choose another --out" in capsys.readouterr().err
-    assert {path.name for path in target.iterdir()} == {*FILES, ".quadsim.json", "mine.txt"}
+    assert "its summary.json does not list mine.txt; move that away first" in capsys.readouterr().err
+    assert {path.name for path in target.iterdir()} == {*FILES, "summary.json", "mine.txt"}
 
 
 def test_a_solver_that_is_not_installed_is_named_and_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -289,4 +289,4 @@ def test_the_command_prints_json_alone(
     assert main(["bench", "ladder", "--quick", "--json", "--out", str(tmp_path / "ladder")]) == EXIT_DONE
     printed = json.loads(capsys.readouterr().out)
     assert len(printed["flights"]) == 9
-    assert {path.name for path in (tmp_path / "ladder").iterdir()} == {*FILES, ".quadsim.json"}
+    assert {path.name for path in (tmp_path / "ladder").iterdir()} == {*FILES, "summary.json"}

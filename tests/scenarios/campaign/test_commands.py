@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import tomlkit
 
-from quadsim.outputs import digest_of
+from quadsim.outputs import amend, digest_of
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
@@ -118,9 +118,7 @@ def test_a_replay_of_a_flight_that_met_a_limit_starts_with_a_notice(
     rows = pq.read_table(other / "flights.parquet")
     ended = [row | {"verdict": "timeout", "reason": "for ever"} for row in rows.to_pylist()]
     pq.write_table(pa.Table.from_pylist(ended, schema=rows.schema), other / "flights.parquet")
-    manifest = json.loads((other / "manifest.json").read_text())
-    manifest["files"]["flights.parquet"] = digest_of(other / "flights.parquet")
-    (other / "manifest.json").write_text(json.dumps(manifest))
+    amend(other, {"files": {"flights.parquet": digest_of(other / "flights.parquet")}})
     assert main(["replay", str(other), "--flight", "2", *BARE]) == EXIT_FAILED
     notice = "quadsim: flight 2 was ended in the campaign (for ever); here nothing ends it but Ctrl-C"
     assert capsys.readouterr().err.splitlines()[0] == notice
@@ -147,7 +145,7 @@ def test_two_campaigns_are_compared_flight_by_flight(
         (["campaign", "little.toml", "--require", "P(lost) < 2 @ 95%"], "requirement 'P(lost) < 2 @ 95%'"),
         (["campaign", "little.toml", "--require", "P(rmse.q > 1) < 0.1 @ 95%"], "no column named 'rmse.q'"),
         (["campaign", "little.toml", "--require", "lost < 1%"], "must read P(EVENT) OP SHARE @ CONFIDENCE%"),
-        (["campaign", "little.toml", "--require", "P(lost) < 1% @ 95%", "--junit", "."], "cannot write .: is a folder"),
+        (["campaign", "little.toml", "--require", "P(lost) < 1% @ 95%", "--junit", "."], ": is a folder"),
         (
             ["campaign", "little.toml", "--require", "P(lost) < 1% @ 95%", "--junit", "gone/v.xml"],
             "gone/v.xml: No such",
@@ -183,7 +181,7 @@ def test_ctrl_c_keeps_what_was_flown(file: Path) -> None:
         campaign.send_signal(signal.SIGINT)
         _, output = campaign.communicate(timeout=30.0)
         assert campaign.returncode == EXIT_FAILED
-    assert "interrupted (Ctrl-C); c has what was flown, --resume continues it" in output
+    assert "/c has what was flown, --resume continues it" in output
     assert "Traceback" not in output
     manifest = json.loads((file.parent / "c" / "manifest.json").read_text())
     assert manifest["status"] == "interrupted"

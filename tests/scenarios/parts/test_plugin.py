@@ -410,7 +410,6 @@ def test_wrong_input_has_exit_status_two_and_no_traceback(
 
 BUGS = {
     "in its constructor": HOVER.replace("        self.speeds,", "        None + 1\n        self.speeds,"),
-    "in its step": HOVER.replace("        return self.speeds", "        return None + 1"),
     "in its reset": HOVER + "    def reset(self, speeds):\n        None + 1\n",
 }
 

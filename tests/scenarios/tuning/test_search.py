@@ -13,7 +13,7 @@ from quadsim.errors import FileError
 from quadsim.outputs import growing
 from scenarios.tuning.plan import TuningPlan, load_tuning
 from scenarios.tuning.ranking import Score
-from scenarios.tuning.run import KIND
+from scenarios.tuning.run import MANIFEST_FILE
 from scenarios.tuning.search import JOURNAL_FILE, Search
 from scenarios.tuning.spec import START
 
@@ -34,7 +34,7 @@ def distance(values: Any) -> float:
 def carry_on(plan: TuningPlan, directory: Path, batches: int, *, again: bool) -> list[dict[int, Any]]:
     """The batches, each by a new study where `again`, as after a kill."""
     found = []
-    with growing(directory, KIND) as files:
+    with growing(directory, MANIFEST_FILE) as files:
         search = Search(plan, files)
         search.begin(scored(START, 5.0))
         for _ in range(batches):
@@ -78,7 +78,7 @@ def test_a_start_outside_of_the_ranges_is_no_trial_of_the_search(tmp_path: Path)
         "values": ["piqp-dense", "piqp-multistage"],
     }
     plan = load_tuning(str(write_tuning(tmp_path, search=[search, choice])))
-    with growing(tmp_path / "t", KIND) as files:
+    with growing(tmp_path / "t", MANIFEST_FILE) as files:
         found = Search(plan, files)
         found.begin(scored(START, 5.0))
         assert found.candidates() == {START: {}}
@@ -89,7 +89,7 @@ def test_a_start_outside_of_the_ranges_is_no_trial_of_the_search(tmp_path: Path)
 
 
 def test_a_field_that_matters_is_distinguished_from_one_that_does_not(plan: TuningPlan, tmp_path: Path) -> None:
-    with growing(tmp_path / "t", KIND) as files:
+    with growing(tmp_path / "t", MANIFEST_FILE) as files:
         search = Search(plan, files)
         search.begin(scored(START, 300.0))
         scores = [scored(START, 300.0)]
@@ -105,7 +105,7 @@ def test_a_field_that_matters_is_distinguished_from_one_that_does_not(plan: Tuni
 
 
 def test_a_damaged_journal_is_refused(plan: TuningPlan, tmp_path: Path) -> None:
-    with growing(tmp_path / "t", KIND) as files:
+    with growing(tmp_path / "t", MANIFEST_FILE) as files:
         files.write({JOURNAL_FILE: b"no journal\n"})
         with pytest.raises(FileError, match="is no journal"):
             Search(plan, files)

@@ -24,7 +24,7 @@ from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnav
 from quadsim.flight.audit import Limit, audit
 from quadsim.flight.parquet import write_log
 from quadsim.flight.rundir import Run, load_run
-from quadsim.outputs import write_json, writing_file
+from quadsim.outputs import amend
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
 from quadsim.report.film.frames import Shot, make_footage, thin
@@ -105,7 +105,7 @@ def rewrite(run: Run, directory: Path, rows: int, *, states: float = 1.0) -> Pat
         reason="lost on purpose",
     )
     write_log(directory, log, plant_stride=1, metadata={})
-    write_json(directory / "summary.json", {**run.summary, "status": "aborted", "reason": log.reason})
+    amend(directory, {**run.summary, "status": "aborted", "reason": log.reason})
     return directory
 
 
@@ -227,13 +227,14 @@ def test_a_worker_that_fails_on_a_full_disk_is_reported(
 @pytest.mark.usefixtures("fake_worker")
 def test_a_failing_worker_stops_the_others_and_leaves_nothing(short_run: Run, tmp_path: Path):
     target = tmp_path / "film.mp4"
-    with writing_file(target, ".mp4") as older:
-        older.write_bytes(b"an older film")
-    with pytest.raises(OutputError, match="renderer failed: GLError: the picture is lost") as caught:
+    target.write_bytes(b"an older film")
+    with pytest.raises(OutputError, match="it is already there; choose another file"):
         render_video(short_run.directory, target, workers=2)
+    with pytest.raises(OutputError, match="renderer failed: GLError: the picture is lost") as caught:
+        render_video(short_run.directory, target, workers=2, overwrite=True)
     assert caught.value.path == target
     assert [entry.name for entry in tmp_path.iterdir()] == ["film.mp4"]
-    assert target.read_bytes().startswith(b"an older film")
+    assert target.read_bytes() == b"an older film"
 
 
 @pytest.mark.usefixtures("fake_worker")

@@ -42,7 +42,7 @@ def entities(path: Path) -> set[str]:
 
 
 def test_it_is_the_recording_that_would_have_been_written_here(run_directory: Path, tmp_path: Path) -> None:
-    with recording_in_background(run_directory):
+    with recording_in_background(run_directory, run_directory / RECORDING_FILE):
         pass
     write_recording(load_run(run_directory), tmp_path / "here.rrd")
     assert entities(run_directory / RECORDING_FILE) == entities(tmp_path / "here.rrd")
@@ -52,7 +52,10 @@ def test_it_is_the_recording_that_would_have_been_written_here(run_directory: Pa
 def test_an_error_is_the_callers_with_its_type_and_values(run_directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RERUN", "off")
     off = "rerun is switched off by the environment variable RERUN"
-    with pytest.raises(OutputError, match=off) as caught, recording_in_background(run_directory):
+    with (
+        pytest.raises(OutputError, match=off) as caught,
+        recording_in_background(run_directory, run_directory / RECORDING_FILE),
+    ):
         pass
     assert caught.value.path == run_directory / RECORDING_FILE
     assert not (run_directory / RECORDING_FILE).exists()
@@ -60,19 +63,22 @@ def test_an_error_is_the_callers_with_its_type_and_values(run_directory: Path, m
 
 def test_a_run_that_cannot_be_read_is_named(run_directory: Path) -> None:
     (run_directory / PLANT_FILE).unlink()
-    with pytest.raises(FileError, match=PLANT_FILE), recording_in_background(run_directory):
+    with (
+        pytest.raises(FileError, match=PLANT_FILE),
+        recording_in_background(run_directory, run_directory / RECORDING_FILE),
+    ):
         pass
 
 
 def test_a_process_that_dies_is_no_recording(run_directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/bin/false")
     died = r"flight\.rrd: its process ended with status 1$"
-    with pytest.raises(OutputError, match=died), recording_in_background(run_directory):
+    with pytest.raises(OutputError, match=died), recording_in_background(run_directory, run_directory / RECORDING_FILE):
         pass
 
 
 def test_what_ends_the_block_ends_the_process(run_directory: Path, started: list[subprocess.Popen[bytes]]) -> None:
-    with pytest.raises(KeyboardInterrupt), recording_in_background(run_directory):
+    with pytest.raises(KeyboardInterrupt), recording_in_background(run_directory, run_directory / RECORDING_FILE):
         raise KeyboardInterrupt
     (process,) = started
     assert process.returncode is not None
@@ -82,5 +88,5 @@ def test_what_ends_the_block_ends_the_process(run_directory: Path, started: list
 
 def test_a_ctrl_c_does_not_reach_the_process(run_directory: Path, started: list[subprocess.Popen[bytes]]) -> None:
     """A terminal interrupts the group of processes in its foreground."""
-    with recording_in_background(run_directory):
+    with recording_in_background(run_directory, run_directory / RECORDING_FILE):
         assert os.getpgid(started[0].pid) == started[0].pid != os.getpgid(0)

@@ -492,7 +492,7 @@ def test_nothing_but_the_recording_is_left(short_run: Run, tmp_path: Path) -> No
 def test_what_is_there_is_not_replaced(short_run: Run, tmp_path: Path) -> None:
     target = tmp_path / "flight.rrd"
     target.write_bytes(b"mine")
-    with pytest.raises(OutputError, match="something else is already there"):
+    with pytest.raises(OutputError, match="it is already there; choose another file"):
         write_recording(short_run, target)
     assert target.read_bytes() == b"mine"
     assert [entry.name for entry in tmp_path.iterdir()] == ["flight.rrd"]

@@ -156,16 +156,16 @@ def test_the_page_stands_with_its_files(thousand: pa.Table, better: pa.Table, tm
     hostile = ("<b>paper</b>", "robust & more")
     page = write_comparison_report(compare(thousand, better, hostile), tmp_path / "out")
     names = {path.name for path in page.parent.iterdir()}
-    assert names == {"index.html", "comparison.json", "comparison.md", ".quadsim.json"}
+    assert names == {"index.html", "comparison.json", "comparison.md", "summary.json"}
     text = page.read_text()
     assert "<b>paper</b>" not in text
     assert "&lt;b&gt;paper&lt;/b&gt;" in text
-    write_comparison_report(compare(thousand, thousand, NAMES), tmp_path / "out")
+    write_comparison_report(compare(thousand, thousand, NAMES), tmp_path / "out", overwrite=True)
     assert "not distinguishable" in page.read_text()
     theirs = tmp_path / "theirs"
     theirs.mkdir()
     (theirs / "index.html").write_text("mine")
-    with pytest.raises(OutputError, match="something else is already there"):
+    with pytest.raises(OutputError, match="it is not empty"):
         write_comparison_report(compare(thousand, better, NAMES), theirs)
 
 

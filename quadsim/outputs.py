@@ -1,0 +1,308 @@
+"""The one place that replaces and removes files.
+
+An output directory that is there and not empty is refused.  A new one is built beside its place and renamed into it;
+`files` in its `summary.json` has the SHA-256 of every other file.  To overwrite it is to unlink, by name, the regular
+files on that list; anything else in it is refused before.  One that grows in place, as a campaign's does, is locked.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import itertools
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from stat import S_IMODE, S_ISDIR, S_ISREG
+from typing import Any, Final
+
+from quadsim.errors import OutputError, printable
+
+SUMMARY_FILE: Final = "summary.json"
+LOCK_FILE: Final = ".lock"  # of a directory that grows
+_FREE_BYTES_NEEDED: Final = 16 * 1024 * 1024
+
+
+def absolute(path: Path | str) -> Path:
+    """The absolute path, links and `..` followed and `~` expanded, so that no controller's `chdir` moves it.
+
+    Raises:
+        OutputError: it leads nowhere.
+    """
+    try:
+        real = Path(os.path.realpath(Path(path).expanduser()))
+        circular = real.is_symlink()
+    except (ValueError, RuntimeError, OSError) as error:  # a null byte; a user without a home; too long a name
+        raise OutputError(ascii(str(path))[1:-1], getattr(error, "strerror", None) or str(error)) from error
+    if circular:
+        raise OutputError(path, "a symbolic link leads back to itself")
+    return real
+
+
+def to_json(data: Mapping[str, Any]) -> str:
+    """Strict JSON (no NaN), as all our files have it."""
+    return json.dumps(data, indent=2, allow_nan=False) + "\n"
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file's content, as a list of files has it."""
+    with path.open("rb") as file:
+        return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
+
+
+def file_hashes(directory: Path) -> dict[str, str]:
+    """SHA-256 of every regular file below a directory but its summary and its lock, by relative path, sorted."""
+    names = {name for name, mode in _below(directory).items() if S_ISREG(mode)} - {SUMMARY_FILE, LOCK_FILE}
+    return {name: digest_of(directory / name) for name in sorted(names)}
+
+
+@contextlib.contextmanager
+def reserving(path: Path | str, *, overwrite: bool = False, free: bool = False) -> Iterator[Path]:
+    """The absolute place of an output directory, made before the work for it; gone again if the block leaves it empty.
+
+    `overwrite` allows an earlier output there; `free` takes the next free name instead: NAME, NAME-2, ...
+
+    Raises:
+        OutputError: it cannot be made, or holds something that must not be replaced.
+    """
+    first = target = absolute(path)
+    made: list[Path] = []
+    try:
+        with _errors(target):
+            made += [parent for parent in target.parents if not parent.exists()]
+            if made == [] and not target.parent.is_dir():
+                raise OutputError(target, f"{target.parent} is a file")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            for i in itertools.count(2):
+                with contextlib.suppress(FileExistsError):
+                    target.mkdir()
+                    made.insert(0, target)
+                if not free or target in made:
+                    break
+                target = first.with_name(f"{first.name}-{i}")
+            _require_replaceable(target, overwrite=overwrite)
+            if shutil.disk_usage(target).free < _FREE_BYTES_NEEDED:
+                raise OutputError(target, "the disk is full")
+        yield target
+    finally:
+        for folder in made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()  # which removes an empty one only
+
+
+@contextlib.contextmanager
+def writing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
+    """A directory to fill, which becomes `path`, its files listed, when the block ends well, and vanishes else.
+
+    Raises:
+        OutputError: see `reserving`; where something else is in its place by then, what was made stays beside it.
+    """
+    with reserving(path, overwrite=overwrite) as target, _beside(target) as work:
+        work.chmod(S_IMODE(target.stat().st_mode))
+        yield work
+        amend(work, {"files": file_hashes(work)})
+        try:
+            _require_replaceable(target, overwrite=overwrite)
+            _clear(target)
+            work.rename(target)
+        except OSError as error:
+            kept = work.rename(work.with_suffix(".kept"))
+            problem = error.problem if isinstance(error, OutputError) else error.strerror
+            raise OutputError(target, f"{problem}; what was made is in {kept}") from error
+
+
+@contextlib.contextmanager
+def adding(directory: Path, **changes: Any) -> Iterator[Path]:
+    """A folder to fill; when the block ends well its files go into a finished directory, `changes` into its summary.
+
+    Raises:
+        OutputError: they cannot be written, or something that the summary does not list has their names.
+    """
+    with _beside(directory) as work:
+        yield work
+        hashes, listed = file_hashes(work), _listed(directory) or {}
+        for name in hashes:
+            if os.path.lexists(directory / name) and name not in listed:
+                raise OutputError(directory / name, f"{SUMMARY_FILE} does not list it; move it away first")
+        for name in hashes:
+            (directory / name).parent.mkdir(exist_ok=True)
+            (work / name).rename(directory / name)
+        amend(directory, {**changes, "files": hashes})
+
+
+def amend(directory: Path, changes: Mapping[str, Any]) -> None:
+    """Change entries of a directory's summary in one step; of a table only the entries that are given."""
+    path = directory / SUMMARY_FILE
+    summary = json.loads(path.read_bytes()) if path.exists() else {}
+    for key, value in changes.items():
+        summary[key] = {**summary.get(key, {}), **value} if isinstance(value, Mapping) else value
+    summary["files"] = dict(sorted(summary.pop("files", {}).items()))
+    with writing_file(path, overwrite=True) as new:
+        new.write_text(to_json(summary), encoding="utf-8")
+
+
+def require_file(path: Path | str, *, overwrite: bool = False) -> Path:
+    """The absolute path of a file that may be written; refused before any work is done for it.
+
+    Raises:
+        OutputError: it cannot be written, or something is there that may not be overwritten.
+    """
+    path = absolute(path)
+    with _errors(path):
+        if os.path.lexists(path) and not (overwrite and path.is_file()):
+            raise OutputError(path, "is a folder" if path.is_dir() else "it is already there; choose another file")
+        with tempfile.TemporaryFile(dir=path.parent):
+            return path
+
+
+@contextlib.contextmanager
+def writing_file(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
+    """A file to write in a folder of its own, which becomes `path` when the block ends well; errors: `require_file`."""
+    path = require_file(path, overwrite=overwrite)
+    with _beside(path) as work:
+        yield work / f"new{path.suffix}"
+        (work / f"new{path.suffix}").rename(require_file(path, overwrite=overwrite))
+
+
+class Growing:
+    """A directory to which files are added in place; see `growing`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def write(self, files: Mapping[str, bytes]) -> None:
+        """Write or replace files by their relative paths, each in one step."""
+        for name, content in files.items():
+            with _errors(self.path / name):
+                (self.path / name).parent.mkdir(exist_ok=True)
+                with writing_file(self.path / name, overwrite=True) as new:
+                    new.write_bytes(content)
+
+    def remove(self, names: Sequence[str]) -> None:
+        """Remove files, and folders that are empty then."""
+        with _errors(self.path):
+            for name in names:
+                (self.path / name).unlink(missing_ok=True)
+        for folder in {(self.path / name).parent for name in names} - {self.path}:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+    def finish(self, summary: Mapping[str, Any]) -> None:
+        """Write `summary.json`, with the list of all other files."""
+        self.write({SUMMARY_FILE: to_json({**summary, "files": file_hashes(self.path)}).encode()})
+
+
+@contextlib.contextmanager
+def growing(path: Path | str, mark: str, *, overwrite: bool = False) -> Iterator[Growing]:
+    """A directory that grows in place, by one process at a time: a new one, or one with a file `mark`.
+
+    Raises:
+        OutputError: it cannot be written, holds something else, or another process writes there.
+    """
+    directory = absolute(path)
+    goes_on = (directory / mark).is_file() and not overwrite
+    with contextlib.nullcontext() if goes_on else reserving(directory, overwrite=overwrite), _locked(directory):
+        if odd := [name for name, mode in _below(directory).items() if not (S_ISREG(mode) or S_ISDIR(mode))]:
+            raise OutputError(directory, f"{_few(odd)}: links are refused; move them away first")
+        if not goes_on:
+            _clear(directory, keep=LOCK_FILE)
+        try:
+            yield Growing(directory)
+        finally:
+            if list(_below(directory)) == [LOCK_FILE]:
+                (directory / LOCK_FILE).unlink()
+
+
+def _require_replaceable(target: Path, *, overwrite: bool) -> None:
+    """Refuse a directory that is not empty, unless its own summary lists all in it and it may be overwritten."""
+    if not target.is_dir():
+        raise OutputError(target, "a file is already there; choose another --out")
+    with contextlib.suppress(FileNotFoundError):  # where the current directory is gone
+        if target.samefile(Path.cwd()):
+            raise OutputError(target, "it is the current directory; name one to be made")
+    there, listed = _below(target), _listed(target)
+    if there and not overwrite:
+        raise OutputError(target, f"it is not empty ({_few([*there])}); choose another --out, or add --overwrite")
+    if there and listed is None:
+        raise OutputError(target, f"it has no {SUMMARY_FILE} that lists its files; choose another --out")
+    files = {*(listed or ()), SUMMARY_FILE, LOCK_FILE}
+    folders = {str(parent) for name in files for parent in Path(name).parents}
+    others = [n for n, mode in there.items() if n not in (files if S_ISREG(mode) else folders if S_ISDIR(mode) else ())]
+    if others:
+        raise OutputError(target, f"its {SUMMARY_FILE} does not list {_few(others)}; move that away first")
+    with _locked(target) if LOCK_FILE in there else contextlib.nullcontext():
+        pass
+
+
+def _clear(target: Path, keep: str = "") -> None:
+    """Unlink the listed files of a directory and its lock, remove its folders, and unlink its summary last."""
+    files = {*(_listed(target) or ()), LOCK_FILE} - {keep}
+    for name, mode in reversed(_below(target).items()):
+        if S_ISDIR(mode):
+            (target / name).rmdir()
+        elif name in files:
+            (target / name).unlink()
+    (target / SUMMARY_FILE).unlink(missing_ok=True)
+
+
+def _listed(directory: Path) -> dict[str, str] | None:
+    """The files that a directory's summary lists, with their SHA-256; None where there is no such list."""
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        files = json.loads((directory / SUMMARY_FILE).read_bytes())["files"]
+        return files if files and all(value.startswith("sha256:") for value in files.values()) else None
+    return None
+
+
+def _below(directory: Path) -> dict[str, int]:
+    """The modes of all below a directory by relative path, folders before what is in them; links are not followed."""
+    paths = (Path(folder, name) for folder, inner, files in os.walk(directory) for name in sorted((*inner, *files)))
+    return {path.relative_to(directory).as_posix(): path.lstat().st_mode for path in paths}
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(map(printable, names[:3])) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+@contextlib.contextmanager
+def _beside(target: Path) -> Iterator[Path]:
+    """A folder beside a target, gone when the block ends; an error about what is in it names it as if in the target."""
+    with _errors(target):
+        work = Path(tempfile.mkdtemp(prefix=".quadsim-", suffix=".partial", dir=target.parent))
+        try:
+            yield work
+        except OutputError as error:
+            if not error.path.is_relative_to(work):
+                raise
+            raise OutputError(target / error.path.relative_to(work), error.problem) from error
+        finally:
+            shutil.rmtree(work, ignore_errors=True)  # made here, under a name that nobody was told
+
+
+@contextlib.contextmanager
+def _locked(directory: Path) -> Iterator[None]:
+    """Hold a directory for this process alone."""
+    with _errors(directory / LOCK_FILE):
+        handle = os.open(directory / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise OutputError(directory, "another process is writing there") from error
+        yield
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def _errors(path: Path) -> Iterator[None]:
+    """Raise the system's errors as those of an output."""
+    try:
+        yield
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(path, error.strerror or str(error)) from error
