@@ -5,11 +5,13 @@ So no worker loads it again, has to look through it for cycles, nor copies the p
 
 from __future__ import annotations
 
+import gc
+
 import mpc.constrained
 import mpc.robust.controller
 import mpc.unconstrained  # noqa: F401
 import scenarios.campaign.engine.supervisor
 import scenarios.campaign.pilot  # noqa: F401
-from scenarios.gc_tuning import freeze_for_good
 
-freeze_for_good()
+gc.collect()
+gc.freeze()

@@ -274,7 +274,6 @@ def _begin(plan: TuningPlan) -> dict[str, Any]:
         "files": {},
         "optuna": require_optuna().__version__,
         **records.flown_by(plan.start),
-        **records.controller_code(plan.start),
         "sessions": [],
     }
 

@@ -7,6 +7,7 @@ it does to the worker, which the supervisor replaces.  It ends with its parent, 
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import pickle
 import signal
@@ -23,7 +24,6 @@ from scenarios.campaign.engine.processes import adopt_orphans, end_children, has
 from scenarios.campaign.engine.protocol import Answer, Pilot, describe
 from scenarios.campaign.engine.worker import FLIGHT, PULSE_BYTES, SIZE, FlightReport, fly_for
 from scenarios.campaign.results.verdicts import MEMORY, TIMEOUT
-from scenarios.gc_tuning import collect_rarely, freeze_for_good
 
 LOOK_S: Final = 0.2  # between two looks at a worker that flies [s]
 _TURN_S: Final = 1.0  # most that one look counts of the time since the last one [s]
@@ -63,7 +63,6 @@ def serve(pipe: Connection, folder: str) -> None:
     os.setsid()  # so that its parent can end its children, if it is killed
     with contextlib.suppress(AttributeError, TypeError, OSError):
         os.close(forkserver._forkserver._forkserver_alive_fd)  # type: ignore[attr-defined]  # what is written there kills the server
-    collect_rarely()
     adopt_orphans()
     with contextlib.suppress(OSError):
         os.chdir(folder)
@@ -74,7 +73,8 @@ def serve(pipe: Connection, folder: str) -> None:
             raise
         except Exception as error:
             return pipe.send(Unfit(describe(error)))
-        freeze_for_good()
+        gc.collect()
+        gc.freeze()
         _Supervisor(pilot, pipe).keep()
     return None
 
