@@ -19,7 +19,7 @@ from quadsim import __version__
 from quadsim.errors import QuadsimError, printable
 from scenarios.commands import EXIT_FAILED, EXIT_WRONG_INPUT, find_command
 
-_MOST_LINES, _LONGEST_LINE = 20, 1000  # of a message: one with many problems has a line for each
+_MOST_LINES, _LONGEST_LINE = 21, 1000  # of a message: one with many problems has a line for each
 _SCENARIO: Final = "library name, or path to a TOML file"
 _NUMBER: Final[dict[str, Any]] = {"type": int, "metavar": "N"}
 _SUMMARY: Final[dict[str, Any]] = {"action": "store_true", "help": "print the summary alone, as JSON on stdout"}

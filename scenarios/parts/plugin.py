@@ -29,6 +29,8 @@ from scenarios.schema.plugin import ENTRY_POINTS, ForceSpec, PluginSpec
 _STEP: Final = (
     "a class or an object with a method step(now, state, reference), or a function law(now, state, reference)"
 )
+_WHOLE: Final = ("iterations", "active", "fallback")  # parts of a Command
+_REAL: Final = ("slack", "primal_residual", "dual_residual", "solve_s")
 _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
 
 
@@ -43,7 +45,9 @@ class PluginController:
         self.name = printable(str(getattr(law, "name", type(law).__name__)))[:200]
         self.solver = printable(str(getattr(law, "solver", "")))[:200]
         if hasattr(law, "predict"):
-            self.predict = law.predict
+            self.predict = lambda states, plans: _numbers(
+                law.predict(states.copy(), plans.copy()), (*plans.shape[:2], states.shape[1]), f"{self.name}.predict"
+            )
 
     @property
     def unanswered(self) -> object:
@@ -64,30 +68,28 @@ class PluginController:
         answer: Any = self._law.step(replace(now, acting=acting), state.copy(), reference.copy())
         try:
             if not isinstance(answer, Command):
-                answer = Command(speeds=answer, plan=np.tile(np.asarray(answer, float), (self.horizon, 1)))
-            numbers: dict[str, Any] = {
-                name: operator.index(getattr(answer, name)) for name in ("iterations", "active", "fallback")
-            }
-            for name in ("slack", "primal_residual", "dual_residual", "solve_s"):
-                numbers[name] = float(getattr(answer, name))
-            for name, shape in {"speeds": (N_ROTORS,), "plan": (self.horizon, N_ROTORS)}.items():
-                numbers[name] = np.array(getattr(answer, name), float)
-                if numbers[name].shape != shape:
-                    raise ValueError(f"{name} must be of shape {shape}")
+                answer = Command(speeds=answer, plan=np.tile(_numbers(answer, (N_ROTORS,), "it"), (self.horizon, 1)))
+            parts: dict[str, Any] = {name: operator.index(getattr(answer, name)) for name in _WHOLE}
+            parts |= {name: float(getattr(answer, name)) for name in _REAL}
+            parts["speeds"] = _numbers(answer.speeds, (N_ROTORS,), "its speeds")
+            parts["plan"] = _numbers(answer.plan, (self.horizon, N_ROTORS), "its plan")
             if answer.inner is not None and not answer.inner.rate > 0.0:
-                raise ValueError("inner must have a positive rate")
-            return replace(answer, **numbers, status=printable(answer.status)[:200])
+                raise ValueError("its inner loop must have a positive rate")
+            return replace(answer, **parts, status=printable(answer.status)[:200])
         except (AttributeError, TypeError, ValueError) as error:
             problem = f"{self.name} answered {answer!r:.100}, neither {N_ROTORS} speeds nor a Command: {error}"
             raise CommandError(problem, time=now.time) from error
 
 
-def make_law(law: Any, spec: PluginSpec, vehicle: Vehicle, period: float) -> PluginController:
-    """The controller of a function law(now, state, reference), an object with a `step`, or what makes one of a vehicle.
+def _numbers(given: Any, shape: tuple[int, ...], name: str) -> Array:
+    array = np.array(given, float)
+    if array.shape != shape:
+        raise InputError(f"{name} must have shape {shape}; got {array.shape}")
+    return array
 
-    Raises:
-        InputError: it is none of these, or cannot be called with its settings.
-    """
+
+def make_law(law: Any, spec: PluginSpec, vehicle: Vehicle, period: float) -> PluginController:
+    """The controller of a function law(now, state, reference), a class, an object, or what makes one of a vehicle."""
     if (code := _code_of(law)) is not type(law):
         if isinstance(code, type) or "vehicle" in inspect.signature(code).parameters:
             law = _call(code, spec, {"vehicle": vehicle}, period=period, horizon=spec.horizon)
@@ -136,7 +138,9 @@ def import_plugin(spec: PluginSpec | ForceSpec) -> Any:
         importlib.invalidate_caches()
         found = importlib.import_module(module)
     except (Exception, SystemExit) as error:
-        raise InputError(f"{_table(spec)}.type: {module} cannot be imported: {_reason(error)}") from error
+        absent = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
+        where = f"; it is looked for among what is installed, and in {', '.join(folders)}" if absent else ""
+        raise InputError(f"{_table(spec)}.type: {module} cannot be imported: {_reason(error)}{where}") from error
     finally:
         sys.path[:] = path
     file = getattr(sys.modules[top], "__file__", None) or "Python"
@@ -188,7 +192,9 @@ def _reason(error: BaseException) -> str:
     """An exception in one line, with the user's line that raised it."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     hidden = (
-        isinstance(error, SyntaxError) or last.filename in (__file__, inspect.__file__) or "<frozen" in last.filename
+        isinstance(error, SyntaxError)
+        or last.filename in (__file__, inspect.__file__, importlib.__file__)
+        or "<frozen" in last.filename
     )
     return " ".join(f"{type(error).__name__}: {error}".split()) + (
         "" if hidden else f" ({last.filename}, line {last.lineno})"
