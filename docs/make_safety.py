@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
-import safety_campaign
 import safety_mutations
 import safety_outputs
 from make_numbers import ROOT, replace_in
@@ -23,7 +22,6 @@ ATTACKS: dict[str, tuple[Callable[[int], Mapping[str, int]], int]] = {
     "Changed `summary.json` and tables of runs, read by every command": (SUMMARIES, 2000),
     "Changed files of campaigns, read by every command": (CAMPAIGNS, 2000),
     "Processes killed (SIGKILL) while they write": (safety_outputs.measure_kills, 40),
-    "One campaign with controllers that hang, fork, eat memory, exit": (safety_campaign.measure, 60),
 }
 """What was tried: by which function, and how often."""
 PARALLEL = 4  # the first attacks run in parallel, in processes of their own, as an ordinary user

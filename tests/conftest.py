@@ -44,7 +44,7 @@ settings.load_profile("quadsim")
 
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
 LONG = (
-    *("scenarios/campaign/engine/test_cluster.py", "scenarios/campaign/test_survival.py", "scenarios/test_library.py"),
+    *("scenarios/campaign/engine/test_cluster.py", "scenarios/test_library.py"),
     *("test_safety.py", "scenarios/campaign/test_run.py", "test_commands.py", "scenarios/bench/test_bench.py"),
     *("scenarios/campaign/report/test_campaign_page.py", "quadsim/report/film/test_video.py"),
     *("quadsim/report/test_comparison_page.py", "scenarios/design/test_first_flights.py"),
@@ -55,7 +55,7 @@ LONG = (
     *("mpc/test_staged.py", "scenarios/campaign/test_commands.py", "scenarios/test_mutations.py"),
     *("test_packaging.py", "mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
     *("scenarios/gym/test_environment.py", "test_learning_examples.py"),
-    *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py"),
+    *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py", "scenarios/test_bad_controllers.py"),
     *("scenarios/campaign/statistics/test_drivers.py", "scenarios/papers/test_beyond.py"),
     *("scenarios/tuning/test_run.py", "scenarios/tuning/report/test_tuning_page.py"),
 )
