@@ -10,6 +10,7 @@ import io
 import os
 import signal
 import sys
+from types import FrameType
 from typing import Final
 
 _STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -20,9 +21,16 @@ _RENDERERS: Final = ("", "egl", "osmesa", "glfw", "disable")
 def main() -> int:
     """Run the command line of this process; returns the exit status."""
     heard = [stop for stop in _STOPS if signal.getsignal(stop) is not signal.SIG_IGN]
+    stopped = False
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal stopped
+        stopped = True
+        raise KeyboardInterrupt
+
     try:
         for stop in heard:
-            signal.signal(stop, signal.default_int_handler)
+            signal.signal(stop, interrupt)
         _open_what_is_closed()
         problem = _set_environment()
         if sys.stdout is None:
@@ -35,7 +43,9 @@ def main() -> int:
         from scenarios.cli import main as run
 
         return run()
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ImportError, SystemError):  # a compiled module, imported, makes the latter of the first
+        if not stopped:
+            raise
         with contextlib.suppress(OSError):  # the terminal may be gone
             print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
         return 1
