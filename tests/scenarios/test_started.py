@@ -294,3 +294,11 @@ def test_linear_algebra_has_one_thread_once_a_flight_has_started() -> None:
         assert threads() == {2}
         with quadsim.start("hover"):
             assert threads() == {1}
+
+
+def test_the_cycle_collector_looks_through_nothing_from_before_a_flight_while_it_flies() -> None:
+    frozen: list[int] = []
+    with start(load_scenario("hover", ["duration=0.2"])) as started:
+        started.complete(lambda *_: frozen.append(gc.get_freeze_count()))
+    assert min(frozen[1:]) > 10_000
+    assert gc.get_freeze_count() == 0
