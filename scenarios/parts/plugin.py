@@ -181,6 +181,8 @@ def require_importable(law: object, what: str = "controller") -> None:
 def _code_of(law: Any) -> Any:
     """The class or function that was passed in, by itself or in a partial; an object's class."""
     code = law.func if isinstance(law, functools.partial) else law
+    if getattr(law, "args", ()) and code is not law:
+        raise ParameterError("", "controller", law, "a partial with named arguments alone")
     return code if isinstance(code, type) or inspect.isroutine(code) else type(code)
 
 
