@@ -46,7 +46,7 @@ turbulence and four sensors.
 - None of this changes a bit of a flight's numbers, nor a pixel of figures and films. What the whole flight gains
   besides is the controller's: exact optima from the last period's active set.
 - No pass of Python's cycle collector over what was there before a flight falls into one of its steps, whatever is
-  installed: it is frozen, and collected between flights; see `scenarios/gc_tuning.py`.
+  installed: it is frozen while the closed loop runs.
 - A command imports what it takes, not what all commands take; figures are laid out without being drawn for it; a film
   keeps its words as pictures. What is left of a frame is the rasteriser's and the encoder's.
 """

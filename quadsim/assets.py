@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from quadsim.errors import FileError, UnknownNameError
+from quadsim.errors import FileError, InputError, UnknownNameError
+
+DEEPEST: Final = 20  # tables and lists within one another; a scenario has a third of them
+_KEY: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
+_TOO_DEEP: Final = re.compile(rf"(?<![\w-]){_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{DEEPEST}}}")
 
 
 def models_dir() -> Path:
@@ -53,8 +58,38 @@ def read_toml(path: Path) -> dict[str, Any]:
         FileError: it is missing, unreadable or not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return parse_toml(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(path, f"cannot be read ({error})") from error
-    except (ValueError, RecursionError) as error:  # also numbers and nesting beyond what Python reads
+    except InputError as error:
+        raise FileError(path, str(error)) from error
+    except ValueError as error:  # also numbers beyond what Python reads
         raise FileError(path, f"is not valid TOML: {error}") from error
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a text.
+
+    Raises:
+        InputError: they are nested too deep.
+        ValueError: it is not TOML.
+    """
+    deeper = InputError(f"must have at most {DEEPEST} tables and lists within one another")
+    if _TOO_DEEP.search(text):  # tomllib takes gigabytes for a key of 40 000 dots
+        raise deeper
+    try:
+        data = tomllib.loads(text)
+    except RecursionError:
+        raise deeper from None
+    if _is_deeper(data, DEEPEST):
+        raise deeper
+    return data
+
+
+def _is_deeper(value: Any, levels: int) -> bool:
+    """Whether tables and lists are nested more than this many levels deep."""
+    layer = [value]
+    for _ in range(levels + 1):
+        tables = (each.values() if isinstance(each, dict) else each for each in layer if isinstance(each, dict | list))
+        layer = [inner for table in tables for inner in table]
+    return bool(layer)

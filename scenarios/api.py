@@ -19,9 +19,8 @@ from scenarios.build import build_controller
 from scenarios.build import resolve as write_out
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import check_parts, load_scenario
-from scenarios.parts.plugin import build_force
+from scenarios.parts.plugin import import_plugin, make_force, make_law, refer_to
 from scenarios.parts.randomness import generator
-from scenarios.parts.user_code import refer_to, refer_to_force, set_up, set_up_force
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, reporting
 from scenarios.reaudit import Reaudit, reaudit, stored_scenario
@@ -247,11 +246,12 @@ def _set_up(
     referring, law, own = named_by(scenario, controller, forces), None, None
     if controller is not None and not isinstance(controller, str):
         spec = refer_to(controller, scenario.controller.horizon)
-        law = set_up(controller, spec, build_vehicle(scenario), scenario.control_period)
+        law = make_law(controller, spec, build_vehicle(scenario), scenario.control_period)
     if forces:
         vehicle, rng = build_vehicle(scenario), generator(scenario.seed, "forces")
-        own = [build_force(spec, vehicle, rng) for spec in scenario.forces]
-        own += [set_up_force(force, vehicle, rng) for force in forces]
+        named = [(import_plugin(spec), spec) for spec in scenario.forces]
+        named += zip(forces, referring.forces[len(named) :], strict=True)
+        own = [make_force(force, spec, vehicle, rng) for force, spec in named]
     check_parts(referring)
     return referring, law, own
 
@@ -470,6 +470,6 @@ def named_by(scenario: Scenario, controller: object, forces: Sequence[object] = 
     elif controller is not None:
         changes["controller"] = refer_to(controller, horizon).model_dump(exclude_none=True)
     if forces:
-        specs = [*scenario.forces, *map(refer_to_force, forces)]
-        changes["forces"] = [spec.model_dump(exclude_none=True) for spec in specs]
+        specs = [*scenario.forces, *(refer_to(force) for force in forces)]
+        changes["forces"] = [spec.model_dump(exclude_none=True, exclude={"horizon"}) for spec in specs]
     return scenario.replace(changes) if changes else scenario

@@ -15,7 +15,7 @@ from quadsim.vehicle import Vehicle
 from scenarios.courses.windows import timed_regions
 from scenarios.parts.controllers import make_controller, make_problem
 from scenarios.parts.effects import build_changes, build_wind
-from scenarios.parts.plugin import build_force
+from scenarios.parts.plugin import import_plugin, make_force
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import resolve_vehicle
 from scenarios.schema.optimisation import WeightedSpec
@@ -47,7 +47,9 @@ def build_plant(scenario: Scenario, vehicle: Vehicle, forces: Sequence[Force] | 
         effects=scenario.effects.resolved(vehicle),
         changes=build_changes(scenario),
         wind=build_wind(scenario, vehicle),
-        forces=[build_force(spec, vehicle, rng) for spec in scenario.forces] if forces is None else forces,
+        forces=[make_force(import_plugin(spec), spec, vehicle, rng) for spec in scenario.forces]
+        if forces is None
+        else forces,
         obstacles=scenario.obstacles,
         rng=generator(scenario.seed, "disturbance"),
     )

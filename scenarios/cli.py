@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NoReturn
@@ -17,9 +18,8 @@ from typing import Any, Final, NoReturn
 from quadsim import __version__
 from quadsim.errors import QuadsimError, printable
 from scenarios.commands import EXIT_FAILED, EXIT_WRONG_INPUT, find_command
-from scenarios.gc_tuning import collect_rarely
 
-_LINES = "\n"  # what a message of ours may be made of besides text: one with many problems has a line for each
+_MOST_LINES, _LONGEST_LINE = 21, 1000  # of a message: one with many problems has a line for each
 _SCENARIO: Final = "library name, or path to a TOML file"
 _NUMBER: Final[dict[str, Any]] = {"type": int, "metavar": "N"}
 _OVERWRITE: Final[dict[str, Any]] = {
@@ -34,7 +34,7 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """See `argparse.ArgumentParser.error`."""
-        super().error(printable(message))
+        super().error(_shown(message))
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -266,16 +266,14 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    options = make_parser().parse_args(arguments)
-    if arguments is None:  # as a process of its own
-        collect_rarely()  # saves 5 % of a run
+    options = _parse(sys.argv[1:] if arguments is None else arguments)
     try:
         with _notices():
             status = find_command(options.command)(options)
         sys.stdout.flush()
         return status
     except QuadsimError as error:
-        print(f"quadsim: {printable(str(error), keep=_LINES)}", file=sys.stderr)
+        print(f"quadsim: {_shown(str(error))}", file=sys.stderr)
         return error.exit_status
     except SystemExit as error:  # of code that was imported: a flight would have ended by it as aborted
         if isinstance(error.__context__, BrokenPipeError):  # rich's way to end
@@ -294,9 +292,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_WRONG_INPUT
 
 
+def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """The options of a command line, `~` in paths expanded as a shell does for words, but not for `--out=~/x`."""
+    parser = make_parser()
+    home = re.compile(r"(--[\w-]+=)?(~.*)", re.DOTALL)
+    words = [
+        (match[1] or "") + os.path.expanduser(match[2]) if (match := home.fullmatch(word)) else word  # noqa: PTH111
+        for word in arguments
+    ]
+    for word in words:
+        if re.fullmatch(r"--[\w-]+=--", word):  # of which argparse makes an empty list
+            parser.error(f"argument {word[:-3]}: expected a value; got '--'")
+    options = parser.parse_args(words)
+    for name in ("out", "junit"):
+        if (getattr(options, name, None) or "").startswith("-"):
+            given = getattr(options, name)
+            parser.error(
+                f"argument --{name}: must be a path; got {given!r}, to be written as ./{given} if that is meant"
+            )
+    return options
+
+
+def _shown(message: str) -> str:
+    """A message as a terminal takes it, of some twenty lines at most."""
+    lines = printable(message, keep="\n").split("\n")
+    shown = [line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]} ..." for line in lines[:_MOST_LINES]]
+    return "\n".join([*shown, *([f"... and {len(lines) - _MOST_LINES} more"] if len(lines) > _MOST_LINES else [])])
+
+
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
-    """Show the program's notices on stderr: which user-defined code it runs."""
+    """Show the program's notices on stderr: which code of the user's was imported."""
     logger, handler = logging.getLogger("quadsim"), _NoticeHandler()
     before = logger.level
     logger.addHandler(handler)

@@ -1,4 +1,4 @@
-"""The process of the `quadsim` command: any stop signal, from its first moment on, ends it in order.
+"""The process of the `quadsim` command: its environment, set before anything else is imported, its signals and streams.
 
 Ctrl-C, SIGTERM and SIGHUP all are `KeyboardInterrupt`, unless the process was started with them ignored, as by `nohup`.
 """
@@ -7,100 +7,65 @@ from __future__ import annotations
 
 import contextlib
 import io
-import math
 import os
 import signal
 import sys
-import time as clock
 from types import FrameType
 from typing import Final
 
 _STOPS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_PATIENCE_S: Final = 1.0
-"""Within which another signal is the same one: what is cleared up meanwhile is not to be interrupted."""
-_LONGEST_IMPORT_S: Final = 5.0  # all of ours together take a fifth of that, on a busy machine more
-
-
-class _Stop:
-    """Makes Ctrl-C of a signal; who goes away, or is impatient, sends several.
-
-    Python ignores an exception that comes up in a destructor or a callback, of which imports have many; a compiled
-    module that is being imported makes an ImportError of it, which whoever can do without that module ignores.  Such a
-    Ctrl-C is raised once more, and none within an import, unless that does not end.
-
-    Attributes:
-        heard: whether there was one.
-    """
-
-    def __init__(self) -> None:
-        self._first = self._last = -math.inf
-
-    @property
-    def heard(self) -> bool:
-        return math.isfinite(self._last)
-
-    def raise_again(self, ignored: sys.UnraisableHookArgs) -> None:
-        """See `sys.unraisablehook`."""
-        if issubclass(ignored.exc_type, KeyboardInterrupt):
-            self._raise_soon()
-        else:
-            sys.__unraisablehook__(ignored)
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        """See `signal.signal`."""
-        now = clock.monotonic()
-        if number != signal.SIGALRM:
-            before, self._last = self._last, now
-            if now - before <= _PATIENCE_S:
-                return
-            if now - self._first > _LONGEST_IMPORT_S:
-                self._first = now
-        if _is_importing(frame) and now - self._first < _LONGEST_IMPORT_S:
-            self._raise_soon()
-        else:
-            raise KeyboardInterrupt
-
-    def _raise_soon(self) -> None:
-        signal.signal(signal.SIGALRM, self)
-        signal.setitimer(signal.ITIMER_REAL, 0.01)
-
-
-def _is_importing(frame: FrameType | None) -> bool:
-    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
-        frame = frame.f_back
-    return frame is not None
+_THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_RENDERERS: Final = ("", "egl", "osmesa", "glfw", "disable")
 
 
 def main() -> int:
     """Run the command line of this process; returns the exit status."""
     heard = [stop for stop in _STOPS if signal.getsignal(stop) is not signal.SIG_IGN]
-    handler = _Stop()
+    stopped = False
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal stopped
+        stopped = True
+        raise KeyboardInterrupt
+
     try:
         for stop in heard:
-            signal.signal(stop, handler)
-        sys.unraisablehook = handler.raise_again
+            signal.signal(stop, interrupt)
         _open_what_is_closed()
+        problem = _set_environment()
         if sys.stdout is None:
-            print("quadsim: stdout is closed; to do without what is printed: >/dev/null", file=sys.stderr)
+            problem = "stdout is closed; to do without what is printed: >/dev/null"
+        if problem is not None:
+            print(f"quadsim: {problem}", file=sys.stderr)
             return 2
         if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors in ("strict", "surrogateescape"):
             sys.stdout.reconfigure(errors="backslashreplace")  # a terminal may lack characters
         from scenarios.cli import main as run
 
-        if handler.heard:  # and swallowed by what was imported
-            raise KeyboardInterrupt
         return run()
-    except (KeyboardInterrupt, ImportError, SystemError) as error:
-        if not (isinstance(error, KeyboardInterrupt) or handler.heard):
+    except (KeyboardInterrupt, ImportError, SystemError):  # a compiled module, imported, makes the latter of the first
+        if not stopped:
             raise
-        signal.setitimer(signal.ITIMER_REAL, 0.0)  # a stop that was to be raised after an import is answered here
         with contextlib.suppress(OSError):  # the terminal may be gone
             print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
         return 1
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
         for stop in heard:  # what is done is done, and the status reports how
             signal.signal(stop, signal.SIG_IGN)
+
+
+def _set_environment() -> str | None:
+    """Set what this process and its children need; returns what is wrong with what was there, or None."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # mujoco's import starts `python -c`, which else imports from this directory
+    os.environ.update(dict.fromkeys(_THREADS, "1"))  # results do not depend on the number of cores
+    renderer = os.environ.pop("MUJOCO_GL", "")  # with a library that is missing, mujoco's import fails
+    os.environ["QUADSIM_GL"] = renderer.strip().lower()
+    if os.environ["QUADSIM_GL"] not in _RENDERERS:
+        return f"MUJOCO_GL must be one of {', '.join(filter(None, _RENDERERS))}, or unset; got {renderer!r:.100}"
+    epoch = os.environ.get("SOURCE_DATE_EPOCH", "0")
+    if not (epoch.isascii() and epoch.isdigit() and len(epoch) <= 12):  # matplotlib reads it
+        return f"SOURCE_DATE_EPOCH must be a whole number of seconds since 1970, or unset; got {epoch!r:.100}"
+    return None
 
 
 def _open_what_is_closed() -> None:

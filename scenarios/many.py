@@ -26,7 +26,6 @@ from types import ModuleType
 from typing import Any, Final
 
 from quadsim.errors import MissingPackageError, ParameterError, QuadsimError, printable
-from scenarios.gc_tuning import collect_rarely, freeze_for_good
 from scenarios.machine import usable_cores, versions
 
 Row = dict[str, Any]
@@ -249,8 +248,6 @@ def _serve(pipe: connection.Connection, fly: bytes, memory: float) -> None:
     _die_with_caller()
     os.dup2(2, 1)  # what controllers print is no part of the caller's output
     _limit_memory(memory)
-    collect_rarely()
-    freeze_for_good()
     with suppress(EOFError, OSError):
         pipe.send(None)
         while True:

@@ -12,7 +12,7 @@ from quadsim.errors import InputError, ParameterError
 from quadsim.outputs import absolute, reserving
 from scenarios.api import as_scenario, named_by
 from scenarios.flight import Outputs
-from scenarios.parts.user_code import require_importable
+from scenarios.parts.plugin import require_importable
 from scenarios.progress import Progress, reporting
 from scenarios.schema.scenario import Scenario
 from scenarios.shipped import paper_names

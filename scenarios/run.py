@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from quadsim.controller import Command, Controller
 from quadsim.errors import InputError, ParameterError
@@ -27,9 +28,7 @@ from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller, build_ground, build_plant, resolve
 from scenarios.courses.make import build_motion, follow_course
 from scenarios.flight import Flight, Outputs, write_run
-from scenarios.gc_tuning import frozen
 from scenarios.limits import build_limits
-from scenarios.one_thread import ONE_THREAD
 from scenarios.parts.effects import build_computation
 from scenarios.parts.live import FlightEvents, Successor, unanswered_by
 from scenarios.parts.navigation import build_navigation
@@ -98,7 +97,7 @@ def fly_once(
     navigation: Navigation | None,
     progress: Callable[[int], None] | None = None,
 ) -> FlightLog:
-    """Fly a scenario with a plant and a controller that were built for it, undisturbed by Python's cycle collector.
+    """Fly a scenario with a plant and a controller that were built for it.
 
     Args:
         scenario: what is flown; without events `setpoint` and `controller`, which are not of these parts.
@@ -113,8 +112,7 @@ def fly_once(
         if isinstance(event, SetpointEvent | ControllerEvent):
             raise ParameterError("events", "type", event.type, "another one where the parts were built before")
     loop = closed_loop(scenario, vehicle, plant, controller, reference, navigation=navigation)
-    with frozen():
-        complete(loop, periods=scenario.periods, progress=progress)
+    complete(loop, periods=scenario.periods, progress=progress)
     return loop.log()
 
 
@@ -123,8 +121,8 @@ class StartedFlight:
 
     What happens in flight comes from the scenario's events, and from `apply`.  A period depends on these and on the
     seed alone, never on a clock: the scenario of `flight` flies to the same bits.  Linear algebra is held to one
-    thread in each step.  It is for one thread at a time, but for `successor`; it owns native memory: `close` it, or use
-    it as a context manager.
+    thread in the whole process from then on.  It is for one thread at a time, but for `successor`; it owns native
+    memory: `close` it, or use it as a context manager.
 
     Attributes:
         vehicle: the modelled vehicle.
@@ -155,28 +153,27 @@ class StartedFlight:
     ) -> None:
         """Set up at t = 0; see `start`."""
         self._started, self.vehicle, self.limits = scenario, build_vehicle(scenario), build_limits(scenario)
-        ONE_THREAD.look_again()
-        with ONE_THREAD:
-            if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
-                raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
-            controller = self._build(scenario.controller) if law is None else law
-            for _, spec in scenario.controller_changes:
-                self._build(spec)  # to be refused before anything is flown; one by one, as each may take megabytes
-            self._law = controller.name, controller.solver
-            self._plant = build_plant(scenario, self.vehicle, forces=forces)
-            self._navigation = build_navigation(scenario, self.vehicle)
-            started = clock.perf_counter()
-            reference = follow_course(scenario)
-            self.loop = closed_loop(
-                scenario,
-                self.vehicle,
-                self._plant,
-                controller,
-                reference,
-                navigation=self._navigation,
-                recorded=recorded,
-            )
-            self._simulate_s = clock.perf_counter() - started
+        threadpool_limits(limits=1)  # the matrices are small, and results do not depend on the number of cores
+        if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
+            raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
+        controller = self._build(scenario.controller) if law is None else law
+        for _, spec in scenario.controller_changes:
+            self._build(spec)  # to be refused before anything is flown; one by one, as each may take megabytes
+        self._law = controller.name, controller.solver
+        self._plant = build_plant(scenario, self.vehicle, forces=forces)
+        self._navigation = build_navigation(scenario, self.vehicle)
+        started = clock.perf_counter()
+        reference = follow_course(scenario)
+        self.loop = closed_loop(
+            scenario,
+            self.vehicle,
+            self._plant,
+            controller,
+            reference,
+            navigation=self._navigation,
+            recorded=recorded,
+        )
+        self._simulate_s = clock.perf_counter() - started
         self._events = FlightEvents(
             scenario,
             self.vehicle,
@@ -221,8 +218,7 @@ class StartedFlight:
         Raises:
             FlightError: the vehicle is lost; the flight has ended.
         """
-        with ONE_THREAD:
-            return self.loop.observation
+        return self.loop.observation
 
     def step(self, command: Command | Array | None = None) -> Sample:
         """Fly one control period.
@@ -246,8 +242,7 @@ class StartedFlight:
             command = Command(speeds=speeds, plan=np.tile(speeds, (self.loop.controller.horizon, 1)))
         started = clock.perf_counter()
         try:
-            with ONE_THREAD:
-                return self.loop.step(command)
+            return self.loop.step(command)
         finally:
             self._simulate_s += clock.perf_counter() - started
 
@@ -255,8 +250,7 @@ class StartedFlight:
         """Fly on to the scenario's end; a flight error or Ctrl-C ends it early, in order."""
         started, periods = clock.perf_counter(), self.scenario.periods
         progress("flight", self.k, periods)
-        with ONE_THREAD, frozen():
-            complete(self.loop, periods=periods, progress=lambda done: progress("flight", done, periods))
+        complete(self.loop, periods=periods, progress=lambda done: progress("flight", done, periods))
         self._simulate_s += clock.perf_counter() - started
 
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
@@ -328,8 +322,7 @@ class StartedFlight:
         )
 
     def _build(self, spec: ControllerSpec) -> Controller:
-        with ONE_THREAD:
-            return build_controller(self._started.model_copy(update={"controller": spec}), self.vehicle)
+        return build_controller(self._started.model_copy(update={"controller": spec}), self.vehicle)
 
 
 def start(
@@ -364,8 +357,7 @@ def fly_scenario(
 ) -> Flight:
     """Fly a scenario and audit it, writing nothing.
 
-    Linear algebra is held to one thread: the matrices are small, and results do not depend on the core count.  A
-    controller that changes the working directory changes it for the flight alone.
+    A controller that changes the working directory changes it for the flight alone.
 
     Args:
         scenario: what is flown.

@@ -26,7 +26,6 @@ from quadsim.vehicle import Vehicle
 from scenarios.cost.measure import ARM_LENGTHS, DRAGS
 from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
 from scenarios.flight import Flight, Outputs
-from scenarios.gc_tuning import freeze_for_good
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent
@@ -56,7 +55,7 @@ LONG = (
     *("mpc/test_staged.py", "scenarios/campaign/test_commands.py"),
     *("test_packaging.py", "mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
     *("scenarios/gym/test_environment.py", "test_learning_examples.py"),
-    *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py"),
+    *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py", "scenarios/test_bad_controllers.py"),
     *("scenarios/campaign/statistics/test_drivers.py", "scenarios/papers/test_beyond.py"),
     *("scenarios/tuning/test_run.py", "scenarios/tuning/report/test_tuning_page.py"),
 )
@@ -79,8 +78,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leave all that is loaded out of the passes of Python's cycle collector, and have few: they took 9 % of all."""
-    freeze_for_good()
+    """Have few passes of Python's cycle collector: they took 9 % of all."""
     gc.set_threshold(20_000, 20, 50)
 
 

@@ -124,8 +124,6 @@ def one_core() -> Iterator[int | None]:
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
     """Linear algebra on one thread; cycles are collected only on request."""
-    from scenarios.gc_tuning import thaw  # here: this module is run beside older checkouts too
-
     collecting = gc.isenabled()
     gc.collect()
     gc.freeze()
@@ -134,7 +132,7 @@ def undisturbed() -> Iterator[None]:
         with threadpool_limits(limits=1):
             yield
     finally:
-        thaw()
+        gc.unfreeze()
         if collecting:
             gc.enable()
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,11 +19,9 @@ from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
 from scenarios.campaign.spec import CampaignSpec
 from scenarios.machine import machine, versions
 from scenarios.parts.controllers import make_controller
-from scenarios.parts.foreign_code import announce_recorded, find_code
-from scenarios.parts.foreign_code import digest as digest_of_code
-from scenarios.parts.plugin import PluginController
+from scenarios.parts.plugin import import_plugin
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.schema.plugin import PluginSpec
+from scenarios.schema.plugin import ForceSpec, PluginSpec
 from scenarios.schema.scenario import Scenario
 
 MANIFEST_FILE: Final = "manifest.json"
@@ -54,7 +53,6 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
         "flights": plan.spec.flights,
         "flown": 0,
         **flown_by(plan),
-        **controller_code(plan),
         "sessions": [],
     }
     write(manifest, files)
@@ -119,18 +117,9 @@ def require_same(plan: Plan, directory: Path) -> None:
 def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
     """Of `code`, `controller`, `forces`, `versions` and `machine`, those that are not as when a campaign was begun.
 
-    Imports a plug-in controller; what is to run, and what ran then, is logged to
-    `scenarios.parts.foreign_code.LOGGER` before.
+    Imports a plug-in controller.
     """
-    if isinstance(plan.scenario.controller, PluginSpec):
-        announce_recorded(plan.scenario.controller, manifest.get("controller_code", manifest.get("controller")))
     return [name for name, value in flown_by(plan).items() if manifest.get(name) != value]
-
-
-def controller_code(plan: Plan) -> dict[str, Any]:
-    """The digest of a user-defined controller, for `other_than_flew`."""
-    own = plan.scenario.controller
-    return {"controller_code": find_code(own).digest} if isinstance(own, PluginSpec) else {}
 
 
 def flown_by(plan: Plan) -> dict[str, Any]:
@@ -138,7 +127,7 @@ def flown_by(plan: Plan) -> dict[str, Any]:
     return {
         "code": code_digest(),
         "controller": controller_digest(plan.scenario),
-        "forces": [find_code(force).digest for force in plan.scenario.forces] or None,
+        "forces": [_user_code(force) for force in plan.scenario.forces] or None,
         "versions": versions(),
         "machine": machine(),
     }
@@ -147,7 +136,7 @@ def flown_by(plan: Plan) -> dict[str, Any]:
 @functools.cache
 def code_digest() -> str:
     """SHA-256 of everything of ours that numbers come from: code, models, scenarios."""
-    return digest_of_code([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
+    return _digest([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
 
 
 def controller_digest(scenario: Scenario) -> str | None:
@@ -158,14 +147,27 @@ def controller_digest(scenario: Scenario) -> str | None:
     """
     if not isinstance(scenario.controller, PluginSpec):
         return None
-    controller = make_controller(scenario.controller, build_vehicle(scenario), scenario.control_period)
-    if not isinstance(controller, PluginController):
-        return None
-    package = controller.module.partition(".")[0]
-    file = getattr(sys.modules[package], "__file__", None)
+    make_controller(scenario.controller, build_vehicle(scenario), scenario.control_period)
+    return _user_code(scenario.controller)
+
+
+def _user_code(spec: PluginSpec | ForceSpec) -> str | None:
+    """SHA-256 of a user's module, or of the whole package that it is in; None without a file."""
+    file = getattr(sys.modules[import_plugin(spec).__module__.partition(".")[0]], "__file__", None)
     if file is None:
         return None
-    return digest_of_code([Path(file).parent if Path(file).name == "__init__.py" else Path(file)])
+    return _digest([Path(file).parent if Path(file).name == "__init__.py" else Path(file)])
+
+
+def _digest(roots: Iterable[Path]) -> str:
+    """SHA-256 of the code, models and scenarios in files and folders."""
+    found = hashlib.sha256()
+    for root in roots:
+        for path in [root] if root.is_file() else sorted(root.rglob("*")):
+            if path.suffix in (".py", ".toml", ".xml") and path.is_file():
+                found.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
+                found.update(path.read_bytes())
+    return f"sha256:{found.hexdigest()}"
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:

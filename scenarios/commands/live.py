@@ -17,7 +17,7 @@ from scenarios.live.guard import LOOPBACK
 from scenarios.live.pacing import Pace
 from scenarios.live.script import play, read_script
 from scenarios.live.session import Session
-from scenarios.reaudit import stored_scenario
+from scenarios.reaudit import reaudit, stored_scenario
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.scenario import Scenario
 from scenarios.shipped import scenario_names
@@ -29,6 +29,8 @@ def live(options: Namespace) -> int:
     finished = run.is_dir()
     if finished and (options.settings or options.seed is not None):
         raise ParameterError("", "--set" if options.settings else "--seed", "given", "absent where a run is flown on")
+    if finished:
+        reaudit(run, products=False)
     scenario = stored_scenario(run) if finished else load(options.scenario, options)
     against = None if options.against is None else load(options.against, Namespace(settings=[], seed=None)).controller
     script = None if options.script is None else read_script(options.script)

@@ -26,7 +26,6 @@ from scenarios.gym.observations import USUAL, Observations
 from scenarios.gym.randomisation import make_plan
 from scenarios.gym.rendering import Screen, has_display, make_screen
 from scenarios.limits import build_limits
-from scenarios.one_thread import ONE_THREAD
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import StartedFlight, start
 from scenarios.schema.base import LARGEST_SEED
@@ -205,19 +204,18 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             else self.actions.command(action, seen.moment.body_rates, flight.loop.controller.horizon)
         )
         nothing = np.full(len(self.limits), np.inf)
-        with ONE_THREAD:
-            try:
-                sample = flight.loop.step(command)
-            except FlightError:
-                return self._vector(seen), 0.0, True, False, self._info(nothing, nothing)
-            period = one_period(sample, self.scenario.plant.timestep)
-            self._truth, self._rotors = state, _ = period.plant.state[-1], period.plant.speeds[-1]
-            try:
-                self._seen = flight.loop.observation
-            except FlightError:  # lost: no controller would be called any more
-                moment = replace(seen.moment, acting=sample.speeds)
-                rows = seen.preview
-                self._seen = replace(seen, state=state, reference=rows[0], preview=rows[1:], moment=moment)
+        try:
+            sample = flight.loop.step(command)
+        except FlightError:
+            return self._vector(seen), 0.0, True, False, self._info(nothing, nothing)
+        period = one_period(sample, self.scenario.plant.timestep)
+        self._truth, self._rotors = state, _ = period.plant.state[-1], period.plant.speeds[-1]
+        try:
+            self._seen = flight.loop.observation
+        except FlightError:  # lost: no controller would be called any more
+            moment = replace(seen.moment, acting=sample.speeds)
+            rows = seen.preview
+            self._seen = replace(seen, state=state, reference=rows[0], preview=rows[1:], moment=moment)
         terminated = flight.loop.reason is not None or self._seen.moment.phase is Phase.CRASHED
         if self.render_mode == "human":
             self._draw()
@@ -239,8 +237,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if self._queried is None or self._queried.k != flight.k:
             seen = self._seen
             self.actions.of(np.zeros(4))  # which those without equivalent speeds refuse
-            with ONE_THREAD:
-                command = flight.loop.controller.step(seen.moment, seen.state, seen.preview)
+            command = flight.loop.controller.step(seen.moment, seen.state, seen.preview)
             self.action_for(command)
         assert self._queried is not None
         return self._queried.action

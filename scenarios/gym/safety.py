@@ -14,7 +14,6 @@ from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle
 from scenarios.gym.actions import Action
 from scenarios.gym.environment import QuadrotorEnv
-from scenarios.one_thread import ONE_THREAD
 from scenarios.parts.controllers import make_filter
 from scenarios.schema.robust import RobustSpec
 
@@ -105,5 +104,4 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         seen, horizon = self._base.started.observation, self._law.horizon
         preview = seen.preview[:horizon]
         preview = np.concatenate([preview, np.repeat(preview[-1:], horizon - len(preview), axis=0)])
-        with ONE_THREAD:
-            return self._law.step(seen.moment, seen.state, preview)
+        return self._law.step(seen.moment, seen.state, preview)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
-from quadsim.errors import FileError, InputError, ParameterError
+from quadsim.assets import read_toml
+from quadsim.errors import InputError, ParameterError
 from scenarios.live.session import Session
 
 
@@ -28,12 +28,7 @@ def read_script(path: str | Path) -> Script:
         FileError: it cannot be read.
         InputError: it is not a script.
     """
-    try:
-        data = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise FileError(path, f"cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise FileError(path, f"is no TOML: {error}") from error
+    data = read_toml(Path(path))
     unknown = sorted(set(data) - {"duration", "inputs"})
     if unknown:
         raise InputError(f"{path}: unknown: {', '.join(unknown)}; a script has duration and [[inputs]]")

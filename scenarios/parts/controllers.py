@@ -22,7 +22,7 @@ from quadsim.controller import Controller
 from quadsim.errors import ExportError, InputError, ParameterError
 from quadsim.state import INDEX, N_STATES, POSITION, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.parts.plugin import build_plugin
+from scenarios.parts.plugin import import_plugin, make_law
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.controller import ConstrainedSpec, ControllerSpec, NonlinearSpec, UnconstrainedSpec
 from scenarios.schema.optimisation import ANGLES, BoundedSpec, InputWeightsSpec, SoftSpec, WeightedSpec
@@ -149,7 +149,7 @@ def make_controller(spec: ControllerSpec, vehicle: Vehicle, period: float, shape
         case LQRSpec() | PIDSpec() | GeometricSpec():
             return _baseline(spec, vehicle, period)
         case PluginSpec():
-            return build_plugin(spec, vehicle, period)
+            return make_law(import_plugin(spec), spec, vehicle, period)
 
 
 def make_filter(spec: RobustSpec, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Controller]:

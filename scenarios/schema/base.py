@@ -17,7 +17,6 @@ from pydantic.fields import FieldInfo
 from quadsim.fields import Number
 
 MOST_ENTRIES: Final = 1000  # of a list of tables
-DEEPEST: Final = 20  # tables and lists within one another; a scenario has a third of them
 Triple = Annotated[list[Number], Len(3, 3)]
 Pair = Annotated[list[Number], Len(2, 2)]
 LARGEST_HORIZON: Final = 1000
@@ -69,16 +68,3 @@ def require_ordered(name: str, pair: Sequence[float]) -> None:
     """Refuse a pair of bounds whose lower is not below its upper."""
     if not pair[0] < pair[1]:
         raise ValueError(f"{name} must have its lower bound below its upper; got {list(pair)}")
-
-
-def is_deeper(value: Any, levels: int) -> bool:
-    """Whether tables and lists are nested more than this many levels deep."""
-    layer = [value]
-    for _ in range(levels + 1):
-        layer = [
-            inner
-            for each in layer
-            if isinstance(each, dict | list)
-            for inner in (each.values() if isinstance(each, dict) else each)
-        ]
-    return bool(layer)

@@ -7,9 +7,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from quadsim.assets import read_toml
-from quadsim.errors import FileError, InputError, ParameterError
-from scenarios.schema.base import DEEPEST, is_deeper
+from quadsim.assets import DEEPEST, read_toml
+from quadsim.errors import FileError, ParameterError
 from scenarios.schema.plugin import located
 
 LARGEST_FILE: Final = 8_000_000
@@ -57,6 +56,8 @@ def read_scenario(
     chain = (*above, path.resolve())
     if base.resolve() in chain:
         raise FileError(path, f"is its own base: {' -> '.join([*(file.name for file in chain), base.name])}")
+    if len(chain) > DEEPEST:
+        raise FileError(path, f"must have at most {DEEPEST} bases above one another")
     inherited = read_scenario(base, find, locate=locate, above=chain)
     locate(inherited, base.parent)
     # The base's place in the library is its own.
@@ -130,17 +131,10 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     """A file's tables, if a person can have meant it as a scenario."""
-    try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE:
-            raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
-        data = read_toml(path)
-    except InputError:
-        raise
-    except (RecursionError, ValueError) as error:  # nested too deep, or a number of thousands of digits
-        raise FileError(path, f"is not valid TOML: {error}") from error
-    if is_deeper(data, DEEPEST):
-        raise FileError(path, f"must have at most {DEEPEST} tables and lists within one another")
+    size = path.stat().st_size
+    if size > LARGEST_FILE:
+        raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
+    data = read_toml(path)
     if isinstance(data.get("controller"), str):  # its name alone, which a table over it, or a setting, adds to
         data["controller"] = {"type": data["controller"]}
     return data

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import tomllib
 from typing import Any
 
-from quadsim.errors import ParameterError, UnknownNameError
-from scenarios.schema.base import DEEPEST, is_deeper
+from quadsim.assets import DEEPEST, parse_toml
+from quadsim.errors import InputError, ParameterError, UnknownNameError
 
 
 def apply_setting(data: dict[str, Any], setting: str) -> None:
@@ -22,9 +20,13 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
         raise ParameterError("", "--set", setting, "of the form dotted.path=value")
     if keys == ["base"]:
         raise ParameterError("", "--set", setting, "of a field other than base, which only a file can have")
-    value = _parse_value(text.strip())
-    if len(keys) > DEEPEST or is_deeper(value, DEEPEST):
-        raise ParameterError("", "--set", setting[:100], f"of at most {DEEPEST} tables and lists within one another")
+    try:
+        if len(keys) > DEEPEST:
+            raise InputError
+        value = _parse_value(text.strip())
+    except InputError:
+        rule = f"of at most {DEEPEST} tables and lists within one another"
+        raise ParameterError("", "--set", setting[:100], rule) from None
     set_field(data, path.strip(), value, source="--set", given=setting)
 
 
@@ -99,9 +101,10 @@ def _require_numbers(entries: list[Any], path: str, *, source: str, given: str) 
 
 def _parse_value(text: str) -> Any:
     """A value of TOML, or the text itself where it is none."""
-    # RecursionError: lists within lists without end; ValueError: not TOML, or a number of thousands of digits.
-    with contextlib.suppress(RecursionError, ValueError):
-        table = tomllib.loads(f"value = {text}")
-        if table.keys() == {"value"}:
-            return table["value"]
-    return text
+    try:
+        table = parse_toml(f"value = {text}")
+    except InputError:
+        raise
+    except ValueError:  # also of a number of thousands of digits
+        return text
+    return table["value"] if table.keys() == {"value"} else text

@@ -281,7 +281,6 @@ def _begin(plan: TuningPlan) -> dict[str, Any]:
         "status": "running",
         "optuna": require_optuna().__version__,
         **records.flown_by(plan.start),
-        **records.controller_code(plan.start),
         "sessions": [],
     }
 

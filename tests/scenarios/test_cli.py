@@ -5,8 +5,12 @@ from __future__ import annotations
 import errno
 import importlib.util
 import json
+import os
 import shutil
+import subprocess
+import sys
 import tomllib
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
@@ -565,3 +569,117 @@ def test_a_printed_scenario_is_not_bound_to_its_table(here: Path, capsys: pytest
     printed = tomllib.loads(capsys.readouterr().out)
     assert "sha256" not in printed["reference"]
     assert Path(printed["reference"]["file"]).name == "csv-trefoil.csv"
+
+
+# --- input that takes memory, recursion or the terminal -------------------------------------------------------------
+
+DOTS = ".".join(["a"] * 40_000)
+DEEP = {
+    "dotted": f"{DOTS} = 1",
+    "header": f"[{DOTS}]",
+    "quoted": ".".join(['"a\\""'] * 40_000) + " = 1",
+    "inline": f"vehicle = {{ {DOTS} = 1 }}",
+    "lists": f"inputs = {'[' * 500}{']' * 500}",
+    "tables": f"inputs = {'{ a = ' * 5_000}1{'}' * 5_000}",
+}
+
+
+@pytest.mark.parametrize("text", DEEP.values(), ids=DEEP)
+@pytest.mark.parametrize(
+    "command", [["check"], ["campaign"], ["tune"], ["vehicle"], ["scenario", "--for"], ["live", "hover", "--script"]]
+)
+def test_a_file_that_is_nested_too_deep_is_refused_before_it_takes_memory(
+    command: list[str], text: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "deep.toml").write_text(text)
+    tracemalloc.start()
+    try:
+        assert main([*command, "deep.toml"]) == EXIT_WRONG_INPUT
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 50e6
+    message = "quadsim: deep.toml: must have at most 20 tables and lists within one another\n"
+    assert capsys.readouterr().err == message
+
+
+@pytest.mark.parametrize(
+    "setting", [f"{DOTS}=1", f"controller={{{DOTS}=1}}", f"seed=1\n{DOTS}=1", "seed=" + "[" * 99_999]
+)
+def test_a_setting_that_is_nested_too_deep_is_refused_before_it_takes_memory(
+    setting: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", "hover", "--set", setting]) == EXIT_WRONG_INPUT
+    message = capsys.readouterr().err
+    assert message.startswith("quadsim: --set must be of at most 20 tables and lists within one another; got '")
+    assert len(message) < 300
+
+
+def test_texts_and_numbers_with_many_dots_are_not_nested(here: Path) -> None:
+    text = "a.b.c, " * 100 + "." * 100 + " 1.0 2.0" * 100
+    (here / "mine.toml").write_text(f'base = "hover"\nname = "mine"\ndescription = "{text}"\n')
+    assert load_scenario("mine.toml").description == text
+
+
+def test_a_long_chain_of_bases_is_refused(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for i in range(3000):
+        (here / f"{i}.toml").write_text(f'base = "{i + 1}.toml"\n')
+    assert main(["check", "0.toml"]) == EXIT_WRONG_INPUT
+    assert capsys.readouterr().err == "quadsim: 20.toml: must have at most 20 bases above one another\n"
+
+
+@pytest.mark.parametrize("option", ["--out", "--seed", "--set", "--junit"])
+def test_two_dashes_are_no_value(option: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["check" if option == "--junit" else "run", "hover", f"{option}=--"])
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f"error: argument {option}: expected a value; got '--'")
+    assert left_in(here) == []
+
+
+@pytest.mark.parametrize("path", ["-", "--json", "-x/y"])
+def test_a_path_does_not_begin_with_a_dash(path: str, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["run", "hover", f"--out={path}"])
+    assert f"--out: must be a path; got '{path}', to be written as ./{path}" in capsys.readouterr().err
+    assert left_in(here) == []
+
+
+def test_home_is_expanded_as_a_shell_does(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(here / "home"))
+    (here / "home").mkdir()
+    assert main(["run", "hover", *SHORT, *TABLES, "--out=~/mine"]) == EXIT_DONE
+    assert main(["check", "~/mine", "--junit=~/mine.xml"]) == EXIT_DONE
+    assert sorted(path.name for path in (here / "home").iterdir()) == ["mine", "mine.xml"]
+
+
+def test_a_message_has_some_twenty_lines(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "many.toml").write_text('base = "hover"\n' + "".join(f"f{i} = 1\n" for i in range(500)))
+    assert main(["check", "many.toml"]) == EXIT_WRONG_INPUT
+    *lines, last = capsys.readouterr().err.splitlines()
+    assert len(lines) == 20
+    assert last == "  and 480 more"
+    assert main(["check", "hover", "--set", f"seed={'x' * 80_000}"]) == EXIT_WRONG_INPUT
+    assert len(capsys.readouterr().err) < 1100
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "rule"),
+    [
+        ("MUJOCO_GL", "foo", "one of egl, osmesa, glfw, disable, or unset"),
+        ("SOURCE_DATE_EPOCH", "x", "a whole number of seconds since 1970, or unset"),
+    ],
+)
+def test_an_environment_that_libraries_die_of_is_refused(name: str, value: str, rule: str, here: Path) -> None:
+    process = [sys.executable, "-P", "-c", "from scenarios.entry import main; raise SystemExit(main())", "list"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), name: value}
+    done = subprocess.run(process, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (EXIT_WRONG_INPUT, "")
+    assert done.stderr == f"quadsim: {name} must be {rule}; got '{value}'\n"
+
+
+def test_a_renderer_that_is_not_there_is_no_matter_of_who_simulates(here: Path) -> None:
+    """MuJoCo's own import fails where the library that MUJOCO_GL names is missing."""
+    process = [sys.executable, "-P", "-m", "scenarios.cli", "check", "hover", *SHORT]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "MUJOCO_GL": "osmesa"}
+    done = subprocess.run(process, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (EXIT_DONE, "")

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+import sysconfig
 import time as clock
+from importlib import metadata
 from pathlib import Path
 
 import psutil
 import pytest
 
 from quadsim.flight import rundir
-from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
+from scenarios.commands import COMMANDS, EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -92,79 +95,96 @@ def test_a_signal_in_the_first_moments_ends_it_in_order(tmp_path: Path, stop: si
     assert {path.name for path in tmp_path.iterdir()} <= {"runs"}
 
 
-SWALLOWED = """
-import os, signal, sys, time
-from scenarios import cli, entry
-class Dying:
-    def __del__(self):
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.1)
-def run():
-    Dying()
-    time.sleep(5)
-    return 0
-cli.main = run
-sys.exit(entry.main())
+CAMPAIGN = """
+name = "little"
+scenario = "hover"
+flights = 2
+set = { duration = 0.2, constraints = [] }
+[[vary]]
+name = "mass"
+fields = ["vehicle.mass"]
+distribution = "uniform"
+low = 4.0
+high = 4.4
 """
-
-
-def test_a_stop_that_python_ignores_is_heard(tmp_path: Path) -> None:
-    """It does so in destructors and callbacks, of which imports have many."""
-    done = subprocess.run(
-        [sys.executable, "-c", SWALLOWED],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        timeout=60,
-        preexec_fn=listening,
-    )
-    assert done.returncode == EXIT_FAILED
-    assert done.stderr.startswith(b"quadsim: interrupted (Ctrl-C)")
-
-
-DISPENSABLE = """
-import os, signal, time
-try:
-    os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(0.1)
-except KeyboardInterrupt:
-    raise ImportError("as of a compiled module") from None
+TUNING = """
+name = "little"
+trials = 1
+batch = 1
+flights = [1]
+require = "P(lost) < 0.9 @ 50%"
+fresh = { flights = 2 }
+objectives = [{ name = "error", expression = "rmse.z" }]
+campaign = { scenario = "hover", set = { duration = 0.2, constraints = [] } }
+[[search]]
+name = "horizon"
+fields = ["controller.horizon"]
+distribution = "integer"
+low = 10
+high = 20
 """
-ENDLESS = """
-import os, signal
-os.kill(os.getpid(), signal.SIGINT)
-while True:
-    pass
-"""
-IMPORTING = """
-import sys, time
-from scenarios import cli, entry
-def run():
-    try:
-        import module
-    except ImportError:
-        pass
-    time.sleep(5)
-    return 0
-cli.main = run
-entry._LONGEST_IMPORT_S = 1.0
-sys.exit(entry.main())
-"""
+SCRIPT = "duration = 0.2\n"
+HELD = "import numpy as np\ndef held(now, state, reference):\n    import random\n    return np.full(4, 192.8)\n"
+BRIEF = ("--set", "duration=0.2")
+ONE_OF_EACH = {  # of every command; the first writes the run that others read
+    "run": ["run", "hover", *BRIEF, "--no-video", "--out", "run"],
+    "check": ["check", "hover", *BRIEF, "--set", "controller='my_law:held'", "--set", "constraints=[]"],
+    "list": ["list"],
+    "compare": ["compare", "run", "run", "--out", "page"],
+    "live": ["live", "run", "--script", "script.toml", "--out", "live"],
+    "video": ["video", "run", "--out", "film.mp4", "--workers", "1"],
+    "view": ["view", "run", "--web"],
+    "scenario": ["scenario", "--for", "lopes2011"],
+    "vehicle": ["vehicle", "lopes2011", "--out", "vehicle.png"],
+    "campaign": ["campaign", "campaign.toml", "--out", "campaign", "--workers", "1", "--no-report"],
+    "replay": ["replay", "campaign", *TABLES, "--out", "replayed"],
+    "tune": ["tune", "tuning.toml", "--out", "tuning", "--workers", "1", "--no-report"],
+    "reproduce": ["reproduce", "quadrotor-uav"],
+    "export": ["export", "paper-unconstrained", *BRIEF, "--out", "exported"],
+    "bench": ["bench", "flight", "--repeats", "1", *BRIEF],
+    "doctor": ["doctor"],
+}
 
 
-@pytest.mark.parametrize("module", [DISPENSABLE, ENDLESS])
-def test_a_stop_within_an_import_is_heard(tmp_path: Path, module: str) -> None:
-    (tmp_path / "module.py").write_text(module)
-    done = subprocess.run(
-        [sys.executable, "-c", IMPORTING],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        timeout=60,
-        preexec_fn=listening,
-    )
-    assert done.returncode == EXIT_FAILED
-    assert done.stderr.startswith(b"quadsim: interrupted (Ctrl-C)")
+@pytest.fixture
+def trapped(tmp_path: Path) -> Path:
+    """A folder with a file of the name of every module there is, which notes that it was executed."""
+    modules = {*sys.stdlib_module_names, *metadata.packages_distributions(), "quadsim", "mpc", "scenarios"}
+    for name in modules - {"__main__"}:
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'executed')!r}, 'a').write(__name__ + '\\n')\n")
+    return tmp_path
+
+
+def test_python_itself_does_import_from_the_current_directory(trapped: Path) -> None:
+    """Else the next test could not fail."""
+    subprocess.run([sys.executable, "-c", "import mujoco"], cwd=trapped, check=False, capture_output=True)
+    assert (trapped / "executed").read_text()
+
+
+def test_no_command_imports_from_the_current_directory(trapped: Path) -> None:
+    """But for a controller that was named, whose own imports find what is installed first."""
+    for name, text in {"campaign": CAMPAIGN, "tuning": TUNING, "script": SCRIPT}.items():
+        (trapped / f"{name}.toml").write_text(text)
+    (trapped / "my_law.py").write_text(HELD)
+    executed = trapped / "executed"
+    assert {*COMMANDS} <= {*ONE_OF_EACH}
+    for name, arguments in ONE_OF_EACH.items():
+        process = subprocess.Popen(
+            [Path(sysconfig.get_path("scripts")) / "quadsim", *arguments],
+            cwd=trapped,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=6.0 if name == "view" else 120.0)
+        with contextlib.suppress(ProcessLookupError):  # a viewer stays
+            os.killpg(process.pid, signal.SIGTERM)
+        _, errors = process.communicate()
+        assert not executed.exists(), (name, executed.read_text(), errors)
+        assert process.returncode == EXIT_DONE or name in ("video", "view", "vehicle", "check"), (name, errors)
+        assert (f"quadsim: imported my_law from {trapped}/my_law.py\n" in errors) == (name == "check")
 
 
 def spent(process: subprocess.Popen[str]) -> float:

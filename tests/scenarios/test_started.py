@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import tomllib
 import weakref
@@ -19,7 +18,6 @@ from quadsim.errors import CommandError, FlightError, InputError
 from quadsim.sim.loop import ClosedLoop
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.one_thread import ONE_THREAD
 from scenarios.parts.neutral import prepared
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario, start
@@ -291,14 +289,16 @@ def threads() -> set[int]:
     return {library["num_threads"] for library in threadpool_info()}
 
 
-def test_linear_algebra_has_one_thread_while_anybody_flies() -> None:
-    """Whoever leaves first, as a controller that is built elsewhere, does not let the others have more."""
+def test_linear_algebra_has_one_thread_once_a_flight_has_started() -> None:
     with threadpool_limits(limits=2):
-        one, other = contextlib.ExitStack(), contextlib.ExitStack()
-        one.enter_context(ONE_THREAD)
-        other.enter_context(ONE_THREAD)
-        assert threads() == {1}
-        one.close()
-        assert threads() == {1}
-        other.close()
         assert threads() == {2}
+        with quadsim.start("hover"):
+            assert threads() == {1}
+
+
+def test_the_cycle_collector_looks_through_nothing_from_before_a_flight_while_it_flies() -> None:
+    frozen: list[int] = []
+    with start(load_scenario("hover", ["duration=0.2"])) as started:
+        started.complete(lambda *_: frozen.append(gc.get_freeze_count()))
+    assert min(frozen[1:]) > 10_000
+    assert gc.get_freeze_count() == 0

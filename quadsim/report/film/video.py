@@ -28,8 +28,8 @@ from quadsim.report.film.frames import Shot, film_span
 from quadsim.vehicle import Vehicle
 
 BACKENDS: Final = ("egl", "osmesa")  # what can render without a screen, in the order tried
-_WORKER: Final = (sys.executable, "-m", "quadsim.report.film.render_worker")
-_PROBE: Final = (sys.executable, "-m", "quadsim.report.film.probe")
+_WORKER: Final = (sys.executable, "-P", "-m", "quadsim.report.film.render_worker")
+_PROBE: Final = (sys.executable, "-P", "-m", "quadsim.report.film.probe")
 _PROBE_SECONDS: Final = 60.0
 _LEAST_FREE_BYTES: Final = 1024 * 1024
 _FEWEST_FRAMES: Final = 30  # A further worker is not worth its start for fewer frames than these
@@ -43,7 +43,9 @@ def rendering_backend() -> str:
     Raises:
         RenderingUnavailableError: none does; with the output of each.
     """
-    preferred = os.environ.get("MUJOCO_GL", "").strip().lower()
+    preferred = (
+        os.environ.get("QUADSIM_GL") or os.environ.get("MUJOCO_GL", "").strip().lower()
+    )  # see scenarios/entry.py
     tried: dict[str, str] = {}
     for backend in sorted(BACKENDS, key=lambda name: name != preferred):
         try:

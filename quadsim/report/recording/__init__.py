@@ -41,7 +41,7 @@ from quadsim.report.recording.texts import send_texts
 from quadsim.report.recording.world import send_airframe, send_scene, send_space
 
 _CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
-_VIEWER: Final = (sys.executable, "-c", _CALL, "--bind=127.0.0.1", "--port=auto")
+_VIEWER: Final = (sys.executable, "-P", "-c", _CALL, "--bind=127.0.0.1", "--port=auto")
 """Starts a viewer of its own, which only this machine can reach."""
 _INTERRUPTED: Final = 130  # the viewer's exit status after Ctrl-C
 
@@ -104,7 +104,7 @@ def recording_in_background(directory: Path, path: Path) -> Iterator[None]:
         OutputError: the file cannot be written, as from `write_recording`.
     """
     with subprocess.Popen(
-        [sys.executable, "-m", "quadsim.report.recording", str(directory), str(path)],
+        [sys.executable, "-P", "-m", "quadsim.report.recording", str(directory), str(path)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env={**os.environ, **own_packages()},

@@ -17,7 +17,7 @@ import quadsim
 import scenarios.parts.live
 from quadsim.errors import InputError
 from scenarios.cli import main
-from scenarios.commands import EXIT_WRONG_INPUT
+from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.live.knobs import knobs
 from scenarios.live.pacing import LATE, Pace
 from scenarios.live.script import Script, play, read_script
@@ -271,7 +271,7 @@ def test_a_script_is_saved_as_a_run_that_flies_to_the_same_bytes(
         ("duration = 1\ninputs = [{ at = 2.0 }]", "at must be from 0 to below duration"),
         ("duration = 1\ninputs = 3", "inputs must be tables"),
         ("duration = 1\nspeed = 3", "unknown: speed"),
-        ("duration = ", "no TOML"),
+        ("duration = ", "is not valid TOML"),
     ],
 )
 def test_a_script_that_is_none_is_refused(tmp_path: Path, text: str, refusal: str) -> None:
@@ -335,3 +335,25 @@ def test_a_wrong_input_is_refused_by_name(session: Session, table: dict[str, Any
     session.submit(table)
     (refused,) = session.advance().refused
     assert message in refused
+
+
+def test_a_run_that_check_refuses_is_not_flown_on_and_none_of_its_code_is_imported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    law, run, script = tmp_path / "law_of_run.py", tmp_path / "run", tmp_path / "script.toml"
+    law.write_text("import numpy as np\ndef held(now, state, reference):\n    return np.full(4, 192.8)\n")
+    (tmp_path / "mine.toml").write_text(
+        'base = "hover"\nname = "mine"\nduration = 0.2\nconstraints = []\ncontroller = "law_of_run:held"\n'
+    )
+    script.write_text("duration = 0.4", encoding="utf-8")
+    outputs = ("--no-video", "--no-recording", "--no-figures")
+    assert main(["run", str(tmp_path / "mine.toml"), *outputs, "--out", str(run)]) == EXIT_DONE
+    capsys.readouterr()
+    command = ["live", str(run), "--script", str(script)]
+    assert main([*command, "--out", str(tmp_path / "on")]) == EXIT_DONE
+    assert f"quadsim: imported law_of_run from {law}\n" in capsys.readouterr().err
+    summary = (run / "summary.json").read_text()
+    (run / "summary.json").write_text(summary.replace('"duration": 0.2', '"duration": 0.3'))
+    assert main([*command, "--out", str(tmp_path / "refused")]) == EXIT_WRONG_INPUT
+    assert "imported" not in capsys.readouterr().err
+    assert not (tmp_path / "refused").exists()
