@@ -71,6 +71,7 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
         "unit": limit.unit,
         **{name: value if math.isfinite(value) else None for name, value in (stated | found).items()},
         "satisfied": finding.satisfied,
+        "verdict": finding.verdict,
     }
 
 

@@ -21,8 +21,8 @@ from quadsim.flight.audit import Finding, Limit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
-from scenarios.campaign.results.events import Flags
-from scenarios.campaign.results.verdicts import ERROR, VERDICTS
+from scenarios.campaign.results.events import Event, Flags
+from scenarios.campaign.results.verdicts import ERROR, HARMLESS, INCOMPLETE, VERDICTS
 
 Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
 DRAW: Final = "draw."  # how the columns of drawn values begin
@@ -109,7 +109,7 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
     Args:
         log: with plant rows at the physics rate.
         findings: its audit.
-        verdict: `satisfied`, `violated` or `lost`.
+        verdict: `satisfied`, `violated`, `lost` or `incomplete`.
         wall_s: how long it took to fly [s].
         machine: the processor that flew it.
     """
@@ -117,7 +117,7 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
         "status": log.status,
         "verdict": verdict,
         "reason": log.reason,
-        "violated": verdict != "satisfied",
+        "violated": verdict not in (HARMLESS, INCOMPLETE),
         "crashed": str(Phase.CRASHED) in log.control.phase,
         "duration": round(float(log.plant.t[-1]), 9),
         "wall_s": wall_s,
@@ -127,7 +127,8 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
         name = finding.limit.name
         row[MARGIN + name] = finding.worst_margin if math.isfinite(finding.worst_margin) else None
         row[TIME_VIOLATED + name] = finding.time_violated
-        row[SATISFIED + name] = finding.satisfied
+        unknown = finding.verdict == "incomplete" and verdict != "lost"  # a lost flight had to get there
+        row[SATISFIED + name] = None if unknown else finding.satisfied
     row["worst_margin"], row["worst_constraint"] = worst_margin(findings)
     return row | (_numbers(log) if log.control.t.size else {})
 
@@ -239,6 +240,16 @@ def verdicts(table: pa.Table) -> dict[str, Flags]:
     """(K,) which flights have each verdict."""
     found = texts(table, "verdict")
     return {verdict: np.asarray(found == verdict, bool) for verdict in VERDICTS}
+
+
+def is_counted(table: pa.Table, event: Event) -> Flags:
+    """(K,) which flights count for an event's share: of failure and violation, those that show whether it happened.
+
+    An incomplete flight without it shows neither: it is left out, as it is no success.
+    """
+    if event.text not in ("failure", "violation"):
+        return np.ones(table.num_rows, bool)
+    return np.asarray((texts(table, "verdict") != INCOMPLETE) | event.column(table), bool)
 
 
 def draw_names(table: pa.Table) -> list[str]:
