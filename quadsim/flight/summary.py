@@ -174,7 +174,8 @@ def contradictions(summary: Mapping[str, Any]) -> Iterator[str]:
             yield f"{name}: worst_margin_sampled is there without worst_margin"
         found = constraint_verdict(entry)
         if entry["satisfied"] != (found == "satisfied") or entry.get("verdict", found) != found:
-            yield f"{name}: satisfied is {str(entry['satisfied']).lower()}, and its worst margins say {found}"
+            stated = f"satisfied is {str(entry['satisfied']).lower()}, its verdict {entry.get('verdict', '-'):.40}"
+            yield f"{name}: {stated}, and its worst margins say {found}"
 
 
 def _unit(entry: Mapping[str, Any]) -> str | None:

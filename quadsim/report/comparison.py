@@ -100,7 +100,8 @@ def verdict(summary: Summary) -> str:
     if summary["status"] != "completed":
         return "lost"
     verdicts = _required_verdicts(summary)
-    if summary["controller"].get("unrecovered") or crash(summary) or "violated" in verdicts:
+    crashed = nested(summary, "ground", "crashed") or crash(summary)
+    if crashed or summary["controller"].get("unrecovered") or "violated" in verdicts:
         return "violated"
     return "incomplete" if "incomplete" in verdicts else "satisfied"
 

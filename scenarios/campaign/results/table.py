@@ -247,7 +247,7 @@ def is_counted(table: pa.Table, event: Event) -> Flags:
 
     An incomplete flight without it shows neither: it is left out, as it is no success.
     """
-    if event.text not in ("failure", "violation"):
+    if event.text not in ("failure", "violation") or "verdict" not in table.column_names:
         return np.ones(table.num_rows, bool)
     return np.asarray((texts(table, "verdict") != INCOMPLETE) | event.column(table), bool)
 

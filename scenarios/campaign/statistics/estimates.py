@@ -28,7 +28,7 @@ from scenarios.campaign.results.table import (
     unit_of,
     verdicts,
 )
-from scenarios.campaign.results.verdicts import VERDICTS
+from scenarios.campaign.results.verdicts import INCOMPLETE, VERDICTS
 from scenarios.campaign.statistics.dependence import any_dependence, best_splits, rank_correlation, trend
 from scenarios.campaign.statistics.inference import CONFIDENCE, holm, lower_bounds, share_of, upper_bounds
 from scenarios.campaign.statistics.scatters import margin_ends
@@ -125,7 +125,8 @@ def _event(table: pa.Table, event: Event) -> dict[str, Any]:
 def _constraint(table: pa.Table, name: str) -> dict[str, Any]:
     margin = numbers(table, MARGIN + name)
     held = flags(table, SATISFIED + name, absent=False)
-    reached = held | np.isfinite(margin) | np.asarray(texts(table, "status") != "completed", bool)
+    unknown = [value is None for value in table[SATISFIED + name].to_pylist()]
+    reached = ~(np.array(unknown, bool) & np.isin(texts(table, "verdict").astype(str), (INCOMPLETE, "violated")))
     found: dict[str, Any] = {
         "unit": unit_of(table, MARGIN + name),
         "not_satisfied": share_of(~held[reached]),
