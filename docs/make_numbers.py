@@ -46,14 +46,14 @@ def fly(name: str, *settings: str) -> Flight:
 
 
 def margin(flight: Flight, name: str) -> str:
-    """By how much a flight violates a bound, in the bound's unit, and for how long at the physics rate."""
+    """The verdict on a bound, the signed margin that decides it, and the time beyond it at the physics rate."""
     finding = next(finding for finding in flight.findings if finding.limit.name == name)
-    beyond = -min(finding.worst_margin, finding.worst_margin_sampled)
+    decides, unit = finding.deciding_margin, finding.limit.unit
     if finding.satisfied:
-        return f"held ({beyond:+.3f} {finding.limit.unit})" if beyond > 1e-6 else "held"
+        return f"held ({round(decides, 3) + 0.0:.3f} {unit})"
     if not finding.time_violated:
-        return f"commands exceed by {beyond:.2f} {finding.limit.unit}, rotors held"
-    return f"violated by {beyond:.2f} {finding.limit.unit}, {finding.time_violated:.2f} s"
+        return f"violated by commands ({decides:.2f} {unit}), rotors held"
+    return f"violated ({decides:.2f} {unit}), {finding.time_violated:.2f} s"
 
 
 def results(flights: dict[str, Flight]) -> Table:

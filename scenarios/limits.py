@@ -52,6 +52,9 @@ def controller_bounds(spec: ControllerSpec, vehicle: Vehicle) -> dict[str, Range
     found: dict[str, Range] = {name: (pair[0], pair[1]) for name, pair in getattr(spec, "output_bounds", {}).items()}
     if isinstance(spec, NonlinearPartsSpec) and spec.tilt is not None:
         found["tilt"] = (-math.inf, spec.tilt)
+    if isinstance(spec, NonlinearPartsSpec) and spec.body_rate is not None:
+        largest = spec.body_rate if isinstance(spec.body_rate, list) else [spec.body_rate] * 3
+        found |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", largest, strict=True)}
     inputs = getattr(spec, "input_bounds", None)
     if inputs is not None:
         pairs = {"speed": inputs.speed or (vehicle.speed_min, vehicle.speed_max), "slew": inputs.slew}

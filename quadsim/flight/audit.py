@@ -23,6 +23,7 @@ from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from quadsim.space import Constraining
 from quadsim.state import (
     EULER,
+    EULER_RATE,
     INDEX,
     POSITION,
     REFERENCE_NAMES,
@@ -30,6 +31,7 @@ from quadsim.state import (
     STATE_NAMES,
     STATE_UNITS,
     Array,
+    euler_to_body_rates,
     shown_unit,
     tilt,
 )
@@ -72,6 +74,16 @@ def _estimate_error(i: int) -> Signal:
     return Signal(unit=unit, sampled=lambda log: scale * log.measured_error[:, i], plant=None)
 
 
+def _body_rate(axis: int) -> Signal:
+    def rates(states: Array) -> Array:
+        return np.degrees(euler_to_body_rates(states[:, EULER], states[:, EULER_RATE])[:, axis])
+
+    def plant(log: PlantLog) -> Array:  # Euler rates lose their digits near the vertical
+        return rates(log.state) if log.body_rates is None else np.degrees(log.body_rates[:, axis])
+
+    return Signal(unit="deg/s", sampled=lambda log: rates(log.truth), plant=plant)
+
+
 SIGNALS: Final[dict[str, Signal]] = {
     **{name: _state(i) for name, i in INDEX.items()},
     **{f"{name}_error": _error(j) for j, name in enumerate(REFERENCE_NAMES)},
@@ -79,6 +91,7 @@ SIGNALS: Final[dict[str, Signal]] = {
     "tilt": Signal(
         unit="deg", sampled=lambda log: np.degrees(tilt(log.truth)), plant=lambda log: np.degrees(tilt(log.state))
     ),
+    **{f"body_rate_{name}": _body_rate(axis) for axis, name in enumerate("xyz")},
     # Commanded at the samples, acting in between: they differ where rotors saturate.
     "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds),
     "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None),

@@ -146,7 +146,8 @@ MOST_STEPS: Final = 10_000_000
 
 
 Verdict = Literal["satisfied", "violated", "lost", "incomplete"]
-BOUNDED: Final = (*STATE_NAMES, "tilt", "speed", "slew")  # signals that controllers may have bounds on
+BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate_z", "speed", "slew")
+"""Signals that controllers may have bounds on."""
 
 
 class Scenario(Spec):

@@ -93,7 +93,7 @@ def test_a_window_that_the_flight_never_reached_is_neither_held_nor_violated() -
 
 
 def test_a_value_that_is_no_number_violates_its_limit() -> None:
-    finding = find(logged("z", samples=[0.0, math.nan, 0.0], plant=[0.0] * 5 + [math.nan] + [0.0] * 3), Z)
+    finding = find(logged("z", samples=SAMPLES, plant=(*PLANT[:-1], math.nan)), Z)
     assert finding.verdict == "violated"
 
 
