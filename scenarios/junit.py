@@ -90,14 +90,8 @@ def _passed(entry: Mapping[str, Any]) -> bool | None:
 def _sentence(entry: Mapping[str, Any]) -> str:
     if constraint_verdict(entry) == "incomplete":
         return "not reached: the flight has no value in the constraint's time window"
-    margins = [
-        f"{format_number(entry[key])} {where} (tolerance {entry[tolerance]:g})"
-        for key, where, tolerance in (
-            ("worst_margin", "at the physics rate", "tolerance"),
-            ("worst_margin_sampled", "at the samples", "tolerance_sampled"),
-        )
-    ]
     return (
-        f"worst margin [{entry['unit']}, negative = violated] {', '.join(margins)}, at t = {entry['worst_time']:.3f} "
-        f"s; violated for {entry['time_violated']:.3f} s"
+        f"worst margin {format_number(entry['worst_margin'])} {entry['unit']} at t = {entry['worst_time']:.3f} s "
+        f"(tolerance {entry['tolerance']:g}), {format_number(entry['worst_margin_sampled'])} at the samples "
+        f"(tolerance {entry['tolerance_sampled']:g}); violated for {entry['time_violated']:.3f} s"
     )
