@@ -223,9 +223,9 @@ def main() -> None:
         "numbers.md",
         "# The numbers\n\nMade by `make numbers`; nothing here is typed by hand.\n",
         f"## The paper's flights\n\n{table}",
-        "In brackets is the margin that decides, negative beyond the bound. A bound that is *held* may be exceeded between\n"
-        "the samples within the audit's tolerance, 0.05 deg for tilt. Seconds are those beyond bound and tolerance, at the\n"
-        "physics rate; for steps, which exist once per period, at the samples.\n",
+        "In brackets is the margin that decides, negative beyond the bound. A bound that is *held* may be exceeded\n"
+        "between the samples within the audit's tolerance, 0.05 deg for tilt. Seconds are those beyond bound and\n"
+        "tolerance, at the physics rate; for steps, which exist once per period, at the samples.\n",
         "The same over the parameters that the paper leaves out, L and d/b, is in\n"
         "[constraints-cost.md](constraints-cost.md).\n",
         f"## Targets of the flights and of the mathematics\n\n{markdown(targets(constrained, variations))}",
