@@ -81,9 +81,10 @@ def page(flights: dict[str, Flight]) -> str:
         "comments, to start your\nown from; comments in the files, in `scenarios/library`, state "
         "what each shows and with what numbers.\n",
         "The verdict is *satisfied* (flown to its end, every required constraint holds), *violated* (one does not, the "
-        "vehicle\ncrashes, or the controller ends in [permanent fallback](controllers.md#fallback)) or *lost* (the "
-        "flight ends early). Each file states\nit, and a test flies them all; those that are not satisfied are meant "
-        "not to be.\n",
+        "vehicle\ncrashes, or the controller ends in [permanent fallback](controllers.md#fallback)), *lost* (the "
+        "flight ends early) or *incomplete* (it ends\nbefore the window of a required constraint begins, as with "
+        "`--set duration=20`). Each file states it, and a test flies them all;\nthose that are not satisfied are meant "
+        "not to be. What is audited: [constraints](controllers.md#what-is-audited).\n",
         "A flight is lost when its controller gives up or answers with no command, when the simulation diverges, or "
         "when the true\nstate is beyond a criterion of `[lost]` at a control sample: looked at once per period, until "
         "the vehicle has crashed, which is\n*violated*. Every scenario has these criteria, and `false` switches one "

@@ -18,7 +18,7 @@ import numpy as np
 
 from quadsim.errors import MissingPackageError, OutputError, QuadsimError, UnknownNameError, printable
 from quadsim.flight import metrics, rundir
-from quadsim.flight.audit import SIGNALS, Finding, margins_at, margins_sampled
+from quadsim.flight.audit import HELD, SIGNALS, Finding, margins_at, margins_sampled
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import log_tables, write_log
 from quadsim.outputs import absolute, adding, amend, to_json, writing
@@ -29,6 +29,7 @@ from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.feasibility_check import report
 from scenarios.courses.make import build_course_steps
+from scenarios.limits import audit_notes
 from scenarios.machine import machine, usable_cores, versions
 from scenarios.parts.effects import build_computation
 from scenarios.parts.story import story
@@ -116,18 +117,23 @@ class Flight:
 
         What permanent fallback is: `quadsim.flight.metrics.unrecovered`.
         """
-        whole = self.log.reason is None and not self.log.control.crashed
-        held = all(finding.satisfied for finding in self.findings if finding.limit.required)
-        return whole and held and not metrics.unrecovered(self.log.control)
+        return self.outcome == "satisfied"
 
     @property
     def outcome(self) -> Verdict:
-        """The verdict in one word: `aborted` by Ctrl-C or code that raised, `lost` where anything else ended it."""
+        """The verdict in one word.
+
+        `aborted`: by Ctrl-C or code that raised; `lost`: anything else ended it; `incomplete`: it ended before a
+        required constraint was reached, and did nothing wrong up to there.
+        """
         if self.log.aborted:
             return "aborted"
         if self.log.reason is not None:
             return "lost"
-        return "satisfied" if self.satisfied else "violated"
+        verdicts = {finding.verdict for finding in self.findings if finding.limit.required}
+        if self.log.control.crashed or metrics.unrecovered(self.log.control) or "violated" in verdicts:
+            return "violated"
+        return "incomplete" if "incomplete" in verdicts else "satisfied"
 
     @cached_property
     def diagnosis(self) -> Mapping[str, Any] | None:
@@ -302,8 +308,8 @@ class Flight:
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""
         rows = "".join(
-            f"<tr><td>{escape(entry.limit.name)}</td><td>{entry.worst_margin:.4g} {escape(entry.limit.unit)}</td>"
-            f"<td>{'holds' if entry.satisfied else 'violated'}</td></tr>"
+            f"<tr><td>{escape(entry.limit.name)}</td><td>{entry.deciding_margin:.4g} {escape(entry.limit.unit)}</td>"
+            f"<td>{HELD[entry.verdict]}</td></tr>"
             for entry in self.findings
         )
         errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz" if self.time.size)
@@ -316,7 +322,7 @@ class Flight:
         return (
             f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self.summary['duration']:g} s flown, "
             f"RMS error [m]: {errors or 'none'}</p>"
-            f"<table><tr><th>constraint</th><th>worst margin</th><th>verdict</th></tr>{rows}</table>{plot}"
+            f"<table><tr><th>constraint</th><th>deciding margin</th><th>verdict</th></tr>{rows}</table>{plot}"
         )
 
     @property
@@ -401,11 +407,11 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "scenario": scenario.name,
         "description": scenario.description,
         "status": log.status,
-        "outcome": flight.outcome,
         "reason": log.reason,
         **({"traceback": [*log.traceback]} if log.traceback else {}),
         "lost": log.lost,
         "satisfied": flight.satisfied,
+        "verdict": flight.outcome,
         "group": scenario.group,
         "expected": scenario.expect,
         "as_expected": flight.outcome == scenario.expect,
@@ -415,6 +421,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         **({"events": events} if (events := story(scenario, log.control.t.size * scenario.control_period)) else {}),
         "tracking": numbers["tracking"],
         "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
+        "audit_notes": audit_notes(scenario),
         "control": numbers["control"],
         "diagnosis": flight.diagnosis,
         "controller": {

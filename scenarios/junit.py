@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any, Final
 from xml.etree import ElementTree
 
 from quadsim.errors import printable
+from quadsim.flight.summary import constraint_verdict
 from quadsim.outputs import absolute, require_file, writing_file
 from quadsim.report.comparison import failure_sentences
+from quadsim.report.table import format_number
 
 if TYPE_CHECKING:
     from scenarios.campaign.run import Result
@@ -39,7 +41,8 @@ def junit_file(path: str | Path) -> Path:
 def write_junit(result: Flight | Reaudit | Result | Sequence[Reproduction], path: str | Path) -> Path:
     """Write verdicts as JUnit XML: a test case per constraint and one for the flight; per requirement; or per number.
 
-    A constraint that is not required is a case that passes, with what was measured in its output.
+    A constraint that is not required is a case that passes, with what was measured in its output.  One that is
+    required and was not reached is `skipped`: the flight shows neither that it holds nor that it does not.
 
     Args:
         result: of `fly`, `read` or `check`, of a `campaign` with requirements, or of `reproduce`.
@@ -61,46 +64,51 @@ def write_junit(result: Flight | Reaudit | Result | Sequence[Reproduction], path
     """
     if isinstance(result, Sequence):
         numbers = [(each.paper.name, number) for each in result for number in each.numbers]
-        cases = [(f"{paper}: {number.spec.name}", number.within, number.sentence) for paper, number in numbers]
-        return write_cases("reproduce", cases, Path(path))
+        held = [(f"{paper}: {number.spec.name}", number.within, number.sentence) for paper, number in numbers]
+        return write_cases("reproduce", held, Path(path))
     summary = result.summary
     if "campaign" in summary:
         judged: Sequence[Judgement] = getattr(result, "judgements", ())
-        cases = [(each.requirement.text, each.holds, each.sentence) for each in judged]
-        return write_cases(summary["campaign"], cases, Path(path))
+        held = [(each.requirement.text, each.holds, each.sentence) for each in judged]
+        return write_cases(summary["campaign"], held, Path(path))
     text = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
     whole = summary["status"] == "completed" and not summary["controller"].get("unrecovered")
-    cases = [("flight", whole, text)]
-    cases += [
-        (entry["name"], entry["satisfied"] or not entry["required"], _sentence(entry))
-        for entry in summary["constraints"]
-    ]
+    cases: list[tuple[str, bool | None, str]] = [("flight", whole, text)]
+    cases += [(entry["name"], _passed(entry), _sentence(entry)) for entry in summary["constraints"]]
     return write_cases(summary["scenario"], cases, Path(path))
 
 
-def write_cases(suite: str, cases: Sequence[tuple[str, bool, str]], path: Path) -> Path:
-    """Write test cases of a suite: the name of each, whether it passes, and its message.
+def write_cases(suite: str, cases: Sequence[tuple[str, bool | None, str]], path: Path) -> Path:
+    """Write test cases of a suite: the name of each, whether it passes (None: skipped), and its message.
 
     Characters that XML forbids, and others that steer a terminal, become escapes.
     """
-    name, failures = printable(f"quadsim.{suite}"), sum(not passed for _, passed, _ in cases)
-    root = ElementTree.Element("testsuite", name=name, tests=str(len(cases)), failures=str(failures))
+    name, results = printable(f"quadsim.{suite}"), [passed for _, passed, _ in cases]
+    counts = {"tests": len(cases), "failures": results.count(False), "skipped": results.count(None)}
+    root = ElementTree.Element("testsuite", {"name": name, **{key: str(count) for key, count in counts.items()}})
     for case_name, passed, sentence in cases:
         case = ElementTree.SubElement(root, "testcase", classname=name, name=printable(case_name))
         if passed:
             ElementTree.SubElement(case, "system-out").text = printable(sentence)
         else:
-            ElementTree.SubElement(case, "failure", message=printable(sentence))
+            ElementTree.SubElement(case, "skipped" if passed is None else "failure", message=printable(sentence))
     with writing_file(junit_file(path), overwrite=True) as file:
         file.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
     return path
 
 
+def _passed(entry: Mapping[str, Any]) -> bool | None:
+    """Whether a constraint's case passes; None where it was required and not reached."""
+    if entry["required"] and constraint_verdict(entry) == "incomplete":
+        return None
+    return bool(entry["satisfied"]) or not entry["required"]
+
+
 def _sentence(entry: Mapping[str, Any]) -> str:
-    if entry["worst_margin"] is None or entry["worst_margin_sampled"] is None:
-        return "the flight ended before the constraint's time window"
+    if constraint_verdict(entry) == "incomplete":
+        return "not reached: the flight has no value in the constraint's time window"
     return (
-        f"worst margin {entry['worst_margin']:.6g} {entry['unit']} at t = {entry['worst_time']:.3f} s "
-        f"(tolerance {entry['tolerance']:g}), {entry['worst_margin_sampled']:.6g} at the samples "
+        f"worst margin {format_number(entry['worst_margin'])} {entry['unit']} at t = {entry['worst_time']:.3f} s "
+        f"(tolerance {entry['tolerance']:g}), {format_number(entry['worst_margin_sampled'])} at the samples "
         f"(tolerance {entry['tolerance_sampled']:g}); violated for {entry['time_violated']:.3f} s"
     )

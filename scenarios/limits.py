@@ -1,23 +1,133 @@
-"""From `[[constraints]]` and the polytopes of a controller to what a flight is audited against."""
+"""What a flight is audited against: the bounds of its controller, and its `[[constraints]]`, obstacles and regions.
+
+The controller's bounds are audited without being named.  An entry of `[[constraints]]` without bounds takes the
+controller's, for a tolerance or a window of its own.  One with bounds stands for the controller's on the same signal
+where it holds throughout the flight; `audit_notes` says where they differ.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
 
 from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
+from quadsim.report.table import format_number
 from scenarios.courses.windows import timed_regions
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
 if TYPE_CHECKING:
+    from quadsim.vehicle import Vehicle
+    from scenarios.schema.controller import ControllerSpec
     from scenarios.schema.scenario import Scenario
+
+Range = tuple[float, float]
+COMMANDED: Final = ("speed", "slew")
+SHARE, SHARE_SAMPLED, ROUNDING = 0.01, 0.002, 1e-6
+"""Tolerances of bounds that no entry names: shares of half the band, and of commands their rounding [rad/s]."""
 
 
 def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
-    """What the flight is audited against: its constraints, obstacles and regions, and the controller's polytopes."""
-    return (*scenario.constraints, *_sum_limits(scenario), *space_limits(scenario))
+    """What the flight is audited against: its constraints, the bounds of its controller, obstacles and regions."""
+    bounds = controller_bounds(scenario.controller, build_vehicle(scenario))
+    return (
+        *_stated(scenario, bounds),
+        *_unnamed(scenario, bounds),
+        *_sum_limits(scenario),
+        *space_limits(scenario),
+    )
+
+
+def with_bounds_stated(scenario: Scenario) -> Scenario:
+    """The scenario with its controller's bounds as constraints, for another controller to be held to the same."""
+    bounds = controller_bounds(scenario.controller, build_vehicle(scenario))
+    return scenario.model_copy(update={"constraints": [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]})
+
+
+def controller_bounds(spec: ControllerSpec, vehicle: Vehicle) -> dict[str, Range]:
+    """The bounds that a controller has on signals of the audit, hard or soft, in their units."""
+    found: dict[str, Range] = {name: (pair[0], pair[1]) for name, pair in getattr(spec, "output_bounds", {}).items()}
+    if isinstance(spec, NonlinearPartsSpec) and spec.tilt is not None:
+        found["tilt"] = (-math.inf, spec.tilt)
+    if isinstance(spec, NonlinearPartsSpec) and spec.body_rate is not None:
+        largest = spec.body_rate if isinstance(spec.body_rate, list) else [spec.body_rate] * 3
+        found |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", largest, strict=True)}
+    inputs = getattr(spec, "input_bounds", None)
+    if inputs is not None:
+        pairs = {"speed": inputs.speed or (vehicle.speed_min, vehicle.speed_max), "slew": inputs.slew}
+        found |= {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
+    return found
+
+
+def audit_notes(scenario: Scenario) -> list[str]:
+    """What a reader of the audit has to know: bounds that no constraint names, and others than the controller's."""
+    vehicle = build_vehicle(scenario)
+    bounds = controller_bounds(scenario.controller, vehicle)
+    unnamed = [limit.name for limit in _unnamed(scenario, bounds)]
+    absent = [entry.name for entry in scenario.constraints if not (entry.has_bounds or entry.signal in bounds)]
+    notes = []
+    if unnamed:
+        notes.append(
+            f"{', '.join(unnamed)}: audited as the controller bounds {'it' if len(unnamed) == 1 else 'them'}; "
+            f"tolerance {100 * SHARE:g} % of half the band, {100 * SHARE_SAMPLED:g} % at the samples, "
+            f"{ROUNDING:g} rad/s for commands"
+        )
+    if absent:
+        notes.append(f"{', '.join(absent)}: not audited, the controller has no such bound and the entry states none")
+    audited = [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]
+    changes = [(0.0, bounds)] + [(at, controller_bounds(spec, vehicle)) for at, spec in scenario.controller_changes]
+    for limit in audited:
+        for (at, now), (_, before) in zip(changes, [(0.0, {}), *changes], strict=False):
+            pair = now.get(limit.signal)
+            if pair is not None and pair not in (before.get(limit.signal), (limit.lower, limit.upper)):
+                since = f" from {at:g} s" if at else ""
+                notes.append(
+                    f"{limit.name}: audited against {_range(limit.lower, limit.upper)} {limit.unit}, the controller "
+                    f"bounds {_range(*pair)} {limit.unit}{since}"
+                )
+    return notes
+
+
+def _stated(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit]:
+    """The entries of `[[constraints]]` with their bounds; those without any to take are left out."""
+    return [
+        entry if entry.has_bounds else replace(entry, lower=bounds[entry.signal][0], upper=bounds[entry.signal][1])
+        for entry in scenario.constraints
+        if entry.has_bounds or entry.signal in bounds
+    ]
+
+
+def _unnamed(scenario: Scenario, bounds: Mapping[str, Range]) -> Iterator[Limit]:
+    """A limit for each bound of the controller that no entry stands for."""
+    named = {
+        entry.signal
+        for entry in scenario.constraints
+        if not entry.has_bounds or (entry.start <= 0.0 and math.isinf(entry.stop))
+    }
+    for signal, (lower, upper) in bounds.items():
+        if signal in named:
+            continue
+        limit = Limit(
+            name=f"controller.{signal}" if signal in scenario.audited_names else signal,
+            signal=signal,
+            lower=lower,
+            upper=upper,
+        )
+        commanded = signal in COMMANDED
+        yield replace(
+            limit,
+            tolerance=ROUNDING if commanded else SHARE * limit.half_band,
+            tolerance_sampled=ROUNDING if commanded else SHARE_SAMPLED * limit.half_band,
+        )
+
+
+def _range(lower: float, upper: float) -> str:
+    if math.isinf(lower) or math.isinf(upper):
+        return f"at least {format_number(lower)}" if math.isinf(upper) else f"at most {format_number(upper)}"
+    return f"±{format_number(upper)}" if lower == -upper else f"{format_number(lower)} .. {format_number(upper)}"
 
 
 def space_limits(scenario: Scenario) -> tuple[SpaceLimit, ...]:

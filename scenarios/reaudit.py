@@ -22,6 +22,7 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
+from quadsim.report.comparison import verdict
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.courses.make import build_course_steps
@@ -228,10 +229,9 @@ def _differences(
     satisfied = summary["reason"] is None and not log.control.crashed and not unrecovered and required
     if summary["satisfied"] != satisfied:
         yield f"satisfied is recorded as {summary['satisfied']}, and its audit and outcome make it {satisfied}"
-    ended = "aborted" if log.aborted else "lost"
-    outcome = ended if summary["reason"] is not None else "satisfied" if satisfied else "violated"
-    if summary.get("outcome", outcome) != outcome:
-        yield f"outcome is recorded as {summary['outcome']!r:.80}, and its audit and reason make it {outcome!r}"
+    outcome = verdict(summary)
+    if summary.get("verdict", outcome) != outcome:
+        yield f"verdict is recorded as {summary['verdict']!r:.40}, and its audit and outcome make it {outcome}"
     if summary.get("as_expected") and outcome != scenario.expect:
         yield f"as_expected is recorded as True, and the flight is {outcome} where {scenario.expect} is expected"
 
@@ -272,8 +272,9 @@ def _constraint_differences(
     milder = there is not None and (recorded is None or recorded > there + rounding * max(1.0, abs(there)))
     if "worst_margin" not in alike and milder:
         yield f"worst_margin is recorded as {recorded}, and the tables go down to {there:.6g}"
-    if recorded is not None and not _is_close(_margin(finding, entry["peak_plant"]), recorded, rounding):
-        yield f"worst_margin is recorded as {recorded}, and peak_plant as {entry['peak_plant']}"
+    peak = "peak_sampled" if finding.limit.source.plant is None else "peak_plant"
+    if recorded is not None and not _is_close(_margin(finding, entry[peak]), recorded, rounding):
+        yield f"worst_margin is recorded as {recorded}, and {peak} as {entry[peak]}"
     beyond = recorded is not None and recorded < -entry["tolerance"]
     least, most = _time_beyond(finding, scenario, log)
     if (entry["time_violated"] > 0.0 and not beyond) or not least <= entry["time_violated"] <= most:

@@ -85,7 +85,7 @@ def test_the_scenarios_of_the_page_on_controllers_fly(tmp_path: Path, monkeypatc
     page = (ROOT / "docs" / "controllers.md").read_text(encoding="utf-8")
     monkeypatch.chdir(EXAMPLES)
     blocks = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     for block in blocks:
         (tmp_path / "one.toml").write_text(block, encoding="utf-8")
         scenario = load_scenario(str(tmp_path / "one.toml"), ["duration=1", "constraints=[]"])

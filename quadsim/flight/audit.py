@@ -2,6 +2,8 @@
 
 A QP bounds the samples of a linear model; a vehicle has to hold its limits in between as well.  The audit therefore
 reads the plant at the physics rate, and states its tolerances: a verdict is `margin >= -tolerance`.
+
+One sign throughout: a margin is the distance to the nearer bound, positive inside, negative beyond it.
 """
 
 from __future__ import annotations
@@ -9,18 +11,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from annotated_types import doc
 from numpy.typing import NDArray
 
-from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from quadsim.space import Constraining
 from quadsim.state import (
     EULER,
+    EULER_RATE,
     INDEX,
     POSITION,
     REFERENCE_NAMES,
@@ -28,12 +31,16 @@ from quadsim.state import (
     STATE_NAMES,
     STATE_UNITS,
     Array,
+    euler_to_body_rates,
     shown_unit,
     tilt,
 )
 from quadsim.vehicle import N_ROTORS
 
 Mask = NDArray[np.bool_]
+Held = Literal["satisfied", "violated", "incomplete"]
+HELD: Final[dict[str, str]] = {"satisfied": "holds", "violated": "violated", "incomplete": "not reached"}
+"""The verdicts on a constraint in a reader's words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +74,16 @@ def _estimate_error(i: int) -> Signal:
     return Signal(unit=unit, sampled=lambda log: scale * log.measured_error[:, i], plant=None)
 
 
+def _body_rate(axis: int) -> Signal:
+    def rates(states: Array) -> Array:
+        return np.degrees(euler_to_body_rates(states[:, EULER], states[:, EULER_RATE])[:, axis])
+
+    def plant(log: PlantLog) -> Array:  # Euler rates lose their digits near the vertical
+        return rates(log.state) if log.body_rates is None else np.degrees(log.body_rates[:, axis])
+
+    return Signal(unit="deg/s", sampled=lambda log: rates(log.truth), plant=plant)
+
+
 SIGNALS: Final[dict[str, Signal]] = {
     **{name: _state(i) for name, i in INDEX.items()},
     **{f"{name}_error": _error(j) for j, name in enumerate(REFERENCE_NAMES)},
@@ -74,6 +91,7 @@ SIGNALS: Final[dict[str, Signal]] = {
     "tilt": Signal(
         unit="deg", sampled=lambda log: np.degrees(tilt(log.truth)), plant=lambda log: np.degrees(tilt(log.state))
     ),
+    **{f"body_rate_{name}": _body_rate(axis) for axis, name in enumerate("xyz")},
     # Commanded at the samples, acting in between: they differ where rotors saturate.
     "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds),
     "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None),
@@ -109,14 +127,15 @@ class Limit:
     """Bounds on a signal of the flight; see `quadsim.flight.audit.Limit`.
 
     `slew` is the command's step per period, `speed` and `slew` hold for every rotor.  A bound that is infinite is none.
+    An entry without bounds stands for the controller's; `scenarios.limits` puts these in.
     """
 
     name: Annotated[str, doc("what reports call it")] = field(metadata={"pattern": "^[A-Za-z0-9_.-]+$"})
     signal: Annotated[
         str, doc("what is bounded: " + ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items()))
     ] = field(metadata={"json_schema_extra": {"enum": [*SIGNALS]}})
-    lower: Annotated[Number, doc("[unit of the signal] lower bound")] = -math.inf
-    upper: Annotated[Number, doc("[unit of the signal] upper bound")] = math.inf
+    lower: Annotated[Number, doc("[unit of the signal] lower bound; both absent: the controller's")] = -math.inf
+    upper: Annotated[Number, doc("[unit of the signal] upper bound; both absent: the controller's")] = math.inf
     tolerance: Annotated[NonNegative, doc("[unit of the signal] allowed beyond, at the physics rate")] = 0.0
     tolerance_sampled: Annotated[NonNegative, doc("[unit of the signal] allowed beyond, at the control samples")] = 0.0
     required: Annotated[bool, doc("false: measured and reported, never a failure")] = True
@@ -126,8 +145,6 @@ class Limit:
     def __post_init__(self) -> None:
         self._check_signal()
         owner = f"constraints.{self.name}"
-        if math.isinf(self.lower) and math.isinf(self.upper):
-            raise InputError("lower must be given, or upper, or both")
         if not self.lower < self.upper:
             raise ParameterError(owner, "lower", self.lower, f"below upper = {self.upper}")
         if not 0.0 <= self.tolerance_sampled <= self.tolerance < math.inf:
@@ -149,6 +166,11 @@ class Limit:
     def unit(self) -> str:
         """Unit of the bounds, tolerances and margins."""
         return self.source.unit
+
+    @property
+    def has_bounds(self) -> bool:
+        """Whether it states a bound of its own."""
+        return math.isfinite(self.lower) or math.isfinite(self.upper)
 
     @property
     def half_band(self) -> float:
@@ -214,20 +236,43 @@ class Finding:
 
     limit: Limit  # the limit audited
     peak_sampled: float  # the value nearest to (or furthest beyond) a bound at the control samples
-    peak_plant: float  # the same at the physics rate; equal to `peak_sampled` for signals that exist at samples only
+    peak_plant: float  # the same at the physics rate; NaN for signals that exist at samples only
     worst_margin_sampled: float  # smallest signed margin at the control samples
-    worst_margin: float  # smallest signed margin at the physics rate
+    worst_margin: float  # smallest signed margin at the physics rate, or at the samples where the signal has no other
     worst_time: float  # when that was [s]
     time_violated: float  # time spent beyond bound plus tolerance [s]
 
     @property
-    def satisfied(self) -> bool:
+    def verdict(self) -> Held:
         """Whether the limit held, within its tolerances, at the samples and between them.
 
-        A window that the flight did not reach was not held; one that fell between two samples is judged by the plant.
+        `incomplete` where the flight has no value in the limit's time window, as when it ended before.  A window that
+        fell between two samples is judged by the plant.
         """
-        broken_at_samples = self.worst_margin_sampled < -self.limit.tolerance_sampled
-        return self.worst_margin >= -self.limit.tolerance and not broken_at_samples
+        if math.isnan(self.worst_time):
+            return "incomplete"
+        return "satisfied" if self.deciding_margin >= -self.deciding_tolerance else "violated"  # NaN: violated
+
+    @property
+    def satisfied(self) -> bool:
+        """Whether the limit was reached, and held."""
+        return self.verdict == "satisfied"
+
+    @property
+    def _at_samples(self) -> bool:
+        """Whether the samples alone violate it."""
+        broken = self.worst_margin_sampled < -self.limit.tolerance_sampled
+        return broken and self.worst_margin >= -self.limit.tolerance
+
+    @property
+    def deciding_margin(self) -> float:
+        """The signed margin that the verdict rests on: at the physics rate, unless the samples alone violate it."""
+        return self.worst_margin_sampled if self._at_samples else self.worst_margin
+
+    @property
+    def deciding_tolerance(self) -> float:
+        """The tolerance that belongs to it."""
+        return self.limit.tolerance_sampled if self._at_samples else self.limit.tolerance
 
 
 def margins_sampled(limit: Limit, log: FlightLog) -> Array:
@@ -266,7 +311,7 @@ def _find(log: FlightLog, limit: Limit) -> Finding:
     return Finding(
         limit=limit,
         peak_sampled=sampled[0],
-        peak_plant=peak,
+        peak_plant=math.nan if limit.source.plant is None else peak,
         worst_margin_sampled=sampled[1],
         worst_margin=margin,
         worst_time=time,

@@ -58,6 +58,7 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
         "unit": limit.unit,
         **{name: value if math.isfinite(value) else None for name, value in (stated | found).items()},
         "satisfied": finding.satisfied,
+        "verdict": finding.verdict,
     }
 
 
@@ -93,7 +94,7 @@ def load_run(directory: Path) -> Run:
     except (ArithmeticError, TypeError, ValueError) as error:
         raise FileError(directory / SUMMARY_FILE, f"is damaged ({error})") from error
     raised = tuple(summary.get("traceback", ()))
-    interrupted = summary.get("outcome") == "aborted" and not raised
+    interrupted = summary.get("verdict") == "aborted" and not raised
     log = replace(read_log(directory, reason=summary["reason"]), interrupted=interrupted, traceback=raised)
     return Run(directory=directory, summary=summary, log=log, vehicle=vehicle, limits=limits)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError, printable
-from quadsim.flight.audit import CLEARANCE, SIGNALS, SUM, TERMS, sum_signal
+from quadsim.flight.audit import CLEARANCE, SIGNALS, SUM, TERMS, Held, sum_signal
 from quadsim.flight.form import MAYBE_NUMBER, MAYBE_TEXT, NUMBER, Each, Optional, misfits, read_json
 from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES
@@ -50,6 +50,7 @@ _CONSTRAINT: Final = {
     **dict.fromkeys(("name", "signal", "unit"), str),
     **dict.fromkeys(("tolerance", "tolerance_sampled", "start", "time_violated"), NUMBER),
     **dict.fromkeys(("required", "satisfied"), bool),
+    "verdict": Optional(str),
     "terms": Optional(Each(NUMBER)),
     "shape": Optional(dict),
     "radius": Optional(NUMBER),
@@ -91,16 +92,16 @@ FORM: Final = {
     **dict.fromkeys(("scenario", "status"), str),
     "reason": MAYBE_TEXT,
     "traceback": Optional([str]),
-    "outcome": Optional(str),
     "satisfied": bool,
     "duration": NUMBER,
-    **dict.fromkeys(("description", "group", "expected"), Optional(str)),
+    **dict.fromkeys(("description", "group", "expected", "verdict"), Optional(str)),
     "as_expected": Optional(bool),
     "seed": Optional(int),
     "course": Optional({**_COURSE, "jumps": [NUMBER], "problems": [str], "sentence": str}),
     "events": Optional([{"time": NUMBER, "text": str}]),
     "tracking": dict,
     "constraints": [_CONSTRAINT],
+    "audit_notes": Optional([str]),
     "control": dict,
     "controller": _LAW,
     "diagnosis": Optional((_DIAGNOSIS, type(None))),
@@ -130,7 +131,7 @@ FORM: Final = {
     "files": Each(str),
 }
 FLOWN_FORM: Final = FORM | _FLOWN  # of a flight that came to its first period
-_TOGETHER: Final = {"worst_margin": ("worst_time", "peak_plant"), "worst_margin_sampled": ("peak_sampled",)}
+_TOGETHER: Final = {"worst_margin": ("worst_time",), "worst_margin_sampled": ("peak_sampled",)}
 """Of a constraint: present wherever a margin is."""
 
 
@@ -183,8 +184,10 @@ def contradictions(summary: Mapping[str, Any]) -> Iterator[str]:
                 yield f"{name}: {key} is there without {' and '.join(others)}"
         if entry["worst_margin"] is None and entry["worst_margin_sampled"] is not None:
             yield f"{name}: worst_margin_sampled is there without worst_margin"
-        if entry["satisfied"] != is_satisfied(entry):
-            yield f"{name}: satisfied is {str(entry['satisfied']).lower()}, and its worst margins say otherwise"
+        found = constraint_verdict(entry)
+        if entry["satisfied"] != (found == "satisfied") or entry.get("verdict", found) != found:
+            stated = f"satisfied is {str(entry['satisfied']).lower()}, its verdict {entry.get('verdict', '-'):.40}"
+            yield f"{name}: {stated}, and its worst margins say {found}"
 
 
 def _unit(entry: Mapping[str, Any]) -> str | None:
@@ -198,9 +201,22 @@ def _unit(entry: Mapping[str, Any]) -> str | None:
     return sum_signal(terms).unit if known else None
 
 
-def is_satisfied(entry: Mapping[str, Any]) -> bool:
-    """The verdict on a constraint that follows from its margins; see `quadsim.flight.audit.Finding.satisfied`."""
+def constraint_verdict(entry: Mapping[str, Any]) -> Held:
+    """The verdict on a constraint that follows from its margins; see `quadsim.flight.audit.Finding.verdict`."""
+    if entry["worst_time"] is None:
+        return "incomplete"
+    margin, tolerance = deciding_margin(entry)
+    return "satisfied" if margin is not None and margin >= -tolerance else "violated"
+
+
+def deciding_margin(entry: Mapping[str, Any]) -> tuple[float | None, float]:
+    """The margin that a constraint's verdict rests on, and its tolerance; see `Finding.deciding_margin`.
+
+    None where there is none: its window was not reached, or a value was no number.
+    """
     at_physics_rate, at_samples = entry["worst_margin"], entry["worst_margin_sampled"]
-    if at_physics_rate is None or at_physics_rate < -entry["tolerance"]:
-        return False
-    return at_samples is None or bool(at_samples >= -entry["tolerance_sampled"])
+    tolerance, tolerance_sampled = entry["tolerance"], entry["tolerance_sampled"]
+    broken = at_samples is not None and at_samples < -tolerance_sampled
+    if broken and at_physics_rate is not None and at_physics_rate >= -tolerance:
+        return at_samples, tolerance_sampled
+    return at_physics_rate, tolerance

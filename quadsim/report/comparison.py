@@ -14,6 +14,8 @@ import numpy as np
 
 from quadsim.controller import Phase, law_name
 from quadsim.errors import printable
+from quadsim.flight.audit import HELD
+from quadsim.flight.summary import constraint_verdict, deciding_margin
 from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
 from quadsim.space import SHAPES, Obstacle
 
@@ -26,6 +28,7 @@ _VERDICTS: Final = {
     "violated": "does not hold every required constraint",
     "lost": "is lost",
     "aborted": "is aborted",
+    "incomplete": "ends before every required constraint is reached",
 }
 FOR_GOOD: Final = "ends in permanent fallback"
 """Of a flight whose verdict rests on that alone; see `quadsim.flight.metrics.unrecovered`."""
@@ -94,23 +97,26 @@ def outcome(summary: Summary) -> Cell:
 
 
 def verdict(summary: Summary) -> str:
-    """The verdict on a flight in one word: satisfied, violated, lost, or aborted."""
+    """The verdict on a flight in one word: satisfied, violated, lost, aborted or incomplete."""
     if summary["status"] != "completed":
-        return "aborted" if summary.get("outcome") == "aborted" else "lost"
-    whole = not (summary["controller"].get("unrecovered") or nested(summary, "ground", "crashed"))
-    return "satisfied" if whole and _all_held(summary) else "violated"
+        return "aborted" if summary.get("verdict") == "aborted" else "lost"
+    verdicts = _required_verdicts(summary)
+    crashed = nested(summary, "ground", "crashed") or crash(summary)
+    if crashed or summary["controller"].get("unrecovered") or "violated" in verdicts:
+        return "violated"
+    return "incomplete" if "incomplete" in verdicts else "satisfied"
 
 
 def verdict_sentence(summary: Summary) -> str:
     """What the verdict rests on, after the name of the flight."""
     found = verdict(summary)
-    if found == "violated" and _all_held(summary):
+    if found == "violated" and "violated" not in _required_verdicts(summary):
         return FOR_GOOD if summary["controller"].get("unrecovered") else "crashes"
     return _VERDICTS[found]
 
 
-def _all_held(summary: Summary) -> bool:
-    return all(entry["satisfied"] for entry in summary["constraints"] if entry["required"])
+def _required_verdicts(summary: Summary) -> set[str]:
+    return {constraint_verdict(entry) for entry in summary["constraints"] if entry["required"]}
 
 
 def fallback_sentence(periods: int) -> str:
@@ -122,7 +128,8 @@ def crash(summary: Summary) -> str | None:
     """That the vehicle crashed, and the obstacles that it touched; None where it did not."""
     if Phase.CRASHED not in summary["controller"].get("statuses", ()):
         return None
-    violated = [entry for entry in summary["constraints"] if entry.get("shape") and not entry["satisfied"]]
+    shapes = [entry for entry in summary["constraints"] if entry.get("shape")]
+    violated = [entry for entry in shapes if constraint_verdict(entry) == "violated"]
     touched = [entry["name"] for entry in violated if issubclass(SHAPES[entry["shape"]["type"]], Obstacle)]
     return f"crashed, touched {', '.join(touched)}" if touched else "crashed"
 
@@ -147,12 +154,13 @@ def verdict_cell(summary: Summary) -> Cell:
 def required(summary: Summary) -> Cell:
     """The verdict on the constraints that the scenario demands, naming those that do not hold."""
     demanded = [entry for entry in summary["constraints"] if entry["required"]]
-    failed = [entry for entry in demanded if not entry["satisfied"]]
-    missed = [entry["name"] for entry in failed if entry["worst_margin"] is None]
-    broken = [entry["name"] for entry in failed if entry["worst_margin"] is not None]
-    parts = [f"{what}: {', '.join(names)}" for what, names in (("violated", broken), ("not reached", missed)) if names]
-    if parts:
-        return Cell(text="; ".join(parts), mark=Mark.BAD)
+    found = {
+        what: [entry["name"] for entry in demanded if constraint_verdict(entry) == verdict]
+        for verdict, what in HELD.items()
+        if verdict != "satisfied"
+    }
+    if parts := [f"{what}: {', '.join(names)}" for what, names in found.items() if names]:
+        return Cell(text="; ".join(parts), mark=Mark.BAD if found["violated"] else Mark.WARN)
     return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none")
 
 
@@ -184,8 +192,10 @@ def format_bounds(entry: Summary, unit: str = "") -> str:
 
 def format_excess(entry: Summary) -> str:
     """How far a constraint was exceeded; marked where that was at the samples alone, in what was commanded."""
-    at_samples = entry["worst_margin"] >= -entry["tolerance"]
-    margin = entry["worst_margin_sampled"] if at_samples else entry["worst_margin"]
+    margin, _ = deciding_margin(entry)
+    if margin is None:
+        return "by no number"
+    at_samples = margin != entry["worst_margin"]
     return f"by {format_number(-margin)} {entry['unit']}{' at the samples' if at_samples else ''}"
 
 
@@ -245,22 +255,26 @@ def _constraint_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
 
 
 def _verdict(entry: Summary) -> Cell:
-    """The verdict on a constraint and the tolerances it stands on, e.g. `holds (tolerance 0.01 / 0.05 deg)`."""
-    if entry["worst_margin"] is None:
-        finding = "not reached"
-    elif entry["satisfied"]:
-        finding = "holds"
-    else:
-        excess = format_excess(entry)
-        finding = f"violated {excess}" if entry["required"] else f"exceeded {excess}, not required"
-    tolerance = f"tolerance {entry['tolerance_sampled']:g} / {entry['tolerance']:g} {entry['unit']}"
-    return Cell(text=f"{finding} ({tolerance})", mark=_verdict_mark(entry))
+    """The verdict on a constraint, the margin that decides and its tolerance.
+
+    For example `holds (margin -0.0376 deg, tolerance 0.05)`.
+    """
+    found = constraint_verdict(entry)
+    finding = HELD[found]
+    if found == "violated" and not entry["required"]:
+        finding = "exceeded, not required"
+    if found != "incomplete":
+        margin, tolerance = deciding_margin(entry)
+        at_samples = " at the samples" if margin != entry["worst_margin"] else ""
+        finding += f" (margin {format_number(margin)} {entry['unit']}{at_samples}, tolerance {tolerance:g})"
+    return Cell(text=finding, mark=_verdict_mark(entry))
 
 
 def _verdict_mark(entry: Summary) -> Mark:
-    if entry["satisfied"]:
+    found = constraint_verdict(entry)
+    if found == "satisfied":
         return Mark.GOOD
-    return Mark.BAD if entry["required"] else Mark.WARN
+    return Mark.BAD if found == "violated" and entry["required"] else Mark.WARN
 
 
 def _margin(key: str, tolerance: str) -> Callable[[Summary], Cell]:
@@ -328,6 +342,7 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
     ("outcome", "", outcome),
     ("verdict on the flight", "", verdict_cell),
     ("required constraints", "", required),
+    ("audit", "", lambda summary: Cell(text="; ".join(summary.get("audit_notes", ())) or "as the controller bounds")),
     ("time flown", "s", _number("duration")),
     ("controller", "", _text(lambda summary: law_name(summary["controller"].get("name", ABSENT)))),
     ("solver", "", _text(lambda summary: summary["controller"].get("solver") or "closed form")),

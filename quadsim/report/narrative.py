@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from quadsim.flight.rundir import Run
+from quadsim.flight.summary import constraint_verdict, deciding_margin
 from quadsim.report.comparison import (
     Summary,
     distinct_courses,
@@ -114,13 +115,13 @@ def _limit_sentences(named: _Named) -> Iterator[str]:
     for name, summary in named:
         for entry in summary["constraints"]:
             cases.setdefault(entry["name"], []).append((name, entry))
-            if entry["worst_margin"] is None:
+            if constraint_verdict(entry) == "incomplete":
                 unreached.setdefault(name, []).append(entry["name"])
     held = [constraint for constraint, entries in cases.items() if all(entry["satisfied"] for _, entry in entries)]
     if held:
         yield f"Held within tolerance by every run that is held to it: {_list(held)}."
     for constraint, entries in cases.items():
-        reached = [(name, entry) for name, entry in entries if entry["worst_margin"] is not None]
+        reached = [(name, entry) for name, entry in entries if constraint_verdict(entry) != "incomplete"]
         if constraint in held or not reached:
             continue
         bounds = {format_bounds(entry, entry["unit"]) for _, entry in reached}
@@ -137,8 +138,8 @@ def _case(entry: Summary) -> str:
         text = f"{'violates' if entry['required'] else 'exceeds'} it {format_excess(entry)}"
         seconds = entry["time_violated"]
         return f"{text}, for {format_number(seconds)} s in all" if seconds else text
-    margin = min(entry["worst_margin_sampled"], entry["worst_margin"])
-    if abs(margin) < 1e-6:
+    margin, _ = deciding_margin(entry)
+    if margin is None or abs(margin) < 1e-6:
         return "reaches it and keeps it"
     distance = f"{format_number(abs(margin))} {entry['unit']}"
     return f"keeps it by {distance}" if margin > 0.0 else f"keeps it within tolerance, {distance} beyond"

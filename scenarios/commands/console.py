@@ -16,7 +16,9 @@ from rich.text import Text
 
 from quadsim.controller import law_name
 from quadsim.errors import printable
-from quadsim.report.comparison import FOR_GOOD, crash, failure_sentences, verdict_sentence
+from quadsim.flight.audit import HELD
+from quadsim.flight.summary import constraint_verdict, deciding_margin
+from quadsim.report.comparison import FOR_GOOD, crash, failure_sentences, required, verdict, verdict_sentence
 from quadsim.report.table import Cell, Grid, Mark, Row
 from scenarios.progress import Progress, silent
 
@@ -80,6 +82,8 @@ def print_summary(summary: Mapping[str, Any], where: str | None) -> None:
         console.print(_tracking_table(summary["tracking"]))
     if summary["constraints"]:
         console.print(audit_table(summary["constraints"]))
+    for line in summary.get("audit_notes", ()):
+        console.print(line, soft_wrap=True)
     for line in _controller_lines(summary) if summary["tracking"] else ():
         console.print(line)
     for line in (*_effect_lines(summary), *failure_sentences(summary)):
@@ -123,37 +127,47 @@ def outcome(summary: Mapping[str, Any]) -> Text:
     colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
     if summary["status"] != "completed":
         return styled((f"aborted{remark}", colour), f": {summary['reason']}")
-    verdict = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
+    phrase = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
+    if verdict(summary) == "incomplete":
+        colour = "green" if remark and as_expected else "yellow"
+        return styled((f"incomplete, {required(summary).text}{remark}", colour))
     if verdict_sentence(summary) == FOR_GOOD:
-        verdict = "but in permanent fallback"
-    return styled((f"{crash(summary) or 'completed'}, {verdict}{remark}", colour))
+        phrase = "but in permanent fallback"
+    return styled((f"{crash(summary) or 'completed'}, {phrase}{remark}", colour))
 
 
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
     """Every constraint with its bounds, peaks, margin, tolerances and verdict."""
-    caption = "beyond: seconds; tolerance: at the samples / at the physics rate"
+    caption = (
+        "margin: the one that decides, negative = violated, s: at the samples; tolerance: its own; beyond: seconds; "
+        "-: no value there"
+    )
     if any(not entry["required"] for entry in constraints):
         caption += ";  * reported, not required by the scenario"
-    head = ("constraint", "bounds", "sampled", "plant", "margin", "beyond", "tolerance", "verdict")
-    lines = [
-        (
-            f"{entry['name']} [{entry['unit']}]",
-            _range(entry["lower"], entry["upper"]),
-            *(_number(entry[name]) for name in ("peak_sampled", "peak_plant", "worst_margin", "time_violated")),
-            f"{_number(entry['tolerance_sampled'])}/{_number(entry['tolerance'])}",
-            _verdict(entry),
+    head = ("constraint", "bounds", "sampled", "plant", "margin", "tolerance", "beyond", "verdict")
+    lines = []
+    for entry in constraints:
+        margin, tolerance = deciding_margin(entry)
+        at_samples = "" if margin == entry["worst_margin"] else " s"
+        lines.append(
+            (
+                f"{entry['name']} [{entry['unit']}]",
+                _range(entry["lower"], entry["upper"]),
+                *(_number(entry[name]) for name in ("peak_sampled", "peak_plant")),
+                f"{_number(margin)}{at_samples}",
+                _number(tolerance),
+                _number(entry["time_violated"]),
+                _verdict(entry),
+            )
         )
-        for entry in constraints
-    ]
     return _table("audit at the physics rate", head, lines, caption=caption, left=("verdict",), rigid=True)
 
 
 def _verdict(entry: Mapping[str, Any]) -> Text:
-    if entry["satisfied"]:
-        return styled(("holds", "green"))
-    if entry["worst_margin"] is None:
-        return styled(("not reached", "red"))  # the flight ended before its time window
-    return styled(("VIOLATED", "red") if entry["required"] else ("exceeded*", "yellow"))
+    found = constraint_verdict(entry)
+    if found == "violated":
+        return styled(("VIOLATED", "red") if entry["required"] else ("exceeded*", "yellow"))
+    return styled((HELD[found], "green" if found == "satisfied" else "yellow"))
 
 
 def _tracking_table(tracking: Mapping[str, Any]) -> Table:

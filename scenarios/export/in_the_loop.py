@@ -23,6 +23,7 @@ from scenarios.export.emulation import Program, build, require_programs
 from scenarios.export.exporter import controller_files, exported_law, programs
 from scenarios.export.serial_line import SerialMPC
 from scenarios.flight import Flight, Outputs
+from scenarios.limits import with_bounds_stated
 from scenarios.progress import Progress, reporting
 from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.scenario import Scenario
@@ -131,6 +132,6 @@ def _allowing(scenario: Scenario, spacing: float) -> Scenario:
         )
         if limit.signal in ("speed", "slew")
         else limit
-        for limit in scenario.constraints
+        for limit in with_bounds_stated(scenario).constraints
     ]
     return scenario.model_copy(update={"constraints": limits})

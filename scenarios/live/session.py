@@ -20,6 +20,7 @@ from quadsim.sim.loop import Sample
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.flight import Flight
+from scenarios.limits import with_bounds_stated
 from scenarios.parts.live import Successor
 from scenarios.run import StartedFlight, start
 from scenarios.schema.controller import ControllerSpec
@@ -104,7 +105,7 @@ class Session:
         self._queue.clear()
         scenarios = [self.scenario]
         if self._against is not None:
-            scenarios.append(self.scenario.model_copy(update={"controller": self._against}))
+            scenarios.append(with_bounds_stated(self.scenario).model_copy(update={"controller": self._against}))
         self.flights = tuple(start(each, live=True) for each in scenarios)
         self._held = _Held()
         self.reason: str | None = None

@@ -20,6 +20,7 @@ from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
 from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.space import AnyObstacle, Corridor, Fence
+from quadsim.state import STATE_NAMES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec, changed
@@ -144,7 +145,9 @@ MOST_STEPS: Final = 10_000_000
 """Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
 
 
-Verdict = Literal["satisfied", "violated", "lost", "aborted"]
+Verdict = Literal["satisfied", "violated", "lost", "aborted", "incomplete"]
+BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate_z", "speed", "slew")
+"""Signals that controllers may have bounds on."""
 
 
 class Scenario(Spec):
@@ -159,7 +162,7 @@ class Scenario(Spec):
         default="satisfied",
         description="its verdict, if all is right: satisfied (flown to its end, every required constraint holds), "
         "violated (one does not, the vehicle crashes, or the controller ends in permanent fallback), lost (the flight "
-        "ends early, by a criterion of [lost] or otherwise)",
+        "ends early, by a criterion of [lost] or otherwise), incomplete (it ends before the window of one begins)",
     )
     duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT)] = Field(
         default=math.inf,
@@ -198,7 +201,9 @@ class Scenario(Spec):
     )
     keep_in: Fence | None = Field(default=None, description="a convex region to stay in throughout; absent: none")
     constraints: Annotated[list[Limit], MaxLen(MOST_ENTRIES)] = Field(
-        default=[], description="what the flight is audited against; signals and their units are those of the audit"
+        default=[],
+        description="what the flight is audited against beside the controller's own bounds; an entry without bounds "
+        "takes the controller's",
     )
 
     @model_validator(mode="after")
@@ -250,12 +255,23 @@ class Scenario(Spec):
         if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
             raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
         check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
+        for entry in self.constraints:
+            if not entry.has_bounds and entry.signal not in BOUNDED:
+                raise ValueError(
+                    f"constraints.{entry.name} must have lower, upper or both; no controller has bounds on "
+                    f"{entry.signal}"
+                )
+        names = self.audited_names
+        if len(set(names)) < len(names):
+            raise ValueError(f"constraints must have distinct names; got {names}")
+
+    @property
+    def audited_names(self) -> list[str]:
+        """The names of constraints, rows of polytopes, obstacles and regions."""
         polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearPartsSpec) else []
         names = [constraint.name for constraint in self.constraints]
         names += [name for polytope in polytopes for name in polytope.row_names]
-        names += [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
-        if len(set(names)) < len(names):
-            raise ValueError(f"constraints must have distinct names; got {names}")
+        return names + [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
 
     def _check_events(self) -> None:
         carried, controller = len(self.effects.load.payloads) if self.effects.load is not None else 0, self.controller

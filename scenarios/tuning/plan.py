@@ -150,7 +150,8 @@ class TuningPlan:
         found = self.candidate({entry.name: value}, self.spec.name)
         if build_limits(found) != build_limits(self.scenario):
             rule = (
-                "of fields that leave alone what flights are held against: constraints, obstacles, regions, polytopes"
+                "of fields that leave alone what flights are held against: constraints, obstacles, regions, and the "
+                "controller's bounds and polytopes"
             )
             raise ParameterError(f"search.{entry.name}", "fields", entry.fields, rule)
         check_parts(found)

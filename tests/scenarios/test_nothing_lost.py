@@ -59,7 +59,7 @@ def test_a_controller_that_ends_badly_ends_its_flight_as_aborted(tmp_path: Path,
     done = quadsim_command("run", "hover", *OWN, *BARE, here=tmp_path)
     assert done.returncode == 1, done.stderr
     summary = summary_of(tmp_path / "runs" / "hover")
-    assert (summary["status"], summary["outcome"], summary["duration"]) == ("aborted", "aborted", 0.95)
+    assert (summary["status"], summary["verdict"], summary["duration"]) == ("aborted", "aborted", 0.95)
     assert summary["reason"] == f"at t = 0.950 s: the controller raised {last}"
     assert summary["traceback"][-1] == last
     assert late in summary["traceback"][-2] or late in summary["traceback"][-3]
@@ -171,10 +171,10 @@ def test_ctrl_c_keeps_what_was_flown(tmp_path: Path, film: bool) -> None:
     found = summary_of(summary.parent)
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["hover"]
     if film:
-        assert (process.returncode, found["outcome"]) == (0, "satisfied")
+        assert (process.returncode, found["verdict"]) == (0, "satisfied")
         assert found["products"]["flight.mp4"].startswith(("interrupted (Ctrl-C)", "failed: "))
     else:
-        assert (process.returncode, found["outcome"]) == (1, "aborted")
+        assert (process.returncode, found["verdict"]) == (1, "aborted")
         assert found["reason"].endswith("interrupted (Ctrl-C)")
         assert found["duration"] > 0.9
 

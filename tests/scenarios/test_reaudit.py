@@ -77,15 +77,22 @@ def test_one_sed_does_not_make_a_violated_run_hold(runs: Path, capsys: pytest.Ca
     assert main(["check", str(runs / "bad")]) == EXIT_WRONG_INPUT
     text = capsys.readouterr()
     assert text.out == ""
-    assert "summary.json: contradicts itself: speed: satisfied is true, and its worst margins say otherwise" in text.err
+    assert "summary.json: contradicts itself: speed: satisfied is true, its verdict violated, and its" in text.err
 
 
 def all_well(summary: dict[str, Any]) -> None:
     """What a careful liar writes."""
     summary["satisfied"] = summary["as_expected"] = True
+    summary["verdict"] = "satisfied"
     for entry in summary["constraints"]:
         if not entry["satisfied"]:
-            entry |= {"satisfied": True, "time_violated": 0.0, "worst_margin": 5.0, "worst_margin_sampled": 5.0}
+            entry |= {
+                "satisfied": True,
+                "verdict": "satisfied",
+                "time_violated": 0.0,
+                "worst_margin": 5.0,
+                "worst_margin_sampled": 5.0,
+            }
             entry["peak_plant"] = entry["peak_sampled"] = entry["upper"] - 5.0
 
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError, ParameterError
-from quadsim.flight.audit import Limit
+from quadsim.flight.audit import Limit, margins_at, margins_sampled
 from quadsim.flight.rundir import Run
 from quadsim.state import EULER, POSITION, Array, euler_to_quaternion, tilt
 
@@ -54,7 +54,7 @@ class MarginTrack:
 
     limit: Limit  # the limit
     now: Array  # (F,) signed margin; NaN outside the limit's time window
-    worst: Array  # (F,) smallest margin so far; NaN before the window
+    worst: Array  # (F,) smallest margin so far, of the samples too where they violate it; NaN before the window
     share: float
     """The smallest of the whole flight, tolerance included, over half the limit's band: 1 in its middle, negative
     where it is violated; infinite where the flight never reaches the window."""
@@ -148,7 +148,11 @@ def _row_before(t: Array, times: Array) -> np.ndarray[Any, np.dtype[np.intp]]:
 
 def _track(run: Run, limit: Limit, times: Array) -> MarginTrack:
     t, values = limit.source.finest(run.log)
-    margin = np.where(limit.holds_at(t), limit.margin(values), np.nan)
+    margin = margins_at(limit, t, values)
+    if limit.source.plant is not None:  # what a command violates, rotors that saturate do not show
+        sampled = margins_sampled(limit, run.log)
+        broken = np.flatnonzero(sampled < -limit.tolerance_sampled)
+        np.fmin.at(margin, _row_before(t, run.log.control.t[broken]), sampled[broken])
     row, worst = _row_before(t, times), np.fmin.accumulate(margin)
     share = (float(worst[-1]) + limit.tolerance) / limit.half_band
     return MarginTrack(limit=limit, now=margin[row], worst=worst[row], share=np.inf if np.isnan(share) else share)

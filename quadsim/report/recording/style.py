@@ -24,6 +24,7 @@ PANELS: Final[dict[str, tuple[str, ...]]] = {
     "Velocity": ("vx", "vy", "vz"),
     "Position errors": ("x_error", "y_error", "z_error"),
     "Attitude rates": ("roll_rate", "pitch_rate", "yaw_rate"),
+    "Body rates": ("body_rate_x", "body_rate_y", "body_rate_z"),
     "Yaw and tilt": ("yaw", "tilt", "yaw_error"),
     "Position as measured, less the true one": ("x_estimate_error", "y_estimate_error", "z_estimate_error"),
     "Attitude as measured, less the true one": ("roll_estimate_error", "pitch_estimate_error", "yaw_estimate_error"),

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from quadsim.controller import ACCEPTED, Phase
+from quadsim.flight.audit import HELD
 from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
+from quadsim.flight.summary import constraint_verdict, deciding_margin
 from quadsim.report.comparison import fallback_sentence, tracking_values
 from quadsim.report.narrative import condition_sentences
 from quadsim.report.recording.style import time_column
@@ -73,7 +75,9 @@ def _summary(run: Run) -> str:
     constraints, tracking, control = (run.summary[key] for key in ("constraints", "tracking", "controller"))
     lines = [f"**{run.name}: {_outcome(run)}**", ""]
     if constraints:
-        lines += ["| constraint | | worst margin | allowed |", "|---|---|---:|---|", *map(_verdict, constraints), ""]
+        head = "| constraint | | deciding margin | tolerance | bounds |"
+        lines += [head, "|---|---|---:|---:|---|", *map(_verdict, constraints), ""]
+        lines += [line for note in run.summary.get("audit_notes", ()) for line in (f"{note}.", "")]
     if not all(entry["required"] for entry in constraints):
         lines += ["In brackets: measured, not required.", ""]
     if tracking:
@@ -94,12 +98,11 @@ def _summary(run: Run) -> str:
 def _verdict(entry: Mapping[str, Any]) -> str:
     """One constraint of the summary as a row of a Markdown table."""
     lower, upper = _number(entry["lower"]), _number(entry["upper"])
-    margins = [entry[key] for key in ("worst_margin", "worst_margin_sampled") if entry[key] is not None]
-    worst = _number(min(margins, default=None))
+    margin, tolerance = deciding_margin(entry)
     bounds = f"≤ {upper}" if lower == "-" else f"≥ {lower}" if upper == "-" else f"{lower} to {upper}"
     name = entry["name"] if entry["required"] else f"({entry['name']})"
-    verdict = "**holds**" if entry["satisfied"] else "**violated**"
-    return f"| {name} | {verdict} | {worst} | {bounds} ± {entry['tolerance']:g} {entry['unit']} |"
+    verdict = HELD[constraint_verdict(entry)]
+    return f"| {name} | **{verdict}** | {_number(margin)} | {tolerance:g} | {bounds} {entry['unit']} |"
 
 
 def _number(value: float | None) -> str:

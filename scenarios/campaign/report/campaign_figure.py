@@ -66,8 +66,8 @@ def _draw_convergence(axes: Axes, summary: Summary) -> None:
     from matplotlib.ticker import LogLocator, NullFormatter
 
     axes.set_title("share of failed flights, in its interval", loc="left", fontsize=9.5)
-    if not summary["flights"]:
-        _note(axes, "no flights")
+    if not summary["convergence"]["flights"]:
+        _note(axes, "all flights are incomplete" if summary["flights"] else "no flights")
         return
     curves = summary["convergence"]
     n = curves["flights"]

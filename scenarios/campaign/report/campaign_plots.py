@@ -38,7 +38,7 @@ _TICK_ROOM: Final = 46  # characters that have room below a panel of a narrow pa
 def campaign_plots(table: pa.Table, summary: Summary) -> dict[str, Plot]:
     """The plots that its flights have something for: any of `convergence`, `metrics`, `drivers` and `scatter`."""
     found = {}
-    if table.num_rows:
+    if summary["convergence"]["flights"]:
         found["convergence"] = _convergence(summary)
     if drawn := histograms(table):
         found["metrics"] = _histograms(drawn, verdict_keys(table))

@@ -9,10 +9,11 @@ from typing import Any, Final
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from scenarios.campaign.report.campaign_curves import drivers, sure_splits
 from scenarios.campaign.results.table import Summary
-from scenarios.campaign.results.verdicts import HARMLESS
+from scenarios.campaign.results.verdicts import HARMLESS, INCOMPLETE
 from scenarios.campaign.statistics.inference import ALPHA
 from scenarios.campaign.statistics.wording import interval, label, p_value, percent
 
+_MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN}
 _GROUPS: Final = {
     3: ("lowest third", "middle", "highest third"),
     5: ("lowest fifth", "second", "third", "fourth", "highest fifth"),
@@ -36,8 +37,10 @@ def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
         head=("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}"),
         lines=lines,
         note=(
-            f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold or was "
-            "not reached, or the flight was lost, raised an error or met a limit of time or memory. Intervals are "
+            f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold, or "
+            "the flight was lost, raised an error or met a limit of time or memory. Incomplete: the flight ended "
+            "before it reached a required constraint, without a failure; the shares of failure and violation leave it "
+            "out. Intervals are "
             "Clopper-Pearson's: two-sided, and "
             "one-sided in the last two columns. They take flights as independent draws; draws spread evenly (Latin "
             "hypercube, Sobol', Halton) make the estimates more precise than that, and a grid gives the share over its "
@@ -64,9 +67,9 @@ def constraint_table(summary: Summary) -> Grid:
             *(f"{100.0 * summary['confidence']:g} % interval", "worst margin", "in flight"),
         ),
         lines=tuple(lines),
-        note="Margins are signed, at the physics rate and without the tolerance; negative is beyond the bound. A "
-        "constraint whose time window a flight did not reach was not held. Margins of a lost flight end where it was "
-        "aborted: what came after is not in them.",
+        note="Margins are signed, at the physics rate and without the tolerance; negative is beyond the bound. Shares "
+        "are of the flights that reached the constraint or were lost before it. Margins of a lost flight end where it "
+        "was aborted: what came after is not in them.",
     )
 
 
@@ -96,7 +99,7 @@ def worst_table(summary: Summary, directory: str) -> Grid:
     lines = tuple(
         line(
             str(flight["flight"]),
-            Cell(text=flight["verdict"], mark=Mark.NONE if flight["verdict"] == HARMLESS else Mark.BAD),
+            Cell(text=flight["verdict"], mark=_MARKS.get(flight["verdict"], Mark.BAD)),
             *(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
             format_number(flight["duration"]),
             Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
@@ -110,7 +113,7 @@ def worst_table(summary: Summary, directory: str) -> Grid:
         head=("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason"),
         lines=lines,
         note="Lost flights first, then those that raised an error, took too long or too much memory, violated a "
-        "constraint, and held all; among these, "
+        "constraint, ended before one was reached, and held all; among these, "
         "failed ones first, then the smaller worst margin. Margins of a lost flight end where it was aborted." + again,
     )
 

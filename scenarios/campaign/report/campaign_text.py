@@ -25,8 +25,12 @@ _MOST_DRIVERS: Final = 3
 def verdict_sentence(summary: Summary) -> str:
     """How many flights failed, and how sure that is: `37 of 1000 flights failed: 3.7 % (95 %: 2.6 to 5.1 %)`."""
     failure = summary["events"]["failure"]
+    left_out = summary["flights"] - failure["flights"]
+    apart = f"; {count_of(left_out, 'incomplete flight')} not counted" if left_out else ""
     text = f"{failure['count']} of {count_of(failure['flights'], 'flight')} failed"
-    return f"{text}: {share_with_interval(failure, summary['confidence'])}" if failure["flights"] else text
+    if not failure["flights"]:
+        return text + apart
+    return f"{text}: {share_with_interval(failure, summary['confidence'])}{apart}"
 
 
 def campaign_sentences(summary: Summary) -> list[str]:
@@ -54,9 +58,9 @@ def _outcomes(summary: Summary) -> Iterator[str]:
 
 
 def _bounds(summary: Summary) -> Iterator[str]:
-    if not summary["flights"]:
-        return
     events = summary["events"]
+    if not events["failure"]["flights"]:
+        return
     parts = [f"{_bound(events['failure'])} fail"]
     if events["violation"]["count"] != events["failure"]["count"]:
         parts.append(f"{_bound(events['violation'])} violate a required constraint")
@@ -83,7 +87,7 @@ def _constraints(summary: Summary) -> Iterator[str]:
     share = share_with_interval(found["not_satisfied"], summary["confidence"])
     if len(names) > 1:
         listed = listing(names, most=_MOST_NAMED)
-        yield f"What most often does not hold is {listed}, each in {share} of all flights."
+        yield f"What most often does not hold is {listed}, each in {share} of the flights held to it."
         return
     margin = (
         f"; its worst margin is {format_number(found['worst_margin'])} {found['unit']}, in flight "
@@ -91,7 +95,7 @@ def _constraints(summary: Summary) -> Iterator[str]:
         if found["worst_margin"] is not None
         else ""
     )
-    yield f"What most often does not hold is {names[0]}, in {share} of all flights{margin}."
+    yield f"What most often does not hold is {names[0]}, in {share} of the flights held to it{margin}."
 
 
 def driver_sentences(summary: Summary) -> Iterator[str]:

@@ -30,7 +30,9 @@ def pairing(comparison: Comparison) -> str:
     if comparison.own_draws:
         phrase += f"; one campaign alone draws {', '.join(comparison.own_draws)}"
     if comparison.left_out:
-        phrase += f"; {comparison.left_out} flights that only one of them has are left out"
+        phrase += (
+            f"; {comparison.left_out} flights of one alone, or with an incomplete flight in the pair, are left out"
+        )
     return f"{phrase}."
 
 

@@ -21,8 +21,8 @@ from quadsim.flight.audit import Finding, Limit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
-from scenarios.campaign.results.events import Flags
-from scenarios.campaign.results.verdicts import VERDICTS
+from scenarios.campaign.results.events import Event, Flags
+from scenarios.campaign.results.verdicts import HARMLESS, INCOMPLETE, VERDICTS
 from scenarios.many import ERROR
 
 Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
@@ -110,7 +110,7 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
     Args:
         log: with plant rows at the physics rate.
         findings: its audit.
-        verdict: `satisfied`, `violated` or `lost`.
+        verdict: `satisfied`, `violated`, `lost` or `incomplete`.
         wall_s: how long it took to fly [s].
         machine: the processor that flew it.
     """
@@ -118,7 +118,7 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
         "status": log.status,
         "verdict": verdict,
         "reason": log.reason,
-        "violated": verdict != "satisfied",
+        "violated": verdict not in (HARMLESS, INCOMPLETE),
         "crashed": str(Phase.CRASHED) in log.control.phase,
         "duration": round(float(log.plant.t[-1]), 9),
         "wall_s": wall_s,
@@ -128,7 +128,8 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
         name = finding.limit.name
         row[MARGIN + name] = finding.worst_margin if math.isfinite(finding.worst_margin) else None
         row[TIME_VIOLATED + name] = finding.time_violated
-        row[SATISFIED + name] = finding.satisfied
+        unknown = finding.verdict == "incomplete" and verdict != "lost"  # a lost flight had to get there
+        row[SATISFIED + name] = None if unknown else finding.satisfied
     row["worst_margin"], row["worst_constraint"] = worst_margin(findings)
     return row | (_numbers(log) if log.control.t.size else {})
 
@@ -240,6 +241,16 @@ def verdicts(table: pa.Table) -> dict[str, Flags]:
     """(K,) which flights have each verdict."""
     found = texts(table, "verdict")
     return {verdict: np.asarray(found == verdict, bool) for verdict in VERDICTS}
+
+
+def is_counted(table: pa.Table, event: Event) -> Flags:
+    """(K,) which flights count for an event's share: of failure and violation, those that show whether it happened.
+
+    An incomplete flight without it shows neither: it is left out, as it is no success.
+    """
+    if event.text not in ("failure", "violation") or "verdict" not in table.column_names:
+        return np.ones(table.num_rows, bool)
+    return np.asarray((texts(table, "verdict") != INCOMPLETE) | event.column(table), bool)
 
 
 def draw_names(table: pa.Table) -> list[str]:

@@ -8,6 +8,7 @@ from quadsim.report.palette import BOUND, LINES, REFERENCE
 from scenarios.many import DIED, ERROR, MEMORY, TIMEOUT
 
 HARMLESS: Final = "satisfied"
+INCOMPLETE: Final = "incomplete"  # of a flight that ended before it reached a required constraint: neither good nor bad
 
 
 class Verdict(NamedTuple):
@@ -25,19 +26,27 @@ _HELD, _VIOLATED, _RAISED = "held every required constraint", "violated a requir
 
 VERDICTS: Final = {
     HARMLESS: Verdict(0, _HELD, _HELD, LINES[0], "o", "circle"),
-    "violated": Verdict(1, _VIOLATED, _VIOLATED, LINES[1], "D", "diamond"),
-    "lost": Verdict(5, "were lost", "was lost", BOUND, "x", "x"),
-    ERROR: Verdict(4, _RAISED, _RAISED, REFERENCE, "s", "square"),
-    DIED: Verdict(4, "ended with their process", "ended with its process", LINES[3], "P", "cross"),
+    INCOMPLETE: Verdict(
+        1,
+        "ended before a required constraint was reached",
+        "ended before a required constraint was reached",
+        LINES[2],
+        "P",
+        "cross",
+    ),
+    "violated": Verdict(2, _VIOLATED, _VIOLATED, LINES[1], "D", "diamond"),
+    "lost": Verdict(6, "were lost", "was lost", BOUND, "x", "x"),
+    ERROR: Verdict(5, _RAISED, _RAISED, REFERENCE, "s", "square"),
+    DIED: Verdict(5, "ended with their process", "ended with its process", LINES[3], "p", "pentagon"),
     TIMEOUT: Verdict(
-        3, "were ended since they took too long", "was ended since it took too long", LINES[4], "^", "triangle-up"
+        4, "were ended since they took too long", "was ended since it took too long", LINES[4], "^", "triangle-up"
     ),
     MEMORY: Verdict(
-        *(2, "were ended since they took too much memory", "was ended since it took too much memory"),
+        *(3, "were ended since they took too much memory", "was ended since it took too much memory"),
         *(LINES[5], "v", "triangle-down"),
     ),
 }
 """In the order in which they are drawn and counted."""
 
 VERDICT_EVENTS: Final = tuple(name for name in VERDICTS if name not in (HARMLESS, "violated"))
-"""Verdicts that are events of their own name; `violation` is every verdict but `satisfied`."""
+"""Verdicts that are events of their own name; `violation` is every verdict but `satisfied` and `incomplete`."""

@@ -21,11 +21,13 @@ from scenarios.campaign.results.table import (
     constraint_names,
     draw_names,
     flags,
+    is_counted,
     numbers,
     texts,
     unit_of,
 )
 from scenarios.campaign.statistics import inference
+from scenarios.campaign.statistics.estimates import FAILURE
 from scenarios.campaign.statistics.scatters import ShownMargins, paired_margins
 from scenarios.campaign.statistics.wording import p_value, signed_interval, signed_points
 
@@ -161,7 +163,7 @@ class Comparison:
     Attributes:
         names: of the first and the second campaign.
         flights: pairs, flights that both campaigns have.
-        left_out: flights that only one of them has.
+        left_out: flights that only one of them has, or of whose pair one is incomplete.
         completed: pairs in which both flights were completed.
         shared_draws: parameters that both drew, alike in every pair.
         own_draws: parameters that only one of them drew.
@@ -250,6 +252,13 @@ def compare(
         raise InputError(f"campaigns {names[0]!r} and {names[1]!r} have no flight of one number: nothing can be paired")
     a, b = (table.take(np.flatnonzero(np.isin(numbers(table, "flight"), shared))) for table in (table_a, table_b))
     a, b = (table.sort_by("flight") for table in (a, b))
+    complete = is_counted(a, FAILURE) & is_counted(b, FAILURE)
+    if not complete.any():
+        raise InputError(
+            f"campaigns {names[0]!r} and {names[1]!r} have no pair of flights of which both reached every required "
+            "constraint: fly them for longer"
+        )
+    a, b = a.filter(complete), b.filter(complete)
     draws_a, draws_b = draw_names(a), draw_names(b)
     shared_draws = tuple(name for name in draws_a if name in draws_b)
     for column in ("seed", *(DRAW + name for name in shared_draws)):
@@ -258,8 +267,8 @@ def compare(
     events = events_of(a, b)
     return Comparison(
         names=names,
-        flights=shared.size,
-        left_out=table_a.num_rows + table_b.num_rows - 2 * shared.size,
+        flights=a.num_rows,
+        left_out=table_a.num_rows + table_b.num_rows - 2 * a.num_rows,
         completed=int(completed.sum()),
         shared_draws=shared_draws,
         own_draws=tuple(sorted(set(draws_a) ^ set(draws_b))),

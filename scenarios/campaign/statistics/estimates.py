@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from quadsim.errors import ParameterError
 from quadsim.state import Array
-from scenarios.campaign.results.events import EVENT_NAMES, Flags, parse_event
+from scenarios.campaign.results.events import EVENT_NAMES, Event, Flags, parse_event
 from scenarios.campaign.results.table import (
     DRAW,
     MARGIN,
@@ -20,6 +20,7 @@ from scenarios.campaign.results.table import (
     constraint_names,
     draw_names,
     flags,
+    is_counted,
     is_number,
     metric_names,
     numbers,
@@ -27,11 +28,12 @@ from scenarios.campaign.results.table import (
     unit_of,
     verdicts,
 )
-from scenarios.campaign.results.verdicts import VERDICTS
+from scenarios.campaign.results.verdicts import INCOMPLETE, VERDICTS
 from scenarios.campaign.statistics.dependence import any_dependence, best_splits, rank_correlation, trend
 from scenarios.campaign.statistics.inference import CONFIDENCE, holm, lower_bounds, share_of, upper_bounds
 from scenarios.campaign.statistics.scatters import margin_ends
 
+FAILURE: Final = parse_event("failure")
 WORST_FLIGHTS: Final = 10
 _CURVE_POINTS: Final = 80
 SPLIT_EVENTS: Final = ("failure", "violation", "lost")
@@ -44,21 +46,25 @@ def estimate(table: pa.Table) -> dict[str, Any]:
     """Everything in a campaign's summary about its flights, as plain data for JSON.
 
     Keys: `flights`; `confidence` of every interval; `verdicts`, flights of each; `events` and `constraints`, by name,
-    as proportions (`inference.Proportion`), a constraint's being that it did not hold or was not
-    reached; `metrics`, over the flights that have each; `parameters`, how the outcome depends on each varied parameter
-    (`parameters`); `worst`, the ten worst flights; `convergence` of the shares of failure and
+    as proportions (`inference.Proportion`), a constraint's being that it did not hold, among the flights that reached
+    it or were lost before; `metrics`, over the flights that have each; `parameters`, how the outcome depends on each
+    varied parameter (`parameters`); `worst`, the ten worst flights; `convergence` of the shares of failure and
     violation over the first n flights.
+
+    Incomplete flights are neither failures nor successes (`results.table.is_counted`): the shares of failure and
+    violation, `parameters` and `convergence` leave them out.
     """
+    counted = table.filter(is_counted(table, FAILURE))
     return {
         "flights": table.num_rows,
         "confidence": CONFIDENCE,
         "verdicts": {verdict: int(found.sum()) for verdict, found in verdicts(table).items()},
-        "events": {name: share_of(parse_event(name).column(table)) for name in EVENT_NAMES},
+        "events": {name: _event(table, parse_event(name)) for name in EVENT_NAMES},
         "metrics": {name: _metric(table, name) for name in metric_names(table)},
         "constraints": {name: _constraint(table, name) for name in constraint_names(table)},
-        "parameters": parameters(table),
+        "parameters": parameters(counted),
         "worst": [_flight(table, int(i)) for i in ranking(table)[:WORST_FLIGHTS]],
-        "convergence": _convergence(table),
+        "convergence": _convergence(counted),
     }
 
 
@@ -112,11 +118,18 @@ def _metric(table: pa.Table, name: str) -> dict[str, Any]:
     }
 
 
+def _event(table: pa.Table, event: Event) -> dict[str, Any]:
+    return share_of(event.column(table)[is_counted(table, event)])
+
+
 def _constraint(table: pa.Table, name: str) -> dict[str, Any]:
     margin = numbers(table, MARGIN + name)
+    held = flags(table, SATISFIED + name, absent=False)
+    unknown = [value is None for value in table[SATISFIED + name].to_pylist()]
+    reached = ~(np.array(unknown, bool) & np.isin(texts(table, "verdict").astype(str), (INCOMPLETE, "violated")))
     found: dict[str, Any] = {
         "unit": unit_of(table, MARGIN + name),
-        "not_satisfied": share_of(~flags(table, SATISFIED + name, absent=False)),
+        "not_satisfied": share_of(~held[reached]),
         "worst_margin": None,
         "worst_flight": None,
     }

@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from quadsim.errors import InputError, ParameterError
 from scenarios.campaign.results.events import Event, parse_event
+from scenarios.campaign.results.table import is_counted
 from scenarios.campaign.statistics.inference import lower_bounds, upper_bounds
 from scenarios.campaign.statistics.wording import count_of, percent
 
@@ -121,13 +122,13 @@ def judge(table: pa.Table, requirement: Requirement) -> Judgement:
     """Hold a campaign's flights, `flights.parquet`, against a requirement.
 
     It holds when the one-sided Clopper-Pearson bound at its confidence is on the required side; so it takes
-    flights enough, and no flights support nothing.
+    flights enough, and no flights support nothing.  Incomplete flights do not count (`results.table.is_counted`).
 
     Raises:
         UnknownNameError: the table has no column that the event names.
         InputError: the event compares text with a number.
     """
-    happened = requirement.event.column(table)
+    happened = requirement.event.column(table)[is_counted(table, requirement.event)]
     count, flights = int(happened.sum()), happened.size
     bound = _bound(requirement, count, flights)
     return Judgement(

@@ -62,6 +62,8 @@ def test_samples_have_a_tolerance_of_their_own(sampled: float, satisfied: bool) 
     finding = find(logged("z", samples=SAMPLES, plant=PLANT), limit)
     assert finding.worst_margin_sampled == pytest.approx(-0.1)
     assert finding.satisfied == satisfied
+    deciding = (finding.worst_margin, 10.0) if satisfied else (finding.worst_margin_sampled, sampled)
+    assert (finding.deciding_margin, finding.deciding_tolerance) == deciding
 
 
 @pytest.mark.parametrize(
@@ -81,13 +83,18 @@ def test_a_window_counts_and_nothing_outside_it(start: float, stop: float, peak:
     assert finding.peak_plant == peak
 
 
-def test_a_window_that_the_flight_never_reached_is_not_held() -> None:
+def test_a_window_that_the_flight_never_reached_is_neither_held_nor_violated() -> None:
     finding = find(logged("z", samples=SAMPLES, plant=PLANT), replace(Z, start=9.0))
     assert math.isnan(finding.worst_margin)
     assert math.isnan(finding.peak_plant)
     assert math.isnan(finding.worst_margin_sampled)
     assert finding.time_violated == 0.0
-    assert not finding.satisfied
+    assert (finding.verdict, finding.satisfied) == ("incomplete", False)
+
+
+def test_a_value_that_is_no_number_violates_its_limit() -> None:
+    finding = find(logged("z", samples=SAMPLES, plant=(*PLANT[:-1], math.nan)), Z)
+    assert finding.verdict == "violated"
 
 
 def test_a_flight_of_no_period_holds_nothing() -> None:
@@ -129,7 +136,8 @@ def test_errors_are_real_minus_reference_at_the_samples(axis: str, state: int, s
     log = small_log(3)
     errors = scale * (log.control.truth[:, state] - log.control.reference[:, {"x": 0, "yaw": 3}[axis]])
     finding = find(log, Limit(name="error", signal=f"{axis}_error", upper=0.0))
-    assert finding.peak_sampled == finding.peak_plant == pytest.approx(errors.max())
+    assert finding.peak_sampled == pytest.approx(errors.max())
+    assert math.isnan(finding.peak_plant)  # it has no value there
     assert finding.worst_time == log.control.t[np.argmax(errors)]
 
 
@@ -150,7 +158,7 @@ def test_steps_of_the_command_are_audited_from_the_first_on() -> None:
     np.testing.assert_allclose(margins_sampled(finding.limit, log), [-1.0, 5.0, -2.0])
     assert finding.worst_margin == pytest.approx(-2.0)
     assert finding.worst_time == pytest.approx(0.2)
-    assert finding.peak_plant == finding.peak_sampled
+    assert math.isnan(finding.peak_plant)
 
 
 def test_margins_outside_the_window_are_nan() -> None:

@@ -43,6 +43,13 @@ EVERYTHING = {
 }
 
 
+def with_margin(entry: dict[str, Any], margin: float) -> dict[str, Any]:
+    """A required constraint that was held, or violated, by a margin."""
+    verdict = "satisfied" if margin >= 0.0 else "violated"
+    margins = dict.fromkeys(("worst_margin", "worst_margin_sampled"), margin)
+    return {**entry, **margins, "worst_time": 1.0, "required": True, "satisfied": margin >= 0.0, "verdict": verdict}
+
+
 def having(run: Run, scenario: str, **entries: Any) -> Run:
     return dataclasses.replace(run, summary={**copy.deepcopy(run.summary), "scenario": scenario, **entries})
 
@@ -103,7 +110,7 @@ def test_a_flight_that_never_touches_the_ground_or_crashes_on_it(bare_run: Run) 
 def test_a_verdict_is_held_against_the_one_the_scenario_states(
     bare_run: Run, status: str, satisfied: bool, expected: str, as_expected: bool, text: str, mark: Mark, sentence: str
 ) -> None:
-    constraints = [{**bare_run.summary["constraints"][0], "required": True, "satisfied": satisfied}]
+    constraints = [with_margin(bare_run.summary["constraints"][0], 1.0 if satisfied else -1.0)]
     run = having(bare_run, "flight", status=status, constraints=constraints, expected=expected, as_expected=as_expected)
     found = verdict_cell(run.summary)
     assert (found.text, found.mark) == (text, mark)
@@ -111,9 +118,20 @@ def test_a_verdict_is_held_against_the_one_the_scenario_states(
     assert (not sentences) if sentence is None else (sentence in sentences[0])
 
 
+def test_a_required_constraint_that_was_not_reached_makes_a_flight_incomplete(bare_run: Run) -> None:
+    entry = bare_run.summary["constraints"][0]
+    beyond = {"worst_margin": None, "worst_margin_sampled": None, "worst_time": None}
+    unreached = {**with_margin(entry, 1.0), **beyond, "name": "arrival", "satisfied": False}
+    flown = having(bare_run, "short", constraints=[with_margin(entry, 1.0), unreached], expected="satisfied")
+    assert (verdict(flown.summary), verdict_cell(flown.summary).mark) == ("incomplete", Mark.BAD)
+    assert "short ends before every required constraint is reached" in " ".join(comparison_sentences([flown]))
+    assert verdict({**flown.summary, "constraints": [with_margin(entry, -1.0), unreached]}) == "violated"
+    assert verdict({**flown.summary, "constraints": [{**unreached, "required": False}]}) == "satisfied"
+
+
 def test_a_verdict_needs_no_expectation_and_minds_required_constraints_alone(bare_run: Run) -> None:
     entry = bare_run.summary["constraints"][0]
-    summary = {**bare_run.summary, "constraints": [{**entry, "required": False, "satisfied": False}]}
+    summary = {**bare_run.summary, "constraints": [{**with_margin(entry, -1.0), "required": False}]}
     assert verdict(summary) == "satisfied"
     assert verdict_cell(summary).mark is Mark.NONE
 
@@ -167,7 +185,8 @@ DIAGNOSIS = {
 
 
 def test_fallback_for_good_is_no_success_and_is_reported_with_its_reason(bare_run: Run) -> None:
-    held = [{**entry, "satisfied": True} for entry in bare_run.summary["constraints"]]
+    held = [with_margin(entry, 1.0) for entry in bare_run.summary["constraints"]]
+    broken = [with_margin(entry, -1.0) for entry in bare_run.summary["constraints"]]
     controller = {**bare_run.summary["controller"], "unrecovered": 318}
     good = having(bare_run, "good", constraints=held)
     stuck = having(
@@ -177,9 +196,7 @@ def test_fallback_for_good_is_no_success_and_is_reported_with_its_reason(bare_ru
     assert [verdict(run.summary) for run in (good, stuck, crashed)] == ["satisfied", "violated", "violated"]
     assert verdict_sentence(stuck.summary) == "ends in permanent fallback"
     assert verdict_sentence(crashed.summary) == "crashes"
-    assert verdict_sentence(having(stuck, "both", constraints=bare_run.summary["constraints"]).summary).startswith(
-        "does"
-    )
+    assert verdict_sentence(having(stuck, "both", constraints=broken).summary).startswith("does")
     sentences = comparison_sentences([good, stuck])
     assert "stuck ends in permanent fallback; its scenario states the verdict satisfied." in sentences
     reasons = ["318 periods in fallback, never recovered", DIAGNOSIS["sentence"], DIAGNOSIS["advice"]]

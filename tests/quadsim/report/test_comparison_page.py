@@ -105,7 +105,7 @@ def test_the_page_stands_beside_its_files(page_of_two: Path) -> None:
 def test_the_text_gives_outcomes_reasons_and_numbers(page_of_two: Path) -> None:
     text = without_scripts(page_of_two.read_text())
     assert "aborted: at t = 6.000 s: the plant&#39;s state is &lt;not&gt; finite &amp; more" in text
-    assert "holds (tolerance 0.01 / 0.05 deg)" in text
+    assert "holds (margin 5 deg, tolerance 0.05)" in text
     assert text.count("<video") == 1
     assert "This run has no video" in text
     assert "paper-constrained/flight.rrd" in text

@@ -113,6 +113,7 @@ def test_margins_see_a_violation_that_samples_miss() -> None:
 def test_cost_counts_required_constraints_beyond_their_tolerance() -> None:
     limit = {"name": "height", "signal": "z", "upper": 1.0, "tolerance": 0.01, "tolerance_sampled": 0.01}
     limits = [limit, {**limit, "name": "wish", "required": False}, {**limit, "name": "later", "start": 0.9}]
+    limits += [{"name": name, "signal": name, "required": False} for name in ("roll", "pitch", "speed", "slew")]
     env = quadsim.gym.make_env(short("hover", 1.0, constraints=limits))
     env.reset()
     infos = [env.step(np.full(4, 0.5, np.float32))[4] for _ in range(20)]

@@ -67,7 +67,7 @@ def test_counts_follow_from_the_times() -> None:
 
 
 def test_absent_bounds_are_infinite() -> None:
-    (limit,) = build_limits(
+    limit, *_ = build_limits(
         parse_scenario(scenario_table() | {"constraints": [{"name": "a", "signal": "z", "lower": 1}]})
     )
     assert (limit.lower, limit.upper, limit.start, limit.stop) == (1.0, np.inf, 0.0, np.inf)
@@ -107,7 +107,7 @@ WRONG = {
     "control_period=0": "control_period must be > 0.0; got 0",
     "group=nowhere": "group must be one of 'paper', 'papers', 'courses', 'air', 'faults', 'ground', 'space', 'sensors' "
     "or 'other'; ...",
-    "expect=fine": "expect must be one of 'satisfied', 'violated' or 'lost'; got 'fine'",
+    "expect=fine": "expect must be one of 'satisfied', 'violated', 'lost', 'aborted' or 'incomplete'; got 'fine'",
     "name='" + 81 * "a" + "'": "name must be a text of 80 or fewer characters; got '" + 81 * "a" + "'",
     "seed=-1": "seed must be >= 0; got -1",
     "seed=1.5": "seed must be a whole number; got 1.5",
@@ -192,13 +192,15 @@ WRONG = {
     "controller.input_bounds.slew=[1, 5]": (
         "controller.input_bounds.slew must allow a speed to be held, so contain 0; got [1.0, 5.0]"
     ),
-    "constraints.roll.lower=5": "constraints.roll.lower must be below upper = 5.0; got 5.0",
+    "constraints.arrival_x.lower=5": "constraints.arrival_x.lower must be below upper = 0.01; got 5.0",
     "constraints.roll.tolerance_sampled=1": (
         "constraints.roll.tolerance_sampled must be at most tolerance = 0.05; got 1.0"
     ),
     "constraints.roll.stop=-1": "constraints.roll.stop must be at least start = 0.0; got -1.0",
     "constraints.roll.name=pitch": "constraints must have distinct names; got ['pitch', 'pitch', 'speed', ...",
-    "constraints=[{name='a', signal='x'}]": "constraints.a.lower must be given, or upper, or both",
+    "constraints=[{name='a', signal='x_error'}]": (
+        "constraints.a must have lower, upper or both; no controller has bounds on x_error"
+    ),
     "controller.type=unconstrained": (
         "controller.solver is not a field of the scenario file "
         "(there are: horizon, output_weights, input_weights, terminal, compiled, type)\n"

@@ -106,5 +106,5 @@ def test_what_measures_no_flight_is_not_compared(column: str) -> None:
 
 
 def test_names_are_those_of_the_summary() -> None:
-    assert EVENT_NAMES == ("failure", "violation", "lost", "crash", "error", "died", "timeout", "memory")
+    assert EVENT_NAMES == ("failure", "violation", "lost", "crash", "incomplete", "error", "died", "timeout", "memory")
     assert [parse_event(name).text for name in EVENT_NAMES] == [*EVENT_NAMES]

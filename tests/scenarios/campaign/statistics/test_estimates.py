@@ -8,10 +8,14 @@ import pyarrow as pa
 import pytest
 from scipy import stats
 
-from quadsim.errors import ParameterError
+from quadsim.errors import InputError, ParameterError
+from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
+from scenarios.campaign.statistics.comparison import compare
 from scenarios.campaign.statistics.estimates import estimate, ranking, worst_flight
+from scenarios.campaign.statistics.requirement import judge, parse_requirement
 
 MakeCampaign = Callable[..., pa.Table]
+NONE = ("incomplete", "died", "timeout", "memory")
 
 
 def with_column(table: pa.Table, name: str, values: list[object]) -> pa.Table:
@@ -45,17 +49,9 @@ def small() -> pa.Table:
 def test_events_and_verdicts_are_counted(small: pa.Table) -> None:
     found = estimate(small)
     assert found["flights"] == 8
-    assert found["verdicts"] == {
-        "satisfied": 3,
-        "violated": 2,
-        "lost": 2,
-        "error": 1,
-        "died": 0,
-        "timeout": 0,
-        "memory": 0,
-    }
+    assert found["verdicts"] == {"satisfied": 3, "violated": 2, "lost": 2, "error": 1} | dict.fromkeys(NONE, 0)
     counts = {name: event["count"] for name, event in found["events"].items()}
-    expected = {"failure": 6, "violation": 5, "lost": 2, "crash": 1, "error": 1, "died": 0, "timeout": 0, "memory": 0}
+    expected = {"failure": 6, "violation": 5, "lost": 2, "crash": 1, "error": 1} | dict.fromkeys(NONE, 0)
     assert counts == expected
     failure = found["events"]["failure"]
     exact = stats.binomtest(6, 8).proportion_ci(0.95)
@@ -73,10 +69,40 @@ def test_metrics_are_those_of_the_flights_that_have_them(small: pa.Table) -> Non
     assert (found["rmse.x"]["min"], found["rmse.x"]["max"]) == (0.1, 6.0)
 
 
-def test_a_constraint_that_was_not_reached_did_not_hold(small: pa.Table) -> None:
+def test_a_constraint_that_lost_flights_did_not_reach_did_not_hold(small: pa.Table) -> None:
     roll = estimate(small)["constraints"]["roll"]
-    assert roll["not_satisfied"]["count"] == 5
+    assert (roll["not_satisfied"]["count"], roll["not_satisfied"]["flights"]) == (5, 8)
     assert (roll["worst_margin"], roll["worst_flight"]) == (-15.0, 3)
+
+
+def test_incomplete_flights_are_neither_failures_nor_successes(small: pa.Table) -> None:
+    """Flights 0 and 2 ended before the window of `roll`."""
+    verdicts = ["incomplete" if i in (0, 2) else value for i, value in enumerate(small["verdict"].to_pylist())]
+    held = [None if i in (0, 2) else value for i, value in enumerate(small["satisfied.roll"].to_pylist())]
+    table = with_column(with_column(small, "verdict", verdicts), "satisfied.roll", held)
+    found, before = estimate(table), estimate(small)
+    assert (found["flights"], found["verdicts"]["incomplete"]) == (8, 2)
+    for event in ("failure", "violation"):
+        assert found["events"][event]["flights"] == 6
+        assert found["events"][event]["count"] == before["events"][event]["count"]
+    assert found["events"]["lost"] == before["events"]["lost"]
+    assert found["constraints"]["roll"]["not_satisfied"]["flights"] == 6
+    assert found["convergence"]["flights"][-1] == 6
+    assert judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).flights == 6
+    assert verdict_sentence(found).startswith("6 of 6 flights failed")
+    assert verdict_sentence(found).endswith("; 2 incomplete flights not counted")
+
+
+def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(small: pa.Table) -> None:
+    table = with_column(with_column(small, "verdict", ["incomplete"] * 8), "failed", [False] * 8)
+    table = with_column(with_column(table, "violated", [False] * 8), "satisfied.roll", [None] * 8)
+    found = estimate(table)
+    assert verdict_sentence(found) == "0 of 0 flights failed; 8 incomplete flights not counted"
+    assert "All 8 flights ended before a required constraint was reached." in campaign_sentences(found)
+    assert found["events"]["failure"]["flights"] == found["constraints"]["roll"]["not_satisfied"]["flights"] == 0
+    assert not judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).holds
+    with pytest.raises(InputError, match="no pair of flights of which both reached every required constraint"):
+        compare(table, table, ("one", "other"))
 
 
 def test_the_worst_flights_come_first(small: pa.Table) -> None:

@@ -1,0 +1,195 @@
+"""What is audited: the bounds of the controller, named or not, and what stands for them."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+
+import quadsim
+from quadsim.flight.audit import Limit
+from scenarios.cli import main
+from scenarios.commands import EXIT_DONE, EXIT_FAILED
+from scenarios.limits import audit_notes, build_limits
+from scenarios.live.session import Session
+from scenarios.loading import load_scenario
+from scenarios.reaudit import reaudit
+from scenarios.schema.scenario import Scenario
+
+
+def audited(scenario: Scenario) -> dict[str, Limit]:
+    return {limit.name: limit for limit in build_limits(scenario)}
+
+
+def hover(**changes: Any) -> Scenario:
+    return quadsim.load("hover").replace(
+        {"duration": 0.5, **{key.replace("__", "."): at for key, at in changes.items()}}
+    )
+
+
+def test_a_bound_that_no_entry_names_is_audited_within_one_percent() -> None:
+    scenario = hover(controller__output_bounds__vz=[-0.5, 1.5])
+    limit = audited(scenario)["vz"]
+    assert (limit.signal, limit.lower, limit.upper, limit.required) == ("vz", -0.5, 1.5, True)
+    assert (limit.tolerance, limit.tolerance_sampled) == pytest.approx((0.01, 0.002))  # of half the band, 1 m/s
+    (note,) = audit_notes(scenario)
+    assert note.startswith("vz: audited as the controller bounds it; tolerance 1 % of half the band, 0.2 %")
+
+
+def test_a_swept_bound_is_held_against_each_of_its_values() -> None:
+    table = quadsim.sweep(
+        hover(duration=2.0, initial__euler=[1.0, 0.0, 0.0]),
+        {"controller.output_bounds.roll": [[-2.0, 2.0], [-5.0, 5.0]]},
+        workers=1,
+    )
+    margins = list(table["margin.roll"])
+    assert margins == pytest.approx([1.0, 4.0], abs=0.05)
+
+
+def test_a_bound_on_velocity_that_is_violated_makes_the_flight_violated() -> None:
+    """Soft, so that it gives: 10 m up in a step, faster than 0.3 m/s."""
+    changes = {
+        "duration": 4.0,
+        "controller.output_bounds.vz": [-0.3, 0.3],
+        "controller.soft": {"linear": 0.0, "quadratic": 1e-3},
+        "controller.tightening": None,
+    }
+    flight = quadsim.fly(quadsim.load("robust").replace(changes))
+    (finding,) = (entry for entry in flight.audit if entry.limit.name == "vz")
+    assert finding.verdict == flight.outcome == "violated"
+
+
+def test_an_entry_without_bounds_takes_the_controllers_with_its_own_tolerance_and_window() -> None:
+    entry = {"name": "late", "signal": "roll", "tolerance": 0.3, "start": 0.2, "required": False}
+    limits = audited(hover(constraints=[entry]))
+    late = limits["late"]
+    assert (late.lower, late.upper, late.tolerance, late.start, late.required) == (-5.0, 5.0, 0.3, 0.2, False)
+    assert "roll" not in limits, "the entry stands for the bound"
+    assert {"pitch", "speed", "slew"} <= limits.keys()
+
+
+def test_an_entry_for_a_part_of_the_flight_leaves_the_bound_audited() -> None:
+    entry = {"name": "roll", "signal": "roll", "lower": -1.0, "upper": 1.0, "start": 0.2}
+    limits = audited(hover(constraints=[entry]))
+    assert (limits["roll"].upper, limits["controller.roll"].upper) == (1.0, 5.0)
+
+
+def test_other_numbers_than_the_controllers_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ["constraints.roll.lower=-8.0", "constraints.roll.upper=8.0", "duration=0.5"]
+    line = "roll: audited against ±8 deg, the controller bounds ±5 deg"
+    assert audit_notes(load_scenario("hover", settings)) == [line]
+    options = [part for setting in settings for part in ("--set", setting)]
+    assert main(["run", "hover", *options, "--out", str(tmp_path / "run"), "--no-video", "--no-recording"]) == EXIT_DONE
+    assert line in capsys.readouterr().out
+    quadsim.compare(tmp_path / "run", out=tmp_path / "page", cost=False)
+    assert line in (tmp_path / "page/index.html").read_text()
+    assert reaudit(tmp_path / "run").satisfied
+
+
+def test_a_law_without_bounds_is_held_to_what_the_entries_state() -> None:
+    scenario = hover(controller={"type": "pid"})
+    assert set(audited(scenario)) == {"hold_x", "hold_y", "hold_z"}
+    (note,) = audit_notes(scenario)
+    assert note == "roll, pitch, speed, slew: not audited, the controller has no such bound and the entry states none"
+
+
+def test_bounds_that_an_event_changes_are_reported_with_their_time() -> None:
+    event = {"type": "controller", "at": 0.2, "fields": {"output_bounds.roll": [-3.0, 3.0]}}
+    scenario = hover(events=[event])
+    assert audited(scenario)["roll"].upper == 5.0
+    assert audit_notes(scenario) == ["roll: audited against ±5 deg, the controller bounds ±3 deg from 0.2 s"]
+
+
+def test_all_bounds_of_nonlinear_mpc_are_audited() -> None:
+    law = {
+        "type": "nonlinear",
+        "tilt": 30.0,
+        "body_rate": [100.0, 200.0, 50.0],
+        "output_bounds": {"vz": [-1.0, 1.0]},
+        "inputs": "speed",
+        "input_bounds": {"slew": [-20.0, 20.0]},
+    }
+    limits = audited(hover(controller=law, constraints=[]))
+    assert {name: (limit.lower, limit.upper) for name, limit in limits.items()} == {
+        "vz": (-1.0, 1.0),
+        "tilt": (-math.inf, 30.0),
+        "body_rate_x": (-100.0, 100.0),
+        "body_rate_y": (-200.0, 200.0),
+        "body_rate_z": (-50.0, 50.0),
+        "speed": (0.0, 250.0),  # what the vehicle's rotors hold
+        "slew": (-20.0, 20.0),
+    }
+    assert quadsim.fly(hover(controller=law, constraints=[])).outcome == "satisfied"
+
+
+ARRIVAL = {"constraints": [{"name": "arrival", "signal": "z_error", "lower": -0.1, "upper": 0.1, "start": 1.0}]}
+
+
+def incomplete() -> Scenario:
+    return hover(**ARRIVAL)
+
+
+def entry_of(summary: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    (found,) = (entry for entry in summary["constraints"] if entry["name"] == name)
+    return found
+
+
+def test_a_required_constraint_that_the_flight_does_not_reach_makes_it_incomplete() -> None:
+    flight = quadsim.fly(incomplete())
+    assert (flight.outcome, flight.satisfied) == ("incomplete", False)
+    assert flight.summary["verdict"] == entry_of(flight.summary, "arrival")["verdict"] == "incomplete"
+    assert not flight.summary["as_expected"]
+    assert quadsim.fly(incomplete().replace({"constraints.arrival.required": False})).outcome == "satisfied"
+    assert quadsim.fly(incomplete().replace({"duration": 1.5})).outcome == "satisfied"
+    low = {"name": "low", "signal": "z", "upper": 0.5}
+    assert quadsim.fly(hover(constraints=[*ARRIVAL["constraints"], low])).outcome == "violated"
+
+
+def test_the_command_line_tells_incomplete_from_violated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, verdicts = tmp_path / "scenario.toml", tmp_path / "verdicts.xml"
+    path.write_text(incomplete().to_toml())
+    quiet = ["--out", str(tmp_path / "run"), "--no-video", "--no-recording", "--no-figures"]
+    assert main(["run", str(path), *quiet]) == EXIT_DONE
+    assert "incomplete, not reached: arrival" in capsys.readouterr().out
+    for target in (path, tmp_path / "run"):
+        assert main(["check", str(target), "--junit", str(verdicts)]) == EXIT_FAILED
+        assert "VIOLATED" not in capsys.readouterr().out
+        suite = ElementTree.parse(verdicts).getroot()
+        assert (suite.get("failures"), suite.get("skipped")) == ("0", "1")
+        (case,) = suite.findall("testcase[skipped]")
+        assert case.get("name") == "arrival"
+    assert main(["check", str(path), "--json"]) == EXIT_FAILED
+    assert json.loads(capsys.readouterr().out)["verdict"] == "incomplete"
+
+
+def test_a_live_session_that_is_ended_early_is_incomplete() -> None:
+    session = Session(quadsim.load("paper-constrained"))
+    for _ in range(5):
+        session.advance()
+    assert session.flight().outcome == "incomplete"
+    session.close()
+
+
+def test_a_second_law_of_a_session_is_held_to_the_bounds_of_the_first() -> None:
+    scenario = quadsim.load("hover")
+    session = Session(scenario, against=scenario.replace({"controller": {"type": "pid"}}).controller)
+    first, second = (flight.limits for flight in session.flights)
+    assert first == second
+    session.close()
+
+
+def test_the_margin_that_decides_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    """Commands beyond what the rotors turn: the plant holds its bound, the samples do not."""
+    main(["check", "paper-unconstrained-clipped", "--set", "duration=1.0", "--set", "constraints.speed.required=true"])
+    (line,) = (text for text in capsys.readouterr().out.splitlines() if text.strip().startswith("speed [rad/s]"))
+    assert "VIOLATED" in line
+    assert "-122 s" in line
+    main(["check", "hover", "--set", "duration=0.5"])
+    (line,) = (text for text in capsys.readouterr().out.splitlines() if text.strip().startswith("slew [rad/s]"))
+    assert line.split()[4] == "-", "steps of the command have no value between the samples"
+    flight = quadsim.fly(hover())
+    assert entry_of(flight.summary, "slew")["peak_plant"] is None
+    assert entry_of(flight.summary, "slew")["worst_margin"] is not None
