@@ -134,10 +134,10 @@ class Solution(NamedTuple):
 
     made: Point | Callable[[], Point]  # the point, or what makes it: a shortcut's is not wanted in flight
     status: str  # `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.exact.shortcut`
-    iterations: int  # of the back end
+    iterations: int  # of whoever answered
     active: int  # inequality rows and box entries active at the point
-    primal_residual: float  # as the back end reports it, before any polish; NaN where it reports none
-    dual_residual: float  # likewise
+    reported_primal: float  # residual as the QP solver reports it, before any polish; NaN where none is reported
+    reported_dual: float  # likewise
     solve_s: float  # wall time inside the back end, updates included, and what shortcuts took before it [s]
 
     @property
