@@ -25,8 +25,6 @@ INFEASIBLE: Final = 1e-3
 """Largest violation of a row [its unit] by a plan that is accepted."""
 INFEASIBLE_ANSWER: Final = "infeasible_answer"
 """Status of an answer whose plan violates a row by more."""
-KKT_EVERY: Final = 20
-"""Periods from one whose KKT residuals are computed to the next."""
 LARGEST_MAP: Final = 2**20
 """Entries of the map from inputs to rows of states up to which states are predicted by it, else step by step."""
 

@@ -6,11 +6,12 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import KKT_EVERY, ActuatorBounds, AnswerCheck, command_of, free_command, rejection, shifted
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, free_command, rejection, shifted
 from mpc.exact.shortcut import with_shortcut
 from mpc.handover import resized, within
 from mpc.ocp import Problem, Query, Unanswered
 from mpc.paper.prediction import rollout
+from mpc.qp import KKT_EVERY
 from mpc.solvers import INVALID_DATA, Answer, Method, Solver
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space

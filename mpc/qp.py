@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from scipy.sparse import csc_matrix
@@ -13,6 +13,9 @@ from mpc.ocp import Problem, Rest
 from quadsim.state import Array, Indices
 
 Matrix: TypeAlias = Array | csc_matrix
+
+KKT_EVERY: Final = 20
+"""Periods from one whose KKT residuals are computed in flight to the next."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
-from mpc.answer import KKT_EVERY, ActuatorBounds, AnswerCheck, command_of, refused
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused
 from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import observed, resized, within
@@ -44,6 +44,7 @@ from mpc.nonlinear.rigidbody import (
 from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
 from mpc.observer import DisturbanceObserver
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
+from mpc.qp import KKT_EVERY
 from mpc.relinearised import Relinearised
 from mpc.solvers import INVALID_DATA, Answer
 from mpc.space.clearing import Clearing

@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import KKT_EVERY, ActuatorBounds, AnswerCheck, command_of, free_command, refused, rejection, shifted
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, free_command, refused, rejection, shifted
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
@@ -38,6 +38,7 @@ from mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
 from mpc.observer import DisturbanceObserver, thrust_axis
 from mpc.observer import ObserverSettings as ObserverSettings
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
+from mpc.qp import KKT_EVERY
 from mpc.relinearised import Relinearised
 from mpc.robust.settings import LONGEST_SPAN
 from mpc.robust.settings import Linearisation as Linearisation

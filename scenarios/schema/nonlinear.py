@@ -7,12 +7,12 @@ from typing import Annotated, Final, Literal
 from annotated_types import Len, MaxLen
 from pydantic import Field, model_validator
 
-from mpc.answer import KKT_EVERY
 from mpc.disturbance import RampSettings
 from mpc.fallback.settings import FallbackSettings
 from mpc.indi import INDISettings
 from mpc.nonlinear.settings import Weights
 from mpc.observer import ObserverSettings
+from mpc.qp import KKT_EVERY
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.fields import NonNegative, Positive
 from scenarios.schema.base import MOST_ENTRIES, Horizon, Lag, Pair, Spec, require_ordered

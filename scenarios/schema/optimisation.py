@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 from annotated_types import Len, MaxLen, doc
 from pydantic import Field, model_validator
 
-from mpc.answer import KKT_EVERY
+from mpc.qp import KKT_EVERY
 from mpc.space.settings import AvoidanceSettings
 from quadsim.errors import UnknownNameError
 from quadsim.fields import NonNegative, Number, Weight
