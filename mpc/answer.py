@@ -127,16 +127,20 @@ class AnswerCheck:
         kkt_every: in every so many periods, and for every refused answer, the KKT residuals are computed.
     """
 
+    _maps: tuple[Indices | slice, Array, Array, Array] | None
+
     def __init__(self, problem: Problem, kkt_every: int) -> None:
         self._problem, self._every, self._periods = problem, kkt_every, 0
         rows, entries = problem.rows, problem.horizon**2 * problem.model.nu
-        self._maps: tuple[Indices, Array, Array, Array] | None = None
+        self._rest, self._maps = problem.rest, None
         if rows.C.ndim == 2 and entries * np.count_nonzero(rows.on_states) <= LARGEST_MAP:
             on_states = np.flatnonzero(rows.on_states)
             part = rows.part(on_states, np.arange(problem.model.n), problem.model.nu)
             maps = row_maps(part, prediction(problem.model, problem.horizon))
             of_inputs, of_state = (np.concatenate(of) for of in (maps.of_inputs, maps.of_state))
-            self._maps = on_states, of_inputs, of_state, part.C
+            first, last = (on_states[0], on_states[-1] + 1) if on_states.size else (0, 0)
+            at = slice(first, last) if last - first == on_states.size else on_states  # the former is much quicker
+            self._maps = at, of_inputs, of_state, part.C
 
     def reset(self) -> None:
         """The next period is the first."""
@@ -167,10 +171,10 @@ class AnswerCheck:
         steps = plan - np.concatenate((query.u_before[None], plan[:-1]))
         values = plan @ rows.D.T + steps @ rows.E.T
         if self._maps is not None and problem is self._problem and query.steps is None:
-            x_s, u_s = query.rest or problem.rest
+            x_s, u_s = query.rest or self._rest
             on_states, of_inputs, of_state, C = self._maps
             of_plan = of_inputs @ (plan - u_s).ravel() + of_state @ (query.state - x_s)
-            values[:, on_states] += of_plan.reshape(-1, on_states.size) + C @ x_s
+            values[:, on_states] += of_plan.reshape(len(plan), -1) + C @ x_s
         else:
             states = predicted(problem, query, plan)
             before = np.concatenate((query.state[None], states[:-1]))

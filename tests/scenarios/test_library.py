@@ -14,7 +14,7 @@ import pytest
 from make_scenarios import HEAD, PAGE, TITLES, nearest, row
 
 from mpc.answer import INFEASIBLE
-from quadsim.controller import ACCEPTED, FALLBACK, LAW, MISSED, STOPPED
+from quadsim.controller import FALLBACK, LAW, MISSED, STOPPED
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from quadsim.state import INDEX
 from scenarios.courses.csv_course import read_table

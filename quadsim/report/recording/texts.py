@@ -26,7 +26,11 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     log = run.log.control
     good = ACCEPTED | {Phase.LANDED}
     events = [
-        (t, f"{status} by {by}, fallback {fallback}", "INFO" if status in good and not fallback else "WARN")
+        (
+            t,
+            f"{status}{'' if fallback else f' by {by}'}, fallback {fallback}",
+            "INFO" if status in good and not fallback else "WARN",
+        )
         for t, (status, by, fallback) in _changes(
             log.t, list(zip(log.status, log.answered_by, log.fallback.tolist(), strict=True))
         )
