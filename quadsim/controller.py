@@ -221,6 +221,6 @@ def law_name(recorded: str) -> str:
 
 
 def counts(answered_by: Mapping[str, int]) -> str:
-    """Periods by who answered them, most first: `607 gain, 592 active-set, 1 piqp-multistage`."""
+    """Periods by who answered them, most first: `607 gain, 592 active-set, 1 piqp-multistage`; `280 commanded`."""
     ranked = sorted(answered_by.items(), key=lambda entry: -entry[1])
-    return ", ".join(f"{count} {by}" for by, count in ranked)
+    return ", ".join(f"{count} {COMMANDED if by == LAW else by}" for by, count in ranked)

@@ -58,7 +58,7 @@ def _computation(study: CostStudy) -> Grid:
     lines = []
     for candidate in study.candidates:
         lines.append(_times(study, candidate.name, candidate.step_ms, candidate))
-        parts = {"by the unconstrained optimum": candidate.shortcut, "by QPs": ~candidate.shortcut}
+        parts = {"by the unconstrained optimum": candidate.shortcut, "with active constraints": ~candidate.shortcut}
         if 0 < candidate.shortcut.sum() < candidate.shortcut.size:
             for how, periods in parts.items():
                 label = f"... its {periods.sum()} periods answered {how}"

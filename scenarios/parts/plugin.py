@@ -18,13 +18,14 @@ import numpy as np
 from mpc.handover import hand_over
 from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import CommandError, InputError, ParameterError, printable
+from quadsim.flight.log import RESIDUALS
 from quadsim.sim.effects import Force
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.foreign_code import announce, folders_of, searched
 from scenarios.schema.plugin import GIVEN, ForceSpec, PluginSpec
 
-_WHOLE, _REAL = ("iterations", "active", "fallback"), ("slack", "primal_residual", "dual_residual", "solve_s")
+_WHOLE, _REAL = ("iterations", "active", "fallback"), ("slack", *RESIDUALS, "solve_s")
 """What else a command has: whole numbers, and numbers."""
 STEP = ("now", "state", "reference")
 """What the arguments of a controller's step are called, and of a function that is one."""
@@ -123,8 +124,9 @@ class PluginController:
             raise refuse("speeds", f"{N_ROTORS} numbers")
         if plan is None or plan.shape != (self.horizon, N_ROTORS):
             raise refuse("plan", f"numbers of shape {(self.horizon, N_ROTORS)}")
-        if not isinstance(answer.status, str):
-            raise refuse("status", "a text")
+        for name in ("status", "answered_by"):
+            if not isinstance(getattr(answer, name), str):
+                raise refuse(name, "a text")
         for name in _WHOLE:
             if not isinstance(getattr(answer, name), int | np.integer):
                 raise refuse(name, "a whole number")
@@ -134,7 +136,8 @@ class PluginController:
         rate = getattr(answer.inner, "rate", None)
         if answer.inner is not None and not (isinstance(rate, int | float) and 0.0 < rate < math.inf):
             raise refuse("inner", "None, or an inner loop with a positive rate")
-        return replace(answer, speeds=speeds, plan=plan, status=_line(answer.status))
+        status, by = _line(answer.status), _line(answer.answered_by)
+        return replace(answer, speeds=speeds, plan=plan, status=status, answered_by=by)
 
 
 def _line(text: object) -> str:

@@ -22,8 +22,8 @@ UNITS = {
     FLIGHT_FILE: (
         "t=s x=m vx=m/s y=m vy=m/s z=m vz=m/s roll=rad roll_rate=rad/s pitch=rad pitch_rate=rad/s yaw=rad "
         "yaw_rate=rad/s ref_x=m ref_y=m ref_z=m ref_yaw=rad u1=rad/s u2=rad/s u3=rad/s u4=rad/s status=- "
-        "answered_by=- phase=- iterations=- active=- fallback=- slack=rad reported_primal=- reported_dual=- infeasibility=- "
-        "kkt_stationarity=- kkt_complementarity=- kkt_dual=- delay=s "
+        "answered_by=- phase=- iterations=- active=- fallback=- slack=rad reported_primal=- "
+        "reported_dual=- infeasibility=- kkt_stationarity=- kkt_complementarity=- kkt_dual=- delay=s "
         "true_x=m true_vx=m/s true_y=m true_vy=m/s true_z=m true_vz=m/s true_roll=rad true_roll_rate=rad/s "
         "true_pitch=rad true_pitch_rate=rad/s true_yaw=rad true_yaw_rate=rad/s"
     ),
