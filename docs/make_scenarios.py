@@ -94,7 +94,7 @@ def page(flights: dict[str, Flight]) -> str:
         "`s`: seconds flown. `nearest to its bound`: the required constraint, but for those on speeds and steps, with "
         "the least left\nas a share of its range, and what is left at the physics rate; a little below 0 is within the "
         "constraint's tolerance where\nthe verdict is *satisfied*. `QPs`: periods in which the unconstrained optimum "
-        "was not feasible and a QP was solved.\n",
+        "was not feasible, so that the\nactive-set method or a QP solver found the optimum.\n",
     ]
     for group in get_args(Group):
         members = [flight for flight in flights.values() if flight.scenario.group == group]

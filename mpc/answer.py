@@ -9,15 +9,24 @@ from typing import Final
 import numpy as np
 
 from mpc.constraints import Bounds
-from mpc.ocp import Problem
+from mpc.ocp import Problem, Query, predicted
+from mpc.paper.condensed import row_maps
+from mpc.paper.prediction import prediction
+from mpc.qp import QP, kkt_residuals
 from mpc.solvers import Answer
-from quadsim.controller import ACCEPTED, Command
+from quadsim.controller import ACCEPTED, FALLBACK, Command
 from quadsim.errors import ParameterError
-from quadsim.state import Array, all_true
+from quadsim.state import Array, Indices, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 BOUND_TOLERANCE: Final = 1e-6
 """How far outside its bounds [rad/s] an answer may be and still count as in bounds; it is then moved onto them."""
+INFEASIBLE: Final = 1e-3
+"""Largest violation of a row [its unit] by a plan that is accepted."""
+INFEASIBLE_ANSWER: Final = "infeasible_answer"
+"""Status of an answer whose plan violates a row by more."""
+LARGEST_MAP: Final = 2**20
+"""Entries of the map from inputs to rows of states up to which states are predicted by it, else step by step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +117,76 @@ class ActuatorBounds:
         return clipped
 
 
+class AnswerCheck:
+    """What each answer is worth by the problem as it was posed, believing neither a solver nor the QP's form.
+
+    The plan's states are predicted anew, from the model and the period's state.
+
+    Args:
+        problem: whose queries mostly are answered; another one's are checked too, not as quickly.
+        kkt_every: in every so many periods, and for every refused answer, the KKT residuals are computed.
+    """
+
+    _maps: tuple[Indices | slice, Array, Array, Array] | None
+
+    def __init__(self, problem: Problem, kkt_every: int) -> None:
+        self._problem, self._every, self._periods = problem, kkt_every, 0
+        rows, entries = problem.rows, problem.horizon**2 * problem.model.nu
+        self._rest, self._maps = problem.rest, None
+        if rows.C.ndim == 2 and entries * np.count_nonzero(rows.on_states) <= LARGEST_MAP:
+            on_states = np.flatnonzero(rows.on_states)
+            part = rows.part(on_states, np.arange(problem.model.n), problem.model.nu)
+            maps = row_maps(part, prediction(problem.model, problem.horizon))
+            of_inputs, of_state = (np.concatenate(of) for of in (maps.of_inputs, maps.of_state))
+            first, last = (on_states[0], on_states[-1] + 1) if on_states.size else (0, 0)
+            at = slice(first, last) if last - first == on_states.size else on_states  # the former is much quicker
+            self._maps = at, of_inputs, of_state, part.C
+
+    def reset(self) -> None:
+        """The next period is the first."""
+        self._periods = 0
+
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a failed solver's numbers may be any
+    def __call__(
+        self, problem: Problem, query: Query, answer: Answer, refused: str | None
+    ) -> tuple[Answer, str | None]:
+        """The answer with its `infeasibility`, and its KKT residuals where they are due; and why it is refused.
+
+        `refused` is the reason found so far, which stays.
+        """
+        due, self._periods = self._periods % self._every == 0, self._periods + 1
+        if answer.qp is None:
+            return answer, refused
+        violation = self._infeasibility(problem, query, answer)
+        if refused is None and not violation <= INFEASIBLE:
+            refused = INFEASIBLE_ANSWER
+        if due or refused is not None:
+            qp = answer.qp if isinstance(answer.qp, QP) else answer.qp()
+            return answer._replace(infeasibility=violation, kkt=kkt_residuals(qp, answer.solution)), refused
+        return answer._replace(infeasibility=violation), refused
+
+    def _infeasibility(self, problem: Problem, query: Query, answer: Answer) -> float:
+        """Largest violation of a row by the plan, a soft one's less its slack; 0 where there is none."""
+        rows, plan = problem.rows, answer.plan
+        steps = plan - np.concatenate((query.u_before[None], plan[:-1]))
+        values = plan @ rows.D.T + steps @ rows.E.T
+        if self._maps is not None and problem is self._problem and query.steps is None:
+            x_s, u_s = query.rest or self._rest
+            on_states, of_inputs, of_state, C = self._maps
+            of_plan = of_inputs @ (plan - u_s).ravel() + of_state @ (query.state - x_s)
+            values[:, on_states] += of_plan.reshape(len(plan), -1) + C @ x_s
+        else:
+            states = predicted(problem, query, plan)
+            before = np.concatenate((query.state[None], states[:-1]))
+            values += np.where(rows.of_states, *((rows.C @ x[:, :, None])[:, :, 0] for x in (states, before)))
+        beyond = np.maximum(values - rows.upper, rows.lower - values)
+        if rows.soft.size:
+            beyond[:, rows.soft] -= answer.slacks[:, rows.slack[rows.soft]]
+        return max(float(beyond.flat[beyond.argmax()]), 0.0)
+
+
 def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, before: Array) -> str | None:
-    """Why an answer must not reach the plant, or None.
+    """Why an answer must not reach the plant, or None; `AnswerCheck` has the rest.
 
     `speeds` (4,) is the command, `plan` (N, 4) the inputs planned, `before` (4,) the command in force [rad/s].
     """
@@ -123,23 +200,27 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
 
 def free_command(answer: Answer) -> Command:
     """The command of an optimum without constraints, which is within every bound or it would not be one."""
-    solution = answer.solution
-    return Command(speeds=answer.plan[0].copy(), plan=answer.plan, status=solution.status, solve_s=solution.solve_s)
+    return command_of(answer.plan[0], answer.plan, answer.solution.status, answer)
 
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
-    """Speeds (4,) and a plan (N, 4) as a command under a status, with the solver's report on its answer."""
-    solution, accepted = answer.solution, status in ACCEPTED
+    """Speeds (4,) and a plan (N, 4) as a command under a status, with what is known of the answer."""
+    solution, accepted, kkt = answer.solution, status in ACCEPTED, answer.kkt
     return Command(
         speeds=speeds.copy(),
         plan=plan,
         status=status,
+        answered_by=answer.answered_by if accepted else FALLBACK,
         iterations=solution.iterations,
         active=solution.active if accepted else 0,
         fallback=fallback,
         slack=max(float(answer.slacks.max()), 0.0) if accepted and answer.slacks.size else 0.0,
-        primal_residual=solution.primal_residual,
-        dual_residual=solution.dual_residual,
+        reported_primal=solution.reported_primal,
+        reported_dual=solution.reported_dual,
+        infeasibility=answer.infeasibility,
+        kkt_stationarity=math.nan if kkt is None else kkt.stationarity,
+        kkt_complementarity=math.nan if kkt is None else kkt.complementarity,
+        kkt_dual=math.nan if kkt is None else kkt.dual,
         solve_s=solution.solve_s,
     )
 
@@ -148,7 +229,7 @@ def refused(acting: Array, horizon: int, status: str, answer: Answer | None = No
     """The command in force (4,) held over the horizon, with the reason for refusing another."""
     plan = np.tile(acting, (horizon, 1))
     if answer is None:
-        return Command(speeds=plan[0].copy(), plan=plan, status=status)
+        return Command(speeds=plan[0].copy(), plan=plan, status=status, answered_by=FALLBACK)
     return command_of(plan[0], plan, status, answer)
 
 

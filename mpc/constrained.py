@@ -6,11 +6,12 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, command_of, free_command, rejection, shifted
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, free_command, rejection, shifted
 from mpc.exact.shortcut import with_shortcut
 from mpc.handover import resized, within
 from mpc.ocp import Problem, Query, Unanswered
 from mpc.paper.prediction import rollout
+from mpc.qp import KKT_EVERY
 from mpc.solvers import INVALID_DATA, Answer, Method, Solver
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
@@ -23,10 +24,11 @@ class ConstrainedMPC:
     """Finds the optimum of Eq. (27) each period and sends the first action of the optimal plan.
 
     Where the unconstrained optimum satisfies every constraint it is the solution, and no QP is solved: the status is
-    then `unconstrained`.  Only an answer that is the optimum, finite, and whose first action is within the hard input
-    bounds is used.  Otherwise the previous plan, shifted by one step, is held (fallback level 1) for as long as it
-    lasts, and then the flight is given up.  `shortcut`: whether to try less than the whole QP first
-    (`mpc.exact.shortcut`); the commands are the same.  `space`: what to keep clear of.
+    then `unconstrained`.  Only an answer that is the optimum, finite, whose first action is within the hard input
+    bounds and whose plan keeps the rows as posed (`mpc.answer.AnswerCheck`) is used.  Otherwise the previous plan,
+    shifted by one step, is held (fallback level 1) for as long as it lasts, and then the flight is given up.
+    `shortcut`: whether to try less than the whole QP first (`mpc.exact.shortcut`); the commands are the same.
+    `space`: what to keep clear of.  `kkt_every`: see `mpc.answer.AnswerCheck`.
 
     Attributes:
         problem: as given.
@@ -38,13 +40,21 @@ class ConstrainedMPC:
     answer: Answer | None = None
     _plan: Array | None
 
-    def __init__(self, problem: Problem, solver: Solver, *, shortcut: bool = True, space: Space | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        solver: Solver,
+        *,
+        shortcut: bool = True,
+        space: Space | None = None,
+        kkt_every: int = KKT_EVERY,
+    ) -> None:
         self.problem, self.horizon, self.solver = problem, problem.horizon, solver.name
         self._solver = with_shortcut(problem, solver) if shortcut else solver
         self._clearing = (
             None if space is None else Clearing(problem, lambda query: self._solver.solve(*query[:4]), space)
         )
-        self._bounds = ActuatorBounds.of_problem(problem)
+        self._bounds, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
         self._before, self._plan, self._held = problem.model.u_bar, None, 0
         self.unanswered: Unanswered | None = None
 
@@ -53,6 +63,7 @@ class ConstrainedMPC:
         self._before, self._plan, self._held = np.array(speeds, float), None, 0
         self.unanswered = None
         self._solver.reset()
+        self._check.reset()
         if self._clearing is not None:
             self._clearing.reset()
 
@@ -80,9 +91,13 @@ class ConstrainedMPC:
             answer = self._solver.solve(query.state, query.desired, query.u_before)
         else:
             answer, problem, _ = self._clearing.solve(now.time, query)
-        self.answer = answer
+        refused = None
         if answer.method is not Method.FREE:
-            return self._follow(now.time, problem, query, answer)
+            refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._bounds, self._before)
+        answer, refused = self._check(problem, query, answer, refused)
+        self.answer = answer
+        if answer.method is not Method.FREE or refused is not None:
+            return self._follow(now.time, problem, query, answer, refused)
         self._plan, self._held, self._before = answer.plan, 0, answer.plan[0]
         return free_command(answer)
 
@@ -95,8 +110,7 @@ class ConstrainedMPC:
         self._before, self._plan, self._held = lower, None, 0
         return stopped(lower.copy(), self.horizon, phase)
 
-    def _follow(self, time: float, problem: Problem, query: Query, answer: Answer) -> Command:
-        refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._bounds, self._before)
+    def _follow(self, time: float, problem: Problem, query: Query, answer: Answer, refused: str | None) -> Command:
         if refused not in (None, INVALID_DATA) and self.unanswered is None:
             self.unanswered = Unanswered(problem=problem, query=query, status=refused, time=time)
         if refused is None:

@@ -217,6 +217,20 @@ class Query(NamedTuple):
     steps: tuple[Array, Array, Array] | None = None
 
 
+def predicted(problem: Problem, query: Query, plan: Array) -> Array:
+    """(N, n) the states that a plan (N, nu) leads to."""
+    states, state = np.empty((len(plan), query.state.size)), query.state
+    if query.steps is not None:
+        for i, (A, B, c, u) in enumerate(zip(*query.steps, plan, strict=True)):
+            states[i] = state = A @ state + B @ u + c
+        return states
+    model, (x_s, u_s) = problem.model, query.rest or problem.rest
+    state = state - x_s
+    for i, push in enumerate((plan - u_s) @ model.B.T):
+        states[i] = state = model.A @ state + push
+    return states + x_s
+
+
 @dataclass(frozen=True, kw_only=True)
 class Unanswered:
     """The first problem of a flight that had no answer; `mpc.diagnosis` explains why.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol, TypeAlias, runtime_checkable
+from typing import Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from scipy.sparse import csc_matrix
@@ -13,6 +13,9 @@ from mpc.ocp import Problem, Rest
 from quadsim.state import Array, Indices
 
 Matrix: TypeAlias = Array | csc_matrix
+
+KKT_EVERY: Final = 20
+"""Periods from one whose KKT residuals are computed in flight to the next."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,10 +137,10 @@ class Solution(NamedTuple):
 
     made: Point | Callable[[], Point]  # the point, or what makes it: a shortcut's is not wanted in flight
     status: str  # `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.exact.shortcut`
-    iterations: int  # of the back end
+    iterations: int  # of whoever answered
     active: int  # inequality rows and box entries active at the point
-    primal_residual: float  # as the back end reports it, before any polish; NaN where it reports none
-    dual_residual: float  # likewise
+    reported_primal: float  # residual as the QP solver reports it, before any polish; NaN where none is reported
+    reported_dual: float  # likewise
     solve_s: float  # wall time inside the back end, updates included, and what shortcuts took before it [s]
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from typing import Any, Final
 
@@ -13,7 +14,7 @@ from mpc.paper.condensed import Condensed
 from mpc.qp import QP, ChangingFormulation, Point, Solution
 from mpc.solvers import SOLVERS, Answer, make_backend, refusal
 from mpc.staged import Staged
-from quadsim.controller import ACCEPTED, UNCONSTRAINED
+from quadsim.controller import ACCEPTED, GAIN, UNCONSTRAINED
 from quadsim.state import Array
 
 SOLVER: Final = "piqp-multistage"
@@ -55,7 +56,7 @@ class Relinearised:
         Data that is not finite, or beyond `LARGEST`, is answered with the status `invalid_data`: PIQP cannot be trusted
         to notice.
         """
-        form = self._form
+        form, qp = self._form, None
         self.last = None
         if all(_small(part) for part in (A, B, c, x0, desired, u_before, rest.u)):
             qp, states = form.posed(A, B, c, x0, desired, u_before, rest)
@@ -65,7 +66,8 @@ class Relinearised:
         plan = form.inputs(solution.x)
         if solution.status in ACCEPTED and np.isfinite(plan).all():
             self.last = states(solution.x), plan
-        return Answer(plan=plan, slacks=form.slacks(solution.x), solution=solution)
+        by = GAIN if solution.status == UNCONSTRAINED else self._solver
+        return Answer(plan, form.slacks(solution.x), solution, by, qp=qp)
 
     def _solve(self, qp: QP) -> Solution:
         if hasattr(self._backend, "solve_changed"):
@@ -92,8 +94,8 @@ class Relinearised:
             status=UNCONSTRAINED,
             iterations=0,
             active=0,
-            primal_residual=0.0,
-            dual_residual=0.0,
+            reported_primal=math.nan,
+            reported_dual=math.nan,
             solve_s=clock.perf_counter() - started,
         )
 

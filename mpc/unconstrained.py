@@ -12,7 +12,7 @@ import scipy.linalg
 from mpc.ocp import Problem
 from mpc.paper.condensed import condensed_cost
 from mpc.paper.prediction import prediction, rollout
-from quadsim.controller import GROUNDED, Command, Moment, stopped
+from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Moment, stopped
 from quadsim.state import Array
 
 
@@ -74,7 +74,8 @@ class UnconstrainedMPC:
         desired = self.problem.objective.desired(reference)
         sequence = self.gains.K @ state + self.gains.G @ desired.ravel() + self._offset
         plan = sequence.reshape(self.horizon, -1)
-        return Command(speeds=plan[0].copy(), plan=plan, solve_s=clock.perf_counter() - started)
+        spent_s = clock.perf_counter() - started
+        return Command(speeds=plan[0].copy(), plan=plan, status=UNCONSTRAINED, answered_by=GAIN, solve_s=spent_s)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.model import LinearModel
 from mpc.ocp import Objective, Problem, Rest
-from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios import many
@@ -255,13 +255,13 @@ def small_log(periods: int = 4, *, steps: int = 5, seed: int = 0, reason: str | 
             speeds=rng.uniform(100.0, 250.0, (periods, N_ROTORS)),
             speeds_before=np.array([192.8, 192.9, 193.0, 193.1]),
             status=tuple("solved" if k % 2 == 0 else "max_iterations" for k in range(periods)),
+            answered_by=tuple("piqp-multistage" if k % 2 == 0 else "fallback" for k in range(periods)),
             phase=tuple("flying" if k else "armed" for k in range(periods)),
             iterations=rng.integers(1, 30, periods),
             active=rng.integers(0, 30, periods),
             fallback=rng.integers(0, 2, periods),
             slack=rng.uniform(size=periods),
-            primal_residual=rng.uniform(size=periods),
-            dual_residual=rng.uniform(size=periods),
+            **{name: np.where(np.arange(periods) % 3 == 0, rng.uniform(size=periods), np.nan) for name in RESIDUALS},
             delay=rng.uniform(0.0, 0.05, periods),
         ),
         timing=TimingLog(t=t, solve_ms=rng.uniform(size=periods), step_ms=rng.uniform(1.0, 2.0, periods)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time as clock
 from functools import partial
 from typing import Final, NamedTuple
@@ -16,12 +17,13 @@ from mpc.exact.axes import Axis, axes
 from mpc.exact.free import FreeOptimum
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed, row_maps
-from mpc.qp import Solution
+from mpc.qp import QP, Solution
 from mpc.solvers import Answer, Method, QPSolver, Solver
-from quadsim.controller import SOLVED, UNCONSTRAINED
+from quadsim.controller import ACTIVE_SET, GAIN, SOLVED, UNCONSTRAINED
 from quadsim.state import Array, Indices, all_true, read_only
 
 Flags = NDArray[np.bool_]
+_Query = tuple[Array, Array, Array, Rest | None]
 
 LARGEST_MAP: Final = 2**20
 """Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem
@@ -107,7 +109,7 @@ class Shortcut:
 
     def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
-        started = clock.perf_counter()
+        started, query = clock.perf_counter(), (state, desired, u_before, rest)
         x_s, u_s = self._rest if rest is None else rest
         dx, dy = (state, desired) if rest is None else (state - x_s, desired - self._C_r @ x_s)
         found = self._free.at(dx, dy, u_before - u_s).T
@@ -127,7 +129,8 @@ class Shortcut:
             self._side = self._none_active
             made = partial(self.formulation.point, plan, self._no_slacks, self._no_multipliers)
             spent_s = clock.perf_counter() - started
-            return Answer(plan, self._no_slacks, Solution(made, UNCONSTRAINED, 0, 0, 0.0, 0.0, spent_s), Method.FREE)
+            solution = Solution(made, UNCONSTRAINED, 0, 0, math.nan, math.nan, spent_s)
+            return Answer(plan, self._no_slacks, solution, GAIN, Method.FREE, partial(self._qp, query))
         free = free.copy()  # the values' room is used again
         if all_true(np.isfinite(free)):
             starts = self._starts()
@@ -137,8 +140,12 @@ class Shortcut:
                 optimum = self._all.solve(plan, free, starts)
             if optimum is not None:
                 self._side = optimum.active.side
-                return self._answer(optimum, method, started)
-        return self._by_solver(plan, free, (state, desired, u_before, rest), started)
+                return self._answer(optimum, method, query, started)
+        return self._by_solver(plan, free, query, started)
+
+    def _qp(self, query: _Query) -> QP:
+        """The condensed QP of a query."""
+        return self.formulation.qp.with_vectors(self.formulation.vectors(*query))
 
     def _values_of(self, plan: Array, u_before: Array) -> Array:
         """(N, m) values of the rows, of those of states at the free optimum; the next call's too."""
@@ -180,7 +187,7 @@ class Shortcut:
             return None, True
         return _Found(plan, Active(z=z, values=values, side=side, steps=steps)), True
 
-    def _answer(self, found: _Found, method: Method, started: float) -> Answer:
+    def _answer(self, found: _Found, method: Method, query: _Query, started: float) -> Answer:
         slacks = self._no_slacks
         if slacks.size and np.count_nonzero(violated := np.abs(found.active.side) == 2):
             values, shape = found.active.values, self._rows.lower.shape
@@ -192,15 +199,13 @@ class Shortcut:
             status=SOLVED,
             iterations=active.steps,
             active=int(np.count_nonzero(active.side)),
-            primal_residual=0.0,
-            dual_residual=0.0,
+            reported_primal=math.nan,
+            reported_dual=math.nan,
             solve_s=clock.perf_counter() - started,
         )
-        return Answer(found.plan, slacks, solution, method)
+        return Answer(found.plan, slacks, solution, ACTIVE_SET, method, partial(self._qp, query))
 
-    def _by_solver(
-        self, plan: Array, free: Array, query: tuple[Array, Array, Array, Rest | None], started: float
-    ) -> Answer:
+    def _by_solver(self, plan: Array, free: Array, query: _Query, started: float) -> Answer:
         """The solver's answer to the whole QP, made exact where its active set leads to the optimum."""
         spent_s, iterations = clock.perf_counter() - started, 0
         whole = self._whole
@@ -220,13 +225,19 @@ class Shortcut:
                     found = self._all.solve(plan, free, [self._side])
                 if found is not None:
                     self._side = found.active.side
-                    answer = self._answer(found, Method.WHOLE, started)
+                    answer = self._answer(found, Method.WHOLE, query, started)
                     spent_s += given.solve_s + answer.solution.solve_s
                     break
                 point = self.formulation.point(answer.plan, answer.slacks, multipliers)
-                answer = answer._replace(solution=given._replace(made=point))
+                answer = answer._replace(solution=given._replace(made=point), qp=partial(self._qp, query))
             spent_s += given.solve_s + clock.perf_counter() - started
-        return answer._replace(solution=answer.solution._replace(iterations=iterations, solve_s=spent_s))
+        solution = answer.solution._replace(
+            iterations=iterations,
+            solve_s=spent_s,
+            reported_primal=given.reported_primal,
+            reported_dual=given.reported_dual,
+        )
+        return answer._replace(solution=solution, answered_by=whole.name)
 
 
 class _Found(NamedTuple):

@@ -18,12 +18,25 @@ from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model
 from mpc.paper.prediction import rollout
 from mpc.robust.settings import LONGEST_SPAN
-from quadsim.controller import GROUNDED, SOLVED, UNCONSTRAINED, Command, Moment, Phase, stopped
+from quadsim.controller import (
+    ACTIVE_SET,
+    FALLBACK,
+    GAIN,
+    GROUNDED,
+    SOLVED,
+    UNCONSTRAINED,
+    Command,
+    Moment,
+    Phase,
+    stopped,
+)
 from quadsim.state import EULER, EULER_RATE, VELOCITY, Array
 
 STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before")
 """What `enum quadsim_status` is in a flight's log."""
-FALLBACK: Final = (0, 0, 0, 1, 2, 3)
+ANSWERERS: Final = (GAIN, ACTIVE_SET, ACTIVE_SET, FALLBACK, FALLBACK, FALLBACK)
+"""Who answered."""
+LEVELS: Final = (0, 0, 0, 1, 2, 3)
 """And its fallback level."""
 SOLVER: Final = "compiled"
 """In place of a solver's name."""
@@ -90,14 +103,15 @@ class CompiledMPC:
             self.trim = Trim(speeds=found[at : at + 4], lift=found[at + 4 : at + 7], twist=found[at + 7 : at + 10])
         plan = found[8 : 8 + 4 * N].reshape(N, 4)
         plan[0] = self._before
-        accepted = FALLBACK[method] == 0
+        accepted = LEVELS[method] == 0
         return Command(
             speeds=self._before.copy(),
             plan=plan if accepted else np.tile(self._before, (N, 1)),
-            status=SOLVED if self._unbounded else STATUSES[method],
+            status=UNCONSTRAINED if self._unbounded else STATUSES[method],
+            answered_by=GAIN if self._unbounded else ANSWERERS[method],
             iterations=int(changes),
             active=int(active) if accepted else 0,
-            fallback=FALLBACK[method],
+            fallback=LEVELS[method],
             slack=slack if accepted else 0.0,
             solve_s=spent_s,
         )

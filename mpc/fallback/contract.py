@@ -35,7 +35,17 @@ from mpc.handover import hand_over, resized, within
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
 from mpc.ocp import Unanswered
-from quadsim.controller import ACCEPTED, GROUNDED, Command, Controller, Moment, Phase, check_command, stopped
+from quadsim.controller import (
+    ACCEPTED,
+    FALLBACK,
+    GROUNDED,
+    Command,
+    Controller,
+    Moment,
+    Phase,
+    check_command,
+    stopped,
+)
 from quadsim.errors import FlightError
 from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
@@ -195,7 +205,8 @@ class Guarded:
         if plan is None:
             plan, level = self._hover(known, acting)
         spent = answer or Command(speeds=plan[0], plan=plan)
-        return replace(spent, speeds=plan[0].copy(), plan=plan, status=status, active=0, slack=0.0, fallback=level)
+        spent = replace(spent, status=status, answered_by=FALLBACK, fallback=level)
+        return replace(spent, speeds=plan[0].copy(), plan=plan, active=0, slack=0.0)
 
     def _shifted(self, known: Array, acting: Array, *, lost: bool) -> Array | None:
         """The rest of the last good plan (N, 4), corrected now; None once it is unusable, from then on."""

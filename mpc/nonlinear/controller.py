@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
-from mpc.answer import ActuatorBounds, command_of, refused
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused
 from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import observed, resized, within
@@ -44,6 +44,7 @@ from mpc.nonlinear.rigidbody import (
 from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
 from mpc.observer import DisturbanceObserver
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
+from mpc.qp import KKT_EVERY
 from mpc.relinearised import Relinearised
 from mpc.solvers import INVALID_DATA, Answer
 from mpc.space.clearing import Clearing
@@ -128,6 +129,7 @@ class NonlinearMPC:
         bounds: ActuatorBounds | None = None,
         constraints: tuple[Constraint, ...] = (),
         space: Space | None = None,
+        kkt_every: int = KKT_EVERY,
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
@@ -146,6 +148,7 @@ class NonlinearMPC:
         self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
         self._tilted = settings.tilt is not None
         self.problem = self._problem(constraints)
+        self._check = AnswerCheck(self.problem, kkt_every)
         small = self.problem.horizon * (N_ROTORS + self.problem.rows.slacks.size) <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = Relinearised(self.problem, self.solver, shortcut=True)
@@ -282,6 +285,7 @@ class NonlinearMPC:
         self._forget()
         if self._clearing is not None:
             self._clearing.reset()
+        self._check.reset()
         self.unanswered: Unanswered | None = None
 
     def adopt(self, previous: object) -> None:
@@ -336,7 +340,7 @@ class NonlinearMPC:
             self._last = now.time, measured
         nodes = self._balanced(nodes)
         query, answer, problem = self._iterate(now.time, measured, nodes)
-        status = self._rejection(answer)
+        answer, status = self._check(problem, query, answer, self._rejection(answer))
         if status is not None:
             if status != INVALID_DATA and self.unanswered is None:
                 self.unanswered = Unanswered(problem=problem, query=query, status=status, time=now.time)

@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, command_of, free_command, refused, rejection, shifted
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, free_command, refused, rejection, shifted
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
@@ -38,6 +38,7 @@ from mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
 from mpc.observer import DisturbanceObserver, thrust_axis
 from mpc.observer import ObserverSettings as ObserverSettings
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
+from mpc.qp import KKT_EVERY
 from mpc.relinearised import Relinearised
 from mpc.robust.settings import LONGEST_SPAN
 from mpc.robust.settings import Linearisation as Linearisation
@@ -121,6 +122,7 @@ class RobustMPC:
         constraints: tuple[Constraint, ...] = (),
         shortcut: bool = True,
         space: Space | None = None,
+        kkt_every: int = KKT_EVERY,
     ) -> None:
         self._vehicle, self.settings, self.horizon, self._period = vehicle, settings, horizon, period
         self._nominal = hover_model(vehicle, period)
@@ -137,7 +139,7 @@ class RobustMPC:
             settings=settings,
             constraints=constraints,
         )
-        self._actuators = ActuatorBounds.of_problem(problem)
+        self._actuators, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
         if settings.linearisation is Linearisation.HOVER:
             whole = QPSolver(SOLVER, problem)
             self._solver = with_shortcut(problem, whole) if shortcut else whole
@@ -156,6 +158,7 @@ class RobustMPC:
         self._ahead: Array | None = None
         self._called_at = self._measured = -math.inf
         self.unanswered: Unanswered | None = None
+        self._check.reset()
         if self.settings.linearisation is Linearisation.HOVER:
             self._solver.reset()
         else:
@@ -186,11 +189,14 @@ class RobustMPC:
         if isinstance(query, Command):
             return query
         answer, problem = self._answer(now.time, query)
+        refused, free = None, answer.method is Method.FREE
+        if not free:
+            refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
+        answer, refused = self._check(problem, query, answer, refused)
         self.answer = answer
-        if answer.method is Method.FREE:
+        if free and refused is None:
             self._acting = answer.plan[0]
             return free_command(answer)
-        refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         if refused is not None:
             if refused != INVALID_DATA and self.unanswered is None:
                 self.unanswered = Unanswered(

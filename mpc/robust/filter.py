@@ -141,7 +141,7 @@ class _Nearest:
                 side.reshape(self._horizon, -1)[-1, self._ends] += self._at_rest @ query.rest.x
         solution = self._backend.solve(vectors)
         plan, slacks = self._form.inputs(solution.x), self._form.slacks(solution.x)
-        return Answer(plan=plan.copy(), slacks=slacks, solution=solution)
+        return Answer(plan.copy(), slacks, solution, SafetyFilter.solver)
 
 
 def _feasibility(problem: Problem, standing: Array) -> Problem:

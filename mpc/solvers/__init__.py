@@ -16,7 +16,7 @@ import numpy as np
 
 from mpc.ocp import Problem, Rest
 from mpc.paper.condensed import Condensed
-from mpc.qp import QP, Backend, Formulation, Point, RoughBackend, Solution, Vectors
+from mpc.qp import QP, Backend, Formulation, KKTResiduals, Point, RoughBackend, Solution, Vectors
 from mpc.staged import Staged
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
@@ -129,7 +129,7 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
 
 
 class Method(StrEnum):
-    """How an optimum was found: see `mpc.exact.shortcut`."""
+    """How much of the QP had to be solved: see `mpc.exact.shortcut`."""
 
     FREE = "the unconstrained optimum"
     AXES = "active rows of states alone"
@@ -141,8 +141,12 @@ class Answer(NamedTuple):
 
     plan: Array  # (N, nu) inputs [rad/s]; to be used only when the solution's status is accepted
     slacks: Array  # (N, m_s) by how much soft rows are violated
-    solution: Solution  # to the QP of the solver's formulation
-    method: Method = Method.WHOLE  # how it was found
+    solution: Solution  # to `qp`
+    answered_by: str  # `gain`, `active-set` or the QP solver's name; see `quadsim.controller.Command`
+    method: Method = Method.WHOLE  # how much of the QP had to be solved
+    qp: QP | Callable[[], QP] | None = None  # what was solved, or what makes it; None where the data made none
+    infeasibility: float = math.nan  # see `mpc.answer.AnswerCheck`, as the next; NaN where it is not computed
+    kkt: KKTResiduals | None = None
 
 
 class Solver(Protocol):
@@ -214,12 +218,14 @@ class QPSolver:
         u_before: Array,
         rest: Rest | None,
     ) -> Answer:
+        form, qp = self.formulation, None
         if math.isfinite(state.sum() + desired.sum() + u_before.sum()):
-            solution = solve(self.formulation.vectors(state, desired, u_before, rest))
+            vectors = form.vectors(state, desired, u_before, rest)
+            solution, qp = solve(vectors), partial(form.qp.with_vectors, vectors)
         else:
-            solution = refusal(self.formulation.qp)
+            solution = refusal(form.qp)
         x = solution.x
-        return Answer(plan=self.formulation.inputs(x), slacks=self.formulation.slacks(x), solution=solution)
+        return Answer(form.inputs(x), form.slacks(x), solution, self.name, qp=qp)
 
 
 def refusal(qp: QP) -> Solution:
@@ -229,7 +235,7 @@ def refusal(qp: QP) -> Solution:
         status=INVALID_DATA,
         iterations=0,
         active=0,
-        primal_residual=math.nan,
-        dual_residual=math.nan,
+        reported_primal=math.nan,
+        reported_dual=math.nan,
         solve_s=0.0,
     )

@@ -90,7 +90,7 @@ def solution(
         status=status,
         iterations=iterations,
         active=active,
-        primal_residual=residuals[0],
-        dual_residual=residuals[1],
+        reported_primal=residuals[0],
+        reported_dual=residuals[1],
         solve_s=solve_s,
     )

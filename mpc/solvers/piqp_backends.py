@@ -135,7 +135,7 @@ def solve(solver: Any, vectors: Vectors, **matrices: Matrix) -> Solution:
         status=STATUS[status],
         iterations=int(info.iter),
         active=sum(int(np.count_nonzero(np.minimum(z, ACTIVE_SLACK) > slack)) for z, slack in sides),
-        primal_residual=float(info.primal_res),
-        dual_residual=float(info.dual_res),
+        reported_primal=float(info.primal_res),
+        reported_dual=float(info.dual_res),
         solve_s=elapsed,
     )

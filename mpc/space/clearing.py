@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from mpc.ocp import Problem, Query
+from mpc.ocp import Problem, Query, predicted
 from mpc.solvers import Answer
 from mpc.solvers.piqp_backends import PiqpChanging
 from mpc.space.halfspaces import LOOSE, Space
@@ -17,6 +17,7 @@ from mpc.staged import Staged
 from quadsim.controller import ACCEPTED
 from quadsim.state import Array
 
+SOLVER: Final = "piqp-multistage"  # solves QPs with half-spaces, whatever solves those without
 ROUNDING: Final = 1e-6
 """Violation of a half-space [m] that is taken for rounding."""
 NEAR: Final = 1e-2
@@ -79,7 +80,7 @@ class Clearing:
             answer = self._solve(query)
             if answer.solution.status not in ACCEPTED:
                 return Cleared(answer, problem, np.empty(0))
-            states = _predicted(problem, query, answer.plan)
+            states = predicted(problem, query, answer.plan)
             planned = states[:, self._space.positions] @ turn
             if along is None:
                 along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
@@ -90,10 +91,11 @@ class Clearing:
             room = _room(normals, bounds, planned)
             if (room >= -ROUNDING).all() and not (among and i == 0):
                 break
-            answer, states = self._whole(query, normals, bounds, room, turn)
+            answer, problem, states = self._whole(query, normals, bounds, room, turn)
             if answer.solution.status not in ACCEPTED:
                 named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
-                return Cleared(answer, replace(problem, constraints=(*problem.constraints, *named)), states)
+                constraints = (*self.problem.constraints, *named)
+                return Cleared(answer, replace(problem, constraints=constraints), states)
             planned = states[:, self._space.positions] @ turn
             if np.abs(planned - along).max() < SETTLED:
                 break
@@ -109,20 +111,21 @@ class Clearing:
         added = self._space.constraint(normals, bounds, self.problem.model.n)
         return replace(self.problem, constraints=(*self.problem.constraints, added))
 
-    def _whole(self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array) -> tuple[Answer, Array]:
-        """The optimum with half-spaces of the world, and its states (N, n); `room` (S, N) gives the tightest."""
+    def _whole(self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array) -> Cleared:
+        """The optimum with half-spaces of the world; `room` (S, N) gives the tightest."""
         count = self._space.settings.rows
         while True:
             at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
-            answer = self._solved(query, self._posed(normals[at] @ turn.T, bounds[at]), len(at[0]))
+            problem = self._posed(normals[at] @ turn.T, bounds[at])
+            answer = self._solved(query, problem, len(at[0]))
             if answer.solution.status not in ACCEPTED:
-                return answer, np.empty(0)
-            states = _predicted(self.problem, query, answer.plan)
+                return Cleared(answer, problem, np.empty(0))
+            states = predicted(self.problem, query, answer.plan)
             room = _room(normals, bounds, states[:, self._space.positions] @ turn)
             violated = room < -ROUNDING
             violated[at] = False
             if not violated.any():
-                return answer, states
+                return Cleared(answer, problem, states)
             room[at] = -LOOSE  # what was there stays
             count *= 2
 
@@ -144,24 +147,11 @@ class Clearing:
             A, B, c = query.steps
             matrices = form.renewed(problem, form.prepare(A, B))
             vectors = form.changed_vectors(matrices, c, *query[:3], rest)
-        solution = backend.solve_changed(form.changed(matrices, vectors))
-        return Answer(plan=form.inputs(solution.x), slacks=form.slacks(solution.x), solution=solution)
+        qp = form.changed(matrices, vectors)
+        solution = backend.solve_changed(qp)
+        return Answer(form.inputs(solution.x), form.slacks(solution.x), solution, SOLVER, qp=qp)
 
 
 def _room(normals: Array, bounds: Array, positions: Array) -> Array:
     """(S, N) how far positions (N, 3) are inside half-spaces [m]."""
     return np.asarray((normals * positions).sum(axis=2) - bounds)
-
-
-def _predicted(problem: Problem, query: Query, plan: Array) -> Array:
-    """(N, n) the states that a plan (N, nu) leads to."""
-    states, state = np.empty((len(plan), query.state.size)), query.state
-    if query.steps is not None:
-        for i, (A, B, c, u) in enumerate(zip(*query.steps, plan, strict=True)):
-            states[i] = state = A @ state + B @ u + c
-        return states
-    model, (x_s, u_s) = problem.model, query.rest or problem.rest
-    state = state - x_s
-    for i, push in enumerate((plan - u_s) @ model.B.T):
-        states[i] = state = model.A @ state + push
-    return states + x_s

@@ -13,6 +13,11 @@ import numpy as np
 from quadsim.controller import Phase
 from quadsim.state import ANGLE_RATES, ANGLES, Array, euler_to_body_rates, euler_to_quaternion
 
+RESIDUALS: Final = (
+    *("reported_primal", "reported_dual", "infeasibility"),
+    *("kkt_stationarity", "kkt_complementarity", "kkt_dual"),
+)
+"""Columns of numbers that some periods lack: NaN here, null in files; see `quadsim.controller.Command`."""
 WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}": "N m" for axis in "xyz"}}
 """Columns of the external force, world, and torque, body frame, with their units; only where there is any."""
 WIND: Final = {f"wind_{axis}": "m/s" for axis in "xyz"}
@@ -36,13 +41,19 @@ class ControlLog:
     speeds_before: Array  # (4,) u(-1), the command before the first [rad/s]
     status: tuple[str, ...]
     """K texts, one of `quadsim.controller.ACCEPTED` or what was instead; see `quadsim.controller.Command`."""
+    answered_by: tuple[str, ...]
+    """K texts: `gain`, `active-set`, a QP solver's name, `law`, `fallback` or `stopped`."""
     phase: tuple[str, ...]  # K texts, where the flight stood with the ground; see `quadsim.controller.Phase`
-    iterations: np.ndarray[Any, np.dtype[np.int64]]  # (K,) solver iterations
+    iterations: np.ndarray[Any, np.dtype[np.int64]]  # (K,) of whoever answered
     active: np.ndarray[Any, np.dtype[np.int64]]  # (K,) constraints active at the optimum
     fallback: np.ndarray[Any, np.dtype[np.int64]]  # (K,) 0 none, higher = deeper
     slack: Array  # (K,) largest softening of an output bound [rad]
-    primal_residual: Array  # (K,) as reported by the back end; 0 where an active set answers exactly
-    dual_residual: Array  # (K,) likewise
+    reported_primal: Array  # (K,) as the QP solver reports it; NaN of this and all below where there is none
+    reported_dual: Array  # (K,) likewise
+    infeasibility: Array  # (K,) largest violation of a row as posed, by the plan, less the row's slack [row's unit]
+    kkt_stationarity: Array  # (K,) residuals computed from the QP; see `quadsim.controller.Command`
+    kkt_complementarity: Array  # (K,) likewise
+    kkt_dual: Array  # (K,) likewise
     delay: Array  # (K,) simulated time from the measurement to the command [s]
     attitude: Array | None = None  # (K, 4) quaternion wxyz as measured, sign continuous; None where Euler angles do
     body_rates: Array | None = None  # (K, 3) as measured [rad/s]; None where Euler angles do

@@ -10,9 +10,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.controller import ACCEPTED, MISSED, Phase
+from quadsim.controller import ACCEPTED, MISSED, NO_SOLVER, Phase
 from quadsim.flight.ground import AIRBORNE, Outline, clearance, takeoff_time, touchdown
-from quadsim.flight.log import ControlLog, FlightLog, TimingLog
+from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, TimingLog
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
 
 SETTLING_BAND: Final = 0.05  # half width of the band an output has to stay in to be settled, as a share of the step
@@ -114,23 +114,31 @@ def percentiles(values: Array) -> dict[str, float]:
 
 
 def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[str, Any]:
-    """Counts of statuses and fallbacks, `unrecovered`, iterations, residuals, times against the deadline [ms].
+    """Counts of statuses, answerers and fallbacks, `unrecovered`, iterations, residuals, times [ms].
 
-    Residuals are those of the periods whose optimum was found: a back end that gave up may report none, or infinite
-    ones.
+    `iterations` are those of the periods that the QP solver answered, None where there are none, or several solvers;
+    `iterations_by` has every answerer that iterates.  Of each residual: the largest among accepted answers, and in how
+    many of these periods it was computed.
     """
-    found = np.array([status in ACCEPTED for status in log.status])
+    accepted = np.array([status in ACCEPTED for status in log.status])
+    answerers = np.array(log.answered_by)
+    iterations = {by: log.iterations[answerers == by] for by in sorted(set(log.answered_by))}
+    by_answerer = {
+        by: {"mean": float(counts.mean()), "max": int(counts.max())}
+        for by, counts in iterations.items()
+        if counts.any() or by not in NO_SOLVER
+    }
+    solvers = set(iterations) - NO_SOLVER
     return {
         "statuses": dict(sorted(Counter(log.status).items())),
         "fallbacks": {str(level): count for level, count in sorted(Counter(log.fallback.tolist()).items())},
         "unrecovered": unrecovered(log),
-        "iterations": {"mean": float(log.iterations.mean()), "max": int(log.iterations.max())},
+        "answered_by": dict(sorted(Counter(log.answered_by).items())),
+        "iterations": by_answerer.get(solvers.pop()) if len(solvers) == 1 else None,
+        "iterations_by": by_answerer,
         "active_max": int(log.active.max()),
         "active_periods": int(np.count_nonzero(log.active)),
-        "residual_max": {
-            "primal": _largest(log.primal_residual[found]),
-            "dual": _largest(log.dual_residual[found]),
-        },
+        "residuals": {name: _largest(getattr(log, name)[accepted]) for name in RESIDUALS},
         "solve_ms": percentiles(timing.solve_ms),
         "step_ms": percentiles(timing.step_ms),
         "deadline_ms": deadline_ms,
@@ -189,10 +197,10 @@ def ground(log: FlightLog, outline: Outline) -> dict[str, Any]:
     }
 
 
-def _largest(residuals: Array) -> float | None:
-    """The largest residual; None for a back end that reports none, 0 where there was nothing to report."""
-    largest = float(np.max(residuals, initial=0.0))
-    return None if math.isnan(largest) else largest
+def _largest(residuals: Array) -> dict[str, Any]:
+    """The largest of those that are there, None where none is, and how many are."""
+    computed = residuals[np.isfinite(residuals)]
+    return {"max": float(computed.max()) if computed.size else None, "periods": computed.size}
 
 
 def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseStep] = ()) -> dict[str, Any]:

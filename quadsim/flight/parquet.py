@@ -16,7 +16,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from quadsim.errors import FileError
-from quadsim.flight.log import BODY_RATES, QUATERNION, WIND, WRENCH, ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.log import (
+    BODY_RATES,
+    QUATERNION,
+    RESIDUALS,
+    WIND,
+    WRENCH,
+    ControlLog,
+    FlightLog,
+    PlantLog,
+    TimingLog,
+)
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -31,7 +41,7 @@ _TURNING: Final = tuple(f"w{i}" for i in range(1, N_ROTORS + 1))
 _SPEED_UNITS: Final = ("rad/s",) * N_ROTORS
 _TIMES: Final = {"t": "s", "solve_ms": "ms", "step_ms": "ms"}
 _COUNTS: Final = ("iterations", "active", "fallback")
-_NUMBERS: Final = {"slack": "rad", "primal_residual": "-", "dual_residual": "-", "delay": "s"}
+_NUMBERS: Final = {"slack": "rad", **dict.fromkeys(RESIDUALS, "-"), "delay": "s"}
 """Columns of one number in each period, with their units; those of counts have none."""
 
 _Column = tuple[str, str, Any]
@@ -55,9 +65,9 @@ def _optional(*groups: tuple[Array | None, Mapping[str, str]]) -> Iterator[_Colu
 def _table(columns: Sequence[_Column], metadata: Mapping[str, str]) -> pa.Table:
     arrays, schema = [], []
     for name, unit, values in columns:
-        array = values if isinstance(values, pa.Array) else pa.array(values)
+        array = values if isinstance(values, pa.Array) else pa.array(values, from_pandas=name in RESIDUALS)
         arrays.append(array)
-        schema.append(pa.field(name, array.type, nullable=False, metadata={"unit": unit}))
+        schema.append(pa.field(name, array.type, nullable=name in RESIDUALS, metadata={"unit": unit}))
     return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata=dict(metadata)))
 
 
@@ -68,6 +78,7 @@ def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
         *_columns(log.reference, _REFERENCES, REFERENCE_UNITS),
         *_columns(log.speeds, _COMMANDED, _SPEED_UNITS),
         ("status", "-", pa.array(log.status, pa.string())),
+        ("answered_by", "-", pa.array(log.answered_by, pa.string())),
         ("phase", "-", pa.array(log.phase, pa.string())),
         *((name, "-", getattr(log, name)) for name in _COUNTS),
         *((name, unit, getattr(log, name)) for name, unit in _NUMBERS.items()),
@@ -149,7 +160,7 @@ def _stack_if_there(table: pa.Table, names: Sequence[str]) -> Array | None:
 
 def _numbers(table: pa.Table, name: str, kind: type = np.float64) -> np.ndarray[Any, Any]:
     column = table.column(name)
-    if column.null_count:
+    if column.null_count and name not in RESIDUALS:
         raise ValueError(f"{name} has gaps")
     return np.asarray(column.to_numpy(), dtype=kind)
 
@@ -180,6 +191,7 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
             speeds=_stack(flight, _COMMANDED),
             speeds_before=before,
             status=_texts(flight, "status"),
+            answered_by=_texts(flight, "answered_by"),
             phase=_texts(flight, "phase"),
             **{name: _numbers(flight, name, np.int64) for name in _COUNTS},
             **{name: _numbers(flight, name) for name in _NUMBERS},

@@ -217,7 +217,7 @@ def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
 
 def _step_time_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
     measures = {"p50": "median", "p95": "95th percentile", "p99": "99th percentile", "max": "maximum"}
-    for clock, what in {"step_ms": "whole step", "solve_ms": "solver alone"}.items():
+    for clock, what in {"step_ms": "whole step", "solve_ms": "optimum alone, by whoever answered"}.items():
         for measure, label in measures.items():
             values = [nested(summary, "controller", clock, measure) for summary in summaries]
             yield _best_smallest("Time", f"{what}, {label}", "ms", summaries, values)
@@ -313,6 +313,16 @@ def _counts(key: str) -> Callable[[Summary], Cell]:
     return cell
 
 
+def _iterations(measure: str) -> Callable[[Summary], Cell]:
+    """Iterations of each answerer that iterates: they are not comparable."""
+
+    def cell(summary: Summary) -> Cell:
+        answerers = summary["controller"].get("iterations_by", {})
+        return Cell(text=", ".join(f"{by}: {format_number(n[measure])}" for by, n in answerers.items()) or ABSENT)
+
+    return cell
+
+
 def _listed(key: str, form: str, mark: Mark) -> Callable[[Summary], Cell]:
     """Entries of the course in one cell; `none` where there are none, `-` where a run does not say."""
 
@@ -345,7 +355,7 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
     ("audit", "", lambda summary: Cell(text="; ".join(summary.get("audit_notes", ())) or "as the controller bounds")),
     ("time flown", "s", _number("duration")),
     ("controller", "", _text(lambda summary: law_name(summary["controller"].get("name", ABSENT)))),
-    ("solver", "", _text(lambda summary: summary["controller"].get("solver") or "closed form")),
+    ("QP solver, where a QP is left to one", "", _text(lambda summary: summary["controller"].get("solver") or ABSENT)),
     ("horizon", "periods", _text(lambda summary: summary["controller"].get("horizon", ABSENT))),
     ("vehicle", "", _text(lambda summary: summary["vehicle"]["name"])),
     ("mass", "kg", _number("vehicle", "mass")),
@@ -385,11 +395,12 @@ _COMMANDS: Final[tuple[_Line, ...]] = (
     ("total variation", "rad/s", _number("control", "total_variation")),
 )
 _SOLVER: Final[tuple[_Line, ...]] = (
+    ("answered by", "", _counts("answered_by")),
     ("statuses", "", _counts("statuses")),
     ("periods by fallback level", "", _counts("fallbacks")),
     ("in permanent fallback", "", _number("controller", "unrecovered")),
-    ("iterations, mean", "", _number("controller", "iterations", "mean")),
-    ("iterations, most", "", _number("controller", "iterations", "max")),
+    ("iterations, mean", "", _iterations("mean")),
+    ("iterations, most", "", _iterations("max")),
     ("active constraints, most", "", _number("controller", "active_max")),
 )
 _COMPUTATION: Final[tuple[_Line, ...]] = (

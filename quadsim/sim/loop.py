@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
-from quadsim.controller import MISSED, Command, Controller, InnerLoop, Moment, Phase
+from quadsim.controller import FALLBACK, MISSED, Command, Controller, InnerLoop, Moment, Phase
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError
-from quadsim.flight.log import ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.flight.lost import check_loss
 from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
@@ -482,13 +482,15 @@ def _control_log(samples: list[Sample], initial_speeds: Array, period: float) ->
         speeds=np.array([sample.speeds for sample in samples], float).reshape(-1, N_ROTORS),
         speeds_before=np.array(initial_speeds, float),
         status=tuple(MISSED if sample.missed else sample.command.status for sample in samples),
+        answered_by=tuple(
+            FALLBACK if sample.missed or sample.command.fallback else sample.command.answered_by for sample in samples
+        ),
         phase=tuple(str(sample.phase) for sample in samples),
         iterations=column("iterations", np.int64),
         active=column("active", np.int64),
         fallback=np.where(late, np.maximum(fallback, 1), fallback),
         slack=column("slack", float),
-        primal_residual=column("primal_residual", float),
-        dual_residual=column("dual_residual", float),
+        **{name: column(name, float) for name in RESIDUALS},
         delay=np.array([sample.delay for sample in samples], float),
     )
 

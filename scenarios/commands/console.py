@@ -14,7 +14,7 @@ from rich.progress import Progress as ProgressBars
 from rich.table import Table
 from rich.text import Text
 
-from quadsim.controller import law_name
+from quadsim.controller import ACCEPTED, Phase, counts, law_name
 from quadsim.errors import printable
 from quadsim.flight.audit import HELD
 from quadsim.flight.summary import constraint_verdict, deciding_margin
@@ -181,11 +181,11 @@ def _tracking_table(tracking: Mapping[str, Any]) -> Table:
 
 def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     control, controller = summary["control"], summary["controller"]
-    statuses = ", ".join(f"{count} {status}" for status, count in controller["statuses"].items())
-    times = controller["step_ms"]
-    how = law_name(controller["name"]) + (f" by {controller['solver']}" if controller["solver"] else "")
+    times, usual = controller["step_ms"], ACCEPTED | {Phase.LANDED, Phase.CRASHED}
+    refused = ", ".join(f"{n} {status}" for status, n in controller["statuses"].items() if status not in usual)
     yield (
-        f"{how}: {statuses}; step p50 {times['p50']:.3f}, p99 {times['p99']:.3f}, max {times['max']:.3f} ms "
+        f"{law_name(controller['name'])}: {counts(controller['answered_by'])}{f' ({refused})' if refused else ''}; "
+        f"step p50 {times['p50']:.3f}, p99 {times['p99']:.3f}, max {times['max']:.3f} ms "
         f"of {controller['deadline_ms']:g} ms"
     )
     yield (
@@ -227,7 +227,7 @@ def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"RMS error of the measured state: {lengths} m; {angles} deg"
 
 
-_BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "statuses", "whole step, m")
+_BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "answered by", "statuses", "whole step, m")
 """How the labels begin of the rows that a terminal shows; the page and its `comparison.md` have them all."""
 
 

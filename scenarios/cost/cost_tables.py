@@ -58,7 +58,7 @@ def _computation(study: CostStudy) -> Grid:
     lines = []
     for candidate in study.candidates:
         lines.append(_times(study, candidate.name, candidate.step_ms, candidate))
-        parts = {"by the unconstrained optimum": candidate.shortcut, "by QPs": ~candidate.shortcut}
+        parts = {"by the unconstrained optimum": candidate.shortcut, "with active constraints": ~candidate.shortcut}
         if 0 < candidate.shortcut.sum() < candidate.shortcut.size:
             for how, periods in parts.items():
                 label = f"... its {periods.sum()} periods answered {how}"
@@ -153,7 +153,7 @@ def _sweep(sweep: Sweep, key: str, title: str) -> Grid:
         head=head,
         lines=tuple(_point(sweep, point, free=free) for point in sweep.points),
         note=(
-            "solved, unconstrained, held: periods answered by QPs, by an unconstrained optimum within every bound, "
+            "solved, unconstrained, held: periods whose optimum has active constraints, is the unconstrained one, "
             "and by an earlier plan where the QP has no solution. active: share of periods with an active constraint. "
             "settling: of the slowest step in x, y or z, judged until the controller sees the next one coming, which a "
             "longer horizon does sooner. step: timed in the same way, on the flight's own queries. Bold: the flight "

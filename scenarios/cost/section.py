@@ -77,7 +77,8 @@ def _computation(study: CostStudy) -> Iterator[str]:
         quick, slow = (percentiles(flown.step_ms[periods])["p50"] for periods in (flown.shortcut, ~flown.shortcut))
         yield (
             f"In {shortcuts} of {flown.shortcut.size} periods the unconstrained optimum satisfies every constraint, "
-            f"and is the answer after {_two(quick)} ms in the median; the others need QPs and {_two(slow)} ms."
+            f"and is the answer after {_two(quick)} ms in the median; the others have active constraints and take "
+            f"{_two(slow)} ms."
         )
     phrases = []
     for candidate in others:

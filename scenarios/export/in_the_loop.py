@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from mpc.answer import ActuatorBounds
-from mpc.export.compiled import FALLBACK, STATUSES
+from mpc.export.compiled import ANSWERERS, LEVELS, STATUSES
 from mpc.export.source import Precision
 from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
-from quadsim.controller import GROUNDED, SOLVED, Command, Moment, stopped
+from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Moment, stopped
 from quadsim.outputs import absolute
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
@@ -68,8 +68,9 @@ class MPCInTheLoop:
         return Command(
             speeds=reply.command.copy(),
             plan=np.tile(reply.command, (self.horizon, 1)),
-            status=SOLVED if self._bounds is None else STATUSES[reply.status],
-            fallback=FALLBACK[reply.status],
+            status=UNCONSTRAINED if self._bounds is None else STATUSES[reply.status],
+            answered_by=GAIN if self._bounds is None else ANSWERERS[reply.status],
+            fallback=LEVELS[reply.status],
         )
 
 

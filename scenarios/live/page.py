@@ -578,7 +578,8 @@ class Page:
         rows = [
             f"<b>{frame.time:.2f} s</b> &times; {factor:.2f} of real time, "
             f"{'paused' if self._pace.paused else escape(sample.phase.value)}",
-            f"<span{mark}>{escape(command.status)}</span>{back}, {command.active} active, "
+            f"<span{mark}>{escape(command.status)}</span> by {escape(command.answered_by)}{back}, "
+            f"{command.active} active, "
             f"step <b>{step:.2f}</b> of {deadline:g} ms"
             + (' <span class="bad">missed</span>' if sample.missed else ""),
             *(

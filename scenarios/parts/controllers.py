@@ -277,6 +277,7 @@ def _nonlinear(spec: NonlinearSpec, vehicle: Vehicle, period: float, shapes: Seq
         bounds=bounds,
         constraints=_outputs(spec),
         space=make_space(spec, vehicle, period, shapes, stride=stride),
+        kkt_every=spec.kkt_every,
     )
     law = guarded(mpc, bounds, spec.fallback, vehicle, period)
     return law if spec.indi is None else Incremental(law, vehicle, spec.indi, bounds)
@@ -317,7 +318,8 @@ def _constrained(spec: ConstrainedSpec, vehicle: Vehicle, period: float, shapes:
     from mpc.solvers import QPSolver
 
     problem, space = make_problem(spec, vehicle, period), make_space(spec, vehicle, period, shapes)
-    return ConstrainedMPC(problem, QPSolver(spec.solver, problem), shortcut=spec.shortcut, space=space)
+    solver = QPSolver(spec.solver, problem)
+    return ConstrainedMPC(problem, solver, shortcut=spec.shortcut, space=space, kkt_every=spec.kkt_every)
 
 
 def _unconstrained(problem: Problem) -> Controller:
@@ -376,7 +378,8 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[
     if spec.tightening is not None and spec.avoidance is not None:
         margins = position_margins(**_tightened(spec, vehicle, period))
     space = make_space(spec, vehicle, period, shapes, margins)
-    return RobustMPC(**_robust_parts(spec, vehicle, period), shortcut=spec.shortcut, space=space)
+    parts = _robust_parts(spec, vehicle, period)
+    return RobustMPC(**parts, shortcut=spec.shortcut, space=space, kkt_every=spec.kkt_every)
 
 
 def tightening_margins(spec: RobustSpec, vehicle: Vehicle, period: float) -> Array | None:

@@ -21,6 +21,7 @@ import numpy as np
 from mpc.handover import hand_over
 from quadsim.controller import Command, Moment
 from quadsim.errors import CommandError, InputError, ParameterError, UnknownNameError, printable
+from quadsim.flight.log import RESIDUALS
 from quadsim.sim.effects import Force
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -30,7 +31,7 @@ _STEP: Final = (
     "a class or an object with a method step(now, state, reference), or a function law(now, state, reference)"
 )
 _WHOLE: Final = ("iterations", "active", "fallback")  # parts of a Command
-_REAL: Final = ("slack", "primal_residual", "dual_residual", "solve_s")
+_REAL: Final = ("slack", *RESIDUALS, "solve_s")
 _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
 
 
@@ -71,11 +72,12 @@ class PluginController:
                 answer = Command(speeds=answer, plan=np.tile(_numbers(answer, (N_ROTORS,), "it"), (self.horizon, 1)))
             parts: dict[str, Any] = {name: operator.index(getattr(answer, name)) for name in _WHOLE}
             parts |= {name: float(getattr(answer, name)) for name in _REAL}
+            parts |= {name: printable(getattr(answer, name))[:200] for name in ("status", "answered_by")}
             parts["speeds"] = _numbers(answer.speeds, (N_ROTORS,), "its speeds")
             parts["plan"] = _numbers(answer.plan, (self.horizon, N_ROTORS), "its plan")
             if answer.inner is not None and not answer.inner.rate > 0.0:
                 raise ValueError("its inner loop must have a positive rate")
-            return replace(answer, **parts, status=printable(answer.status)[:200])
+            return replace(answer, **parts)
         except (AttributeError, TypeError, ValueError) as error:
             problem = f"{self.name} answered {answer!r:.100}, neither {N_ROTORS} speeds nor a Command: {error}"
             raise CommandError(problem, time=now.time) from error

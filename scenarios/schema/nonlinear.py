@@ -12,10 +12,11 @@ from mpc.fallback.settings import FallbackSettings
 from mpc.indi import INDISettings
 from mpc.nonlinear.settings import Weights
 from mpc.observer import ObserverSettings
+from mpc.qp import KKT_EVERY
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.fields import NonNegative, Positive
 from scenarios.schema.base import MOST_ENTRIES, Horizon, Lag, Pair, Spec, require_ordered
-from scenarios.schema.optimisation import AvoidanceSpec, PolytopeSpec, SoftSpec
+from scenarios.schema.optimisation import AvoidanceSpec, KktEvery, PolytopeSpec, SoftSpec
 
 LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states that are so of the quaternion model too
 Terminal = NonNegative | Literal["none", "lqr"]
@@ -101,6 +102,10 @@ class NonlinearPartsSpec(Spec):
     indi: INDISettings | None = Field(default=None, description="absent: rotors hold the commands for a period")
     input_bounds: RotorBoundsSpec = RotorBoundsSpec()
     fallback: FallbackSettings = FallbackSettings()
+    kkt_every: KktEvery = Field(
+        default=KKT_EVERY,
+        description="[periods] from one whose KKT residuals are computed and logged to the next; 1: all",
+    )
 
     @model_validator(mode="after")
     def _check(self) -> NonlinearPartsSpec:

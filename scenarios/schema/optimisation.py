@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal
 from annotated_types import Len, MaxLen, doc
 from pydantic import Field, model_validator
 
+from mpc.qp import KKT_EVERY
 from mpc.space.settings import AvoidanceSettings
 from quadsim.errors import UnknownNameError
 from quadsim.fields import NonNegative, Number, Weight
@@ -21,6 +22,9 @@ ANGLES: Final = frozenset(name for name, unit in zip(STATE_NAMES, STATE_UNITS, s
 """States that scenario files give in degrees (per second)."""
 
 Weights = Weight | Annotated[list[Weight], Len(4, 4)]  # one weight for all rotors, or one each
+
+
+KktEvery = Annotated[int, Field(ge=1)]
 
 
 class InputWeightsSpec(Spec):
@@ -157,6 +161,11 @@ class BoundedSpec(WeightedSpec):
     )
     shortcut: bool = Field(
         default=True, description="solve less than the whole QP where that yields its optimum; exact"
+    )
+
+    kkt_every: KktEvery = Field(
+        default=KKT_EVERY,
+        description="[periods] from one whose KKT residuals are computed and logged to the next; 1: all",
     )
 
     @model_validator(mode="after")

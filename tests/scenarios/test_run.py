@@ -177,7 +177,7 @@ def test_any_horizon_flies(name: str, horizon: int) -> None:
     settings = [SHORT, f"controller.horizon={horizon}"]
     by_qp = ["controller.shortcut=false"] if name == "paper-constrained" else []
     flight = fly_scenario(load_scenario(name, settings + by_qp))
-    assert flight.log.control.status == (SOLVED,) * 10
+    assert flight.log.control.status == (SOLVED if by_qp else UNCONSTRAINED,) * 10
     assert flight.log.predicted is not None
     assert flight.log.predicted.shape == (10, horizon, 3)
 

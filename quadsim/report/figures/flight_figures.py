@@ -145,7 +145,7 @@ def _draw_solve_times(run: Run) -> Figure:
     times, iterations, active = figure.subplots(3, 1, sharex=True, height_ratios=(2.4, 1.0, 1.0))
     timing, control = run.log.timing, run.log.control
     deadline = run.summary["controller"]["deadline_ms"]
-    for i, (name, values) in enumerate({"whole step": timing.step_ms, "solver alone": timing.solve_ms}.items()):
+    for i, (name, values) in enumerate({"whole step": timing.step_ms, "optimum alone": timing.solve_ms}.items()):
         p50, p99 = np.percentile(values, [50, 99])
         label = f"{name}: median {p50:.3g}, p99 {p99:.3g}, max {values.max():.3g} ms"
         shown = values > 0.0  # a clock may read 0, which has no place on a logarithmic axis

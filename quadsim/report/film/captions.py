@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from PIL import Image
 
-from quadsim.controller import ACCEPTED, Phase, law_name
+from quadsim.controller import ACCEPTED, LAW, STOPPED, Phase, law_name
 from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import failure_sentences
@@ -63,7 +63,7 @@ class Overlay:
         self._scale = min(width / 1280.0, height / 720.0) * (_COMPACT_SCALE if compact else 1.0)
         self._width, self._height = width / self._scale, height / self._scale
         controller = run.summary.get("controller", {})
-        self._subtitle = "  ·  ".join(filter(None, (law_name(controller.get("name", "")), controller.get("solver"))))
+        self._subtitle = law_name(controller.get("name", ""))
         self._grounded = any(phase != Phase.FLYING for phase in run.log.control.phase)
         self._ranked = sorted(footage.margins, key=lambda track: track.rank)  # of the whole flight: rows stay in place
         self._top_view = TopView(run, footage, *(_COMPACT_MAP if compact else _MAP), acting=not compact)
@@ -135,6 +135,8 @@ class Overlay:
         status, phase, fallback = control.status[k], control.phase[k], control.fallback[k]
         phrases = [phase] if self._grounded and status != phase else []
         phrases.append(status + (f" (fallback {fallback})" if fallback else ""))
+        if not fallback and control.answered_by[k] not in (LAW, STOPPED):
+            phrases.append(f"by {control.answered_by[k]}")
         if control.iterations[k]:
             phrases += [f"{control.iterations[k]} iterations", f"{control.active[k]} active"]
         good = fallback == 0 and status in ACCEPTED | {Phase.LANDED}

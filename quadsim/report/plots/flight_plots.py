@@ -106,7 +106,7 @@ class _Plotter:
         return self._timed(figure, key, title)
 
     def _times(self) -> Plot:
-        labels = ("whole step [ms]", "solver alone [ms]", "solver iterations", "active constraints")
+        labels = ("whole step [ms]", "optimum alone [ms]", "iterations, of whoever answered", "active constraints")
         figure = panels(labels)
         for i, label, run in self._runs:
             timing, control = run.log.timing, run.log.control

@@ -81,11 +81,11 @@ def send_limit(recording: rr.RecordingStream, limit: Limit, log: FlightLog, colo
 
 
 def send_solver(recording: rr.RecordingStream, run: Run) -> None:
-    """Clock times, and what the solver reports of its answers."""
+    """Clock times, and what is known of the answers."""
     control, timing = run.log.control, run.log.timing
     first, second = SERIES[:2]
     for name, values, label, colour in (
-        ("solve_ms", timing.solve_ms, "solver alone [ms]", first),
+        ("solve_ms", timing.solve_ms, "optimum alone [ms]", first),
         ("step_ms", timing.step_ms, "whole step [ms]", second),
         ("iterations", control.iterations, "iterations", first),
         ("active", control.active, "active constraints", second),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadsim.controller import ACCEPTED, Phase
+from quadsim.controller import ACCEPTED, Phase, counts
 from quadsim.flight.audit import HELD
 from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
@@ -22,14 +22,20 @@ if TYPE_CHECKING:
 
 
 def send_texts(recording: rr.RecordingStream, run: Run) -> None:
-    """The summary, and what happened when: changes of the solver's status, and the end."""
+    """The summary, and what happened when: changes of the status and of who answers, and the end."""
     import rerun as rr
 
     log = run.log.control
     good = ACCEPTED | {Phase.LANDED}
     events = [
-        (t, f"{status}, fallback {fallback}", "INFO" if status in good and not fallback else "WARN")
-        for t, (status, fallback) in _changes(log.t, list(zip(log.status, log.fallback.tolist(), strict=True)))
+        (
+            t,
+            f"{status}{'' if fallback else f' by {by}'}, fallback {fallback}",
+            "INFO" if status in good and not fallback else "WARN",
+        )
+        for t, (status, by, fallback) in _changes(
+            log.t, list(zip(log.status, log.answered_by, log.fallback.tolist(), strict=True))
+        )
     ]
     events += _phase_changes(run)
     events += _failures(run)
@@ -89,8 +95,10 @@ def _summary(run: Run) -> str:
     if "step_ms" in control:
         step = control["step_ms"]
         lines += [
+            f"Answered by: {counts(control['answered_by'])}.",
+            "",
             f"Controller step: median {step['p50']:.3g}, p99 {step['p99']:.3g}, longest {step['max']:.3g} ms; "
-            f"{control['deadline_misses']} beyond {control['deadline_ms']:g} ms."
+            f"{control['deadline_misses']} beyond {control['deadline_ms']:g} ms.",
         ]
     return "\n".join(lines)
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from quadsim.controller import ACCEPTED, Phase
+from quadsim.controller import ACCEPTED, NO_SOLVER, Phase
 from quadsim.errors import FileError
 from quadsim.flight import metrics
 from quadsim.flight.audit import Finding, Limit
@@ -50,6 +50,7 @@ _COMMANDS: Final = (
     ("fallback_max", "-", pa.int64()),
     ("unsolved_periods", "-", pa.int64()),
     ("slack_max", "rad", pa.float64()),
+    ("solver_periods", "-", pa.int64()),
     ("iterations.mean", "-", pa.float64()),
     ("iterations.max", "-", pa.int64()),
 )
@@ -191,6 +192,7 @@ def _numbers(log: FlightLog) -> Row:
     control = log.control
     tracked = metrics.tracking(control)
     accepted = sum(status in ACCEPTED for status in control.status)
+    by_solver = np.array([by not in NO_SOLVER for by in control.answered_by])
     grounded = sum(status in (Phase.LANDED, Phase.CRASHED) for status in control.status)
     return {
         **{f"{measure}.{name}": tracked[measure][name] for measure in _MEASURES for name in REFERENCE_NAMES},
@@ -200,8 +202,9 @@ def _numbers(log: FlightLog) -> Row:
         "fallback_max": int(control.fallback.max()),
         "unsolved_periods": control.t.size - accepted - grounded,
         "slack_max": float(control.slack.max()),
-        "iterations.mean": float(control.iterations.mean()),
-        "iterations.max": int(control.iterations.max()),
+        "solver_periods": int(by_solver.sum()),
+        "iterations.mean": float(control.iterations[by_solver].mean()) if by_solver.any() else None,
+        "iterations.max": int(control.iterations[by_solver].max()) if by_solver.any() else None,
         **dict(zip(("step_p50_ms", "step_p99_ms"), np.percentile(log.timing.step_ms, [50, 99]).tolist(), strict=True)),
     }
 

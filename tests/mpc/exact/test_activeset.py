@@ -59,8 +59,8 @@ class Rows:
             status=SOLVED,
             iterations=found.steps,
             active=int(np.count_nonzero(z)),
-            primal_residual=math.nan,
-            dual_residual=math.nan,
+            reported_primal=math.nan,
+            reported_dual=math.nan,
             solve_s=0.0,
         )
 

@@ -258,7 +258,8 @@ def test_failed_attempts_count(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(answer.plan, given.plan, atol=1e-3)
     assert answer.solution.solve_s > given.solution.solve_s
     assert answer.solution.iterations == given.solution.iterations
-    assert (answer.solution.primal_residual, answer.solution.dual_residual) == (0.0, 0.0)  # of the active set's
+    assert answer.solution.reported_primal == given.solution.reported_primal
+    assert (answer.answered_by, given.answered_by) == ("piqp-multistage", "piqp-multistage")
 
 
 def test_the_first_whole_qp_is_solved_roughly_and_finished_exactly(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,14 +15,15 @@ import pytest
 from support import small_log
 
 from quadsim.errors import FileError
-from quadsim.flight.log import FlightLog
+from quadsim.flight.log import RESIDUALS, FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE, read_log, write_log
 
 UNITS = {
     FLIGHT_FILE: (
         "t=s x=m vx=m/s y=m vy=m/s z=m vz=m/s roll=rad roll_rate=rad/s pitch=rad pitch_rate=rad/s yaw=rad "
-        "yaw_rate=rad/s ref_x=m ref_y=m ref_z=m ref_yaw=rad u1=rad/s u2=rad/s u3=rad/s u4=rad/s status=- phase=- "
-        "iterations=- active=- fallback=- slack=rad primal_residual=- dual_residual=- delay=s "
+        "yaw_rate=rad/s ref_x=m ref_y=m ref_z=m ref_yaw=rad u1=rad/s u2=rad/s u3=rad/s u4=rad/s status=- "
+        "answered_by=- phase=- iterations=- active=- fallback=- slack=rad reported_primal=- "
+        "reported_dual=- infeasibility=- kkt_stationarity=- kkt_complementarity=- kkt_dual=- delay=s "
         "true_x=m true_vx=m/s true_y=m true_vy=m/s true_z=m true_vz=m/s true_roll=rad true_roll_rate=rad/s "
         "true_pitch=rad true_pitch_rate=rad/s true_yaw=rad true_yaw_rate=rad/s"
     ),
@@ -189,3 +190,15 @@ read_log(Path(sys.argv[1]))
 sys.exit(psutil.Process().num_threads() - before)
 """
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
+
+
+def test_a_residual_that_was_not_computed_is_null_on_disk_and_nan_inside(tmp_path: Path) -> None:
+    log = small_log(7)
+    write(tmp_path, log)
+    table = pq.read_table(tmp_path / FLIGHT_FILE)
+    for name in RESIDUALS:
+        values = getattr(log.control, name)
+        assert table.schema.field(name).nullable
+        assert table.column(name).null_count == np.count_nonzero(np.isnan(values)) == 4
+        np.testing.assert_array_equal(getattr(read_log(tmp_path).control, name), values)
+    assert not table.schema.field("slack").nullable

@@ -137,19 +137,29 @@ def test_the_controllers_counts_and_times() -> None:
         fallback=np.array([0, 1, 0, 0]),
         iterations=np.array([3, 100, 4, 5]),
         active=np.array([0, 0, 7, 2]),
-        primal_residual=np.array([1e-9, math.inf, 3e-9, 0.0]),
-        dual_residual=np.array([1e-8, math.nan, 0.0, 2e-8]),
+        answered_by=("piqp-dense", "fallback", "active-set", "piqp-dense"),
+        reported_primal=np.array([1e-9, math.inf, math.nan, 0.0]),
+        infeasibility=np.array([2e-9, 0.1, 3e-9, 0.0]),
+        kkt_dual=np.full(4, math.nan),
     )
     timing = TimingLog(t=log.t, solve_ms=np.array([1.0, 2.0, 3.0, 4.0]), step_ms=np.array([50.0, 50.1, 3.0, 70.0]))
     numbers = metrics.controller(log, timing, deadline_ms=50.0)
     assert numbers["statuses"] == {"max_iterations": 1, "solved": 2, "unconstrained": 1}
     assert numbers["fallbacks"] == {"0": 3, "1": 1}
-    assert numbers["iterations"] == {"mean": 28.0, "max": 100}
+    assert numbers["answered_by"] == {"active-set": 1, "fallback": 1, "piqp-dense": 2}
+    assert numbers["iterations"] == {"mean": 4.0, "max": 5}  # of the QP solver alone
+    assert numbers["iterations_by"] == {
+        "active-set": {"mean": 4.0, "max": 4},
+        "fallback": {"mean": 100.0, "max": 100},
+        "piqp-dense": {"mean": 4.0, "max": 5},
+    }
     assert (numbers["active_max"], numbers["active_periods"]) == (7, 2)
     assert numbers["solve_ms"]["p50"] == 2.5
     assert numbers["step_ms"]["max"] == 70.0
     assert (numbers["deadline_ms"], numbers["deadline_misses"]) == (50.0, 2)
-    assert numbers["residual_max"] == {"primal": 3e-9, "dual": 2e-8}  # of the periods with an optimum
+    assert numbers["residuals"]["reported_primal"] == {"max": 1e-9, "periods": 2}  # of accepted answers alone
+    assert numbers["residuals"]["infeasibility"] == {"max": 3e-9, "periods": 3}
+    assert numbers["residuals"]["kkt_dual"] == {"max": None, "periods": 0}  # absent, not 0
     json.dumps(numbers, allow_nan=False)
 
 
@@ -174,14 +184,10 @@ def test_fallback_for_good_is_the_last_second_at_least_or_the_whole_flight(level
         assert metrics.controller(log, small_log(len(levels)).timing, 100.0)["unrecovered"] == expected
 
 
-def test_nothing_solved_has_no_residual() -> None:
-    log = replace(small_log(2).control, status=("numerics", "numerics"), primal_residual=np.full(2, math.nan))
-    assert metrics.controller(log, small_log(2).timing, 50.0)["residual_max"] == {"primal": 0.0, "dual": 0.0}
-
-
-def test_a_back_end_that_reports_no_residual_has_none() -> None:
-    log = replace(small_log(2).control, status=("solved", "solved"), primal_residual=np.array([math.nan, 0.0]))
-    assert metrics.controller(log, small_log(2).timing, 50.0)["residual_max"]["primal"] is None
+def test_iterations_of_no_solver_and_of_several_are_absent() -> None:
+    log, timing = small_log(2).control, small_log(2).timing
+    for answerers in (("gain", "active-set"), ("piqp-dense", "daqp")):
+        assert metrics.controller(replace(log, answered_by=answerers), timing, 50.0)["iterations"] is None
 
 
 def test_a_flight_of_no_period_has_no_numbers() -> None:

@@ -41,7 +41,7 @@ def test_times_become_shares_of_the_period_and_rates(cost_study: CostStudy) -> N
     grid = table(cost_study, "computation")
     assert texts(line(grid, "as flown")) == ["5.5", "9.55", "9.91", "10", "20 %", "101", "100", "1"]
     assert texts(line(grid, "... its 6 periods answered by the unconstrained optimum"))[0] == "3.5"
-    assert texts(line(grid, "... its 4 periods answered by QPs"))[0] == "8.5"
+    assert texts(line(grid, "... its 4 periods answered with active constraints"))[0] == "8.5"
     late = line(grid, "QP by slow")
     assert (late[5].text, late[5].mark) == ("160 %", Mark.BAD)
     assert line(grid, "gain")[5].mark is Mark.NONE

@@ -250,18 +250,20 @@ def test_events_report_each_change_of_the_solver_and_the_end(record: Callable[[R
     status, fallback = [SOLVED] * control.t.size, control.fallback.copy()
     status[20:30] = [UNCONSTRAINED] * 10
     status[40:43], fallback[40:43] = ["infeasible"] * 3, [1, 1, 2]
-    changed = dataclasses.replace(control, status=tuple(status), fallback=fallback)
+    by = ["piqp-dense"] * 20 + ["gain"] * 10 + ["active-set"] * 10 + ["fallback"] * 3
+    by += ["piqp-dense"] * (control.t.size - len(by))
+    changed = dataclasses.replace(control, status=tuple(status), answered_by=tuple(by), fallback=fallback)
     log = dataclasses.replace(short_run.log, control=changed, reason="the battery fell off")
     content = record(dataclasses.replace(short_run, log=log))
     texts = [row[0] for row in content.rows("/events", "text")]
     levels = [row[0] for row in content.rows("/events", "level")]
     assert texts == [
-        "solved, fallback 0",
-        "unconstrained, fallback 0",
-        "solved, fallback 0",
+        "solved by piqp-dense, fallback 0",
+        "unconstrained by gain, fallback 0",
+        "solved by active-set, fallback 0",
         "infeasible, fallback 1",
         "infeasible, fallback 2",
-        "solved, fallback 0",
+        "solved by piqp-dense, fallback 0",
         "aborted: the battery fell off",
     ]
     assert levels == ["INFO", "INFO", "INFO", "WARN", "WARN", "INFO", "ERROR"]

@@ -1,0 +1,143 @@
+"""Who answered each period, against the calls that solvers really had, and what an answer is worth."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from support import paper_problem
+
+from mpc.answer import INFEASIBLE, AnswerCheck
+from mpc.constrained import ConstrainedMPC
+from mpc.ocp import Query, predicted
+from mpc.qp import KKT_EVERY
+from mpc.solvers import QPSolver
+from mpc.solvers.piqp_backends import PiqpMultistage
+from quadsim.controller import Command, Moment
+from quadsim.flight.log import RESIDUALS
+from scenarios.flight import summarise
+from scenarios.loading import load_scenario
+from scenarios.run import fly_scenario
+
+CALLS = ("solve", "solve_roughly", "solve_changed")
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "answered_by"),
+    [
+        ("paper-constrained", (), {"gain": 607, "active-set": 592, "piqp-multistage": 1}),
+        ("robust", (), {"gain": 196, "active-set": 404}),
+        ("hover", ("controller.shortcut=false",), {"piqp-multistage": 200}),
+    ],
+)
+def test_as_many_periods_are_a_solvers_as_it_had_calls(
+    name: str, settings: tuple[str, ...], answered_by: dict[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = Counter[str]()
+    for call in CALLS:
+        real = getattr(PiqpMultistage, call)
+        monkeypatch.setattr(
+            PiqpMultistage, call, lambda *given, real=real: (calls.update(["piqp-multistage"]), real(*given))[1]
+        )
+    flight = fly_scenario(load_scenario(name, settings))
+    counted: dict[str, Any] = summarise(flight)["controller"]
+    assert counted["answered_by"] == answered_by == Counter(flight.log.control.answered_by)
+    assert counted["answered_by"].get("piqp-multistage", 0) == calls["piqp-multistage"]
+    assert (counted["iterations"] is None) == (not calls)
+
+
+def test_another_solver_answers_what_is_left_to_it_under_its_own_name() -> None:
+    pytest.importorskip("osqp")
+    flight = fly_scenario(load_scenario("paper-constrained", ["controller.solver=osqp", "duration=5"]))
+    assert Counter(flight.log.control.answered_by)["osqp"] == 1
+
+
+@pytest.mark.parametrize(("law", "by"), [("lqr", "law"), ("pid", "law"), ("geometric", "law")])
+def test_a_law_without_a_solver_commands(law: str, by: str) -> None:
+    control = fly_scenario(load_scenario("hover", [f"controller={law}", "duration=1"])).log.control
+    assert set(zip(control.status, control.answered_by, strict=True)) == {("commanded", by)}
+    for name in RESIDUALS:
+        assert np.isnan(getattr(control, name)).all(), name
+
+
+def test_an_unconstrained_mpc_is_a_gain() -> None:
+    control = fly_scenario(load_scenario("paper-unconstrained", ["duration=1"])).log.control
+    assert set(zip(control.status, control.answered_by, strict=True)) == {("unconstrained", "gain")}
+
+
+def test_a_period_in_fallback_or_too_late_is_answered_by_the_fallback() -> None:
+    for name in ("worn-rotor-hard-bounds", "stalled-solver"):
+        control = fly_scenario(load_scenario(name)).log.control
+        fallback = control.fallback > 0
+        assert fallback.any()
+        np.testing.assert_array_equal(np.array(control.answered_by) == "fallback", fallback)
+
+
+@pytest.mark.parametrize("every", [1, 7, KKT_EVERY])
+def test_kkt_residuals_are_computed_as_often_as_stated(every: int) -> None:
+    settings = ["duration=5", f"controller.kkt_every={every}"]
+    control = fly_scenario(load_scenario("paper-constrained", settings)).log.control
+    expected = np.arange(control.t.size) % every == 0
+    for name in ("kkt_stationarity", "kkt_complementarity", "kkt_dual"):
+        values = getattr(control, name)
+        np.testing.assert_array_equal(np.isfinite(values), expected)
+        assert values[expected].max() < 1e-6
+    assert np.isfinite(control.infeasibility).all()
+
+
+class Drifting(QPSolver):
+    """The real solver, whose plan leaves the tilt bound from the second step on, in some periods; still `solved`."""
+
+    bad = False
+
+    def solve(self, *query: Any) -> Any:
+        answer = super().solve(*query)
+        if self.bad:
+            plan = answer.plan.copy()
+            plan[1:] += np.array([-3.0, 0.0, 3.0, 0.0]) if plan[1:].min() > 5.0 else 0.0
+            return answer._replace(plan=plan)
+        return answer
+
+
+def test_a_plan_that_violates_the_rows_as_posed_is_refused_and_its_kkt_residuals_are_computed() -> None:
+    problem = paper_problem()
+    solver = Drifting("piqp-multistage", problem)
+    law = ConstrainedMPC(problem, solver, shortcut=False)
+    law.reset(problem.model.u_bar)
+    reference = np.zeros((50, 4))
+    reference[:, 0] = 10.0
+
+    def step(k: int) -> Command:
+        return law.step(Moment(time=0.05 * k), np.zeros(12), reference)
+
+    good, solver.bad = [step(k) for k in range(2)], True
+    bad = step(2)
+    assert [command.answered_by for command in good] == ["piqp-multistage"] * 2
+    assert good[1].infeasibility < INFEASIBLE
+    assert [math.isfinite(command.kkt_stationarity) for command in good] == [True, False]  # periods 0, 20, ...
+    assert (bad.status, bad.answered_by, bad.fallback) == ("infeasible_answer", "fallback", 1)
+    assert bad.infeasibility > INFEASIBLE
+    assert math.isfinite(bad.kkt_stationarity)  # for every refused answer
+
+
+def test_infeasibility_is_the_largest_violation_of_a_row_step_by_step() -> None:
+    """By the map and by prediction step by step, on plans that violate tilt, speed or slew."""
+    problem = paper_problem()
+    rng, rows = np.random.default_rng(3), problem.rows
+    check, other = AnswerCheck(problem, 1), AnswerCheck(paper_problem("paper-constrained", "controller.horizon=50"), 1)
+    solver = QPSolver("piqp-multistage", problem)
+    for size in (0.0, 0.3, 3.0, 100.0):
+        query = Query(0.01 * rng.normal(size=12), np.zeros((50, 4)), problem.model.u_bar)
+        answer = solver.solve(*query[:3])
+        answer = answer._replace(plan=answer.plan + size * rng.normal(size=answer.plan.shape))
+        states = predicted(problem, query, answer.plan)
+        steps = np.diff(answer.plan, axis=0, prepend=query.u_before[None])
+        values = states @ rows.C.T + answer.plan @ rows.D.T + steps @ rows.E.T
+        expected = max(float(np.maximum(values - rows.upper, rows.lower - values).max()), 0.0)
+        for found in (check, other):
+            checked, refused = found(problem, query, answer, None)
+            assert checked.infeasibility == pytest.approx(expected, rel=1e-9, abs=1e-11)
+            assert (refused == "infeasible_answer") == (expected > INFEASIBLE)
