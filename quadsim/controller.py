@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -14,7 +14,10 @@ from quadsim.state import Array
 SOLVED: Final = "solved"  # status of a period whose optimum a QP solver found
 UNCONSTRAINED: Final = "unconstrained"
 """Status of a period whose unconstrained optimum satisfies every constraint, and so is the constrained one too."""
-ACCEPTED: Final = frozenset({SOLVED, UNCONSTRAINED})  # the statuses whose command is the period's optimum
+NOT_CONVERGED: Final = "not_converged"
+"""Status of a period whose QP was solved, but whose plan does not follow the nonlinear dynamics that it linearises."""
+OPTIMAL: Final = frozenset({SOLVED, UNCONSTRAINED})  # the statuses whose command is the period's optimum
+ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}  # the statuses whose command is flown as answered
 MISSED: Final = "missed"
 """Status of a period whose command came after the next period's begin: the one before it went on acting."""
 LAW_NAMES: Final = {
@@ -87,6 +90,16 @@ class InnerLoop(Protocol):
         ...
 
 
+class SQP(NamedTuple):
+    """How far sequential quadratic programming is from convergence, in the model's own units: m, m/s, rad/s and shares.
+
+    A solved QP says nothing about either.
+    """
+
+    defect: float  # largest |x_{i+1} - f(x_i, u_i)| of the plan, over its nodes and the states' components
+    step: float  # largest change of a state or an input in the last iteration
+
+
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """A controller's answer for one period, and how it was found.
@@ -94,8 +107,8 @@ class Command:
     Attributes:
         speeds: (4,) rotor speeds to hold for the period [rad/s].
         plan: (N, 4) planned speeds, `plan[0]` being this period's [rad/s].
-        status: `solved` or `unconstrained` (`ACCEPTED`), `landed` or `crashed` where rotors are stopped, or what the
-            back end calls what went wrong.
+        status: `solved`, `unconstrained` or `not_converged` (`ACCEPTED`), `landed` or `crashed` where rotors are
+            stopped, or what the back end calls what went wrong.
         iterations: solver iterations; 0 for a closed form.
         active: number of constraints active at the optimum.
         fallback: 0 when `speeds` is this period's optimum, higher = deeper; 1 = the shifted previous plan, or
@@ -104,6 +117,7 @@ class Command:
         primal_residual: largest constraint violation the back end reports [its own scaling].
         dual_residual: largest gradient of the Lagrangian the back end reports.
         solve_s: wall time inside the solver [s].
+        sqp: residual of sequential quadratic programming; None for laws without.
         inner: the inner loop that carries out commands from now on; None for rotors that hold `speeds`.
 
     Examples:
@@ -124,6 +138,7 @@ class Command:
     primal_residual: float = 0.0
     dual_residual: float = 0.0
     solve_s: float = 0.0
+    sqp: SQP | None = None
     inner: InnerLoop | None = None
 
 

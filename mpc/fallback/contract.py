@@ -195,7 +195,9 @@ class Guarded:
         if plan is None:
             plan, level = self._hover(known, acting)
         spent = answer or Command(speeds=plan[0], plan=plan)
-        return replace(spent, speeds=plan[0].copy(), plan=plan, status=status, active=0, slack=0.0, fallback=level)
+        return replace(
+            spent, speeds=plan[0].copy(), plan=plan, status=status, active=0, slack=0.0, sqp=None, fallback=level
+        )
 
     def _shifted(self, known: Array, acting: Array, *, lost: bool) -> Array | None:
         """The rest of the last good plan (N, 4), corrected now; None once it is unusable, from then on."""

@@ -456,6 +456,7 @@ def _control_log(samples: list[Sample], initial_speeds: Array, period: float) ->
 
     fallback = column("fallback", np.int64)
     late = np.array([sample.missed for sample in samples], dtype=bool)
+    residuals = [sample.command.sqp for sample in samples]
     return ControlLog(
         t=_times(len(samples), period),
         state=np.array([each.state for each in observed], float).reshape(-1, N_STATES),
@@ -472,6 +473,7 @@ def _control_log(samples: list[Sample], initial_speeds: Array, period: float) ->
         primal_residual=column("primal_residual", float),
         dual_residual=column("dual_residual", float),
         delay=np.array([sample.delay for sample in samples], float),
+        sqp=np.array([residual or (math.nan, math.nan) for residual in residuals]) if any(residuals) else None,
     )
 
 

@@ -131,6 +131,9 @@ class PluginController:
         for name in _REAL:
             if not isinstance(getattr(answer, name), int | float | np.integer | np.floating):
                 raise refuse(name, "a number")
+        residual = None if answer.sqp is None else _numbers(answer.sqp)
+        if answer.sqp is not None and (residual is None or residual.shape != (2,)):
+            raise refuse("sqp", "None, or two numbers")
         rate = getattr(answer.inner, "rate", None)
         if answer.inner is not None and not (isinstance(rate, int | float) and 0.0 < rate < math.inf):
             raise refuse("inner", "None, or an inner loop with a positive rate")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadsim.controller import ACCEPTED, Phase
+from quadsim.controller import OPTIMAL, Phase
 from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import fallback_sentence, tracking_values
@@ -24,7 +24,7 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     import rerun as rr
 
     log = run.log.control
-    good = ACCEPTED | {Phase.LANDED}
+    good = OPTIMAL | {Phase.LANDED}
     events = [
         (t, f"{status}, fallback {fallback}", "INFO" if status in good and not fallback else "WARN")
         for t, (status, fallback) in _changes(log.t, list(zip(log.status, log.fallback.tolist(), strict=True)))
