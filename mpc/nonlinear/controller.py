@@ -12,9 +12,8 @@ stored state.
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Final
@@ -137,6 +136,7 @@ class NonlinearMPC:
         space: Space | None = None,
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
+        self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
         self._bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
         self._nodes = settings.horizon
         self.horizon = settings.horizon * settings.stride
@@ -355,7 +355,7 @@ class NonlinearMPC:
         if sqp.defect > CONVERGED:
             status = NOT_CONVERGED
             if self.unanswered is None:
-                converges = partial(self._converges, start, now.time, measured, nodes)
+                converges = partial(_converges, self._again, self.settings, start, now.time, measured, nodes)
                 self.unanswered = Unanswered(
                     problem=problem, query=query, status=status, time=now.time, converges=converges
                 )
@@ -492,15 +492,6 @@ class NonlinearMPC:
         assert query.rest is not None
         return self._qp.solve(*query.steps, *query[:3], query.rest)
 
-    def _converges(
-        self, before: Mapping[str, object], time: float, measured: Array, nodes: Nodes, iterations: int
-    ) -> bool:
-        """Whether a period's plan converges within so many iterations, from attributes as they were before it."""
-        law = copy.copy(self)
-        vars(law).update(before, settings=replace(self.settings, iterations=iterations))
-        _, answer, _, sqp = law._iterate(time, measured, nodes)
-        return law._rejection(answer) is None and sqp is not None and sqp.defect <= CONVERGED
-
     def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem, SQP | None]:
         """Steps of sequential quadratic programming from the stored plan; the last problem is that of the answer."""
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
@@ -594,3 +585,22 @@ class NonlinearMPC:
 
     def _refuse(self, status: str, answer: Answer | None = None) -> Command:
         return refused(self._acting, self.horizon, status, answer)
+
+
+def _converges(
+    make: Callable[..., NonlinearMPC],
+    settings: NonlinearSettings,
+    start: Mapping[str, object],
+    time: float,
+    measured: Array,
+    nodes: Nodes,
+    iterations: int,
+) -> bool:
+    """Whether a period's plan converges within so many iterations, from a law's attributes before it.
+
+    All but the number of iterations is data of that period, so that a flight can be pickled.
+    """
+    law = make(settings=replace(settings, iterations=iterations))
+    vars(law).update(start)
+    _, answer, _, sqp = law._iterate(time, measured, nodes)
+    return law._rejection(answer) is None and sqp is not None and sqp.defect <= CONVERGED
