@@ -28,6 +28,8 @@ _WHOLE, _REAL = ("iterations", "active", "fallback"), ("slack", "primal_residual
 """What else a command has: whole numbers, and numbers."""
 STEP = ("now", "state", "reference")
 """What the arguments of a controller's step are called, and of a function that is one."""
+KINDS = "a class, a function law(now, state, reference), or an object with a method step(now, state, reference)"
+"""What a controller may be."""
 _LONGEST = 200  # characters of a name or status
 
 
@@ -203,6 +205,11 @@ def make_law(code: Callable[..., Any], spec: PluginSpec, vehicle: Vehicle, perio
     if inspect.isfunction(code) and tuple(inspect.signature(code).parameters)[:3] == STEP:
         step = functools.partial(code, **spec.settings)
         return PluginController(_Function(step, code.__name__, code.__module__), spec.horizon)
+    if inspect.isfunction(code) or inspect.ismethod(code):
+        takes = inspect.signature(code).parameters
+        if not any(each.name in GIVEN or each.kind is each.VAR_KEYWORD for each in takes.values()):
+            what = "the bound method" if inspect.ismethod(code) else "the function"
+            raise InputError(f"controller must be {KINDS}; got {what} {attribute}({', '.join(takes)})")
     given = dict(zip(GIVEN, (vehicle, period, spec.horizon), strict=True)) | spec.settings
     _check_call(attribute, code, given)
     try:

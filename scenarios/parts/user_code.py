@@ -16,7 +16,7 @@ from quadsim.controller import Controller
 from quadsim.errors import ParameterError
 from quadsim.sim.effects import Force
 from quadsim.vehicle import Vehicle
-from scenarios.parts.plugin import PluginController, make_force, make_law
+from scenarios.parts.plugin import KINDS, PluginController, make_force, make_law
 from scenarios.schema.plugin import ForceSpec, PluginSpec
 
 _INSTALLED: Final = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
@@ -54,8 +54,7 @@ def set_up(law: object, spec: PluginSpec, vehicle: Vehicle, period: float) -> Co
     if isinstance(law, type | functools.partial) or inspect.isroutine(law):
         return make_law(_code_of(law)[0], spec, vehicle, period)
     if not callable(getattr(law, "step", None)):
-        rule = "a class, a function law(now, state, reference), or an object with a method step(now, state, reference)"
-        raise ParameterError("", "controller", law, rule)
+        raise ParameterError("", "controller", law, KINDS)
     return PluginController(law, spec.horizon)
 
 

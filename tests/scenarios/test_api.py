@@ -50,6 +50,13 @@ class Gentle:
         return self.speeds
 
 
+class Bound:
+    """One whose law is a method of another name."""
+
+    def act(self, now: Moment, state: Array, reference: Array) -> Array:
+        return np.full(4, 192.0)
+
+
 @pytest.fixture(scope="module")
 def hover() -> Scenario:
     return quadsim.load("hover").replace({"duration": 1.0})
@@ -222,6 +229,8 @@ def test_a_law_from_a_file_flies_the_same(hover: Scenario, monkeypatch: pytest.M
     ("law", "message"),
     [
         (3.0, "a class, a function law"),
+        (Bound().act, r"a class, a function law.*; got the bound method Bound\.act\(now, state, reference\)"),
+        (lambda state, reference: state, r"a class, a function law.*; got the function .*<lambda>\(state, reference\)"),
         (functools.partial(Gentle, 0.5), "named arguments alone"),
         (functools.partial(Gentle, shade=0.5), "takes no argument 'shade'; did you mean 'share'"),
     ],
