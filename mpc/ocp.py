@@ -11,6 +11,7 @@ constraints, each a value.  What is built from a problem walks the rows of all i
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -233,7 +234,7 @@ def predicted(problem: Problem, query: Query, plan: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Unanswered:
-    """The first problem of a flight that had no answer; `mpc.diagnosis` explains why.
+    """The first problem of a flight that had no answer, or whose SQP did not converge; `mpc.diagnosis` explains why.
 
     Attributes:
         problem: what was to be solved.
@@ -241,6 +242,7 @@ class Unanswered:
         status: what spoke against the answer.
         time: t_k, the period's begin [s].
         delay: from there to the instant of x(k) [s].
+        converges: where sequential quadratic programming did not converge, whether it does within so many iterations.
     """
 
     problem: Problem
@@ -248,6 +250,7 @@ class Unanswered:
     status: str
     time: float
     delay: float = 0.0
+    converges: Callable[[int], bool] | None = None
 
     def __post_init__(self) -> None:
         query = self.query

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,7 +17,10 @@ SOLVED: Final = "solved"  # status of a period whose optimum a QP solver or the 
 UNCONSTRAINED: Final = "unconstrained"
 """Status of a period whose unconstrained optimum satisfies every constraint, and so is the constrained one too."""
 COMMANDED: Final = "commanded"  # status of a period in which a law without a solver commanded
-ACCEPTED: Final = frozenset({SOLVED, UNCONSTRAINED, COMMANDED})  # the statuses whose command is the law's own
+NOT_CONVERGED: Final = "not_converged"
+"""Status of a period whose QP was solved, but whose plan does not follow the nonlinear dynamics that it linearises."""
+OPTIMAL: Final = frozenset({SOLVED, UNCONSTRAINED, COMMANDED})  # the statuses whose command is the law's own answer
+ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}  # the statuses whose command is flown as answered
 MISSED: Final = "missed"
 """Status of a period whose command came after the next period's begin: the one before it went on acting."""
 GAIN: Final = "gain"  # who answered a period: the unconstrained optimum, a product with constant gains
@@ -97,6 +100,16 @@ class InnerLoop(Protocol):
         ...
 
 
+class SQP(NamedTuple):
+    """How far sequential quadratic programming is from convergence, in the model's own units: m, m/s, rad/s and shares.
+
+    A solved QP says nothing about either.
+    """
+
+    defect: float  # largest |x_{i+1} - f(x_i, u_i)| of the plan, over its nodes and the states' components
+    step: float  # largest change of a state or an input in the last iteration
+
+
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """A controller's answer for one period, and how it was found.
@@ -104,8 +117,8 @@ class Command:
     Attributes:
         speeds: (4,) rotor speeds to hold for the period [rad/s].
         plan: (N, 4) planned speeds, `plan[0]` being this period's [rad/s].
-        status: `solved`, `unconstrained` or `commanded` (`ACCEPTED`), `landed` or `crashed` where rotors are stopped,
-            or what the back end calls what went wrong.
+        status: `solved`, `unconstrained`, `commanded` or `not_converged` (`ACCEPTED`), `landed` or `crashed` where
+            rotors are stopped, or what the back end calls what went wrong.
         answered_by: who found `speeds`: `gain`, `active-set`, a QP solver by its name, `law`, `fallback` or `stopped`.
         iterations: those of whoever answered; of the refused answer in a fallback; 0 for a closed form.
         active: number of constraints active at the optimum.
@@ -120,6 +133,7 @@ class Command:
         kkt_complementarity: largest product of a multiplier and the distance to its bound, likewise.
         kkt_dual: largest multiplier whose sign belongs to no bound, likewise.
         solve_s: wall time inside the solver [s].
+        sqp: residual of sequential quadratic programming; None for laws without.
         inner: the inner loop that carries out commands from now on; None for rotors that hold `speeds`.
 
     Examples:
@@ -145,6 +159,7 @@ class Command:
     kkt_complementarity: float = math.nan
     kkt_dual: float = math.nan
     solve_s: float = 0.0
+    sqp: SQP | None = None
     inner: InnerLoop | None = None
 
 

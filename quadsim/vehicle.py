@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Final, NoReturn, get_type_hints
@@ -20,6 +20,8 @@ N_ROTORS: Final = 4
 OfRotors = Annotated[tuple[Number, ...], Len(N_ROTORS, N_ROTORS)]
 SMALLEST, LARGEST = 1e-12, 1e6
 """Magnitudes that a vehicle's numbers may have; MuJoCo refuses smaller inertias, and arithmetic larger ones."""
+SLOWEST_ROTOR: Final = 1.0
+"""Longest time constant of a rotor [s]; propellers of 30 inch have some 0.3 s."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +88,9 @@ class Vehicle:
                 self._check_vector(name, 3, positive=True)
             elif getattr(self, name) is not None:
                 self._check_number(name, getattr(self, name), positive=True)
+        for name in ("rotor_rise", "rotor_fall"):
+            if (getattr(self, name) or 0.0) > SLOWEST_ROTOR:
+                self._refuse(name, f"above 0 and at most {SLOWEST_ROTOR:g} s, usually 0.01 to 0.3 s")
         if any(abs(spin) != 1 for spin in self.rotor_spins):
             self._refuse("rotor_spins", "four values, each 1 or -1")
         if 2.0 * max(self.inertia) > sum(self.inertia) * (1.0 + 1e-12):
@@ -97,15 +102,26 @@ class Vehicle:
         raise ParameterError("vehicle", name, getattr(self, name), rule)
 
     def _check_layout(self) -> None:
-        b, d = self.thrust_coefficient, self.drag_coefficient
-        scale = np.array([b, b * self.arm_length, b * self.arm_length, d])
-        unit_allocation = self.allocation / scale[:, None]
+        rule = self._layout_problem(self.rotor_spins)
+        if rule is None:
+            return
+        alternating = np.empty(N_ROTORS, int)
+        alternating[np.argsort(np.mod(self.rotor_azimuths, 360.0), kind="stable")] = (1, -1, 1, -1)
+        alternating *= alternating[0] * int(self.rotor_spins[0])
+        if self._layout_problem(alternating) is None:
+            expected = tuple(alternating.tolist())
+            self._refuse("rotor_spins", f"alternating around the airframe, so that yaw is controlled: {expected}")
+        self._refuse("rotor_azimuths", rule)
+
+    def _layout_problem(self, spins: Sequence[float] | Array) -> str | None:
+        """What the layout should be and is not, with these spins; None where it is."""
+        x, y, _ = self.rotor_positions.T / self.arm_length
+        unit_allocation = np.stack([np.ones(N_ROTORS), y, -x, np.array(spins, float)])
         if abs(np.linalg.det(unit_allocation)) < 1e-9:
-            self._refuse("rotor_azimuths", "a layout that controls roll, pitch, yaw and thrust")
+            return "a layout that controls roll, pitch, yaw and thrust"
         if np.abs(unit_allocation[1:].sum(axis=1)).max() > 1e-9:
-            layout = {"rotor_azimuths": self.rotor_azimuths, "rotor_spins": self.rotor_spins}
-            rule = "a layout whose torques cancel when all rotors turn alike, so that it can hover"
-            raise ParameterError("vehicle", "rotor_azimuths, rotor_spins", layout, rule)
+            return "a layout whose torques cancel when all rotors turn alike, so that it can hover"
+        return None
 
     def _check_hover(self) -> None:
         hover, weight = self.hover_speed, self.mass * self.gravity

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -37,6 +37,8 @@ WIDER: Final = (1.0, 1.02, 1.1, 1.5)
 bound may be tightened by more."""
 SOFT: Final[tuple[dict[str, float], ...]] = ({}, {"linear": 1e4}, {"linear": 1e3}, {"linear": 1e2})
 """Prices of softness, the usual one first; far from feasible, a solver gives up at high ones."""
+ITERATIONS: Final = (2, 3, 5, 10, 20, 50, 100)
+"""Numbers of iterations that are tried where sequential quadratic programming did not converge."""
 _ROTORS: Final = {1: "slew", 2: "speed"}
 """Fields of `input_bounds` by their constraint's place, as `mpc.constraints.Bounds.constraints` has them."""
 
@@ -65,6 +67,8 @@ def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> di
         scenario: what was flown.
         vehicle: the modelled vehicle.
     """
+    if unanswered.converges is not None:
+        return _unconverged(unanswered, unanswered.converges, getattr(scenario.controller, "iterations", 1))
     spec = scenario.controller
     case = (_Case if isinstance(spec, BoundedSpec) else _OwnCase)(unanswered, scenario, spec, vehicle)
     conflict = find_conflict(unanswered)
@@ -79,6 +83,24 @@ def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> di
     }
     advice = case.widenings(conflict) if isinstance(case, _OwnCase) else _advice(found)
     return {**found, "sentence": _sentence(found), "advice": advice}
+
+
+def _unconverged(unanswered: Unanswered, converges: Callable[[int], bool], before: int) -> dict[str, Any]:
+    """`diagnose` where the QPs were solved, and sequential quadratic programming did not converge."""
+    enough = next((count for count in ITERATIONS if count > before and converges(count)), None)
+    suggestions = [] if enough is None else [{"settings": {"controller.iterations": enough}, "after": None}]
+    more = f"to try: controller.iterations = {enough}, which takes up to {enough} times as long"
+    advice = f"it does not within {ITERATIONS[-1]} iterations either" if enough is None else more
+    return {
+        "time": round(unanswered.time, 9),
+        "status": unanswered.status,
+        "feasible": True,
+        "conflict": [],
+        "suggestions": suggestions,
+        "sentence": f"the QP was solved at t = {unanswered.time:.2f} s, but the SQP did not converge: the plan does "
+        "not follow the nonlinear dynamics",
+        "advice": advice,
+    }
 
 
 class _Case:

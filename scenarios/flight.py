@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import MissingPackageError, OutputError, QuadsimError, UnknownNameError, printable
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import HELD, SIGNALS, Finding, margins_at, margins_sampled
@@ -139,13 +140,15 @@ class Flight:
     def diagnosis(self) -> Mapping[str, Any] | None:
         """Why the first QP without an answer had none, and what would help; None where all QPs had one.
 
+        Where all had one, and a constraint does not hold: the first whose SQP did not converge, if any.
+
         `sentence` and `advice` are for people; the other entries are explained in `docs/controllers.md`.
         """
         if self.recorded is not None:
             return self.recorded.get("diagnosis")
         from scenarios.diagnosis import diagnose
 
-        if self.unanswered is None:
+        if self.unanswered is None or (self.unanswered.status == NOT_CONVERGED and self.satisfied):
             return None
         spec = self.scenario.controller_at(self.unanswered.time)
         posed = self.scenario.model_copy(update={"controller": spec, "events": []})

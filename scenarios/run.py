@@ -30,7 +30,7 @@ from scenarios.courses.make import build_motion, follow_course
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.limits import build_limits
 from scenarios.parts.effects import build_computation
-from scenarios.parts.live import FlightEvents, Successor, unanswered_by
+from scenarios.parts.live import FlightEvents, Successor
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.neutral import prepared
 from scenarios.parts.randomness import generator
@@ -318,7 +318,7 @@ class StartedFlight:
             solver=self._law[1],
             simulate_s=self._simulate_s,
             tallies={} if self._navigation is None else self._navigation.tallies,
-            unanswered=self._events.unanswered or unanswered_by(self.loop.controller),
+            unanswered=self._events.first_unanswered(),
         )
 
     def _build(self, spec: ControllerSpec) -> Controller:

@@ -205,7 +205,7 @@ class Guarded:
         if plan is None:
             plan, level = self._hover(known, acting)
         spent = answer or Command(speeds=plan[0], plan=plan)
-        spent = replace(spent, status=status, answered_by=FALLBACK, fallback=level)
+        spent = replace(spent, status=status, answered_by=FALLBACK, fallback=level, sqp=None)
         return replace(spent, speeds=plan[0].copy(), plan=plan, active=0, slack=0.0)
 
     def _shifted(self, known: Array, acting: Array, *, lost: bool) -> Array | None:

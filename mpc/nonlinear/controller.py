@@ -13,8 +13,9 @@ stored state.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -34,6 +35,7 @@ from mpc.nonlinear.rigidbody import (
     V,
     W,
     advance_nodes,
+    defects,
     drag_acceleration,
     linearise_nodes,
     product,
@@ -49,7 +51,7 @@ from mpc.relinearised import Relinearised
 from mpc.solvers import INVALID_DATA, Answer
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
-from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
+from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, SQP, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import (
     ANGLE_RATES,
@@ -73,6 +75,9 @@ OUTSIDE: Final = 1e-6
 """How far outside its bounds an input, a share of the largest, may be answered; it is then moved onto them."""
 SHORTEST: Final = 0.1
 """Least share of a Gauss-Newton step that Aitken's relaxation takes where several are."""
+CONVERGED: Final = 0.1
+"""Largest dynamics defect of a plan that counts as converged (`quadsim.controller.SQP`).  Flights of the library exceed
+it in at most 9 periods, after steps of the course and upside down; one that tumbles, in all (docs/controllers.md)."""
 PATIENCE: Final = 8
 """After so many steps, none of them shorter than the shortest before, half as much of each is taken at most."""
 TILT_SIDES: Final = 12
@@ -112,7 +117,8 @@ class NonlinearMPC:
 
     Attributes:
         problem: the optimisation; its states and inputs are those of the module.
-        unanswered: the first period since `reset` whose QP had no answer; None where all had.
+        unanswered: the first period since `reset` whose QP had no answer; where all had, the first whose plan had not
+            converged; None where all had.
 
     Raises:
         ParameterError: a number is not possible.
@@ -132,6 +138,7 @@ class NonlinearMPC:
         kkt_every: int = KKT_EVERY,
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
+        self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
         self._bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
         self._nodes = settings.horizon
         self.horizon = settings.horizon * settings.stride
@@ -339,17 +346,27 @@ class NonlinearMPC:
                 self._follow(self._ramp, now.time, measured)
             self._last = now.time, measured
         nodes = self._balanced(nodes)
-        query, answer, problem = self._iterate(now.time, measured, nodes)
+        start = {"_plan": self._plan, "_acting": self._acting, "_model": self._model}
+        query, answer, problem, sqp = self._iterate(now.time, measured, nodes)
         answer, status = self._check(problem, query, answer, self._rejection(answer))
         if status is not None:
-            if status != INVALID_DATA and self.unanswered is None:
+            if status != INVALID_DATA and (self.unanswered is None or self.unanswered.converges is not None):
                 self.unanswered = Unanswered(problem=problem, query=query, status=status, time=now.time)
             self._plan = None
             return self._refuse(status, answer)
+        assert sqp is not None
+        status = answer.solution.status
+        if sqp.defect > CONVERGED:
+            status = NOT_CONVERGED
+            if self.unanswered is None:
+                converges = partial(_converges, self._again, self.settings, start, now.time, measured, nodes)
+                self.unanswered = Unanswered(
+                    problem=problem, query=query, status=status, time=now.time, converges=converges
+                )
         speeds = self._speeds(self._clip(answer.plan))
         self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
         plan = speeds if self.settings.stride == 1 else np.repeat(speeds, self.settings.stride, axis=0)
-        return command_of(speeds[0], plan, answer.solution.status, answer)
+        return replace(command_of(speeds[0], plan, status, answer), sqp=sqp)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the disturbance estimated last, and without rotor lag."""
@@ -479,7 +496,7 @@ class NonlinearMPC:
         assert query.rest is not None
         return self._qp.solve(*query.steps, *query[:3], query.rest)
 
-    def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem]:
+    def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem, SQP | None]:
         """Steps of sequential quadratic programming from the stored plan; the last problem is that of the answer."""
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
         inputs = self._model.shares(nodes.thrusts)
@@ -516,8 +533,8 @@ class NonlinearMPC:
             found = np.concatenate([measured[None], states])
             found[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
             self._plan = found, plan
+            moved = max(np.abs(found - x).max(), np.abs(plan - u).max())
             if self.settings.iterations > 1:
-                moved = max(np.abs(found - x).max(), np.abs(plan - u).max())
                 if moved <= self.settings.tolerance:
                     break
                 # Full Gauss-Newton steps may oscillate: the share of them that is taken follows from how
@@ -532,7 +549,10 @@ class NonlinearMPC:
                 share = min(max(share / max(undone, SHORTEST), SHORTEST), largest)
                 last = step
                 self._plan = x + share * (found - x), u + share * (plan - u)
-        return query, answer, problem
+        if self._qp.last is None:
+            return query, answer, problem, None
+        defect = np.abs(defects(self._model, found, plan)).max()
+        return query, answer, problem, SQP(float(defect), float(moved))
 
     def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:
         """A, B, c along a plan of states (N + 1, n) and inputs (N, 4)."""
@@ -569,3 +589,22 @@ class NonlinearMPC:
 
     def _refuse(self, status: str, answer: Answer | None = None) -> Command:
         return refused(self._acting, self.horizon, status, answer)
+
+
+def _converges(
+    make: Callable[..., NonlinearMPC],
+    settings: NonlinearSettings,
+    start: Mapping[str, object],
+    time: float,
+    measured: Array,
+    nodes: Nodes,
+    iterations: int,
+) -> bool:
+    """Whether a period's plan converges within so many iterations, from a law's attributes before it.
+
+    All but the number of iterations is data of that period, so that a flight can be pickled.
+    """
+    law = make(settings=replace(settings, iterations=iterations))
+    vars(law).update(start)
+    _, answer, _, sqp = law._iterate(time, measured, nodes)
+    return law._rejection(answer) is None and sqp is not None and sqp.defect <= CONVERGED

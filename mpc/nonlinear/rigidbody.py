@@ -194,20 +194,44 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
     Returns:
         (M, n, n), (M, n, 4) and (M, n): exact derivatives of the Runge-Kutta map; the end is not multiplied by frames.
     """
-    M, n, lagging = len(x), model.n, model.rotor_lag is not None
-    m = n - 3 + N_ROTORS + 1  # columns: q, v, omega, rotors, inputs, and the value
-    Y = np.empty((M, _TURNING, m))
+    m = model.n - 3 + N_ROTORS + 1  # columns: q, v, omega, rotors, inputs, and the value
+    Y = np.empty((len(x), _TURNING, m))
     Y[:] = _START[:, :m]
     if frames is not None:
-        Y[:, _q, _q] = frames[:M].transpose(0, 2, 1)
+        Y[:, _q, _q] = frames[:-1].transpose(0, 2, 1)
     Y[:, :, -1] = x[:, 3:N_BODY]
+    Y, travelled = _integrate(model, _drives(model, x, u), Y)
+    return _assemble(model, x, u, Y, travelled, frames)
+
+
+def defects(model: RigidBody, x: Array, u: Array) -> Array:
+    """(N, n) how far a plan's states x (N + 1, n) are from where its inputs u (N, 4) take each one before, signed."""
+    Y, travelled = _integrate(model, _drives(model, x[:-1], u)[..., -1:], x[:-1, 3:N_BODY, None])
+    end = [x[:-1, P] + travelled[:, :, 0], Y[:, :, 0]]
+    if model.rotor_lag is not None:
+        end.append(_rotors_after(model, x[:-1], u))
+    return x[1:] - np.concatenate(end, axis=1)
+
+
+def _integrate(model: RigidBody, drives: Array, Y: Array) -> tuple[Array, Array]:
+    """Take columns through the Runge-Kutta stages: derivatives of (q, v, omega), and last its value, or that alone.
+
+    Args:
+        model: what moves.
+        drives: of `_drives`, for as many of the last columns as it has them.
+        Y: (M, 10, m) at the beginning.
+
+    Returns:
+        (M, 10, m) at the end, and (M, 3, m) how far position has moved.
+    """
+    M, _, m = Y.shape
+    lagging, driven = model.rotor_lag is not None, slice(m - drives.shape[-1], m)
     h = model.step / model.substeps
-    drives = _drives(model, x, u)
     constant = model.acceleration - model.gravity * _UP
     z, G = np.empty((M, 11)), np.zeros((M, _TURNING, m))
     # Views are taken once: at ten nodes a step is made of calls, not of sums.
     z_q, z_w, z_Tq, features = z[:, :4], z[:, 4:7], z[:, 7:], model.features
-    G_v, G_end, G_w = G[:, _v, _TURNING:], G[:, _v, -1], G[:, _w, _TURNING:]
+    G_v, G_end, G_w = G[:, _v, driven], G[:, _v, -1], G[:, _w, driven]
 
     def slope(k: int, Y: Array) -> Array:
         state, drive = Y[:, :, -1], drives[k if lagging else 0]
@@ -246,7 +270,7 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
         first *= h / 6.0
         first += Y
         Y = first
-    return _assemble(model, x, u, Y, travelled, frames)
+    return Y, travelled
 
 
 def _assemble(
@@ -266,8 +290,14 @@ def _assemble(
         rotors, decay = np.arange(N_BODY, n), math.exp(-model.step / model.rotor_lag)
         A[:, rotors, rotors] = decay
         B[:, rotors] = (1.0 - decay) * np.eye(N_ROTORS)
-        end[:, N_BODY:] = u + decay * (x[:, N_BODY:] - u)
+        end[:, N_BODY:] = _rotors_after(model, x, u)
     return A, B, end
+
+
+def _rotors_after(model: RigidBody, x: Array, u: Array) -> Array:
+    """(M, 4) the rotors' states after a step; only where they lag."""
+    assert model.rotor_lag is not None
+    return u + math.exp(-model.step / model.rotor_lag) * (x[:, N_BODY:] - u)
 
 
 def _drives(model: RigidBody, x: Array, u: Array) -> Array:

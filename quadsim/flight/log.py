@@ -27,6 +27,8 @@ QUATERNION: Final = {f"q{axis}": "-" for axis in "wxyz"}
 """Columns of the attitude, body to world, with their units; only of flights that may turn upside down."""
 BODY_RATES: Final = {f"body_rate_{axis}": "rad/s" for axis in "xyz"}
 """Columns of the body rates, with their units; likewise."""
+SQP_RESIDUAL: Final = {"sqp_defect": "-", "sqp_step": "-"}
+"""Columns of `quadsim.controller.SQP`, with their units; only of flights by sequential quadratic programming."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +59,7 @@ class ControlLog:
     delay: Array  # (K,) simulated time from the measurement to the command [s]
     attitude: Array | None = None  # (K, 4) quaternion wxyz as measured, sign continuous; None where Euler angles do
     body_rates: Array | None = None  # (K, 3) as measured [rad/s]; None where Euler angles do
+    sqp: Array | None = None  # (K, 2) of `quadsim.controller.SQP`, NaN in periods without; None where all are
 
     @property
     def measured_perfectly(self) -> bool:

@@ -20,6 +20,7 @@ from quadsim.flight.log import (
     BODY_RATES,
     QUATERNION,
     RESIDUALS,
+    SQP_RESIDUAL,
     WIND,
     WRENCH,
     ControlLog,
@@ -67,7 +68,8 @@ def _table(columns: Sequence[_Column], metadata: Mapping[str, str]) -> pa.Table:
     for name, unit, values in columns:
         array = values if isinstance(values, pa.Array) else pa.array(values, from_pandas=name in RESIDUALS)
         arrays.append(array)
-        schema.append(pa.field(name, array.type, nullable=name in RESIDUALS, metadata={"unit": unit}))
+        nullable = name in RESIDUALS or name in SQP_RESIDUAL
+        schema.append(pa.field(name, array.type, nullable=nullable, metadata={"unit": unit}))
     return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata=dict(metadata)))
 
 
@@ -84,6 +86,7 @@ def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
         *((name, unit, getattr(log, name)) for name, unit in _NUMBERS.items()),
         *([] if log.measured_perfectly else _state_columns(log.truth, _TRUE)),
         *_optional((log.attitude, QUATERNION), (log.body_rates, BODY_RATES)),
+        *((name, unit, pa.array(rows, from_pandas=True)) for name, unit, rows in _optional((log.sqp, SQP_RESIDUAL))),
     ]
     before = ",".join(repr(float(speed)) for speed in log.speeds_before)
     return _table(columns, {**metadata, "speeds_before": before})
@@ -160,7 +163,7 @@ def _stack_if_there(table: pa.Table, names: Sequence[str]) -> Array | None:
 
 def _numbers(table: pa.Table, name: str, kind: type = np.float64) -> np.ndarray[Any, Any]:
     column = table.column(name)
-    if column.null_count and name not in RESIDUALS:
+    if column.null_count and name not in RESIDUALS and name not in SQP_RESIDUAL:
         raise ValueError(f"{name} has gaps")
     return np.asarray(column.to_numpy(), dtype=kind)
 
@@ -197,6 +200,7 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
             **{name: _numbers(flight, name) for name in _NUMBERS},
             attitude=_stack_if_there(flight, list(QUATERNION)),
             body_rates=_stack_if_there(flight, list(BODY_RATES)),
+            sqp=_stack_if_there(flight, list(SQP_RESIDUAL)),
         )
         plant_log = PlantLog(
             t=_numbers(plant, "t"),

@@ -474,6 +474,7 @@ def _control_log(samples: list[Sample], initial_speeds: Array, period: float) ->
 
     fallback = column("fallback", np.int64)
     late = np.array([sample.missed for sample in samples], dtype=bool)
+    residuals = [sample.command.sqp for sample in samples]
     return ControlLog(
         t=_times(len(samples), period),
         state=np.array([each.state for each in observed], float).reshape(-1, N_STATES),
@@ -492,6 +493,7 @@ def _control_log(samples: list[Sample], initial_speeds: Array, period: float) ->
         slack=column("slack", float),
         **{name: column(name, float) for name in RESIDUALS},
         delay=np.array([sample.delay for sample in samples], float),
+        sqp=np.array([residual or (math.nan, math.nan) for residual in residuals]) if any(residuals) else None,
     )
 
 

@@ -136,7 +136,7 @@ def first_scenario(
     entries = (
         Entry("", "name", name),
         Entry("", "description", _description(course, vehicle, tuning)),
-        Entry("", "duration", duration, "s"),
+        *([] if duration is None else [Entry("", "duration", duration, "s")]),
         Entry("", "control_period", tuning.period, why),
         Entry("vehicle", "file", file, "made for its numbers: remake this file when they change"),
         Entry("initial", "position", [0.0, 0.0, 1.0], "m, world; at rest"),
@@ -197,8 +197,8 @@ def _eight_limit(vehicle: Vehicle, tuning: Tuning) -> str:
     return "the largest acceleration within the tilt bound"
 
 
-def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[list[Entry], float, float]:
-    """The lines of `[reference]`, the flight's duration [s], and the course's size [m]."""
+def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[list[Entry], float | None, float]:
+    """The lines of `[reference]`, the flight's duration [s], None to the end of the course, and its size [m]."""
     if course == "hover":
         why = "no windows: every axis stays at its initial position, yaw at 0"
         return [Entry("reference", "", None, why)], 4.0, STEP
@@ -226,7 +226,7 @@ def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[list[Entry],
         Entry("reference", "period", turn, why),
         Entry("reference", "ramp", ramp, "s, half a turn to gain its speed, and to lose it"),
     ]
-    return found, _later(1.0 + turn + ramp + 1.0), length
+    return found, None, length
 
 
 def _robust(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:

@@ -23,7 +23,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.controller import ACCEPTED
+from quadsim.controller import OPTIMAL
 from quadsim.errors import InputError, MissingPackageError, OutputError, ParameterError
 from quadsim.flight.audit import Limit
 from quadsim.report.palette import BOUND, LINES
@@ -573,7 +573,7 @@ class Page:
         command, deadline = sample.command, 1e3 * self._session.period
         step = 1e3 * sample.step_s
         worst = self._history[-1] if self._history else (0.0,) * 11
-        mark = "" if command.status in ACCEPTED else ' class="bad"'
+        mark = "" if command.status in OPTIMAL else ' class="bad"'
         back = "" if command.fallback == 0 else f' <span class="bad">fallback {command.fallback}</span>'
         rows = [
             f"<b>{frame.time:.2f} s</b> &times; {factor:.2f} of real time, "

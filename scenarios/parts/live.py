@@ -206,9 +206,14 @@ class FlightEvents:
             else:
                 self._switch(changed(self._spec, event.fields), ready)
 
+    def first_unanswered(self) -> Unanswered | None:
+        """Of all controllers so far: the first QP without an answer, or else the first SQP that did not converge."""
+        found = [each for each in (self.unanswered, unanswered_by(self._loop.controller)) if each is not None]
+        return min(found, key=lambda each: each.converges is not None, default=None)
+
     def _switch(self, spec: ControllerSpec, ready: Successor | None) -> None:
         found = ready if ready is not None and ready.spec == spec else self._built(spec)
-        self.unanswered = self.unanswered or unanswered_by(self._loop.controller)
+        self.unanswered = self.first_unanswered()
         self._loop.switch(found.controller)
         self._spec = spec
         self._loop.computation = self._computation(self.scenario)

@@ -96,7 +96,12 @@ def make_law(law: Any, spec: PluginSpec, vehicle: Vehicle, period: float) -> Plu
         if isinstance(code, type) or "vehicle" in inspect.signature(code).parameters:
             law = _call(code, spec, {"vehicle": vehicle}, period=period, horizon=spec.horizon)
         else:
-            _call(inspect.signature(code).bind, spec, dict.fromkeys(("now", "state", "reference")))
+            try:
+                inspect.signature(code).bind(None, None, None, **spec.settings)
+            except TypeError as error:
+                what = "bound method" if inspect.ismethod(code) else "function"
+                given = f"the {what} {code.__qualname__}{inspect.signature(code)}"
+                raise InputError(f"controller must be {_STEP}; got {given}: {error}") from error
             law = SimpleNamespace(step=functools.partial(code, **spec.settings), name=code.__name__)
     if not callable(getattr(law, "step", None)):
         raise ParameterError("controller", "type", f"{spec.type} ({law!r:.100})", _STEP)

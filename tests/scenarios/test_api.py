@@ -222,6 +222,7 @@ def test_a_law_from_a_file_flies_the_same(hover: Scenario, monkeypatch: pytest.M
     ("law", "message"),
     [
         (3.0, "a class or an object with a method step"),
+        (lambda state, reference: state, r"or a function law.*; got the function .*<lambda>\(state, reference\)"),
         (functools.partial(Gentle, 0.5), "named arguments alone"),
         (functools.partial(Gentle, shade=0.5), "unexpected keyword argument 'shade'"),
     ],

@@ -23,6 +23,7 @@ from mpc.constrained import ConstrainedMPC
 from mpc.diagnosis import find_conflict, has_answer
 from mpc.fallback.contract import Guarded
 from mpc.fallback.settings import FallbackSettings
+from mpc.nonlinear.controller import CONVERGED
 from mpc.ocp import Unanswered
 from quadsim.controller import ACCEPTED, Command, Controller, Moment
 from quadsim.errors import PlanExhaustedError
@@ -378,6 +379,43 @@ def test_the_example_of_the_documentation_is_what_a_flight_reports(fly_once: Cal
     sentence, advised = re.findall(r"```text\n(no answer .*)\n(to try: .*); \.\.\.\n```", text)[0]
     assert found["sentence"] == sentence
     assert found["advice"].startswith(advised)
+
+
+def test_a_flight_whose_sqp_does_not_converge_says_so_and_what_helps() -> None:
+    """Upside down the real-time iteration tumbles; every QP is solved, and the plans follow no dynamics."""
+    tumble = quadsim.load("nonlinear").replace(
+        {
+            "initial.euler": [180.0, 0.0, 0.0],
+            "lost.tilt": False,
+            "control_period": 0.02,
+            "controller.horizon": 40,
+            "duration": 1.5,
+        }
+    )
+    flight = quadsim.fly(tumble)
+    summary = flight.summary
+    assert summary["controller"]["statuses"] == {"not_converged": 75}
+    assert summary["controller"]["fallbacks"] == {"0": 75}
+    assert flight.log.control.sqp is not None
+    assert flight.log.control.sqp[:, 0].min() > CONVERGED
+    found = flight.diagnosis
+    assert found is not None
+    assert (found["time"], found["status"], found["feasible"], found["conflict"]) == (0.0, "not_converged", True, [])
+    assert "the SQP did not converge" in found["sentence"]
+    text = (Path(__file__).resolve().parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
+    assert f"{found['sentence']}\n{found['advice']}\n" in text
+    helped = quadsim.fly(tumble.replace(found["suggestions"][0]["settings"]))
+    assert helped.summary["controller"]["statuses"].get("not_converged", 0) == 0
+    assert np.abs(helped.state["roll"][-1]) < 0.1 < np.abs(flight.state["roll"][-1])
+
+
+def test_a_satisfied_flight_is_not_diagnosed_for_a_period_that_did_not_converge(
+    fly_once: Callable[..., Flight],
+) -> None:
+    flight = fly_once("inverted-start")
+    assert 0 < flight.log.control.status.count("not_converged") < 20
+    assert flight.outcome == "satisfied"
+    assert flight.diagnosis is None
 
 
 def test_fallback_counts_as_for_good_from_the_longest_time_on_one_shifted_plan() -> None:

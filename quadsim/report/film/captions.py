@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from PIL import Image
 
-from quadsim.controller import ACCEPTED, LAW, STOPPED, Phase, law_name
+from quadsim.controller import LAW, OPTIMAL, STOPPED, Phase, law_name
 from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import failure_sentences
@@ -139,7 +139,7 @@ class Overlay:
             phrases.append(f"by {control.answered_by[k]}")
         if control.iterations[k]:
             phrases += [f"{control.iterations[k]} iterations", f"{control.active[k]} active"]
-        good = fallback == 0 and status in ACCEPTED | {Phase.LANDED}
+        good = fallback == 0 and status in OPTIMAL | {Phase.LANDED}
         return "  ·  ".join(phrases), 14, GREEN if good else RED
 
     def _position(self, painter: Painter, x: float, y: float, i: int) -> None:

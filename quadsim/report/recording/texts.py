@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadsim.controller import ACCEPTED, Phase, counts
+from quadsim.controller import OPTIMAL, Phase, counts
 from quadsim.flight.audit import HELD
 from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
@@ -26,7 +26,7 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     import rerun as rr
 
     log = run.log.control
-    good = ACCEPTED | {Phase.LANDED}
+    good = OPTIMAL | {Phase.LANDED}
     events = [
         (
             t,

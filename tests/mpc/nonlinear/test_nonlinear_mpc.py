@@ -13,13 +13,13 @@ from scipy.optimize import minimize
 from mpc.answer import ActuatorBounds
 from mpc.constraints import Constraint
 from mpc.diagnosis import find_conflict
-from mpc.nonlinear.controller import NonlinearMPC
+from mpc.nonlinear.controller import CONVERGED, NonlinearMPC
 from mpc.nonlinear.reference import nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, advance_nodes, product, rigid_body, thrust_axis
 from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
 from mpc.observer import ObserverSettings
 from quadsim.assets import vehicle_path
-from quadsim.controller import ACCEPTED, Command, Moment, Phase
+from quadsim.controller import ACCEPTED, NOT_CONVERGED, OPTIMAL, Command, Moment, Phase
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
 from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array, quaternion_to_euler
@@ -77,6 +77,55 @@ def still(samples: int, attitude: Array, position: Array | None = None) -> Motio
     return Motion(
         position=where, velocity=nothing, acceleration=nothing, attitude=attitude, body_rates=nothing, thrusts=thrusts
     )
+
+
+# --- convergence of its SQP ----------------------------------------------------------------------------------------
+
+
+def test_its_residual_is_that_of_the_plan_that_is_commanded() -> None:
+    """States predicted by the QP against the model rolled out from each, which one step from hover does not follow."""
+    controller, x0 = law(horizon=20), at_rest((0.0, 1.0, 0.0, 0.0))
+    command = call(controller, x0)
+    assert command.sqp is not None
+    assert controller._plan is not None
+    states, inputs = controller._plan
+    np.testing.assert_allclose(controller._speeds(inputs)[0], command.plan[0])
+    np.testing.assert_array_equal(states[0], x0)
+    found = np.abs(states[1:] - advance_nodes(controller._model, states[:-1], inputs)).max()
+    assert command.sqp.defect == pytest.approx(found, rel=1e-9)
+    assert command.sqp.defect > CONVERGED
+    assert command.sqp.step > 1.0
+    assert command.status == NOT_CONVERGED
+    assert command.status in ACCEPTED - OPTIMAL
+    assert command.fallback == 0
+
+
+def test_more_iterations_converge_where_one_does_not() -> None:
+    x0 = at_rest((0.0, 1.0, 0.0, 0.0))
+    once, often = law(horizon=20), law(horizon=20, iterations=50)
+    command = call(often, x0)
+    assert command.sqp is not None
+    assert command.sqp.defect < 1e-6
+    assert command.status in OPTIMAL
+    assert often.unanswered is None
+    for k in range(3):  # the first period that did not converge is kept, and is solved again as it was posed
+        call(once, x0, k * PERIOD)
+    kept = once.unanswered
+    assert kept is not None
+    assert kept.converges is not None
+    assert (kept.time, kept.status) == (0.0, NOT_CONVERGED)
+    assert [kept.converges(count) for count in (1, 50)] == [False, True]
+
+
+def test_a_qp_without_an_answer_displaces_what_did_not_converge() -> None:
+    controller = law(horizon=20, largest_rates=(1.0, 1.0, 1.0))
+    call(controller, at_rest((0.0, 1.0, 0.0, 0.0)))
+    spinning = at_rest()
+    spinning[W] = 50.0
+    refused = call(controller, spinning, PERIOD)
+    assert refused.sqp is None
+    assert controller.unanswered is not None
+    assert controller.unanswered.status == refused.status not in ACCEPTED
 
 
 # --- its optimum ---------------------------------------------------------------------------------------------------

@@ -104,6 +104,18 @@ def test_what_a_flight_does_not_have_takes_no_column(tmp_path: Path) -> None:
     assert back.control.measured_perfectly
 
 
+def test_a_residual_that_was_not_computed_is_null(tmp_path: Path) -> None:
+    log = small_log(3)
+    write(tmp_path, log)
+    assert "sqp_defect" not in pq.read_schema(tmp_path / FLIGHT_FILE).names
+    sqp = np.array([[0.2, 1.0], [np.nan, np.nan], [0.0, 0.0]])
+    write(tmp_path, dataclasses.replace(log, control=dataclasses.replace(log.control, sqp=sqp)))
+    table = pq.read_table(tmp_path / FLIGHT_FILE)
+    assert table.column("sqp_defect").to_pylist() == [0.2, None, 0.0]
+    assert table.column("sqp_step").to_pylist() == [1.0, None, 0.0]
+    np.testing.assert_array_equal(read_log(tmp_path).control.sqp, sqp)
+
+
 def test_equal_flights_give_equal_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

@@ -18,6 +18,7 @@ from quadsim.vehicle import Vehicle, load_vehicle
 from scenarios.design.first_scenario import BASELINE_SHARE, COURSES, LAWS, first_scenario
 from scenarios.design.vehicle_template import vehicle_template
 from scenarios.loading import load_scenario, parse_scenario
+from scenarios.schema.course import FigureEightSpec
 from scenarios.schema.robust import RobustSpec
 
 ALL = {vehicle.name: vehicle for vehicle in vehicles()}
@@ -71,6 +72,18 @@ def test_the_file_states_what_is_flown(course: str, law: str) -> None:
     else:
         assert made.to_data()["controller"]["tilt"] <= BASELINE_SHARE * (bounds["roll"][1] or 0.0)
         assert "x_error" not in bounds
+
+
+def test_a_figure_eight_is_flown_to_its_end_however_long_it_takes() -> None:
+    """At twice the time of a turn, or in three turns, the flight ends with the course, not halfway."""
+    made = first_scenario(ALL["hummingbird"], "hummingbird", course="figure-eight").scenario
+    assert isinstance(made.reference, FigureEightSpec)
+    turn = made.reference.turn_time
+    for changes in ({}, {"reference.period": 2.0 * turn}, {"reference.turns": 3.0}, {"reference.start": 4.0}):
+        scenario = made.replace(changes)
+        assert isinstance(scenario.reference, FigureEightSpec)
+        assert 0.0 <= scenario.duration - scenario.reference.until < scenario.control_period
+    assert made.replace({"duration": 5.0, "reference.turns": 3.0}).duration == 5.0
 
 
 def test_every_number_of_the_controller_states_its_source() -> None:

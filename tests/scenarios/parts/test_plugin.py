@@ -296,7 +296,8 @@ WRONG = {
     "two arguments": (
         "def Hover(t, x): pass\n",
         None,
-        "controller: mine:Hover cannot be called with now, state, reference: TypeError: too many positional arguments",
+        "controller must be a class or an object with a method step(now, state, reference), or a function "
+        "law(now, state, reference); got the function Hover(t, x): too many positional arguments",
     ),
     "syntax": (
         "class Hover\n",
