@@ -16,6 +16,7 @@ from quadsim.flight import rundir
 from quadsim.outputs import real_path
 from quadsim.outputs.paths import require_inside
 from quadsim.sim.effects import Force
+from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller
 from scenarios.build import resolve as write_out
 from scenarios.flight import Flight, Outputs
@@ -23,7 +24,7 @@ from scenarios.loading import check_parts, load_scenario
 from scenarios.parts.plugin import build_force
 from scenarios.parts.randomness import generator
 from scenarios.parts.user_code import refer_to, refer_to_force, set_up, set_up_force
-from scenarios.parts.vehicle import build_vehicle
+from scenarios.parts.vehicle import build_actual, build_vehicle
 from scenarios.progress import Progress, reporting
 from scenarios.reaudit import Reaudit, reaudit, stored_scenario
 from scenarios.run import StartedFlight, fly_scenario, run_scenario
@@ -246,7 +247,8 @@ def _set_up(
         spec = refer_to(controller, scenario.controller.horizon)
         law = set_up(controller, spec, build_vehicle(scenario), scenario.control_period)
     if forces:
-        vehicle, rng = build_vehicle(scenario), generator(scenario.seed, "forces")
+        vehicle = build_actual(scenario, build_vehicle(scenario))
+        rng = generator(scenario.seed, "forces")
         own = [build_force(spec, vehicle, rng) for spec in scenario.forces]
         own += [set_up_force(force, vehicle, rng) for force in forces]
     check_parts(referring)
@@ -275,7 +277,7 @@ def read(directory: str | Path) -> Flight:
     law = run.summary["controller"]
     return Flight(
         scenario=stored_scenario(directory),
-        vehicle=run.vehicle,
+        vehicle=Vehicle(**run.summary["vehicle"]),
         log=run.log,
         findings=tuple(rundir.finding_from_json(entry) for entry in run.summary["constraints"]),
         controller=law["name"],

@@ -124,6 +124,7 @@ FORM: Final = {
         }
     ),
     "vehicle": _VEHICLE,
+    "actual": Optional(_VEHICLE),
     "wall_s": {"simulate": NUMBER, "total": NUMBER},
     "versions": Optional(Each(str)),
     "machine": Optional({"system": str, "processor": str, "cores": (int, type(None))}),

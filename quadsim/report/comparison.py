@@ -277,6 +277,13 @@ def _violation(entry: Summary) -> Cell:
     return Cell(text=format_number(seconds), mark=_verdict_mark(entry) if seconds > 0.0 else Mark.NONE)
 
 
+def mismatch(summary: Summary) -> tuple[str, ...]:
+    """The numbers of the vehicle that the controller has wrong, as one text; none where it has none wrong."""
+    actual, modelled = summary.get("actual", {}), summary["vehicle"]
+    wrong = [f"{name} {modelled[name]} for {value}" for name, value in actual.items() if value != modelled[name]]
+    return (", ".join(wrong),) if wrong else ()
+
+
 def _text(value: Callable[[Summary], object]) -> Callable[[Summary], Cell]:
     return lambda summary: Cell(text=str(value(summary)))
 
@@ -333,8 +340,8 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
     ("controller", "", _text(lambda summary: law_name(summary["controller"].get("name", ABSENT)))),
     ("solver", "", _text(lambda summary: summary["controller"].get("solver") or "closed form")),
     ("horizon", "periods", _text(lambda summary: summary["controller"].get("horizon", ABSENT))),
-    ("vehicle", "", _text(lambda summary: summary["vehicle"]["name"])),
-    ("mass", "kg", _number("vehicle", "mass")),
+    ("vehicle", "", _text(lambda summary: ", modelled with ".join([summary["vehicle"]["name"], *mismatch(summary)]))),
+    ("mass", "kg", _text(lambda summary: format_number(summary.get("actual", summary["vehicle"])["mass"]))),
     ("seed", "", _text(lambda summary: summary.get("seed", ABSENT))),
 )
 _COURSE: Final[tuple[_Line, ...]] = (

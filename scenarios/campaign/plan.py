@@ -236,12 +236,24 @@ def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *,
     Raises:
         InputError: what comes of it is no scenario.
     """
+    data = _with_actual(data, [field for entry, _ in changes for field in entry.fields])
     after: dict[str, Any] = merge(data, {})
     for entry, value in changes:
         for field in entry.fields:
             new = _scaled(data, entry, field, value, parse, table) if entry.relative else value
             set_field(after, field, new, source=f"{table}.{entry.name}.fields")
     return parse(after)
+
+
+def _with_actual(data: Mapping[str, Any], fields: Iterable[str]) -> dict[str, Any]:
+    """The scenario's tables with the fields of `[actual]` that are drawn, which are as modelled where none is given."""
+    found = merge(data, {})
+    for field in fields:
+        table, _, rest = field.partition(".")
+        name = rest.partition(".")[0]
+        if table == "actual" and name in data["vehicle"]:
+            found.setdefault("actual", {}).setdefault(name, data["vehicle"][name])
+    return found
 
 
 def check_ends(entries: Iterable[VaryBase], check: Callable[[VaryBase, Value], object], *, table: str) -> None:
