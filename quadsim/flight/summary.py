@@ -17,9 +17,12 @@ from quadsim.state import REFERENCE_NAMES, STATE_NAMES
 SUMMARY_FILE: Final = "summary.json"
 
 _WHAT: Final = "a run's summary"
-_COURSE: Final = dict.fromkeys(
-    ("tilt", "velocity", "acceleration", "yaw", "yaw_rate", "rotor_min", "rotor_max", "thrust_to_weight"), NUMBER
-)
+_COURSE: Final = {
+    **dict.fromkeys(
+        ("tilt", "velocity", "acceleration", "yaw", "yaw_rate", "rotor_min", "rotor_max", "thrust_to_weight"), NUMBER
+    ),
+    "thrust_min": Optional(NUMBER),
+}
 _CHANNELS: Final = dict.fromkeys(REFERENCE_NAMES, NUMBER)
 _STATES: Final = dict.fromkeys(STATE_NAMES, NUMBER)
 _SPREAD: Final = dict.fromkeys(("p50", "p95", "p99", "max"), NUMBER)

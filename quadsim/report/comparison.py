@@ -277,6 +277,13 @@ def _violation(entry: Summary) -> Cell:
     return Cell(text=format_number(seconds), mark=_verdict_mark(entry) if seconds > 0.0 else Mark.NONE)
 
 
+def lowest_speed(summary: Summary) -> Cell:
+    """The lowest rotor speed that the course requires; none where it requires a negative thrust."""
+    if any(problem.startswith("not flyable") for problem in nested(summary, "course", "problems") or ()):
+        return Cell(text="not flyable", mark=Mark.BAD)
+    return _number("course", "rotor_min")(summary)
+
+
 def mismatch(summary: Summary) -> tuple[str, ...]:
     """The numbers of the vehicle that the controller has wrong, as one text; none where it has none wrong."""
     actual, modelled = summary.get("actual", {}), summary["vehicle"]
@@ -347,7 +354,7 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
 _COURSE: Final[tuple[_Line, ...]] = (
     ("largest tilt required", "deg", _number("course", "tilt")),
     ("highest speed required", "m/s", _number("course", "velocity")),
-    ("lowest rotor speed required", "rad/s", _number("course", "rotor_min")),
+    ("lowest rotor speed required", "rad/s", lowest_speed),
     ("highest rotor speed required", "rad/s", _number("course", "rotor_max")),
     ("jumps", "", _listed("jumps", "at {:g} s", Mark.NONE)),
     ("beyond the bounds", "", _listed("problems", "{}", Mark.WARN)),

@@ -23,7 +23,7 @@ from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import apply_setting, get_field, set_field
+from scenarios.schema.settings import NOT_DESCRIBED, apply_setting, differences, get_field, note_changes, set_field
 from scenarios.shipped import campaign_path, scenario_path
 
 FIRST: Final = 5  # flights of which one at least has to be possible
@@ -183,6 +183,7 @@ def flown_scenario(spec: CampaignSpec, path: Path, settings: Sequence[str] = ())
     """
     file = scenario_path(spec.scenario)
     data = merge(read_scenario(file, scenario_path), spec.set)
+    note_changes(data, spec.set)
     drawn = {field: entry.name for entry in spec.vary if not entry.relative for field in entry.fields}
     for setting in settings:
         field = setting.partition("=")[0].strip()
@@ -198,6 +199,29 @@ def flown_scenario(spec: CampaignSpec, path: Path, settings: Sequence[str] = ())
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
     check_parts(scenario)
     return resolve_vehicle(scenario, build_vehicle(scenario))
+
+
+def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], ...]:
+    """The fields in which two campaigns' scenarios, draws and limits differ, with the value of each, None for absent.
+
+    Fields of the scenario that both draw are left out: their draws are compared.
+    """
+    drawn = _replaced(first) & _replaced(second)
+    found = differences(_compared(first), _compared(second))
+    return tuple(entry for entry in found if entry[0] not in drawn)
+
+
+def _compared(plan: Plan) -> dict[str, Any]:
+    """A campaign's tables, less what only names it."""
+    scenario = tomllib.loads(plan.scenario.to_toml())
+    vary = [entry.model_dump() for entry in plan.spec.vary]
+    own = plan.spec.model_dump(include={"sampling", "seed", "limits"})
+    return {**{key: value for key, value in scenario.items() if key not in NOT_DESCRIBED}, **own, "vary": vary}
+
+
+def _replaced(plan: Plan) -> set[str]:
+    """The fields of the scenario whose values each flight draws."""
+    return {field for entry in plan.spec.vary if not entry.relative for field in entry.fields}
 
 
 def locate(data: dict[str, Any], directory: Path) -> None:

@@ -19,6 +19,7 @@ from quadsim.flight.form import Optional, read_json
 from quadsim.outputs import Growing, digest, digest_of, growing, to_json
 from scenarios.campaign import manifest as records
 from scenarios.campaign.engine.protocol import Engine
+from scenarios.campaign.plan import plan_differences
 from scenarios.campaign.report.campaign_page import write_comparison_report
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE, Store
 from scenarios.campaign.results.table import Row
@@ -243,17 +244,18 @@ def _validate(
 ) -> TuningResult:
     """Fly the start and the answer on fresh draws, compare them, and write what came of it all."""
     best = found.answer.candidate
-    tables, folders = [], []
+    tables, folders, campaigns = [], [], []
     for candidate in dict.fromkeys((START, best)):
         folder = START_DIR if candidate == START else ANSWER_DIR.format(candidate)
         campaign = plan.of(found.candidates[candidate], name=f"{plan.spec.name}-{folder}", fresh=True)
         directory = files.path / folder
         folders.append(folder)
+        campaigns.append(campaign)
         resume = records.is_campaign(directory)
         tables.append(fly_campaign(campaign, directory, engine, resume=resume, report=report, watch=watch).table)
     comparison = None
     if best != START:
-        comparison = compare(tables[0], tables[1], NAMES)
+        comparison = compare(tables[0], tables[1], NAMES, differences=plan_differences(*campaigns))
     if comparison is not None and report:
         write_comparison_report(comparison, files.path / COMPARISON_DIR)
     summary = summarise(plan, found, tables[0], tables[-1])
