@@ -76,8 +76,8 @@ def note_change(data: dict[str, Any], path: str, value: Any) -> None:
     if not isinstance(description, str) or path in NOT_DESCRIBED:
         return
     text, _, noted = description.partition(_CHANGED)
-    changes = [change for change in noted.removesuffix(")").split("; ") if change]
-    changes = [change for change in changes if change.partition(" ")[0] != path]
+    earlier = noted.removesuffix(")").split("; ") if noted else []
+    changes = [change for change in earlier if not change.startswith(f"{path} = ")]
     changes.append(f"{path} = {shown(value)}")
     data["description"] = f"{text}{_CHANGED}{'; '.join(changes)})"
 
