@@ -15,13 +15,14 @@ from quadsim.flight import rundir
 from quadsim.flight.summary import require_inside
 from quadsim.outputs import absolute, adding
 from quadsim.sim.effects import Force
+from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller
 from scenarios.build import resolve as write_out
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import check_parts, load_scenario
 from scenarios.parts.plugin import import_plugin, make_force, make_law, refer_to
 from scenarios.parts.randomness import generator
-from scenarios.parts.vehicle import build_vehicle
+from scenarios.parts.vehicle import build_actual, build_vehicle
 from scenarios.progress import Progress, reporting
 from scenarios.reaudit import Reaudit, reaudit, stored_scenario
 from scenarios.run import StartedFlight, fly_scenario, run_scenario
@@ -248,7 +249,8 @@ def _set_up(
         spec = refer_to(controller, scenario.controller.horizon)
         law = make_law(controller, spec, build_vehicle(scenario), scenario.control_period)
     if forces:
-        vehicle, rng = build_vehicle(scenario), generator(scenario.seed, "forces")
+        vehicle = build_actual(scenario, build_vehicle(scenario))
+        rng = generator(scenario.seed, "forces")
         named = [(import_plugin(spec), spec) for spec in scenario.forces]
         named += zip(forces, referring.forces[len(named) :], strict=True)
         own = [make_force(force, spec, vehicle, rng) for force, spec in named]
@@ -278,7 +280,7 @@ def read(directory: str | Path) -> Flight:
     law = run.summary["controller"]
     return Flight(
         scenario=stored_scenario(directory),
-        vehicle=run.vehicle,
+        vehicle=Vehicle(**run.summary["vehicle"]),
         log=run.log,
         findings=tuple(rundir.finding_from_json(entry) for entry in run.summary["constraints"]),
         controller=law["name"],

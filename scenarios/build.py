@@ -17,18 +17,18 @@ from scenarios.parts.controllers import make_controller, make_problem
 from scenarios.parts.effects import build_changes, build_wind
 from scenarios.parts.plugin import import_plugin, make_force
 from scenarios.parts.randomness import generator
-from scenarios.parts.vehicle import resolve_vehicle
+from scenarios.parts.vehicle import actual_effects, build_actual, resolve_vehicle, saturates
 from scenarios.schema.optimisation import WeightedSpec
 from scenarios.schema.scenario import Scenario
 
 
 def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     """The scenario with every number that it leaves to its vehicle written out: its file alone defines the flight."""
-    return resolve_vehicle(scenario, vehicle).model_copy(update={"effects": scenario.effects.resolved(vehicle)})
+    return resolve_vehicle(scenario, vehicle).model_copy(update={"effects": actual_effects(scenario, vehicle)})
 
 
 def build_plant(scenario: Scenario, vehicle: Vehicle, forces: Sequence[Force] | None = None) -> Plant:
-    """The simulated vehicle, and what acts on it.
+    """The simulated vehicle as it really is, and what acts on it.
 
     Args:
         scenario: what is flown.
@@ -38,16 +38,16 @@ def build_plant(scenario: Scenario, vehicle: Vehicle, forces: Sequence[Force] | 
     Raises:
         InputError: a combination of effects is not possible, or a force cannot be imported.
     """
-    rng = generator(scenario.seed, "forces")
+    rng, actual = generator(scenario.seed, "forces"), build_actual(scenario, vehicle)
     return Plant(
-        vehicle,
+        actual,
         timestep=scenario.plant.timestep,
         integrator=scenario.plant.integrator,
-        limit_speeds=scenario.plant.limit_speeds,
-        effects=scenario.effects.resolved(vehicle),
+        limit_speeds=saturates(scenario),
+        effects=actual_effects(scenario, vehicle),
         changes=build_changes(scenario),
         wind=build_wind(scenario, vehicle),
-        forces=[make_force(import_plugin(spec), spec, vehicle, rng) for spec in scenario.forces]
+        forces=[make_force(import_plugin(spec), spec, actual, rng) for spec in scenario.forces]
         if forces is None
         else forces,
         obstacles=scenario.obstacles,
@@ -61,11 +61,12 @@ def build_ground(scenario: Scenario, vehicle: Vehicle) -> PhaseMonitor | None:
     there = ground is not None and ground.contact
     if not there and not scenario.obstacles:
         return None
+    actual = build_actual(scenario, vehicle)
     return PhaseMonitor(
-        outline(vehicle) if there else None,
+        outline(actual) if there else None,
         period=scenario.control_period,
         obstacles=scenario.obstacles,
-        radius=vehicle.enclosing_radius,
+        radius=actual.enclosing_radius,
     )
 
 

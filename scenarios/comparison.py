@@ -134,6 +134,7 @@ def compare_campaigns(
         InputError: they are not two finished campaigns.
         OutputError: the directory cannot be written.
     """
+    from scenarios.campaign.plan import plan_differences
     from scenarios.campaign.report.campaign_page import write_comparison_report
     from scenarios.campaign.results.store import FLIGHTS_FILE, read_flights
     from scenarios.campaign.statistics.comparison import compare
@@ -145,7 +146,7 @@ def compare_campaigns(
     names = (plans[0].spec.name, plans[1].spec.name)
     failures = (plans[0].spec.failure, plans[1].spec.failure)
     a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
-    comparison = compare(a, b, names, failures)
+    comparison = compare(a, b, names, failures, plan_differences(*plans))
     if out is not None:
         write_comparison_report(comparison, out, overwrite=overwrite)
     return comparison

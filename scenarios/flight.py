@@ -34,6 +34,7 @@ from scenarios.limits import audit_notes
 from scenarios.machine import machine, usable_cores, versions
 from scenarios.parts.effects import build_computation
 from scenarios.parts.story import story
+from scenarios.parts.vehicle import build_actual
 from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario, Verdict
 
@@ -80,7 +81,7 @@ class Flight:
 
     Attributes:
         scenario: resolved, with every number of its vehicle in it.
-        vehicle: what was flown.
+        vehicle: as modelled, what the controller knows.
         log: the flight as stacked arrays.
         findings: the audit, one per constraint of the scenario.
         controller: name of the control law.
@@ -159,6 +160,11 @@ class Flight:
         """What the audit found at the physics rate, one entry per constraint of the scenario."""
         return self.findings
 
+    @cached_property
+    def actual(self) -> Vehicle:
+        """The vehicle as it was flown: the modelled one, but for what the scenario's `[actual]` states."""
+        return build_actual(self.scenario, self.vehicle)
+
     @property
     def time(self) -> Array:
         """(K,) t_k of each control period [s]."""
@@ -227,7 +233,7 @@ class Flight:
         limits = tuple(finding.limit for finding in self.findings)
         directory = self.directory or Path(self.scenario.name)
         return rundir.Run(
-            directory=directory, summary=dict(self.summary), log=self.log, vehicle=self.vehicle, limits=limits
+            directory=directory, summary=dict(self.summary), log=self.log, vehicle=self.actual, limits=limits
         )
 
     def to_arrow(self, table: str = "flight") -> pa.Table:
@@ -435,8 +441,9 @@ def summarise(flight: Flight) -> dict[str, Any]:
         },
         **({"computation": metrics.computation(log.control)} if flown and build_computation(scenario) else {}),
         **({} if log.control.measured_perfectly else {"estimation": _estimation(flight)}),
-        **({"ground": metrics.ground(log, outline(flight.vehicle))} if flown and ground and ground.contact else {}),
+        **({"ground": metrics.ground(log, outline(flight.actual))} if flown and ground and ground.contact else {}),
         "vehicle": asdict(flight.vehicle),
+        **({"actual": asdict(flight.actual)} if flight.actual != flight.vehicle else {}),
         "wall_s": {"simulate": flight.simulate_s, "total": flight.simulate_s},
         "versions": versions(),
         "machine": machine(),

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
 from quadsim.report.table import format_number
 from scenarios.courses.windows import timed_regions
-from scenarios.parts.vehicle import build_vehicle
+from scenarios.parts.vehicle import build_actual, build_vehicle
 from scenarios.schema.nonlinear import NonlinearPartsSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
@@ -135,7 +135,7 @@ def space_limits(scenario: Scenario) -> tuple[SpaceLimit, ...]:
     regions = timed_regions(scenario)
     if not scenario.obstacles and not regions:
         return ()
-    radius = build_vehicle(scenario).enclosing_radius
+    radius = build_actual(scenario, build_vehicle(scenario)).enclosing_radius
     return (
         *(SpaceLimit(name=obstacle.name, shape=obstacle, radius=radius) for obstacle in scenario.obstacles),
         *(

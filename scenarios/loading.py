@@ -20,7 +20,7 @@ from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, build_motion, located
 from scenarios.limits import space_limits
 from scenarios.parts.effects import build_changes, check_changes, moving_air
-from scenarios.parts.vehicle import build_initial_state, build_vehicle
+from scenarios.parts.vehicle import actual_effects, build_actual, build_initial_state, build_vehicle
 from scenarios.schema.bases import read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec
 from scenarios.schema.plugin import located as located_controller
@@ -39,20 +39,21 @@ def check_parts(scenario: Scenario) -> None:
             flight starts below the floor, or in the air with rotors at rest.
     """
     vehicle = build_vehicle(scenario)
-    load = scenario.effects.resolved(vehicle).load or Load()
-    mass_properties(vehicle, load, load.payloads)
+    actual, effects = build_actual(scenario, vehicle), actual_effects(scenario, vehicle)
+    load = effects.load or Load()
+    mass_properties(actual, load, load.payloads)
     moving_air(scenario, vehicle)
     changes = build_changes(scenario)
     check_changes(scenario, vehicle, changes)
     if scenario.plant.integrator == "rk4":
-        check_free(scenario.effects.resolved(vehicle), changes, scenario.obstacles)
+        check_free(effects, changes, scenario.obstacles)
     course = build_course(scenario)
     if scenario.initial.on_reference and course.derivatives is None:
         rule = f"false where the course states positions alone, as one of type {scenario.reference.type} does"
         raise ParameterError("initial", "on_reference", True, rule)
     ground = scenario.effects.ground
     if ground is not None and (ground.contact or ground.effect):
-        _check_start(scenario, vehicle)
+        _check_start(scenario, actual)
     if limits := space_limits(scenario):
         start = build_initial_state(scenario, build_motion(scenario, vehicle))[None, list(POSITION)]
         for limit in limits:

@@ -34,7 +34,7 @@ from scenarios.parts.live import FlightEvents, Successor
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.neutral import prepared
 from scenarios.parts.randomness import generator
-from scenarios.parts.vehicle import build_initial_speeds, build_initial_state, build_vehicle
+from scenarios.parts.vehicle import build_actual, build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.schema.controller import ControllerSpec, NonlinearSpec
 from scenarios.schema.events import ControllerEvent, Event, SetpointEvent
@@ -126,6 +126,7 @@ class StartedFlight:
 
     Attributes:
         vehicle: the modelled vehicle.
+        actual: the vehicle as it really is, which flies.
         limits: what the flight is audited against.
         loop: the closed loop; its `controller` is what flies now.
 
@@ -153,6 +154,7 @@ class StartedFlight:
     ) -> None:
         """Set up at t = 0; see `start`."""
         self._started, self.vehicle, self.limits = scenario, build_vehicle(scenario), build_limits(scenario)
+        self.actual = build_actual(scenario, self.vehicle)
         threadpool_limits(limits=1)  # the matrices are small, and results do not depend on the number of cores
         if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
             raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")

@@ -91,7 +91,10 @@ def test_convergence_in_the_documents_is_what_the_gains_give() -> None:
 
 def test_the_examples_in_the_page_on_effects_are_a_scenario(tmp_path: Path) -> None:
     page = (ROOT / "docs/effects.md").read_text(encoding="utf-8")
-    example, events = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    example, mismatch, events = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    (tmp_path / "heavy-hover.toml").write_text(mismatch, encoding="utf-8")
+    heavy = fly_scenario(load_scenario(str(tmp_path / "heavy-hover.toml")))
+    assert heavy.state["z"][-1] - heavy.reference["z"][-1] == pytest.approx(-0.2, abs=0.01)
     (tmp_path / "gusty.toml").write_text(example + events, encoding="utf-8")
     scenario = load_scenario(str(tmp_path / "gusty.toml"), ["duration=16.0"])
     assert scenario.effects.air is not None

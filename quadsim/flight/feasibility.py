@@ -48,7 +48,8 @@ class Demand:
     acceleration: Array  # (K, 3) world [m/s^2]
     thrust: Array  # (K,) of all rotors together [N]
     torque: Array  # (K, 3) body [N m]; 0 around kinks and jumps
-    speeds: Array  # (K, 4) rotor speeds [rad/s]; negative where a rotor would have to push down, -sqrt(-w^2)
+    thrusts: Array  # (K, 4) of each rotor [N]; no rotor can give a negative one
+    speeds: Array  # (K, 4) rotor speeds [rad/s]; 0 where a thrust is negative
     slews: Array  # (K - 1, 4) their steps from sample to sample, NaN where a torque is left out on either side [rad/s]
 
 
@@ -61,9 +62,10 @@ class Feasibility:
     acceleration: float  # largest magnitude [m/s^2]
     yaw: float  # largest magnitude [deg]; a model linearised at zero yaw holds near 0
     yaw_rate: float  # largest magnitude [deg/s]
-    rotor_min: float  # lowest rotor speed [rad/s]; negative where a rotor would have to push down
+    rotor_min: float  # lowest rotor speed [rad/s]; 0 where a rotor's thrust is negative
     rotor_max: float  # highest rotor speed [rad/s]
     thrust_to_weight: float  # largest
+    thrust_min: float  # least of one rotor [N]; negative: the course is not flyable, whatever the rotors' limits
     jumps: tuple[float, ...]  # times at which the course itself jumps [s]; the peaks leave them out
     problems: tuple[str, ...]
     """What is beyond a limit or a bound, a line each; empty for a course that can be flown exactly."""
@@ -108,7 +110,7 @@ def demand(
     inner = slice(1, -1)
     wrench = np.column_stack([vehicle.mass * force[inner], torque])
     squared = np.linalg.solve(vehicle.allocation, wrench.T).T
-    speeds = np.sign(squared) * np.sqrt(np.abs(squared))
+    speeds = np.sqrt(np.maximum(squared, 0.0))
     between = smooth[1:] & smooth[:-1]
 
     state = np.zeros((smooth.size, N_STATES))
@@ -123,6 +125,7 @@ def demand(
         acceleration=acceleration[inner],
         thrust=wrench[:, 0],
         torque=torque,
+        thrusts=vehicle.thrust_coefficient * squared,
         speeds=speeds,
         slews=np.where(between[:, None], np.diff(speeds, axis=0), np.nan),
     )
@@ -157,6 +160,7 @@ def assess(
         "rotor_min": float(needed.speeds.min()),
         "rotor_max": float(needed.speeds.max()),
         "thrust_to_weight": float(needed.thrust.max()) / (vehicle.mass * vehicle.gravity),
+        "thrust_min": float(needed.thrusts.min()),
     }
     problems = _problems(needed, vehicle, bounds, tightened or {})
     sentence = _sentence(peaks, vehicle, bounds, jumps, problems)
@@ -182,6 +186,9 @@ def _problems(
     """A line for each side of a limit or bound that the demand leaves."""
     least, most = vehicle.speed_min, vehicle.speed_max
     found = _beyond("rotor speed", "rad/s", needed.speeds, (least, most), "limit")
+    thrust = float(needed.thrusts.min())
+    if thrust < -TOLERANCE * vehicle.mass * vehicle.gravity:
+        found.append(f"not flyable: a rotor would need a negative thrust, down to {thrust:.4g} N")
     for name, (lower, upper) in bounds.items():
         if name == "speed":  # where the vehicle's limit is as narrow, it has been named
             tighter = (lower if lower > least else -math.inf, upper if upper < most else math.inf)

@@ -31,7 +31,7 @@ class Run:
     directory: Path  # where it is
     summary: dict[str, Any]  # `summary.json`
     log: FlightLog  # the flight, its plant rows at the log rate
-    vehicle: Vehicle  # the vehicle flown
+    vehicle: Vehicle  # the vehicle flown, as it really is
     limits: tuple[Limit, ...]  # the constraints it was audited against
 
     @property
@@ -89,7 +89,7 @@ def load_run(directory: Path) -> Run:
     """
     summary = read_summary(directory)
     try:
-        vehicle = Vehicle(**summary["vehicle"])
+        vehicle = Vehicle(**summary.get("actual", summary["vehicle"]))
         limits = tuple(limit_from_json(entry) for entry in summary["constraints"])
     except (ArithmeticError, TypeError, ValueError) as error:
         raise FileError(directory / SUMMARY_FILE, f"is damaged ({error})") from error

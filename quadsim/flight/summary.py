@@ -14,9 +14,12 @@ from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES
 
 _WHAT: Final = "a run's summary"
-_COURSE: Final = dict.fromkeys(
-    ("tilt", "velocity", "acceleration", "yaw", "yaw_rate", "rotor_min", "rotor_max", "thrust_to_weight"), NUMBER
-)
+_COURSE: Final = {
+    **dict.fromkeys(
+        ("tilt", "velocity", "acceleration", "yaw", "yaw_rate", "rotor_min", "rotor_max", "thrust_to_weight"), NUMBER
+    ),
+    "thrust_min": Optional(NUMBER),
+}
 _CHANNELS: Final = dict.fromkeys(REFERENCE_NAMES, NUMBER)
 _STATES: Final = dict.fromkeys(STATE_NAMES, NUMBER)
 _SPREAD: Final = dict.fromkeys(("p50", "p95", "p99", "max"), NUMBER)
@@ -126,6 +129,7 @@ FORM: Final = {
         }
     ),
     "vehicle": _VEHICLE,
+    "actual": Optional(_VEHICLE),
     "wall_s": {"simulate": NUMBER, "total": NUMBER},
     "versions": Optional(Each(str)),
     "machine": Optional({"system": str, "processor": str, "cores": (int, type(None))}),

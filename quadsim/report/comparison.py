@@ -290,6 +290,20 @@ def _violation(entry: Summary) -> Cell:
     return Cell(text=format_number(seconds), mark=_verdict_mark(entry) if seconds > 0.0 else Mark.NONE)
 
 
+def lowest_speed(summary: Summary) -> Cell:
+    """The lowest rotor speed that the course requires; none where it requires a negative thrust."""
+    if any(problem.startswith("not flyable") for problem in nested(summary, "course", "problems") or ()):
+        return Cell(text="not flyable", mark=Mark.BAD)
+    return _number("course", "rotor_min")(summary)
+
+
+def mismatch(summary: Summary) -> tuple[str, ...]:
+    """The numbers of the vehicle that the controller has wrong, as one text; none where it has none wrong."""
+    actual, modelled = summary.get("actual", {}), summary["vehicle"]
+    wrong = [f"{name} {modelled[name]} for {value}" for name, value in actual.items() if value != modelled[name]]
+    return (", ".join(wrong),) if wrong else ()
+
+
 def _text(value: Callable[[Summary], object]) -> Callable[[Summary], Cell]:
     return lambda summary: Cell(text=str(value(summary)))
 
@@ -357,14 +371,14 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
     ("controller", "", _text(lambda summary: law_name(summary["controller"].get("name", ABSENT)))),
     ("QP solver, where a QP is left to one", "", _text(lambda summary: summary["controller"].get("solver") or ABSENT)),
     ("horizon", "periods", _text(lambda summary: summary["controller"].get("horizon", ABSENT))),
-    ("vehicle", "", _text(lambda summary: summary["vehicle"]["name"])),
-    ("mass", "kg", _number("vehicle", "mass")),
+    ("vehicle", "", _text(lambda summary: ", modelled with ".join([summary["vehicle"]["name"], *mismatch(summary)]))),
+    ("mass", "kg", _text(lambda summary: format_number(summary.get("actual", summary["vehicle"])["mass"]))),
     ("seed", "", _text(lambda summary: summary.get("seed", ABSENT))),
 )
 _COURSE: Final[tuple[_Line, ...]] = (
     ("largest tilt required", "deg", _number("course", "tilt")),
     ("highest speed required", "m/s", _number("course", "velocity")),
-    ("lowest rotor speed required", "rad/s", _number("course", "rotor_min")),
+    ("lowest rotor speed required", "rad/s", lowest_speed),
     ("highest rotor speed required", "rad/s", _number("course", "rotor_max")),
     ("jumps", "", _listed("jumps", "at {:g} s", Mark.NONE)),
     ("beyond the bounds", "", _listed("problems", "{}", Mark.WARN)),

@@ -24,7 +24,7 @@ from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import apply_setting, get_field, set_field
+from scenarios.schema.settings import NOT_DESCRIBED, apply_setting, differences, get_field, note_changes, set_field
 from scenarios.shipped import campaign_path, scenario_path
 
 FIRST: Final = 5  # flights of which one at least has to be possible
@@ -191,6 +191,7 @@ def flown_scenario(spec: CampaignSpec, path: Path, settings: Sequence[str] = ())
     """
     file = scenario_path(spec.scenario)
     data = merge(read_scenario(file, scenario_path), spec.set)
+    note_changes(data, spec.set)
     drawn = {field: entry.name for entry in spec.vary if not entry.relative for field in entry.fields}
     for setting in settings:
         field = setting.partition("=")[0].strip()
@@ -206,6 +207,29 @@ def flown_scenario(spec: CampaignSpec, path: Path, settings: Sequence[str] = ())
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
     check_parts(scenario)
     return resolve_vehicle(scenario, build_vehicle(scenario))
+
+
+def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], ...]:
+    """The fields in which two campaigns' scenarios, draws and limits differ, with the value of each, None for absent.
+
+    Fields of the scenario that both draw are left out: their draws are compared.
+    """
+    drawn = _replaced(first) & _replaced(second)
+    found = differences(_compared(first), _compared(second))
+    return tuple(entry for entry in found if entry[0] not in drawn)
+
+
+def _compared(plan: Plan) -> dict[str, Any]:
+    """A campaign's tables, less what only names it."""
+    scenario = tomllib.loads(plan.scenario.to_toml())
+    vary = [entry.model_dump() for entry in plan.spec.vary]
+    own = plan.spec.model_dump(include={"sampling", "seed", "limits"})
+    return {**{key: value for key, value in scenario.items() if key not in NOT_DESCRIBED}, **own, "vary": vary}
+
+
+def _replaced(plan: Plan) -> set[str]:
+    """The fields of the scenario whose values each flight draws."""
+    return {field for entry in plan.spec.vary if not entry.relative for field in entry.fields}
 
 
 def locate(data: dict[str, Any], directory: Path) -> None:
@@ -244,12 +268,24 @@ def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *,
     Raises:
         InputError: what comes of it is no scenario.
     """
+    data = _with_actual(data, [field for entry, _ in changes for field in entry.fields])
     after: dict[str, Any] = merge(data, {})
     for entry, value in changes:
         for field in entry.fields:
             new = _scaled(data, entry, field, value, parse, table) if entry.relative else value
             set_field(after, field, new, source=f"{table}.{entry.name}.fields")
     return parse(after)
+
+
+def _with_actual(data: Mapping[str, Any], fields: Iterable[str]) -> dict[str, Any]:
+    """The scenario's tables with the fields of `[actual]` that are drawn, which are as modelled where none is given."""
+    found = merge(data, {})
+    for field in fields:
+        table, _, rest = field.partition(".")
+        name = rest.partition(".")[0]
+        if table == "actual" and name in data["vehicle"]:
+            found.setdefault("actual", {}).setdefault(name, data["vehicle"][name])
+    return found
 
 
 def check_ends(entries: Iterable[VaryBase], check: Callable[[VaryBase, Value], object], *, table: str) -> None:

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from quadsim.report.table import Grid
 from scenarios.campaign.report.campaign_tables import constraint_table, event_table, replay_command, worst_table
 from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
-from scenarios.campaign.report.comparison_tables import comparison_tables, pairing
+from scenarios.campaign.report.comparison_tables import comparison_tables, difference_table, pairing
 from scenarios.campaign.run import Standing, Watch
 from scenarios.campaign.statistics.comparison import Comparison
 from scenarios.campaign.statistics.inference import proportion
@@ -111,5 +111,7 @@ def print_replay(number: int, row: Mapping[str, Any], differing: Sequence[str]) 
 
 def print_comparison(comparison: Comparison, where: str) -> None:
     """Whether one campaign is better than another."""
-    stdout().print(f"{comparison.sentence} {pairing(comparison)}", soft_wrap=True)
+    stdout().print(pairing(comparison), soft_wrap=True)
+    console.print_grids(difference_table(comparison), None)
+    stdout().print(comparison.sentence, soft_wrap=True)
     console.print_grids(comparison_tables(comparison), where)

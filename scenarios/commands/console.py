@@ -74,6 +74,8 @@ def print_summary(summary: Mapping[str, Any], where: str | None) -> None:
     """A flight's outcome, tracking, audit and solver, from its summary."""
     console, flown = stdout(), styled(f"  {summary['duration']:.2f} s flown")
     console.print(styled((summary["scenario"], "bold"), "  ") + outcome(summary) + flown)
+    if summary.get("description"):
+        console.print(summary["description"], soft_wrap=True)
     for line in summary.get("traceback", ()):
         console.print(styled(line), soft_wrap=True)
     if "course" in summary:

@@ -322,7 +322,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
     def _draw(self) -> np.ndarray[Any, np.dtype[np.uint8]] | None:
         if self._screen is None:
-            self._screen = make_screen(self.render_mode, self.scenario, self.started.vehicle, *self._size)
+            self._screen = make_screen(self.render_mode, self.scenario, self.started.actual, *self._size)
         return self._screen.show(self._truth, self._rotors, self._seen.reference, self.started.loop.time)
 
 

@@ -262,7 +262,7 @@ class Page:
                 {"type": "gust", "velocity": [*map(float, gust.value), 0.0], "duration": 1.0}, subject="gust"
             ),
         )
-        mass = session.flights[0].vehicle.mass
+        mass = session.flights[0].actual.mass
         load = gui.add_number("Payload [kg]", round(0.1 * mass, 4), min=0.0, max=mass, step=round(0.01 * mass, 5))
         self._button(
             "Take payload", lambda event: session.submit({"type": "payload_pickup", "mass": float(load.value)})

@@ -109,7 +109,7 @@ class Session:
         self.flights = tuple(start(each, live=True) for each in scenarios)
         self._held = _Held()
         self.reason: str | None = None
-        weight = self.flights[0].vehicle.mass * self.flights[0].vehicle.gravity
+        weight = self.flights[0].actual.mass * self.flights[0].actual.gravity
         self._stiffness, self._strongest = STIFFNESS * weight, STRONGEST * weight
 
     def close(self) -> None:

@@ -48,7 +48,7 @@ class Stage:
         scene.set_up_direction("+z")
         scene.configure_default_lights(cast_shadow=False)
         scene.configure_environment_map(hdri=None)
-        vehicle = session.flights[0].vehicle
+        vehicle = session.flights[0].actual
         self.unit = vehicle.arm_length
         self._rotors = np.array(vehicle.rotor_positions)
         self._thrust = 1.2 * vehicle.arm_length / (vehicle.mass * vehicle.gravity / len(self._rotors))
@@ -135,7 +135,7 @@ class Stage:
 
     @property
     def _weight(self) -> float:
-        vehicle = self._session.flights[0].vehicle
+        vehicle = self._session.flights[0].actual
         return vehicle.mass * vehicle.gravity
 
     def _add_space(self, trimesh: Any) -> None:

@@ -25,6 +25,7 @@ from quadsim.sim.effects.gust import Gust
 from quadsim.sim.effects.wind import WindChange, WindField
 from quadsim.vehicle import Vehicle
 from scenarios.parts.randomness import generator
+from scenarios.parts.vehicle import actual_effects
 from scenarios.schema.events import (
     Event,
     MassEvent,
@@ -45,7 +46,7 @@ def moving_air(scenario: Scenario, vehicle: Vehicle) -> Air | None:
     Raises:
         ParameterError: there is wind, and nothing that it could push.
     """
-    air = scenario.effects.resolved(vehicle).air or Air()
+    air = actual_effects(scenario, vehicle).air or Air()
     blown = any(isinstance(event, Gust | WindChange) for event in scenario.events)
     if not (any(air.wind) or air.turbulence is not None or blown):
         return None
@@ -123,7 +124,7 @@ def check_changes(scenario: Scenario, vehicle: Vehicle, changes: Iterable[Change
     Raises:
         ParameterError: rotors with inertia are to change their speed at once.
     """
-    rotors = scenario.effects.resolved(vehicle).rotors or RotorDynamics()
+    rotors = actual_effects(scenario, vehicle).rotors or RotorDynamics()
     for change in changes:
         if isinstance(change, LagChange):
             rotors.lagging(change.rise, change.fall)

@@ -13,6 +13,7 @@ from quadsim.sim.effects import Air, Load
 from quadsim.sim.effects.gust import Gust
 from quadsim.sim.effects.wind import WindChange
 from quadsim.vehicle import Vehicle
+from scenarios.parts.vehicle import actual_effects
 from scenarios.schema.events import (
     Event,
     MassEvent,
@@ -35,7 +36,7 @@ def prepared(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     Wind needs drag to push; with the integrator rk4 the mass is fixed, and with an estimator there are the sensors that
     it has.
     """
-    air = scenario.effects.resolved(vehicle).air
+    air = actual_effects(scenario, vehicle).air
     kinds: list[Event] = [_push(scenario)]
     if scenario.plant.integrator == "mujoco":
         kinds.append(_mass(scenario))

@@ -3,20 +3,32 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from quadsim.assets import vehicle_path
-from quadsim.errors import InputError
+from quadsim.errors import InputError, ParameterError
 from quadsim.motion import Motion
+from quadsim.sim.effects import Air, Effects, RotorDynamics
 from quadsim.sim.physics import physics_to_state
 from quadsim.state import Array, make_state
 from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
+
+_SIZES: Final = {
+    "rotor_rise": ("rotors", "rise", RotorDynamics),
+    "rotor_fall": ("rotors", "fall", RotorDynamics),
+    "rotor_inertia": ("rotors", "inertia", RotorDynamics),
+    "rotor_drag": ("air", "rotor_drag", Air),
+    "body_drag": ("air", "body_drag", Air),
+    "rotor_radius": ("ground", "rotor_radius", None),
+}
+"""Parameters of vehicles that act in an effect: its table, the field that states it too, and what switches it on."""
 
 
 def build_vehicle(scenario: Scenario) -> Vehicle:
@@ -35,6 +47,56 @@ def resolve_vehicle(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     """The scenario with the numbers of its vehicle's file in it; effects go on taking theirs from the vehicle."""
     numbers = {name: getattr(vehicle, name) for name in VEHICLE_UNITS}
     return scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update=numbers)})
+
+
+def build_actual(scenario: Scenario, vehicle: Vehicle) -> Vehicle:
+    """The vehicle as it really is: the modelled one, with `[actual]` in its place.
+
+    Plant, forces, drawings and audit have it; controller, estimator and reference have the modelled one.
+
+    Raises:
+        ParameterError: there can be no such vehicle.
+    """
+    try:
+        return replace(vehicle, **_actual(scenario))
+    except ParameterError as error:
+        raise ParameterError("actual", error.name, error.value, error.rule) from error
+
+
+def actual_effects(scenario: Scenario, vehicle: Vehicle) -> Effects:
+    """What acts on the plant: `[effects]`, with every size that it leaves to the vehicle as it really is.
+
+    Lag, rotor inertia and drag that `[actual]` states act, whether or not `[effects]` has their table.
+
+    Args:
+        scenario: what is flown.
+        vehicle: the modelled vehicle.
+
+    Raises:
+        ParameterError: `[effects]` states another size than `[actual]`, or lacks one, or a combination is not possible.
+    """
+    effects = scenario.effects
+    acting: dict[str, Any] = {}
+    for name, size in _actual(scenario).items():
+        table, field, kind = _SIZES.get(name, ("", "", None))
+        settings = getattr(effects, table, None) or (kind and kind())
+        if settings is None:
+            continue
+        stated = getattr(settings, field)
+        if stated not in (None, size):
+            raise ParameterError("actual", name, size, f"absent where effects.{table}.{field} = {stated} states it")
+        acting[table] = settings
+    return replace(effects, **acting).resolved(build_actual(scenario, vehicle))
+
+
+def saturates(scenario: Scenario) -> bool:
+    """Whether rotors saturate at the actual vehicle's speeds: `[plant]` says so, or `[actual]` gives one of them."""
+    return scenario.plant.limit_speeds or not {"speed_min", "speed_max"}.isdisjoint(_actual(scenario))
+
+
+def _actual(scenario: Scenario) -> dict[str, Any]:
+    """The parameters of vehicles that `[actual]` states."""
+    return {} if scenario.actual is None else scenario.actual.overrides()
 
 
 def build_initial_state(scenario: Scenario, motion: Motion | None = None) -> Array:

@@ -10,6 +10,7 @@ from typing import Any, Final
 from quadsim.assets import DEEPEST, read_toml
 from quadsim.errors import FileError, ParameterError
 from scenarios.schema.plugin import located
+from scenarios.schema.settings import note_changes
 
 LARGEST_FILE: Final = 8_000_000
 """Size [bytes] of the largest file that is read; the longest scenario there can be is smaller."""
@@ -61,7 +62,10 @@ def read_scenario(
     inherited = read_scenario(base, find, locate=locate, above=chain)
     locate(inherited, base.parent)
     # The base's place in the library is its own.
-    return merge({key: value for key, value in inherited.items() if key not in ("group", "expect")}, data)
+    merged = merge({key: value for key, value in inherited.items() if key not in ("group", "expect")}, data)
+    if "description" not in data:
+        note_changes(merged, data)
+    return merged
 
 
 def _find_base(path: Path, name: str, find: Callable[[str], Path]) -> Path:

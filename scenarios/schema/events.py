@@ -55,7 +55,7 @@ class MassEvent(_Event):
     """The vehicle's mass becomes another one, whatever it carries besides."""
 
     type: Literal["mass"] = Field(description="kind of event: mass")
-    factor: Factor = Field(description="[-] real mass over the file's from then on, instead of load.mass_factor")
+    factor: Factor = Field(description="[-] mass over the vehicle's from then on, instead of load.mass_factor")
 
 
 class RotorLagEvent(_Event):

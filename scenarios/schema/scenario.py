@@ -43,26 +43,29 @@ from scenarios.schema.writing import to_toml
 from scenarios.shipped import Group
 
 
-class VehicleSpec(Spec):
-    """Which vehicle file, and what in it to replace; units as in the file."""
-
-    file: str = Field(description="a shipped vehicle's name, or a path ending in .toml, relative to the scenario file")
+class ActualSpec(Spec):
+    """The vehicle as it really is, where that is not as modelled: the plant has it, the controller does not know it."""
 
     def overrides(self) -> dict[str, Any]:
-        """The parameters that replace the file's."""
+        """The parameters that are given."""
         return self.model_dump(exclude={"file"}, exclude_none=True)
 
 
+class VehicleSpec(ActualSpec):
+    """Which vehicle file, and what in it to replace, for the model and the plant alike; units as in the file."""
+
+    file: str = Field(description="a shipped vehicle's name, or a path ending in .toml, relative to the scenario file")
+
+
 if not TYPE_CHECKING:  # with every parameter of `quadsim.vehicle.Vehicle`, each of which may be absent
-    VehicleSpec = create_model(
-        VehicleSpec.__name__,
-        __base__=VehicleSpec,
-        __doc__=VehicleSpec.__doc__,
-        **{
-            name: (field.rebuild_annotation() | None, Field(default=None, description=field.description))
-            for name, field in fields_of(Vehicle).items()
-            if name in VEHICLE_UNITS
-        },
+    _PARAMETERS = {
+        name: (field.rebuild_annotation() | None, Field(default=None, description=field.description))
+        for name, field in fields_of(Vehicle).items()
+        if name in VEHICLE_UNITS
+    }
+    ActualSpec, VehicleSpec = (
+        create_model(spec.__name__, __base__=spec, __doc__=spec.__doc__, **_PARAMETERS)
+        for spec in (ActualSpec, VehicleSpec)
     )
 
 
@@ -178,6 +181,7 @@ class Scenario(Spec):
         default=200.0, description="[Hz] rows of plant.parquet; the audit sees every physics step"
     )
     vehicle: VehicleSpec
+    actual: ActualSpec | None = None
     initial: InitialSpec = InitialSpec()
     plant: PlantSpec = PlantSpec()
     reference: ReferenceSpec

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
 
 from quadsim.assets import DEEPEST, parse_toml
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+
+_CHANGED: Final = " (changed: "  # how the end of a description begins that says what was changed
+NOT_DESCRIBED: Final = ("name", "description", "group", "expect", "seed")
+"""Fields that a description says nothing about."""
+_LONGEST: Final = 60  # characters of a value that a description shows
 
 
 def apply_setting(data: dict[str, Any], setting: str) -> None:
@@ -31,7 +38,7 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
 
 
 def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given: str | None = None) -> None:
-    """Replace or add a field; missing tables on the path are added.
+    """Replace or add a field, and say so in the scenario's description; missing tables on the path are added.
 
     An entry of a list of tables is addressed by its name, as in `constraints.roll.upper`, or, where it has none, by its
     index, as in `events.0.at`; a number of a list by its index, as in `initial.euler.2`.
@@ -56,6 +63,60 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
     else:
         _require_numbers(holder, path, source=source, given=given or path)
         holder[_index(holder, ".".join(through), last)] = value
+    note_change(data, path, value)
+
+
+def note_change(data: dict[str, Any], path: str, value: Any) -> None:
+    """Say in a scenario's description, where it has one, that a field was changed, and to what; the last change counts.
+
+    Args:
+        data: the scenario's tables, changed in place.
+        path: dotted.
+        value: None for a field that was made absent.
+    """
+    description = data.get("description")
+    if not isinstance(description, str) or path in NOT_DESCRIBED:
+        return
+    text, _, noted = description.partition(_CHANGED)
+    earlier = noted.removesuffix(")").split("; ") if noted else []
+    changes = [change for change in earlier if not change.startswith(f"{path} = ")]
+    changes.append(f"{path} = {shown(value)}")
+    data["description"] = f"{text}{_CHANGED}{'; '.join(changes)})"
+
+
+def note_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> None:
+    """The same of all fields of some tables that were merged over the scenario's."""
+    for path, value in leaves(changes):
+        note_change(data, path, value)
+
+
+def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
+    """The fields in which nested tables differ, by dotted path, with the value of each; None where one has no such."""
+    a, b = dict(leaves(first, entries=True)), dict(leaves(second, entries=True))
+    return [(path, a.get(path), b.get(path)) for path in {**a, **b} if a.get(path) != b.get(path)]
+
+
+def leaves(data: Mapping[str, Any], above: str = "", *, entries: bool = False) -> Iterator[tuple[str, Any]]:
+    """Numbers, texts and lists of nested tables, by dotted path as of `set_field`; of lists, if so, all `entries`."""
+    for key, value in data.items():
+        below: Any = value
+        if isinstance(value, list | tuple) and value and all(isinstance(e, Mapping) and "name" in e for e in value):
+            below = {str(entry["name"]): {k: v for k, v in entry.items() if k != "name"} for entry in value}
+        elif entries and isinstance(value, list | tuple):
+            below = {str(i): entry for i, entry in enumerate(value)}
+        if isinstance(below, Mapping):
+            yield from leaves(below, f"{above}{key}.", entries=entries)
+        else:
+            yield above + key, below
+
+
+def shown(value: Any) -> str:
+    """A value on one line, numbers to six digits; None for a field that is absent."""
+    if value is None:
+        return "absent"
+    text = f"{value:.6g}" if isinstance(value, float) else json.dumps(value, default=str)
+    text = text.replace("; ", ", ")
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
 def get_field(data: dict[str, Any], path: str) -> Any:

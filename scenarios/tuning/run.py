@@ -20,6 +20,7 @@ from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.outputs import Growing, growing, to_json
 from scenarios.campaign import manifest as records
 from scenarios.campaign.pilot import fly_flights
+from scenarios.campaign.plan import plan_differences
 from scenarios.campaign.report.campaign_page import write_comparison_report
 from scenarios.campaign.results.store import Store
 from scenarios.campaign.results.table import Row
@@ -249,12 +250,13 @@ def _validate(
 ) -> TuningResult:
     """Fly the start and the answer on fresh draws, compare them, and write what came of it all."""
     best = found.answer.candidate
-    tables, folders = [], []
+    tables, folders, campaigns = [], [], []
     for candidate in dict.fromkeys((START, best)):
         folder = START_DIR if candidate == START else ANSWER_DIR.format(candidate)
         campaign = plan.of(found.candidates[candidate], name=f"{plan.spec.name}-{folder}", fresh=True)
         directory = files.path / folder
         folders.append(folder)
+        campaigns.append(campaign)
         resume = records.is_campaign(directory)
         flown = fly_campaign(
             campaign, directory, workers=workers, cluster=cluster, resume=resume, report=report, watch=watch
@@ -262,7 +264,7 @@ def _validate(
         tables.append(flown.table)
     comparison = None
     if best != START:
-        comparison = compare(tables[0], tables[1], NAMES)
+        comparison = compare(tables[0], tables[1], NAMES, differences=plan_differences(*campaigns))
     if comparison is not None and report:
         write_comparison_report(comparison, files.path / COMPARISON_DIR, overwrite=True)
     summary = summarise(plan, found, tables[0], tables[-1])

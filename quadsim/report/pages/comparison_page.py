@@ -16,7 +16,7 @@ from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING
 from quadsim.flight.rundir import FIGURES_DIR, RECORDING_FILE, SCENARIO_FILE, SUMMARY_FILE, VIDEO_FILE, Run
 from quadsim.flight.summary import require_inside
 from quadsim.outputs import writing
-from quadsim.report.comparison import comparison_rows, outcome, required, run_names, verdict_cell
+from quadsim.report.comparison import comparison_rows, mismatch, outcome, required, run_names, verdict_cell
 from quadsim.report.figures.flight_figures import comparison_figure
 from quadsim.report.narrative import comparison_sentences
 from quadsim.report.pages.page import PAGE_FILE, render_page
@@ -145,7 +145,9 @@ def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) 
         "outcome": outcome(run.summary),
         "required": required(run.summary),
         "verdict": verdict_cell(run.summary),
-        "vehicle": f"Vehicle: {run.vehicle.description or run.vehicle.name}, {run.vehicle.mass:g} kg",
+        "vehicle": ", modelled with ".join(
+            [f"Vehicle: {run.vehicle.description or run.vehicle.name}, {run.vehicle.mass:g} kg", *mismatch(run.summary)]
+        ),
         "made_with": _made_with(run),
         "video": None if video is None else quote(video),
         "files": files,

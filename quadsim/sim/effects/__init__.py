@@ -88,7 +88,7 @@ class PayloadChange:
 
 @dataclass(frozen=True, kw_only=True)
 class MassChange:
-    """From `time` [s] on, the vehicle's mass is `factor` times its file's, whatever it carries besides."""
+    """From `time` [s] on, the vehicle's mass is `factor` times its own, whatever it carries besides."""
 
     time: float
     factor: Factor

@@ -35,9 +35,9 @@ Factor = Annotated[float, Ge(0.05), Le(20.0)]
 class Load:
     """How the vehicle that flies differs from its file, which the controller still assumes."""
 
-    mass_factor: Annotated[Factor, doc("[-] real mass over the file's")] = 1.0
+    mass_factor: Annotated[Factor, doc("[-] real mass over that of [actual], or else of [vehicle]")] = 1.0
     inertia_factor: Annotated[
-        tuple[Factor, ...], Len(3, 3), doc("[-] real moments of inertia over the file's, about body x, y, z")
+        tuple[Factor, ...], Len(3, 3), doc("[-] the same of the moments of inertia about body x, y, z")
     ] = (1.0, 1.0, 1.0)
     centre_of_mass: Annotated[Vector, doc("[m] where it really is, body frame")] = (0.0, 0.0, 0.0)
     payloads: Annotated[tuple[Payload, ...], MaxLen(1000), doc("what it carries from the start")] = ()

@@ -18,7 +18,12 @@ from scenarios.campaign.report import campaign_tables
 from scenarios.campaign.report.campaign_figure import draw_campaign
 from scenarios.campaign.report.campaign_plots import campaign_plots, comparison_margins_plot
 from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
-from scenarios.campaign.report.comparison_tables import comparison_markdown, comparison_tables, pairing
+from scenarios.campaign.report.comparison_tables import (
+    comparison_markdown,
+    comparison_tables,
+    difference_table,
+    pairing,
+)
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.statistics.comparison import Comparison
 from scenarios.campaign.statistics.scatters import clipping, clouds, margins, thinning
@@ -114,6 +119,7 @@ def write_comparison_report(comparison: Comparison, directory: Path, *, overwrit
             title=f"{comparison.names[1]} against {comparison.names[0]}",
             comparison=comparison,
             pairing=pairing(comparison),
+            differences=difference_table(comparison),
             tables=comparison_tables(comparison),
             plot=plot,
             files=(COMPARISON_FILE, TABLE_FILE),

@@ -6,6 +6,7 @@ from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, 
 from scenarios.campaign.statistics.comparison import Comparison, EventComparison, MetricComparison
 from scenarios.campaign.statistics.inference import ALPHA, CONFIDENCE
 from scenarios.campaign.statistics.wording import label, p_value, percent, signed_interval, signed_points
+from scenarios.schema.settings import shown
 
 _SURE = f"{100.0 * CONFIDENCE:g} %"
 
@@ -16,10 +17,18 @@ def comparison_tables(comparison: Comparison) -> list[Grid]:
 
 
 def comparison_markdown(comparison: Comparison) -> str:
-    """The verdict and its tables."""
+    """What differs, the verdict, and its tables."""
     head = f"# {comparison.names[1]} against {comparison.names[0]}\n"
-    texts = (head, comparison.sentence + "\n", pairing(comparison) + "\n")
-    return "\n".join([*texts, *map(section, comparison_tables(comparison))])
+    verdict = (comparison.sentence + "\n", *map(section, comparison_tables(comparison)))
+    return "\n".join([head, pairing(comparison) + "\n", *map(section, difference_table(comparison)), *verdict])
+
+
+def difference_table(comparison: Comparison) -> list[Grid]:
+    """The fields in which the campaigns' scenarios and draws differ; no table where none does."""
+    if not comparison.differences:
+        return []
+    lines = tuple(line(field, shown(a), shown(b)) for field, a, b in comparison.differences)
+    return [Grid(key="differences", title="What differs", head=("field", *comparison.names), lines=lines)]
 
 
 def pairing(comparison: Comparison) -> str:
@@ -33,6 +42,10 @@ def pairing(comparison: Comparison) -> str:
         phrase += (
             f"; {comparison.left_out} flights of one alone, or with an incomplete flight in the pair, are left out"
         )
+    if comparison.differences is not None:
+        count = len(comparison.differences)
+        fields = f"{count} fields" if count > 1 else "one field"
+        phrase += f". The campaigns differ in {fields}" if count else ". The campaigns differ in no field"
     return f"{phrase}."
 
 

@@ -42,6 +42,10 @@ COMPARED: Final = (
 """Metrics that are compared, where both campaigns have them."""
 
 
+Differences = tuple[tuple[str, Any, Any], ...]
+"""Fields, with the value of the first and of the second; None where it is absent."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class EventComparison:
     """How often an event happened to one, to the other, and to both."""
@@ -167,6 +171,7 @@ class Comparison:
         completed: pairs in which both flights were completed.
         shared_draws: parameters that both drew, alike in every pair.
         own_draws: parameters that only one of them drew.
+        differences: fields in which their scenarios and draws differ, with both values; None where not known.
         events: failure, then every other event that has a name, then for each constraint that it was not held.
         metrics: the main metrics.
         shown_margins: what is drawn of them; None where fewer than two pairs have margins.
@@ -178,6 +183,7 @@ class Comparison:
     completed: int
     shared_draws: tuple[str, ...]
     own_draws: tuple[str, ...]
+    differences: Differences | None
     events: tuple[EventComparison, ...]
     metrics: tuple[MetricComparison, ...]
     shown_margins: ShownMargins | None = field(repr=False, compare=False)
@@ -221,6 +227,9 @@ class Comparison:
             "completed": self.completed,
             "shared_draws": list(self.shared_draws),
             "own_draws": list(self.own_draws),
+            "differences": None
+            if self.differences is None
+            else [{"field": field, "values": [first, second]} for field, first, second in self.differences],
             "events": {event.event: asdict(event) for event in self.events},
             "metrics": {metric.name: asdict(metric) for metric in self.metrics},
         }
@@ -231,6 +240,7 @@ def compare(
     table_b: pa.Table,
     names: tuple[str, str],
     failures: tuple[Sequence[str], Sequence[str]] | None = None,
+    differences: Differences | None = None,
 ) -> Comparison:
     """Compare two campaigns, pairing their flights by number.
 
@@ -239,6 +249,7 @@ def compare(
         table_b: of the second.
         names: of the first and the second; where they are the same, the comparison distinguishes them as such.
         failures: the events that each counts as failure; None where they are known to be the same.
+        differences: see `scenarios.campaign.plan.plan_differences`; None where not known.
 
     Raises:
         InputError: they count other events as failure, or have other constraints; they have no flight in common; or a
@@ -272,6 +283,7 @@ def compare(
         completed=int(completed.sum()),
         shared_draws=shared_draws,
         own_draws=tuple(sorted(set(draws_a) ^ set(draws_b))),
+        differences=differences,
         events=compare_events(events),
         metrics=tuple(
             _compare_metric(a, b, name, completed)

@@ -208,11 +208,18 @@ def test_falling_faster_than_free_is_thrust_downwards(vehicle: Vehicle) -> None:
     assert found.tilt == pytest.approx(180.0)
 
 
-def test_a_torque_beyond_the_thrust_requires_a_rotor_to_push_down(vehicle: Vehicle) -> None:
+def test_a_torque_beyond_the_thrust_is_not_flyable(vehicle: Vehicle) -> None:
     _, needed = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.0 * t, 2.0 * np.sin(8.0 * t)))
     found = assess(needed, vehicle)
-    assert found.rotor_min == needed.speeds.min() < 0.0
-    assert f"rotor speed down to {found.rotor_min:.4g} rad/s (limit 0)" in found.problems
+    most = np.abs(needed.torque[:, 2]).max()  # [N m]; each rotor gives a quarter of it, at d / b per thrust
+    least = 0.25 * (vehicle.mass * vehicle.gravity - most / vehicle.drag_to_thrust)
+    assert found.thrust_min == pytest.approx(least)
+    assert found.problems == (
+        f"rotor speed up to {found.rotor_max:.4g} rad/s (limit 250)",
+        f"not flyable: a rotor would need a negative thrust, down to {least:.4g} N",
+    )
+    assert found.rotor_min == 0.0
+    assert " rotor speeds of 0 to " in found.sentence
     bounded = assess(needed, vehicle, bounds={"speed": (0.0, 250.0)})
     assert bounded.problems == found.problems  # a bound as wide as the limit is not named again
 

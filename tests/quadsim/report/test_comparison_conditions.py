@@ -81,6 +81,13 @@ def test_rows_agree_with_the_summary_and_have_a_dash_where_it_has_no_entry(bare_
     assert cells(rows, "Simulated computation", "commands too late to be used") == ["3", "-"]
 
 
+def test_a_course_that_takes_negative_thrust_has_no_lowest_rotor_speed(bare_run: Run) -> None:
+    problems = ["rotor speed up to 604.1 rad/s (limit 250)", "not flyable: a rotor would need a negative thrust"]
+    impossible = having(bare_run, "impossible", course={**COURSE, "rotor_min": 0.0, "problems": problems})
+    rows = comparison_rows([impossible, having(bare_run, "full", course=COURSE)])
+    assert cells(rows, "Course", "lowest rotor speed required") == ["not flyable", "183.2"]
+
+
 def test_flights_that_met_nothing_have_no_rows_of_it(bare_run: Run) -> None:
     groups = {row.group for row in comparison_rows([bare_run])}
     assert not {"Course", "Ground", "Measured state", "Simulated computation"} & groups

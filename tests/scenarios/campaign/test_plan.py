@@ -9,7 +9,7 @@ import pytest
 import tomlkit
 
 from quadsim.errors import FileError, InputError, UnknownNameError
-from scenarios.campaign.plan import Plan, load_plan
+from scenarios.campaign.plan import Plan, load_plan, plan_differences
 from scenarios.loading import load_scenario
 from scenarios.shipped import campaign_names, campaign_path
 
@@ -44,6 +44,33 @@ def test_each_flight_has_its_own_name_seed_and_values(tmp_path: Path) -> None:
     assert len(set(factors)) == 3
     assert all(0.9 <= factor <= 1.1 for factor in factors)
     assert [made.identity(flight)["draw.mass"] for flight in range(3)] == factors
+
+
+def test_campaigns_differ_in_fields_of_the_scenario_and_of_what_is_drawn(tmp_path: Path) -> None:
+    """A drag three times as large is not the same draws, though every drawn value is the same."""
+    air = {"rotor_drag": 1e-4, "wind": [0.0, 0.0, 0.0]}
+    wind = {"name": "wind", "fields": ["effects.air.wind.0"], "distribution": "uniform", "low": 0.0, "high": 1.0}
+    first = plan(tmp_path, set={"effects": {"air": air}, "duration": 2.0}, vary=[MASS, wind])
+    changed = {**air, "rotor_drag": 3e-4, "wind": [0.5, 0.0, 0.2]}
+    second = plan(
+        tmp_path, set={"effects": {"air": changed}, "duration": 2.0}, vary=[*varied(high=1.2), wind], name="d"
+    )
+    assert plan_differences(first, first) == ()
+    assert plan_differences(first, second) == (
+        ("effects.air.rotor_drag", 1e-4, 3e-4),
+        ("effects.air.wind.2", 0.0, 0.2),
+        ("vary.mass.high", 1.1, 1.2),
+    )
+    alone = plan(tmp_path, set={"effects": {"air": air}, "duration": 2.0})
+    assert ("vary.wind.low", 0.0, None) in plan_differences(first, alone)
+
+
+def test_a_flight_s_description_says_what_was_changed_and_drawn(tmp_path: Path) -> None:
+    made = plan(tmp_path, set={"duration": 2.0, "effects": {"load": {"mass_factor": 1.0}}})
+    drawn = made.identity(1)["draw.mass"]
+    text = load_scenario("hover").description
+    changed = f"{text} (changed: duration = 2; effects.load.mass_factor = {drawn:.6g})"
+    assert made.of(1).description == changed
 
 
 def test_one_value_goes_to_all_of_its_fields_and_relative_ones_multiply(tmp_path: Path) -> None:
@@ -115,8 +142,9 @@ def test_every_campaign_that_ships_can_be_flown(name: str) -> None:
 def test_campaigns_on_the_same_draws_differ_in_their_controller_alone() -> None:
     paper, robust = load_plan("paper-robustness"), load_plan("paper-robustness-robust")
     assert [paper.identity(k) for k in range(20)] == [robust.identity(k) for k in range(20)]
-    same = robust.of(3).model_copy(update={"controller": paper.of(3).controller, "name": paper.of(3).name})
-    assert same == paper.of(3)
+    other = {name: getattr(paper.of(3), name) for name in ("controller", "name", "description")}
+    assert robust.of(3).model_copy(update=other) == paper.of(3)
+    assert {field.partition(".")[0] for field, *_ in plan_differences(paper, robust)} == {"controller"}
 
 
 def test_the_nominal_campaign_is_of_small_errors_at_the_papers_own_tolerance() -> None:

@@ -42,7 +42,9 @@ def test_a_file_holds_only_what_differs(tmp_path: Path) -> None:
     found, base = load_scenario(mine), load_scenario("paper-constrained")
     assert (found.name, found.group, found.vehicle.mass, found.controller.horizon) == ("mine", "other", 4.2, 30)
     assert found.reference == base.reference
-    assert found.description == base.description
+    changed = "controller.horizon = 30; constraints.roll.tolerance = 0.5; constraints.climb.signal = "
+    assert found.description.startswith(f"{base.description} (changed: ")
+    assert changed in found.description
     assert [entry.name for entry in found.constraints] == [*(entry.name for entry in base.constraints), "climb"]
     assert found.constraints[0] == replace(base.constraints[0], tolerance=0.5)
     assert found.constraints[1:-1] == base.constraints[1:]

@@ -82,6 +82,32 @@ def test_a_vehicle_file_beside_the_scenario_is_found_and_stored_by_its_whole_pat
     assert build_vehicle(scenario).mass == 3.0
 
 
+# --- what its description says was changed ---------------------------------------------------------------------------
+
+
+def test_a_description_says_what_was_changed() -> None:
+    text = load_scenario("hover").description
+    changed = load_scenario("hover", ["controller.horizon=30", "controller.solver=osqp", "seed=7", "name=mine"])
+    assert changed.description == f'{text} (changed: controller.horizon = 30; controller.solver = "osqp")'
+    more = changed.replace({"controller.horizon": 40, "vehicle.mass": 4.123456789, "effects.air": None})
+    parts = ['controller.solver = "osqp"', "controller.horizon = 40", "vehicle.mass = 4.12346", "effects.air = absent"]
+    assert more.description == f"{text} (changed: {'; '.join(parts)})"
+    assert parse_scenario(tomllib.loads(more.to_toml())).description == more.description
+
+
+def test_a_description_of_one_s_own_stays_as_it_is() -> None:
+    found = load_scenario("hover", ["controller.horizon=30", "description=mine"])
+    assert found.description == "mine"
+    assert load_scenario("hover").replace({"description": "mine"}).description == "mine"
+
+
+def test_a_long_value_is_cut_in_a_description() -> None:
+    events = [{"type": "push", "at": float(at), "duration": 0.1, "force": [0.1, 0.0, 0.0]} for at in range(9)]
+    found = load_scenario("hover").replace({"events": events})
+    assert found.description.endswith("...)")
+    assert len(found.description) < 160
+
+
 # --- what is wrong in one field ------------------------------------------------------------------------------------
 
 WRONG = {
@@ -349,8 +375,8 @@ def test_settings_replace_add_and_reach_into_constraints() -> None:
             "controller.horizon = 30",
             "vehicle.arm_length=0.25",
             "constraints.roll.upper=4.5",
-            "description=no quotes needed",
             "controller.input_weights.speed=[1, 2, 3, 4]",
+            "description=no quotes needed",
         ],
     )
     assert scenario.controller.horizon == 30

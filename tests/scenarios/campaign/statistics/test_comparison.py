@@ -149,7 +149,14 @@ def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.T
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
     assert plain["verdict"] == "better"
     text = comparison_markdown(found)
-    assert text.startswith("# robust against paper\n\nrobust is better than paper")
+    assert text.startswith("# robust against paper\n\nPairs have their seed in common")
+    assert "\n\nrobust is better than paper" in text
+    assert "differ in" not in text.partition("robust is better")[0], "nobody said what differs"
+    same, other = (compare(thousand, better, NAMES, differences=d) for d in ((), (("effects.air", None, 3e-4),) * 2))
+    assert "The campaigns differ in no field." in comparison_markdown(same)
+    before = comparison_markdown(other).partition("robust is better")[0]
+    assert "The campaigns differ in 2 fields." in before
+    assert "| effects.air | absent | 0.0003 |" in before
     assert "| failure | 30 (3.0 %) |" in text
     assert "| worst_margin |" in text
 

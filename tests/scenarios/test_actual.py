@@ -1,0 +1,179 @@
+"""`[actual]`: the plant is the vehicle as it really is, and the controller does not know."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quadsim
+from quadsim.controller import Moment
+from quadsim.errors import InputError
+from quadsim.flight import rundir
+from quadsim.report.comparison import comparison_rows
+from quadsim.state import STATE_NAMES, Array
+from quadsim.vehicle import VEHICLE_UNITS
+from scenarios.build import build_plant, build_problem, resolve
+from scenarios.campaign.plan import make_plan
+from scenarios.flight import Flight, Outputs
+from scenarios.loading import load_scenario, parse_scenario
+from scenarios.parts.vehicle import build_vehicle
+from scenarios.reaudit import reaudit
+from scenarios.run import run_scenario, start
+from scenarios.schema.scenario import Scenario
+
+BASE = [
+    "initial.position=[0.0, 0.0, 0.2]",
+    "effects.ground.effect=true",  # where the radius of the rotors acts
+    "obstacles=[{type='sphere', name='ball', position=[1.4, 0.0, 0.2], radius=0.5}]",  # where the vehicle's size does
+]
+ACTUAL: dict[str, Any] = {
+    "mass": 4.4,
+    "gravity": 9.7,
+    "inertia": [0.04, 0.04, 0.07],
+    "arm_length": 0.35,
+    "rotor_azimuths": [10.0, -80.0, 190.0, 100.0],
+    "rotor_spins": [-1, 1, -1, 1],
+    "thrust_coefficient": 3e-4,
+    "drag_to_thrust": 0.03,
+    "speed_min": 150.0,
+    "speed_max": 210.0,
+    "rotor_rise": 0.03,
+    "rotor_fall": 0.03,
+    "rotor_inertia": 1e-4,
+    "rotor_radius": 0.15,
+    "rotor_drag": 1e-3,
+    "body_drag": [0.05, 0.05, 0.1],
+    "extent": 0.8,
+}
+LAGGING = ["actual.rotor_rise=0.05", "actual.rotor_fall=0.05"]  # rotors with inertia need a lag
+
+
+def flown(scenario: Scenario) -> Array:
+    """Truth after 20 ms of commands from the lowest to the highest, near a floor and an obstacle, moving."""
+    state = np.zeros(len(STATE_NAMES))
+    state[[STATE_NAMES.index(name) for name in ("x", "z", "vx", "vz", "pitch")]] = 0.15, 0.2, 1.0, 0.1, 0.05
+    with build_plant(scenario, build_vehicle(scenario)) as plant:
+        plant.reset(state)
+        plant.advance(np.array([100.0, 180.0, 220.0, 240.0]), 20)
+        return plant.state()
+
+
+@pytest.mark.parametrize("name", VEHICLE_UNITS)
+def test_each_parameter_moves_the_plant_and_not_the_controller(name: str) -> None:
+    lag = LAGGING if name == "rotor_inertia" else []
+    modelled, real = (load_scenario("hover", [*BASE, *lag, *more]) for more in ([], [f"actual.{name}={ACTUAL[name]}"]))
+    assert np.abs(flown(real) - flown(modelled)).max() > 1e-9
+
+    first, second = (build_problem(scenario, build_vehicle(scenario)) for scenario in (modelled, real))
+    for of in (lambda p: p.model.A, lambda p: p.model.B, lambda p: p.model.u_bar, lambda p: p.bounds.u_max):
+        np.testing.assert_array_equal(of(first), of(second))
+    speeds, state, target = np.full(4, 190.0), np.full(12, 0.02), np.full((modelled.controller.horizon, 4), 0.1)
+    with start(modelled) as one, start(real) as other:
+        assert one.vehicle == other.vehicle
+        laws = one.loop.controller, other.loop.controller
+        for law in laws:
+            law.reset(speeds)
+        commands = [law.step(Moment(acting=speeds), state, target).plan for law in laws]
+    np.testing.assert_array_equal(*commands)
+
+
+@pytest.fixture(scope="module")
+def heavy(fly_once: Callable[..., Flight]) -> Flight:
+    return fly_once("hover", "actual.mass=4.4")
+
+
+def test_a_mass_that_the_paper_s_law_does_not_know_leaves_it_too_low(heavy: Flight) -> None:
+    last = heavy.state["z"][-40:]
+    assert np.ptp(last) < 1e-3
+    assert heavy.reference["z"][-1] - last[-1] > 0.15
+
+
+def test_the_same_mass_in_the_model_leaves_no_error(fly_once: Callable[..., Flight]) -> None:
+    assert fly_once("hover", "vehicle.mass=4.4").metrics["rmse.z"] < 1e-6
+
+
+def test_a_mass_factor_is_the_same_mismatch(heavy: Flight, fly_once: Callable[..., Flight]) -> None:
+    factor = fly_once("hover", "effects.load.mass_factor=1.1")
+    np.testing.assert_allclose(factor.state["z"], heavy.state["z"], atol=1e-9)
+
+
+def test_both_vehicles_are_recorded_and_shown(tmp_path: Path) -> None:
+    scenario = load_scenario("hover", ["duration=0.5", "actual.mass=4.4", "actual.arm_length=0.35"])
+    directory = tmp_path / "heavy"
+    run_scenario(scenario, directory, Outputs(video=False, recording=False, figures=False))
+    run, flight = rundir.load_run(directory), quadsim.read(directory)
+    assert (run.summary["vehicle"]["mass"], run.summary["actual"]["mass"]) == (4.0, 4.4)
+    assert (flight.vehicle.mass, flight.actual.mass, run.vehicle.arm_length) == (4.0, 4.4, 0.35)
+    assert reaudit(directory).satisfied == flight.satisfied
+    cells = {row.label: row.cells[0].text for row in comparison_rows([run])}
+    assert cells["vehicle"] == "lopes2011, modelled with mass 4.0 for 4.4, arm_length 0.3 for 0.35"
+    assert cells["mass"] == "4.4"
+    again = quadsim.fly(flight.scenario, progress=False)
+    np.testing.assert_array_equal(again.command, flight.command)
+
+
+def test_a_flight_of_the_modelled_vehicle_records_one(constrained_flight: Flight) -> None:
+    assert "actual" not in constrained_flight.summary
+    assert constrained_flight.actual == constrained_flight.vehicle
+
+
+def test_what_the_effects_leave_to_the_vehicle_is_that_of_the_actual_one() -> None:
+    scenario = load_scenario("hummingbird-real-rotors", ["actual.rotor_rise=0.05"])
+    written = resolve(scenario, build_vehicle(scenario))
+    assert written.effects.rotors is not None
+    assert written.effects.rotors.rise == 0.05
+    assert written.vehicle.rotor_rise == 0.0125
+    again = parse_scenario(tomllib.loads(written.to_toml()))
+    assert resolve(again, build_vehicle(again)).to_toml() == written.to_toml()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["actual.mas=4.4"], "actual.mas is not a field of the scenario file; did you mean 'mass'?"),
+        (["actual.file='hummingbird'"], "actual.file is not a field of the scenario file"),
+        (["actual.mass='heavy'"], "actual.mass must be a number; got 'heavy'"),
+        (["actual.mass=-1"], "actual.mass must be positive; got -1.0"),
+        (["actual.speed_max=150.0"], "actual.speed_max must be no lower than its hover speed"),
+        (
+            ["effects.rotors={rise=0.02, fall=0.02}", "actual.rotor_rise=0.05"],
+            r"actual.rotor_rise must be absent where effects.rotors.rise = 0.02 states it; got 0.05",
+        ),
+    ],
+)
+def test_messages(settings: list[str], message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_scenario("hover", settings)
+    assert message in str(caught.value)
+
+
+def test_campaigns_draw_it_by_its_value_or_relative_to_the_model() -> None:
+    vary = [
+        {"name": "mass", "fields": ["actual.mass"], "distribution": "uniform", "low": 4.1, "high": 4.4},
+        {
+            "name": "inertia",
+            "fields": ["actual.inertia.0", "actual.inertia.1"],
+            "distribution": "uniform",
+            "low": 1.1,
+            "high": 1.2,
+            "relative": True,
+        },
+    ]
+    made = make_plan(load_scenario("hover"), {"flights": 3, "vary": vary})
+    made.check()
+    one, drawn = made.of(1), made.identity(1)
+    assert build_vehicle(one) == build_vehicle(made.scenario)
+    assert one.actual is not None
+    assert one.actual.mass == drawn["draw.mass"]
+    assert one.actual.inertia == pytest.approx([0.033 * drawn["draw.inertia"]] * 2 + [0.066])
+
+
+def test_sweeps_take_it(tmp_path: Path) -> None:
+    hover = quadsim.load("hover").replace({"duration": 1.0})
+    found = quadsim.sweep(hover, {"actual.mass": [4.0, 4.4]}, workers=1, progress=False)
+    assert found["rmse.z"][0] < 1e-6 < found["rmse.z"][1]
