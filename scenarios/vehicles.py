@@ -129,7 +129,7 @@ def first_scenario(vehicle: str | Path, *, course: str = "hover", controller: st
     Args:
         vehicle: name of one that ships, or a path ending in `.toml`.
         course: hover, step (of 1 m) or figure-eight (at 60 % of what the vehicle can do).
-        controller: robust, or lqr, pid, geometric with their own defaults.
+        controller: robust, or lqr, pid, geometric; all have to meet the same requirements.
 
     Returns:
         The `scenario` to fly; `to_toml()`, its file, gives the source of each number; `notes` sums that up.

@@ -16,6 +16,13 @@ from scenarios.design.tuning import STEEPEST
 from scenarios.loading import parse_scenario
 from scenarios.run import fly_scenario
 
+REQUIREMENTS: Final = {
+    "tracking": ("hold_x", "hold_y", "hold_z"),
+    "floor": ("floor",),
+    "tilt": ("roll", "pitch"),
+    "rotors": ("speed", "slew"),
+}
+"""What a first scenario requires, and the constraints that state it."""
 LARGEST_RMS: Final = 0.05
 """Of the robust controller's position error, over the course's size."""
 DRAWN: Final = 20
@@ -30,16 +37,18 @@ class FirstFlight:
     Attributes:
         outcome: the verdict in one word.
         rms: of the distance from the reference, over the course's size; NaN where hardly anything was flown.
+        largest: error along x, y or z, likewise.
         nearest: the bound on tilt that was come nearest to, what was left of it as a share; negative: violated.
-        violated: constraints that did not hold.
+        failed: of `REQUIREMENTS`, those that did not hold.
         size: of the course [m].
         tilt: largest roll or pitch [deg].
     """
 
     outcome: str
     rms: float
+    largest: float
     nearest: float
-    violated: tuple[str, ...]
+    failed: tuple[str, ...]
     size: float
     tilt: float
 
@@ -60,17 +69,21 @@ def fly_first(vehicle: Vehicle, course: str, law: str, *, steepest: float = STEE
     numbers = {name: value for name in VEHICLE_UNITS if (value := getattr(vehicle, name)) is not None}
     given = {name: list(value) if isinstance(value, tuple) else value for name, value in numbers.items()}
     flight = fly_scenario(parse_scenario(made.to_data() | {"vehicle": {"file": vehicle.name, **given}}))
+    failed = {finding.limit.name for finding in flight.findings if not finding.satisfied}
+    requirements = tuple(name for name, constraints in REQUIREMENTS.items() if not failed.isdisjoint(constraints))
     if not flight.log.control.t.size:
+        nan = math.nan
         return FirstFlight(
-            outcome=flight.outcome, rms=math.nan, nearest=math.nan, violated=(), size=made.size, tilt=math.nan
+            outcome=flight.outcome, rms=nan, largest=nan, nearest=nan, failed=requirements, size=made.size, tilt=nan
         )
-    errors = tracking(flight.log.control)["rmse"]
-    tilts = [finding for finding in flight.findings if finding.limit.name in ("roll", "pitch")]
+    errors = tracking(flight.log.control)
+    tilts = [finding for finding in flight.findings if finding.limit.name in REQUIREMENTS["tilt"]]
     return FirstFlight(
         outcome=flight.outcome,
-        rms=math.hypot(errors["x"], errors["y"], errors["z"]) / made.size,
+        rms=math.hypot(*(errors["rmse"][axis] for axis in "xyz")) / made.size,
+        largest=max(errors["max_error"][axis] for axis in "xyz") / made.size,
         nearest=min(finding.worst_margin / finding.limit.upper for finding in tilts),
-        violated=tuple(finding.limit.name for finding in flight.findings if not finding.satisfied),
+        failed=requirements,
         size=made.size,
         tilt=peak_tilt(flight.log.plant.state),
     )

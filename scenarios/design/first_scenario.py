@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
+from mpc.baselines.bandwidths import lag_to_allow_for
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.errors import UnknownNameError, printable
 from quadsim.vehicle import Vehicle
@@ -43,13 +44,22 @@ EIGHT_RATIO: Final = 0.3
 STEP_RATIO: Final = 0.28  # bandwidth of the filter of steps over the loop's
 STEP: Final = 1.0  # [m]
 ROOM: Final = 0.15
-"""Largest error allowed in flight, over the size of the course; the RMS error is a third of that or less."""
+"""The tracking requirement, the same for every controller: the largest error along x, y and z over the course's size.
+The robust controller's is 11 % on steps and 5 % on figure eights, at most (docs/first-flights.md)."""
+CLEARANCE: Final = 1.5
+"""Height of the course above the floor over the largest error allowed, where that is more than `LOWEST`."""
+LOWEST: Final = 1.0  # height of a course [m]
 SOFT: Final = (2e4, 1e3)
 """l1 and l2 of the tilt bounds over the weight of x, as the defaults have them with the paper's weight of 10."""
 LQR_TILT: Final = 30.0
-BASELINE_SHARE: Final = 0.9
-"""Tilt [deg] that an LQR is limited to, and share of the tilt bound that the other baselines are: they only limit what
-they require."""
+BASELINE_SHARE: Final = 0.8
+"""Tilt [deg] that an LQR is limited to, and share of the tilt bound that every baseline is: they limit only the tilt
+that they command, and overshoot it."""
+LAG_SHARE: Final = 0.5
+"""Lag that the gains of PID and geometric control allow for, over the rotors' (or half a period, if that is longer):
+half of a time constant counts as dead time (the half rule of SIMC, Skogestad, 2003).  The laws' own default is 1."""
+PREVIEW: Final = 2.0
+"""Time ahead that gives a baseline the reference's velocity and acceleration, times w; an MPC's horizon is 5 / w."""
 GRID: Final = 0.2  # durations are multiples of it [s], and so of every control period
 _EIGHT_PEAK: Final = float(np.hypot(np.sin(angle := np.linspace(0.0, math.pi, 721)), 2.0 * np.sin(2.0 * angle)).max())
 """Largest |d2p/dt2| of the figure eight (a sin wt, a/2 sin 2wt), over a w^2."""
@@ -120,7 +130,7 @@ def first_scenario(
         vehicle: the numbers.
         file: where they are, as the scenario is to name it: a shipped vehicle or a path ending in `.toml`.
         course: one of `COURSES`.
-        law: one of `LAWS`; all but `robust` with their own defaults.
+        law: one of `LAWS`.
         steepest: largest tilt bound [rad].
 
     Raises:
@@ -139,13 +149,13 @@ def first_scenario(
         *([] if duration is None else [Entry("", "duration", duration, "s")]),
         Entry("", "control_period", tuning.period, why),
         Entry("vehicle", "file", file, "made for its numbers: remake this file when they change"),
-        Entry("initial", "position", [0.0, 0.0, 1.0], "m, world; at rest"),
+        Entry("initial", "position", [0.0, 0.0, _height(vehicle, size)], "m, world; at rest"),
         Entry("plant", "limit_speeds", True, "rotors saturate at their lowest and highest speed"),
         *flown,
         *(_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning)),
         Entry("effects.rotors", "", None, "lag and inertia of the vehicle file"),
         Entry("effects.air", "", None, "drag of the vehicle file"),
-        *_constraints(vehicle, tuning, size if law == "robust" else None),
+        *_constraints(vehicle, tuning, size),
     )
     return FirstScenario(notes=_notes(vehicle, tuning, course, law), entries=entries, size=size)
 
@@ -157,7 +167,17 @@ def _notes(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str
         "torque": "torque: 0.5 sqrt(alpha / tilt bound), alpha the smaller of roll's and pitch's",
         "period": "what a period of 10 ms or more can serve",
     }
-    margin = delay_margin(vehicle, tuning)
+    bandwidths = f"{tuning.height:.3g} rad/s for z, {tuning.heading:.3g} rad/s for yaw"
+    if law == "robust":
+        what, margin = "The loop's bandwidth for x and y", delay_margin(vehicle, tuning)
+        then = [
+            f"{bandwidths}. Without bounds it tolerates {1e3 * margin:.3g} ms more delay than it knows of.",
+            "Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: "
+            "scenarios/design/tuning.py.",
+        ]
+    else:
+        what = "The course is made for a robust MPC, whose bandwidth for x and y"
+        then = [f"{bandwidths}. The controller's own rules: docs/own-vehicle.md."]
     return (
         f"A first flight of {_description(course, vehicle, tuning)}.",
         f"Made by: quadsim scenario --for VEHICLE --course {course}"
@@ -166,17 +186,15 @@ def _notes(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str
         f"Thrust to weight {can.thrust_to_weight:.3g}: at most {math.degrees(can.steady_tilt):.3g} deg of steady tilt; "
         "angular acceleration in reserve at hover",
         f"{can.turning[0]:.3g}, {can.turning[1]:.3g}, {can.turning[2]:.3g} rad/s^2 about x, y, z.",
-        f"The loop's bandwidth for x and y is w = {tuning.bandwidth:.3g} rad/s,",
+        f"{what} is w = {tuning.bandwidth:.3g} rad/s,",
         f"limited by {limits[tuning.limited_by]};",
-        f"{tuning.height:.3g} rad/s for z, {tuning.heading:.3g} rad/s for yaw. "
-        f"Without bounds it stands {1e3 * margin:.3g} ms more delay than it knows of.",
-        "Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: scenarios/design/tuning.py.",
+        *then,
     )
 
 
 def _description(course: str, vehicle: Vehicle, tuning: Tuning) -> str:
     what = {
-        "hover": "hover at 1 m",
+        "hover": f"hover at {_height(vehicle, STEP):g} m",
         "step": f"steps of {STEP:g} m in x, y and z",
         "figure-eight": f"a figure eight at {100.0 * SHARE:g} % of {_eight_limit(vehicle, tuning)}",
     }
@@ -209,7 +227,8 @@ def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[list[Entry],
         hold = _later(max(1.5, 1.2 * response))
         why = f"s, 95 % of a step: 3 / ({STEP_RATIO:g} times {slowest:.3g} rad/s, the slower of w and that of z)"
         found = [Entry("reference", "response_time", response, why)]
-        for axis, begin, until, value in (("x", 0, 2, STEP), ("y", 1, 3, STEP), ("z", 0, 2, 1.0 + STEP)):
+        above = round(_height(vehicle, STEP) + STEP, 9)
+        for axis, begin, until, value in (("x", 0, 2, STEP), ("y", 1, 3, STEP), ("z", 0, 2, above)):
             window = {"start": round(start + begin * hold, 9), "stop": round(start + until * hold, 9), "value": value}
             found.append(Entry("reference", axis, [window], "s, s, m"))
         return found, round(start + 4.0 * hold, 9), STEP
@@ -269,10 +288,20 @@ def _robust(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
 
 
 def _baseline(law: str, vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
-    tilt = min(LQR_TILT, BASELINE_SHARE * _tilt(tuning)) if law == "lqr" else BASELINE_SHARE * _tilt(tuning)
-    yield Entry("controller", "type", law, "its gains are its own defaults for the vehicle")
-    why = "deg, largest that it commands; below the audit's, since it plans nothing"
-    yield Entry("controller", "tilt", round(tilt, 3), why)
+    known = {"lqr": "weights by Bryson's rule, its defaults; it tracks pose and velocity, not acceleration"}
+    yield Entry("controller", "type", law, known.get(law, ""))
+    steepest = BASELINE_SHARE * _tilt(tuning)
+    why = "deg, largest that it commands; below the audit's, which it overshoots"
+    yield Entry("controller", "tilt", round(min(LQR_TILT, steepest) if law == "lqr" else steepest, 3), why)
+    ahead = math.ceil(PREVIEW / (tuning.bandwidth * tuning.period))
+    why = f"periods of preview for the reference's velocity: {PREVIEW:g} / w = {PREVIEW / tuning.bandwidth:.3g} s"
+    yield Entry("controller", "horizon", ahead, why)
+    if law != "lqr":
+        lag = lag_to_allow_for(vehicle, tuning.period)
+        why = f"s that its gains allow for: {LAG_SHARE:g} times {1e3 * lag:.3g} ms, the rotors' lag or half a period"
+        yield Entry("controller", "lag", _rounded(LAG_SHARE * lag), why)
+    if law == "geometric":
+        yield Entry("controller", "integral", True, "against drag and what else is not modelled")
     yield from _inputs(vehicle, tuning)
 
 
@@ -285,13 +314,17 @@ def _inputs(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
     yield Entry(table, "slew", [down, up], why)
 
 
-def _constraints(vehicle: Vehicle, tuning: Tuning, size: float | None) -> Iterator[Entry]:
-    """What the flight is audited against; `size` of the course [m] where its errors are limited too."""
+def _constraints(vehicle: Vehicle, tuning: Tuning, size: float) -> Iterator[Entry]:
+    """What the flight is audited against, whatever its controller; `size` of the course [m]."""
     tilt, (down, up) = _tilt(tuning), _slew(tuning)
     rounding = _rounded(1e-9 * vehicle.speed_max)
 
-    def entry(name: str, signal: str, bounds: tuple[float, float], tolerance: float, why: str) -> Iterator[Entry]:
-        pairs = {"name": name, "signal": signal, "lower": bounds[0], "upper": bounds[1]}
+    def entry(
+        name: str, signal: str, bounds: tuple[float, float | None], tolerance: float, why: str
+    ) -> Iterator[Entry]:
+        pairs = {"name": name, "signal": signal, "lower": bounds[0]}
+        if bounds[1] is not None:
+            pairs["upper"] = bounds[1]
         if tolerance:
             pairs |= {"tolerance": tolerance, "tolerance_sampled": tolerance}
         for key, value in pairs.items():
@@ -302,11 +335,24 @@ def _constraints(vehicle: Vehicle, tuning: Tuning, size: float | None) -> Iterat
         yield from entry(name, name, (-tilt, tilt), 0.0, "deg, the tilt bound, at every instant")
     yield from entry("speed", "speed", (vehicle.speed_min, vehicle.speed_max), rounding, "rad/s, what the rotors hold")
     yield from entry("slew", "slew", (down, up), rounding, "rad/s per period, the controller's bound")
-    if size is not None:
-        off = _rounded(ROOM * size)
-        for axis in "xyz":
-            why = f"m, {100 * ROOM:g} % of the course's size, {size:g} m"
-            yield from entry(f"hold_{axis}", f"{axis}_error", (-off, off), 0.0, why)
+    why = (
+        "m, radius of the ball about the hull: the lowest centre that keeps all of the vehicle above the ground, z = 0"
+    )
+    yield from entry("floor", "z", (_floor(vehicle), None), 0.0, why)
+    off = _rounded(ROOM * size)
+    for axis in "xyz":
+        why = f"m, {100 * ROOM:g} % of the course's size, {size:g} m: the same for every controller"
+        yield from entry(f"hold_{axis}", f"{axis}_error", (-off, off), 0.0, why)
+
+
+def _floor(vehicle: Vehicle) -> float:
+    """Lowest z [m] of the centre of mass at which no attitude brings the hull to the ground, to a millimetre above."""
+    return math.ceil(1e3 * vehicle.enclosing_radius - 1e-6) / 1e3
+
+
+def _height(vehicle: Vehicle, size: float) -> float:
+    """Height [m] of the lowest points of a course of some size [m], to a decimetre above."""
+    return max(LOWEST, math.ceil(10.0 * (_floor(vehicle) + CLEARANCE * ROOM * size) - 1e-6) / 10.0)
 
 
 def _tilt(tuning: Tuning) -> float:

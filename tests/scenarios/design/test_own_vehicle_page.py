@@ -55,5 +55,11 @@ def test_its_rules_have_the_numbers_of_the_code() -> None:
     assert f"or where {100 * tuning.THRUST_SHARE:g} % of the thrust" in rows
     assert f"at most {tuning.HEIGHT_RATIO:g} w and {tuning.HEADING_RATIO:g} w" in rows
     assert f"as speeds cost at {tuning.MOVE_RATIO:g} w" in rows
+    assert f"at most {100 * first_scenario.ROOM:g} % of the course's size" in rows
+    assert f"{first_scenario.LOWEST:g} m, or {first_scenario.CLEARANCE:g} times the largest error allowed" in rows
+    assert f"at most {100 * first_scenario.BASELINE_SHARE:g} % of the tilt bound" in rows
+    assert f"`lqr`: {first_scenario.LQR_TILT:g} deg" in rows
+    assert f"the next {first_scenario.PREVIEW:g} / w; an MPC's horizon is {tuning.HORIZON_TIMES:g} / w" in rows
+    assert first_scenario.LAG_SHARE == 0.5, "half, in words"
     assert f"{100 * first_scenario.SHARE:g} % of the level acceleration within the tilt bound" in rows
     assert f"turns with {first_scenario.EIGHT_RATIO:g} w | M of {1.0 / (1.0 - first_scenario.SHARE):g} or more" in rows

@@ -11,15 +11,18 @@ from first_flights import vehicles
 from plausible_vehicles import HEAVIEST, LIGHTEST, QUICKEST, SLOWEST, STRONGEST, WEAKEST, plausible_vehicles
 
 from mpc.model import continuous_model, discretise
+from quadsim.controller import Moment
 from quadsim.errors import ParameterError
 from quadsim.sim.effects import Air, Effects
 from quadsim.sim.plant import Plant
-from quadsim.state import INDEX, make_state
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.state import INDEX, N_STATES, make_state
+from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import authority
 from scenarios.design.first_scenario import SHARE, first_scenario, largest_eight
 from scenarios.design.loop import delay_margin, gain, is_stable
 from scenarios.design.tuning import FASTEST, PERIOD_SHARE, tune
+from scenarios.loading import parse_scenario
+from scenarios.parts.controllers import make_controller
 
 ALL = vehicles()
 EVERY = pytest.mark.parametrize("vehicle", ALL, ids=lambda vehicle: vehicle.name)
@@ -45,6 +48,25 @@ def test_the_loop_stands_a_third_of_its_time_constant_of_more_delay(vehicle: Veh
     margin = delay_margin(vehicle, tuning)
     assert margin * tuning.bandwidth == pytest.approx(1.0 / 3.0, rel=0.05)
     assert margin > 0.75 * (tuning.authority.lag + 0.5 * tuning.period)
+
+
+@pytest.mark.parametrize("vehicle", ALL, ids=lambda vehicle: vehicle.name)
+@pytest.mark.parametrize("law", ["pid", "geometric"])
+def test_a_baselines_loop_tolerates_a_quarter_to_three_quarters_of_that_delay(vehicle: Vehicle, law: str) -> None:
+    """Its gain K (4, n + 4) by differences at hover, of the law that a first scenario has."""
+    numbers = {name: value for name in VEHICLE_UNITS if (value := getattr(vehicle, name)) is not None}
+    data = first_scenario(vehicle, vehicle.name, law=law).to_data() | {"vehicle": {"file": vehicle.name, **numbers}}
+    scenario, tuning, step = parse_scenario(data), tune(vehicle), 1e-5
+    K = np.zeros_like(gain(vehicle, tuning))
+    for i in range(N_STATES):
+        state, answers = np.zeros(N_STATES), []
+        for state[i] in (step, -step):
+            controller = make_controller(scenario.controller, vehicle, tuning.period)
+            answers.append(controller.step(Moment(), state, np.zeros((controller.horizon, 4))).speeds)
+        K[:, i] = (answers[1] - answers[0]) / (2.0 * step)
+    margin = delay_margin(vehicle, tuning)
+    assert is_stable(vehicle, tuning, K, 0.25 * margin)
+    assert not is_stable(vehicle, tuning, K, 0.8 * margin)
 
 
 @EVERY
