@@ -27,7 +27,8 @@ from scenarios.run import run_scenario
 ROOT = Path(__file__).resolve().parent.parent
 SHORT = ("--set", "duration=1.0", "--set", "controller.horizon=5")
 ADDED = {
-    "run": ("--no-video", "--set", "duration=2.0", "--set", "constraints=[]"),
+    "run": ("--no-video", "--set", "duration=2.0", "--set", "constraints=[]", "--overwrite"),
+    "compare": ("--overwrite",),
     "bench solvers": (*SHORT, "--repeats", "1", "--horizons", "none"),
     "bench flight": (*SHORT, "--repeats", "1"),
     "bench render": (*SHORT, "--seconds", "0.2"),

@@ -10,7 +10,7 @@ from typing import Any, Final
 from quadsim.assets import DEEPEST, read_toml
 from quadsim.errors import FileError, ParameterError
 from scenarios.schema.plugin import located
-from scenarios.schema.settings import note_changes
+from scenarios.schema.settings import note_changes, state_bounds
 
 LARGEST_FILE: Final = 8_000_000
 """Size [bytes] of the largest file that is read; the longest scenario there can be is smaller."""
@@ -61,6 +61,8 @@ def read_scenario(
         raise FileError(path, f"must have at most {DEEPEST} bases above one another")
     inherited = read_scenario(base, find, locate=locate, above=chain)
     locate(inherited, base.parent)
+    if "controller" in data:
+        state_bounds(inherited, data["controller"])
     # The base's place in the library is its own.
     merged = merge({key: value for key, value in inherited.items() if key not in ("group", "expect")}, data)
     if "description" not in data:

@@ -54,6 +54,8 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
         ParameterError: the path goes through something that is no table.
         UnknownNameError: a list has no such entry.
     """
+    if path in ("controller", "controller.type"):
+        state_bounds(data, value if path == "controller" else {"type": value})
     *through, last = path.split(".")
     holder = _holder(data, through, source=source, given=given or path)
     if isinstance(holder, dict) and value is None:
@@ -64,6 +66,30 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
         _require_numbers(holder, path, source=source, given=given or path)
         holder[_index(holder, ".".join(through), last)] = value
     note_change(data, path, value)
+
+
+def state_bounds(data: dict[str, Any], controller: Any) -> None:
+    """Write a controller's bounds into the constraints that take them, where another law without these replaces it.
+
+    Args:
+        data: the scenario's tables, changed in place.
+        controller: the table of the other law, or its name.
+    """
+    before, after = data.get("controller"), {"type": controller} if isinstance(controller, str) else controller
+    if not (isinstance(before, dict) and isinstance(after, dict)) or after.get("type") in (None, before.get("type")):
+        return
+    names = ("output_bounds", "input_bounds")
+    bounds, others = ({k: v for name in names for k, v in _table(law, name).items()} for law in (before, after))
+    for entry in data["constraints"] if isinstance(data.get("constraints"), list) else ():
+        pair = bounds.get(str(entry.get("signal"))) if isinstance(entry, dict) else None
+        taken = pair is not None and entry["signal"] not in others and not {"lower", "upper"} & entry.keys()
+        if taken and isinstance(pair, list) and len(pair) == 2:
+            entry["lower"], entry["upper"] = pair
+
+
+def _table(data: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    table = data.get(name)
+    return table if isinstance(table, Mapping) else {}
 
 
 def note_change(data: dict[str, Any], path: str, value: Any) -> None:

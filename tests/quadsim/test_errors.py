@@ -26,13 +26,14 @@ from quadsim.errors import (
     ParameterError,
     PlanExhaustedError,
     QuadsimError,
+    RaisedError,
     RenderingUnavailableError,
     UnknownNameError,
     ViewerUnavailableError,
 )
 
 EVERY = [kind for _, kind in inspect.getmembers(errors, inspect.isclass) if kind.__module__ == errors.__name__]
-FLIGHT = {FlightError, DivergenceError, LostError, CommandError, ForceError, PlanExhaustedError, InterruptedFlightError}
+FLIGHT = {kind for kind in EVERY if issubclass(kind, FlightError)}
 
 
 SAMPLES: list[QuadsimError] = [
@@ -55,6 +56,7 @@ SAMPLES: list[QuadsimError] = [
     ForceError("not finite", time=1.0),
     PlanExhaustedError("no plan", time=1.0),
     InterruptedFlightError(time=1.0),
+    RaisedError("the controller", ZeroDivisionError("of its own"), time=1.0),
 ]
 
 

@@ -262,7 +262,7 @@ def test_a_layout_that_would_turn_in_hover_is_refused(vehicle: Vehicle) -> None:
 @pytest.mark.parametrize("text", ["value = " + "[" * 5000, "value = " + "9" * 5000])
 def test_what_python_cannot_read_is_reported(tmp_path: Path, text: str) -> None:
     (tmp_path / "v.toml").write_text(f"[mass]\n{text}\n", encoding="utf-8")
-    with pytest.raises(FileError, match=r"v\.toml: is not valid TOML"):
+    with pytest.raises(FileError, match=r"v\.toml: (is not valid TOML|must have at most 20 tables and lists)"):
         load_vehicle(tmp_path / "v.toml")
 
 

@@ -302,7 +302,7 @@ def test_a_force_that_fails_ends_the_flight_with_its_reason(hover: Scenario) -> 
         return np.zeros(6) if time < 0.5 else np.full(5, np.nan)
 
     flown = quadsim.fly(hover, forces=[bad], progress=False)
-    assert flown.outcome == "aborted"
+    assert flown.outcome == "lost"
     assert "at t = 0.500 s: the force bad must give six finite numbers" in str(flown.log.reason)
 
 

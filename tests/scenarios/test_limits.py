@@ -89,11 +89,24 @@ def test_other_numbers_than_the_controllers_are_reported(tmp_path: Path, capsys:
     assert reaudit(tmp_path / "run").satisfied
 
 
-def test_a_law_without_bounds_is_held_to_what_the_entries_state() -> None:
-    scenario = hover(controller={"type": "pid"})
-    assert set(audited(scenario)) == {"hold_x", "hold_y", "hold_z"}
-    (note,) = audit_notes(scenario)
-    assert note == "roll, pitch, speed, slew: not audited, the controller has no such bound and the entry states none"
+@pytest.mark.parametrize("how", ["replace", "set", "base"])
+def test_a_law_without_bounds_is_held_to_those_of_the_law_that_it_replaces(how: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('base = "hover"\nname = "mine"\ncontroller = "pid"\n')
+    scenario = {
+        "replace": lambda: hover(controller={"type": "pid"}),
+        "set": lambda: load_scenario("hover", ["controller=pid"]),
+        "base": lambda: load_scenario(str(tmp_path / "mine.toml")),
+    }[how]()
+    before = audited(hover())
+    assert audited(scenario) == before
+    assert (before["roll"].upper, audit_notes(scenario)) == (5.0, [])
+
+
+def test_an_entry_without_bounds_is_not_audited_where_no_law_has_had_any() -> None:
+    entry = {"name": "climb", "signal": "vz"}
+    scenario = hover(controller={"type": "pid"}).replace({"constraints": [entry]})
+    assert audited(scenario) == {}
+    assert audit_notes(scenario) == ["climb: not audited, the controller has no such bound and the entry states none"]
 
 
 def test_bounds_that_an_event_changes_are_reported_with_their_time() -> None:

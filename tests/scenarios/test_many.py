@@ -118,13 +118,14 @@ def test_flights_are_drawn_as_they_are_flown_and_closing_ends_all() -> None:
 
 def test_any_thread_may_have_flights_flown() -> None:
     found: list[list[float | None]] = []
+    before = dict(vars(sys.modules["__main__"]))
     threads = [threading.Thread(target=lambda: found.append(values(rows_of(CALM, workers=1)))) for _ in range(2)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
     assert found == [EXPECTED, EXPECTED]
-    assert sys.modules["__main__"].__dict__.get("__file__") or sys.modules["__main__"].__dict__.get("__spec__")
+    assert vars(sys.modules["__main__"]) == before
 
 
 def test_a_worker_is_where_its_caller_is_and_prints_nothing(

@@ -132,7 +132,7 @@ def test_a_verdict_that_the_tables_do_not_give_is_reported(
 
 def test_every_number_that_the_tables_give_is_held_against_them(flown: Path, tmp_path: Path) -> None:
     run = shutil.copytree(flown / "good", tmp_path / "run")
-    for path in (("tracking", "rmse", "x"), ("control", "speed_max"), ("controller", "iterations", "max")):
+    for path in (("tracking", "rmse", "x"), ("control", "speed_max"), ("controller", "active_max")):
 
         def change(summary: dict[str, Any], path: tuple[str, ...] = path) -> None:
             for key in path[:-1]:

@@ -189,7 +189,7 @@ def test_a_bad_flight_is_a_row_with_its_verdict_and_reason(tmp_path: Path) -> No
         "at t = 0.000 s: the controller raised ZeroDivisionError: of its",
         "its process ended by signal 9",
         "it took longer than 4 s",
-        "at t = 0.000 s: the controller raised MemoryError: (it may take 500 MB)",
+        "at t = 0.000 s: the controller raised MemoryError (it may take 500 MB)",
     ]
     assert table["failed"].to_pylist() == [False, True, True, True, True]
     assert [result.summary["events"][name]["count"] for name in ("failure", "died", "lost")] == [4, 1, 0]
@@ -407,11 +407,11 @@ def test_a_replayed_flight_gives_the_campaigns_numbers(by_two: Result, tmp_path:
     for number in (None, 0, 7):
         recorded = recorded_flight(by_two.directory, number)
         outputs = Outputs(video=False, recording=False, figures=False)
-        again = replay_flight(recorded, tmp_path / "runs" / recorded.scenario.name, outputs)
+        again = replay_flight(recorded, tmp_path / "runs" / str(number), outputs)
         flight, differing = again.flight, again.differing
         assert differing == []
         assert flight.log.control.t.size == 10
-        assert (tmp_path / "runs" / recorded.scenario.name / "summary.json").is_file()
+        assert (tmp_path / "runs" / str(number) / "summary.json").is_file()
 
 
 def test_a_replay_reports_when_numbers_differ(whole: Result, tmp_path: Path) -> None:

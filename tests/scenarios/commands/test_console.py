@@ -99,7 +99,7 @@ def test_a_reason_in_a_run_of_others_is_shown_as_text(
     """An aborted flight of an older version, whose reason someone wrote."""
     run = shutil.copytree(short_run_directory, tmp_path / "run")
     summary = json.loads((run / "summary.json").read_text())
-    summary |= {"status": "aborted", "reason": nasty, "outcome": "lost", "satisfied": False, "as_expected": False}
+    summary |= {"status": "aborted", "reason": nasty, "verdict": "lost", "satisfied": False, "as_expected": False}
     (run / "summary.json").write_text(json.dumps(summary))
     status = main(["check", str(run), "--junit", str(tmp_path / "junit.xml")])
     output = capsys.readouterr()

@@ -272,7 +272,7 @@ def test_compare_puts_the_study_on_the_page(
     written = {path.name for path in (tmp_path / "page").iterdir()}
     assert {"cost.json", "cost.md", "cost_steps.svg", "cost_tilt.png", "cost_horizon.svg"} <= written
     assert '<section id="cost">' in (tmp_path / "page" / "index.html").read_text()
-    assert main(["compare", *both, "--no-cost", "--out", str(tmp_path / "page")]) == EXIT_DONE
+    assert main(["compare", *both, "--no-cost", "--overwrite", "--out", str(tmp_path / "page")]) == EXIT_DONE
     assert "cost.json" not in {path.name for path in (tmp_path / "page").iterdir()}
     assert capsys.readouterr().err == ""
 

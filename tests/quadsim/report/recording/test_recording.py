@@ -462,7 +462,7 @@ def test_the_layout_is_inside_and_shows_only_what_exists(content: Content, short
 
 def rerun(*arguments: str) -> subprocess.CompletedProcess[str]:
     """Runs rerun's command line."""
-    return subprocess.run([*recording_module._VIEWER[:3], *arguments], capture_output=True, text=True, timeout=60)
+    return subprocess.run([*recording_module._VIEWER[:4], *arguments], capture_output=True, text=True, timeout=60)
 
 
 def test_rerun_finds_nothing_wrong_with_the_file_and_the_layout_is_in_force(path: Path) -> None:
@@ -544,7 +544,7 @@ def viewer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[int], P
         program = (
             f"import sys, pathlib; pathlib.Path({str(notes)!r}).write_text(' '.join(sys.argv[1:])); sys.exit({status})"
         )
-        monkeypatch.setattr(recording_module, "_VIEWER", (sys.executable, "-c", program, *recording_module._VIEWER[3:]))
+        monkeypatch.setattr(recording_module, "_VIEWER", (sys.executable, "-c", program, *recording_module._VIEWER[4:]))
         return notes
 
     return replace
