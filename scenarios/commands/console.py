@@ -14,7 +14,7 @@ from rich.progress import Progress as ProgressBars
 from rich.table import Table
 from rich.text import Text
 
-from quadsim.controller import ACCEPTED, Phase, counts, law_name
+from quadsim.controller import OPTIMAL, Phase, counts, law_name
 from quadsim.errors import printable
 from quadsim.flight.audit import HELD
 from quadsim.flight.summary import constraint_verdict, deciding_margin
@@ -183,10 +183,12 @@ def _tracking_table(tracking: Mapping[str, Any]) -> Table:
 
 def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     control, controller = summary["control"], summary["controller"]
-    times, usual = controller["step_ms"], ACCEPTED | {Phase.LANDED, Phase.CRASHED}
+    times, usual = controller["step_ms"], OPTIMAL | {Phase.LANDED, Phase.CRASHED}
     refused = ", ".join(f"{n} {status}" for status, n in controller["statuses"].items() if status not in usual)
+    where = f" ({controller['solver']})" if controller["solver"].startswith("C99") else ""
     yield (
-        f"{law_name(controller['name'])}: {counts(controller['answered_by'])}{f' ({refused})' if refused else ''}; "
+        f"{law_name(controller['name'])}{where}: {counts(controller['answered_by'])}"
+        f"{f' ({refused})' if refused else ''}; "
         f"step p50 {times['p50']:.3f}, p99 {times['p99']:.3f}, max {times['max']:.3f} ms "
         f"of {controller['deadline_ms']:g} ms"
     )
