@@ -72,7 +72,7 @@ def page(flown: list[Vehicle], flights: Flights, steeper: dict[str, FirstFlight]
         f"{100 * LAG_SHARE:g} % of the rotors' lag, which\nleaves a quarter to three quarters of the delay margin of "
         "the robust controller's loop. All take the reference's velocity\n"
         f"from the next {PREVIEW:g} / w; the rules: [own-vehicle.md](own-vehicle.md#baselines). The LQR tracks the "
-        "reference's pose and velocity, not\nits acceleration, and so stays behind on every moving course.\n",
+        "reference's pose and velocity, not\nits acceleration, so it lags on every moving course.\n",
         "Each cell: RMS error and largest error along an axis in percent of the course's size, then the room left to "
         "the tilt bound\nin percent of it, after the requirements that **failed**. Lag is the longer of rise and fall, "
         "w the bandwidth of x and y.\n",
