@@ -33,23 +33,6 @@ NONLINEAR = "## Nonlinear MPC"
 
 REPEATS = 5
 
-BEFORE: Table = [
-    (
-        "60 s of paper-constrained [s]",
-        "bfa97b8: a QP in every period",
-        "132a6f4: where a constraint is active",
-        "7e0c7d8: one QP per axis, not polished",
-    ),
-    ("controller: optimum", "1.06", "0.58", "0.24"),
-    ("controller: the rest", "0.11", "0.07", "0.02"),
-    ("physics", "0.43", "0.40", "0.43"),
-    ("measurement", "0.05", "0.04", "0.04"),
-    ("log and loop", "0.17", "0.04", "0.04"),
-    ("the flight, with clocks in it", "1.80", "1.12", "0.77"),
-]
-"""Measured at these commits, on machines of the kind of the page's other numbers."""
-
-
 AIR = ["effects.air.rotor_drag=3e-4", "effects.air.wind=[3.0, 0.0, 0.0]"]
 LAG = ["effects.rotors.rise=0.02", "effects.rotors.fall=0.02"]
 GPS = ["sensors.position={rate=20, noise=0.5, delay=0.11}", "sensors.attitude={rate=100, noise=1.0}"]
@@ -158,7 +141,6 @@ def rest(flight: FlightProfile, film: RenderProfile, commands: str, effects: str
     return "\n".join(
         [
             *(section(grid) for grid in flight_tables(flight)),
-            f"Before, by commit; measured then, on machines of the same kind, not in this run:\n\n{markdown(BEFORE)}",
             f"## What effects cost\n\n{EFFECTS_NOTE}\n\n{effects}",
             campaigns,
             *(section(grid) for grid in render_tables(film)),

@@ -59,7 +59,7 @@ LAG_SHARE: Final = 0.5
 """Lag that the gains of PID and geometric control allow for, over the rotors' (or half a period, if that is longer):
 half of a time constant counts as dead time (the half rule of SIMC, Skogestad, 2003).  The laws' own default is 1."""
 PREVIEW: Final = 2.0
-"""Time ahead that gives a baseline the reference's velocity and acceleration, times w; an MPC's horizon is 5 / w."""
+"""Preview, times w, from which baselines take the reference's velocity, and all but the LQR its acceleration."""
 GRID: Final = 0.2  # durations are multiples of it [s], and so of every control period
 _EIGHT_PEAK: Final = float(np.hypot(np.sin(angle := np.linspace(0.0, math.pi, 721)), 2.0 * np.sin(2.0 * angle)).max())
 """Largest |d2p/dt2| of the figure eight (a sin wt, a/2 sin 2wt), over a w^2."""
