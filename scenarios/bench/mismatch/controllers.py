@@ -114,8 +114,8 @@ VARIANTS: Final = {
         "the paper's constrained MPC, hard bounds, no fallback", lambda spec, condition, period: spec
     ),
     "soft": ControllerVariant(
-        f"soft bounds on tilt, input weight {INPUT_WEIGHT:g}, move weight {MOVE_WEIGHT:g}; guarded, as are those that "
-        "build on it",
+        f"soft bounds on tilt, input weight {INPUT_WEIGHT:g}, move weight {MOVE_WEIGHT:g}; guarded, as are all "
+        "variants that build on it",
         _robust(modelled=False),
     ),
     "+ model": ControllerVariant("and a prediction that knows rotor lag, delay and heading", _robust()),
