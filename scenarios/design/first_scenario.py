@@ -153,11 +153,19 @@ def first_scenario(
         Entry("plant", "limit_speeds", True, "rotors saturate at their lowest and highest speed"),
         *flown,
         *(_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning)),
-        Entry("effects.rotors", "", None, "lag and inertia of the vehicle file"),
+        *_rotors(vehicle),
         Entry("effects.air", "", None, "drag of the vehicle file"),
         *_constraints(vehicle, tuning, size),
     )
     return FirstScenario(notes=_notes(vehicle, tuning, course, law), entries=entries, size=size)
+
+
+def _rotors(vehicle: Vehicle) -> Iterator[Entry]:
+    """The lines of `[effects.rotors]`; rotors that change their speed at once can have no inertia."""
+    if vehicle.rotor_inertia and not (vehicle.rotor_rise and vehicle.rotor_fall):
+        yield Entry("effects.rotors", "inertia", 0.0, "kg m^2; that of the vehicle file needs its rotor_rise and fall")
+    else:
+        yield Entry("effects.rotors", "", None, "lag and inertia of the vehicle file")
 
 
 def _notes(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str, ...]:

@@ -9,11 +9,12 @@ from pathlib import Path
 import make_first_flights
 import numpy as np
 import pytest
+import tomlkit
 from first_flights import FirstFlight, fly_first, vehicles
 
 import quadsim
 from mpc.baselines.lqr import bryson_objective
-from quadsim.assets import vehicle_names
+from quadsim.assets import vehicle_names, vehicle_path
 from quadsim.errors import UnknownNameError
 from quadsim.vehicle import Vehicle, load_vehicle
 from scenarios.design.first_scenario import BASELINE_SHARE, CLEARANCE, COURSES, LAWS, ROOM, first_scenario
@@ -39,6 +40,18 @@ def test_the_robust_controller_flies_it_first_time(name: str) -> None:
     page = make_first_flights.PAGE.read_text(encoding="utf-8")
     row = " | ".join(make_first_flights.row(ALL[name], flights, "robust"))
     assert f"| {row} |" in page, "docs/first-flights.md is out of date: make first-flights"
+
+
+def test_rotors_with_inertia_and_no_lag_make_a_scenario_that_flies(tmp_path: Path) -> None:
+    """Rotors that change their speed at once can have no inertia: the scenario leaves it out, and says so."""
+    tables = tomllib.loads(vehicle_path("hummingbird").read_text())
+    file = tmp_path / "mine.toml"
+    file.write_text(tomlkit.dumps({k: v for k, v in tables.items() if k not in ("rotor_rise", "rotor_fall")}))
+    vehicle = load_vehicle(file)
+    assert vehicle.rotor_inertia
+    assert vehicle.rotor_rise is None
+    made = parse_scenario(first_scenario(vehicle, str(file)).to_data())
+    assert quadsim.fly(made.replace({"duration": 0.5}), progress=False).log.reason is None
 
 
 @pytest.mark.parametrize("law", LAWS[1:])
