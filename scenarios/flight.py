@@ -475,6 +475,7 @@ def _add_products(flight: Flight, directory: Path, outputs: Outputs, progress: P
             interrupted, problem = True, "interrupted (Ctrl-C)"
         except Exception as error:
             what = str(error) if isinstance(error, QuadsimError) else f"{type(error).__name__}: {error}"
+            what = error.problem if isinstance(error, OutputError) else what  # its path is the product's
             problem = f"failed: {' '.join(printable(what).split())}"[:_LONGEST]
             if asked:
                 failed[name] = problem

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import logging
 import math
@@ -207,13 +208,15 @@ class ClosedLoop:
 
         Raises:
             InputError: the period that starts now is observed already, by the preview of the one before.
+            RaisedError: its `reset` or `adopt` raised.
         """
         if self._observed is not None:
             raise InputError("a controller takes over before a period is observed, not after")
-        controller.reset(self._acting.copy())
-        adopt = getattr(controller, "adopt", None)
-        if adopt is not None:
-            adopt(self.controller)
+        with _ending_flight(self.time):
+            controller.reset(self._acting.copy())
+            adopt = getattr(controller, "adopt", None)
+            if adopt is not None:
+                adopt(self.controller)
         if self.k > self._switched:
             self._predicted.append(self._predict())
         self.controller, self._switched = controller, self.k
@@ -345,12 +348,8 @@ class ClosedLoop:
         step_s, command = 0.0, given
         if command is None:
             started = clock.perf_counter()
-            try:
+            with _ending_flight(now.time):
                 command = self.controller.step(now, observed.state, observed.preview)
-            except FlightError:
-                raise
-            except (Exception, SystemExit) as error:
-                raise RaisedError("the controller", error, time=now.time) from error
             step_s = clock.perf_counter() - started
         delay = 0.0 if computation is None else computation.taken(now.time, command, self._draws)
         self.answered = max(self.answered, now.time + delay)
@@ -451,18 +450,31 @@ def one_period(sample: Sample, timestep: float) -> FlightLog:
     return FlightLog(control=control, timing=_timing_log([sample], control.t), plant=plant)
 
 
+@contextlib.contextmanager
+def _ending_flight(time: float) -> Iterator[None]:
+    """Make whatever a controller's code raises the flight's end, not its loss."""
+    try:
+        yield
+    except FlightError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise RaisedError("the controller", error, time=time) from error
+
+
 def _hold(plant: Plant, inner: InnerLoop | None, speeds: Array, steps: int) -> Iterator[tuple[Segment, Array]]:
     """Advance under a command: segments of flight, each with the rotor speeds (4,) commanded during it [rad/s].
 
     Raises:
-        ParameterError: the inner loop's period is not a whole number of physics steps.
+        RaisedError: the inner loop raised, or its period is not a whole number of physics steps.
     """
     if inner is None:
         yield plant.advance(speeds, steps), plant.applied(speeds)
         return
-    each = inner_steps(inner.rate, plant.timestep)
+    with _ending_flight(plant.time):
+        each = inner_steps(inner.rate, plant.timestep)
     for first in range(0, steps, each):
-        commanded = inner.speeds(plant.time, speeds, plant.physics[_BODY_RATES], plant.speeds)
+        with _ending_flight(plant.time):
+            commanded = inner.speeds(plant.time, speeds, plant.physics[_BODY_RATES], plant.speeds)
         yield plant.advance(commanded, min(each, steps - first)), plant.applied(commanded)
 
 

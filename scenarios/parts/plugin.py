@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from mpc.handover import hand_over
-from quadsim.controller import Command, Moment
+from quadsim.controller import SQP, Command, Moment
 from quadsim.errors import CommandError, InputError, ParameterError, UnknownNameError, printable
 from quadsim.flight.log import RESIDUALS
 from quadsim.sim.effects import Force
@@ -53,11 +53,18 @@ class PluginController:
     @property
     def unanswered(self) -> object:
         """The first problem without an answer, an `mpc.Unanswered`, where the law keeps one."""
-        return getattr(self._law, "unanswered", None)
+        try:
+            return getattr(self._law, "unanswered", None)
+        except Exception as error:  # after the flight, which is not to be lost by it
+            logging.getLogger("quadsim").warning("no diagnosis: unanswered raised %s", _reason(error))
+            return None
 
     def reset(self, speeds: Array) -> None:
-        """See `quadsim.controller.Controller.reset`."""
-        getattr(self._law, "reset", np.copy)(speeds.copy())
+        """See `quadsim.controller.Controller.reset`; raises InputError where the law's raises."""
+        try:
+            getattr(self._law, "reset", np.copy)(speeds.copy())
+        except (Exception, SystemExit) as error:
+            raise InputError(f"controller: {self.name}.reset cannot be called: {_reason(error)}") from error
 
     def adopt(self, previous: object) -> None:
         """See `quadsim.controller.Controller`."""
@@ -73,6 +80,7 @@ class PluginController:
             parts: dict[str, Any] = {name: operator.index(getattr(answer, name)) for name in _WHOLE}
             parts |= {name: float(getattr(answer, name)) for name in _REAL}
             parts |= {name: printable(getattr(answer, name))[:200] for name in ("status", "answered_by")}
+            parts["sqp"] = None if answer.sqp is None else SQP(*map(float, answer.sqp))
             parts["speeds"] = _numbers(answer.speeds, (N_ROTORS,), "its speeds")
             parts["plan"] = _numbers(answer.plan, (self.horizon, N_ROTORS), "its plan")
             if answer.inner is not None and not answer.inner.rate > 0.0:

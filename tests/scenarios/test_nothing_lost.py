@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
 import quadsim
@@ -106,6 +107,62 @@ def test_a_prediction_that_raises_after_the_flight_loses_nothing_else() -> None:
 
     flown = quadsim.fly(quadsim.load("hover", {"duration": 1.0}), controller=Law, progress=False)
     assert (flown.outcome, flown.time.size, flown.log.predicted) == ("satisfied", 20, None)
+
+
+class Inner:
+    """An inner loop that raises, or whose rate does not fit the physics steps."""
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+
+    def speeds(self, *_: object) -> list[float]:
+        raise RuntimeError("inner")
+
+
+@pytest.mark.parametrize(
+    ("parts", "outcome", "reason"),
+    [
+        ({"inner": Inner(500.0)}, "aborted", "the controller raised RuntimeError: inner"),
+        ({"inner": Inner(333.0)}, "aborted", "controller.inner.rate must be such that 1 / rate is a whole multiple"),
+        ({"sqp": "two numbers"}, "lost", "neither 4 speeds nor a Command"),
+    ],
+)
+def test_a_command_whose_parts_are_wrong_ends_the_flight_there(
+    parts: dict[str, Any], outcome: str, reason: str
+) -> None:
+    def law(now: quadsim.Moment, state: object, reference: np.ndarray[Any, Any]) -> quadsim.Command:
+        speeds = np.full(4, 192.8)
+        return quadsim.Command(
+            speeds=speeds, plan=speeds[None].repeat(len(reference), 0), **parts if now.time > 0.38 else {}
+        )
+
+    flown = quadsim.fly(quadsim.load("hover", {"duration": 1.0}), controller=law, progress=False)
+    assert (flown.outcome, flown.time.size) == (outcome, 8)
+    assert reason in str(flown.log.reason)
+
+
+def test_a_law_whose_diagnosis_raises_loses_that_alone(caplog: pytest.LogCaptureFixture) -> None:
+    class Law:
+        unanswered = property(lambda self: 1 / 0)
+
+        def __init__(self, vehicle: Vehicle, **settings: object) -> None:
+            self.speeds = [vehicle.hover_speed] * 4
+
+        def step(self, now: object, state: object, reference: object) -> list[float]:
+            return self.speeds
+
+    flown = quadsim.fly(quadsim.load("hover", {"duration": 1.0}), controller=Law, progress=False)
+    assert (flown.outcome, flown.time.size, flown.diagnosis) == ("satisfied", 20, None)
+    assert "no diagnosis: unanswered raised ZeroDivisionError" in caplog.text
+
+
+def test_a_law_that_raises_as_it_takes_over_ends_the_flight_there(tmp_path: Path) -> None:
+    (tmp_path / "late.py").write_text(LAW.format(late="pass") + "    def reset(self, speeds):\n        1 / 0\n")
+    event = {"type": "controller", "at": 0.5, "fields": {"type": "late:Law", "folder": str(tmp_path)}}
+    scenario = quadsim.load("hover").replace({"duration": 1.0, "events": [event]})
+    flown = quadsim.fly(scenario, progress=False)
+    assert (flown.outcome, flown.time.size) == ("aborted", 10)
+    assert "ZeroDivisionError" in "".join(flown.log.traceback)
 
 
 def test_a_controller_that_changes_the_directory_moves_no_output(tmp_path: Path) -> None:
