@@ -182,7 +182,7 @@ def plan_of_kinds(directory: Path, *kinds: str, **changes: Any) -> Plan:
 def test_a_bad_flight_is_a_row_with_its_verdict_and_reason(tmp_path: Path) -> None:
     kinds = ("calm", "raises", "dies", "hangs", "takes memory")
     plan = plan_of_kinds(tmp_path, *kinds, limits={"flight": 4.0, "memory": 500.0}, failure=["violated"])
-    result = fly_campaign(plan, tmp_path / "c", 2)
+    result = fly_campaign(plan, tmp_path / "c", 2, report=True)
     table = result.table
     assert table["verdict"].to_pylist() == ["satisfied", "error", "died", "timeout", "memory"]
     assert table["reason"].to_pylist()[1:] == [
@@ -193,6 +193,9 @@ def test_a_bad_flight_is_a_row_with_its_verdict_and_reason(tmp_path: Path) -> No
     ]
     assert table["failed"].to_pylist() == [False, True, True, True, True]
     assert [result.summary["events"][name]["count"] for name in ("failure", "died", "lost")] == [4, 1, 0]
+    page = (result.directory / "index.html").read_text(encoding="utf-8")
+    for reason in ("it took longer than 4 s", "(it may take 500 MB)", "its process ended by signal 9"):
+        assert reason in page
 
 
 def test_flights_of_a_users_controller_do_not_change_each_other(tmp_path: Path) -> None:
