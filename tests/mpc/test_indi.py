@@ -11,7 +11,6 @@ from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import GeometricController, geometric_settings
 from mpc.indi import Incremental, INDISettings, TorqueIncrement
 from quadsim.controller import Moment, Phase
-from quadsim.errors import ParameterError
 from quadsim.flight.log import FlightLog
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics
@@ -105,6 +104,8 @@ def test_on_the_ground_there_is_no_inner_loop(vehicle: Vehicle) -> None:
     assert (controller.name, controller.horizon, controller.unanswered) == ("geometric", 10, None)
 
 
-def test_a_rate_that_is_no_whole_number_of_steps_is_refused(vehicle: Vehicle) -> None:
-    with pytest.raises(ParameterError, match=r"controller\.inner\.rate must be such that 1 / rate is a whole multiple"):
-        flown(vehicle, Effects(), INDISettings(rate=300.0), periods=1)
+def test_a_rate_that_is_no_whole_number_of_steps_ends_the_flight(vehicle: Vehicle) -> None:
+    """A scenario with such a rate is refused when it is read."""
+    log = flown(vehicle, Effects(), INDISettings(rate=300.0), periods=1)
+    assert log.aborted
+    assert "controller.inner.rate must be such that 1 / rate is a whole multiple" in str(log.reason)
