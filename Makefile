@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights gym reproduce speed soak campaigns live tuning firmware export-numbers pins clean
+.PHONY: help setup demo test peers firmware check format docs build numbers reproduce pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -23,7 +23,6 @@ RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; re
 FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang cppcheck clang-tidy
 HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done && \
 	echo 'int LLVMFuzzerTestOneInput(void) { return 0; }' | clang -fsanitize=fuzzer -x c -o /dev/null -) >/dev/null 2>&1
-HAS_CXX := (for tool in g++ arm-none-eabi-g++; do $$tool -x c++ -include complex -fsyntax-only /dev/null || exit; done) 2>/dev/null
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
 # $(call quietly,COMMAND,ADVICE): runs a command silently; if it fails, shows its last errors, then the advice.
@@ -46,9 +45,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning: export OMP_NUM_THREADS := 1
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning: export OPENBLAS_NUM_THREADS := 1
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning: export MKL_NUM_THREADS := 1
+test peers firmware numbers reproduce: export OMP_NUM_THREADS := 1
+test peers firmware numbers reproduce: export OPENBLAS_NUM_THREADS := 1
+test peers firmware numbers reproduce: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -67,9 +66,6 @@ format: setup  ## format the code and mend what ruff can
 	@$(PY) -m ruff check --fix
 	@$(PY) -m ruff format
 
-types: setup  ## types alone
-	@$(PY) -m mypy
-
 build: setup  ## source archive and wheel in dist/; the wheel is installed alone and flown
 	@rm -rf dist
 	@$(call quietly,$(PY) -m build --no-isolation,The packages could not be built: $(PY) -m build --no-isolation shows why.)
@@ -78,54 +74,17 @@ build: setup  ## source archive and wheel in dist/; the wheel is installed alone
 
 docs: setup $(VENV)/.docs  ## build the documentation into site/, with a gallery; a broken link or a missing docstring fails
 	@$(PY) -m ruff check --quiet --select D1 --ignore D105,D107 quadsim mpc scenarios
-	@PYTHONPATH=docs $(PY) docs/make_gallery.py
+	@$(PY) docs/gallery.py
 	@$(VENV)/bin/zensical build --clean
 	@sed -i 's|https://unpkg.com/iframe-worker/shim|assets/iframe-worker.js|' site/*.html
 	@! grep -lE 'src="https?:|<link[^>]*href="https?:[^"]*\.(css|js)' site/*.html || { echo "These pages need a network." >&2; false; }
 	@echo "Done. Open site/index.html in a browser."
 
-numbers: setup $(VENV)/.peers  ## remake the numbers in README.md and docs/, but for those of the peers
-	@$(PY) docs/make_numbers.py
-	@$(PY) docs/make_scenarios.py
-	@$(PY) docs/make_performance.py
+numbers: setup  ## fill the tables of README.md and docs/ from JSON (OPTIONS="speed mismatch" measures these first)
+	@$(PY) docs/remake.py $(OPTIONS)
 
-verification: setup $(VENV)/.peers  ## remake docs/verification.md
-	@PYTHONPATH=tests $(PY) docs/make_verification.py
-
-nonlinear: setup $(VENV)/.peers $(VENV)/acados  ## remake the section on nonlinear MPC of docs/performance.md; takes a C compiler
-	@PYTHONPATH=tests $(PY) docs/make_nonlinear.py $(VENV)/acados
-
-robustness: setup  ## remake docs/robustness.md: the mismatch benchmark and 50 faults, some ten minutes
-	@PYTHONPATH=tests $(PY) docs/make_robustness.py
-
-first-flights: setup  ## make and fly first scenarios of many vehicles, remake docs/first-flights.md: some five minutes
-	@PYTHONPATH=tests $(PY) docs/make_first_flights.py
-
-reproduce: setup  ## fly the numbers of every paper that ships and remake docs/papers.md: some five minutes
-	@$(PY) docs/make_papers.py
-
-export-numbers: setup $(VENV)/.firmware  ## remake docs/export.md: exported controllers and peers on emulated targets; some ten minutes
-	@$(HAS_CXX) || { $(call apt,g++ libstdc++-arm-none-eabi-newlib); }
-	@$(PY) docs/make_export.py
-
-speed: setup  ## fly every controller ever faster and remake docs/speed.md: some two minutes
-	@$(PY) docs/make_speed.py
-
-gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minutes; CRAZYFLOW=PYTHON times that beside it
-	@$(PY) docs/make_gym.py $(if $(CRAZYFLOW),--crazyflow $(CRAZYFLOW))
-
-soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
-	@$(PY) tests/soak.py --minutes 60
-
-campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustness.md, some forty minutes; goes on with what is there
-	@$(PY) docs/make_campaigns.py
-
-tuning: setup  ## carry out the tunings that ship and remake docs/tuning.md, up to half an hour each; goes on with what is there
-	@$(PY) docs/make_tuning.py
-
-live: setup $(VENV)/.browser  ## film a session and remake the numbers of docs/live.md: load, latency and bandwidth; a minute
-	@$(PY) docs/make_live.py
-
+reproduce: setup  ## fly the numbers of every paper that ships into docs/papers.md: some five minutes
+	@$(PY) docs/remake.py papers
 
 pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constraints.txt
 	@fresh=$$(mktemp -d) && trap 'rm -rf "$$fresh"' EXIT && fresh_python="$$fresh/bin/python" && \
@@ -161,11 +120,6 @@ $(VENV)/.peers: $(VENV)/.installed
 	@echo "Installing the peers and the other QP solvers into $(VENV)"
 	@$(call quietly,$(PIP_INSTALL) --constraint constraints.txt --group peers && \
 		$(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable '.[solvers]',$(NOT_INSTALLED))
-	@touch $@
-
-$(VENV)/acados: $(VENV)/.peers
-	@echo "Installing acados into $@: beside the peers it would overwrite their CasADi"
-	@$(call quietly,$(PIP_INSTALL) --no-deps --target $@ --group acados,$(NOT_INSTALLED))
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.installed

@@ -30,7 +30,6 @@ from scenarios.bench.mismatch.controllers import FULL, equip
 from scenarios.build import build_controller, build_plant, build_problem
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
-from scenarios.many import answers
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_once
@@ -38,7 +37,6 @@ from scenarios.schema.scenario import Scenario
 
 PERIOD: Final = 0.05
 """Of control [s]."""
-CONTROLLERS: Final = ("robust", "paper")
 """The full robust controller, and the paper's; both guarded."""
 DISTURBANCES: Final = ("mass +30 %", "mass -30 %", "worn rotor", "lag 50 ms")
 """In which the robust controller meets faults, beside the nominal condition.  The paper's is lost in two of them."""
@@ -173,11 +171,6 @@ def draw_flight(controller: str, condition: str, count: int, *, seed: int) -> li
         injections.append(Injection(controller=controller, fault=fault, start=round(start, 9), condition=condition))
         free += wait + fault.duration + SOON
     return injections
-
-
-def inject_all(injections: list[Injection], **options: Any) -> list[Consequence]:
-    """Fly all of them, over processes; options are those of `answers`."""
-    return answers(inject, injections, **options)
 
 
 def inject(injection: Injection, *, longest: float = LAST) -> Consequence:

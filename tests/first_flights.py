@@ -1,9 +1,15 @@
-"""First flights, made and flown in memory: what the tests and docs/first-flights.md judge `scenarios.design` by."""
+"""First flights, made and flown in memory: what the tests and docs/own-vehicle.md judge `scenarios.design` by.
+
+`python tests/first_flights.py` flies every vehicle on every course by every law, and prints JSON.
+"""
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from itertools import product
 from typing import Final
 
 from plausible_vehicles import plausible_vehicles
@@ -11,8 +17,7 @@ from plausible_vehicles import plausible_vehicles
 from quadsim.assets import vehicle_names, vehicle_path
 from quadsim.flight.metrics import peak_tilt, tracking
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios.design.first_scenario import first_scenario
-from scenarios.design.tuning import STEEPEST
+from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
 from scenarios.loading import parse_scenario
 from scenarios.run import fly_scenario
 
@@ -63,9 +68,9 @@ def vehicles() -> list[Vehicle]:
     return [*(load_vehicle(vehicle_path(name)) for name in vehicle_names()), *plausible_vehicles(DRAWN, SEED)]
 
 
-def fly_first(vehicle: Vehicle, course: str, law: str, *, steepest: float = STEEPEST) -> FirstFlight:
-    """Make a first scenario, with a tilt bound of at most `steepest` [rad], and fly it once."""
-    made = first_scenario(vehicle, vehicle.name, course=course, law=law, steepest=steepest)
+def fly_first(vehicle: Vehicle, course: str, law: str) -> FirstFlight:
+    """Make a first scenario and fly it once."""
+    made = first_scenario(vehicle, vehicle.name, course=course, law=law)
     numbers = {name: value for name in VEHICLE_UNITS if (value := getattr(vehicle, name)) is not None}
     given = {name: list(value) if isinstance(value, tuple) else value for name, value in numbers.items()}
     flight = fly_scenario(parse_scenario(made.to_data() | {"vehicle": {"file": vehicle.name, **given}}))
@@ -87,3 +92,16 @@ def fly_first(vehicle: Vehicle, course: str, law: str, *, steepest: float = STEE
         size=made.size,
         tilt=peak_tilt(flight.log.plant.state),
     )
+
+
+def main() -> None:
+    """Fly everything and print it."""
+    cells = list(product(vehicles(), COURSES, LAWS))
+    with ProcessPoolExecutor() as pool:
+        flown = pool.map(fly_first, *zip(*cells, strict=True))
+        names = [{"vehicle": vehicle.name, "course": course, "law": law} for vehicle, course, law in cells]
+        print(json.dumps([name | asdict(flight) for name, flight in zip(names, flown, strict=True)], indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -83,7 +83,7 @@ def test_source_archive_can_be_built_and_tested_from(archives: Archives) -> None
     with tarfile.open(archives.sdist) as sdist:
         held = {name.partition("/")[2] for name in sdist.getnames()}
     assert {"Makefile", "constraints.txt", "README.md", "LICENSE", "CITATION.cff", "tests/conftest.py"} <= held
-    assert {".ci/run", "tests/peers/conftest.py", "docs/make_verification.py", "docs/verification.md"} <= held
+    assert {".ci/run", "tests/peers/conftest.py", "docs/remake.py", "docs/verification.md"} <= held
     assert not [name for name in held if "__pycache__" in name or name.startswith(("runs/", ".venv/"))]
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+import json
 import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,6 +21,9 @@ Answer = tuple[str, ...]
 Export = Callable[..., Path]
 Answers = Callable[..., list[Answer]]
 Run = Callable[..., subprocess.CompletedProcess[str]]
+Measured = Callable[..., None]
+MEASURED = Path(__file__).resolve().parents[2] / "runs" / "numbers" / "export.json"
+"""What docs/remake.py fills the table of docs/export.md from."""
 
 
 @pytest.fixture(scope="session")
@@ -65,3 +70,26 @@ def answers(exported: Export, run: Run, tmp_path_factory: pytest.TempPathFactory
         return [line for line in lines if len(line) == 8]
 
     return check
+
+
+@pytest.fixture
+def measured(record_property: Callable[[str, object], None]) -> Measured:
+    """Reports what a controller takes on a board."""
+
+    def report(board: str, precision: str, **numbers: float) -> None:
+        key = {"target": TARGETS[board].title, "precision": precision}
+        record_property("measured", key | {name: int(number) for name, number in numbers.items()})
+
+    return report
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Save what was measured, once every board was."""
+    reports = terminalreporter.getreports("passed")
+    found = [value for report in reports for name, value in report.user_properties if name == "measured"]
+    boards: dict[tuple[str, str], dict[str, Any]] = {}
+    for numbers in found:
+        boards.setdefault((numbers["target"], numbers["precision"]), {}).update(numbers)
+    if boards and all({"flash", "p50"} <= numbers.keys() for numbers in boards.values()):
+        MEASURED.parent.mkdir(parents=True, exist_ok=True)
+        MEASURED.write_text(json.dumps([boards[key] for key in sorted(boards)], indent=1), encoding="utf-8")

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
-from make_numbers import mujoco_transition, transition_difference
 
 from mpc.model import continuous_model, discretise, hover_model
 from quadsim.errors import ParameterError
+from quadsim.sim.airframe import compile_model, rotor_thrusts
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 
 PERIOD = 0.05
+MUJOCO_ORDER = [0, 6, 1, 7, 2, 8, 3, 9, 4, 10, 5, 11]
+"""Where the paper's states are among MuJoCo's tangent coordinates (positions, rotations, then their rates)."""
 
 
 def paper_dynamics(vehicle: Vehicle, state: Array, speeds: Array) -> Array:
@@ -31,6 +34,33 @@ def paper_dynamics(vehicle: Vehicle, state: Array, speeds: Array) -> Array:
     dq = (izz - ixx) / iyy * r * p + tau[1] / iyy
     dr = (ixx - iyy) / izz * q * p + tau[2] / izz
     return np.array([vx, ax, vy, ay, vz, az, p, dp, q, dq, r, dr])
+
+
+def mujoco_transition(vehicle: Vehicle, timestep: float) -> tuple[Array, Array]:
+    """A and B over one control period by `mjd_transitionFD` at hover, in the paper's coordinates.
+
+    MuJoCo does not differentiate its Runge-Kutta steps, so these are of its first-order Euler integrator.
+    """
+    model = compile_model(vehicle, timestep=timestep)
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    data = mujoco.MjData(model)
+    data.ctrl[:] = rotor_thrusts(vehicle, np.full(4, vehicle.hover_speed))
+    A, B = np.zeros((12, 12)), np.zeros((12, 4))
+    mujoco.mjd_transitionFD(model, data, 1e-6, True, A, B, None, None)
+    A = A[np.ix_(MUJOCO_ORDER, MUJOCO_ORDER)]
+    B = B[MUJOCO_ORDER] * 2.0 * vehicle.thrust_coefficient * vehicle.hover_speed  # thrust slope dT/dw = 2 b w
+    whole_A, whole_B = np.eye(12), np.zeros((12, 4))
+    for _ in range(round(PERIOD / timestep)):
+        whole_A, whole_B = A @ whole_A, A @ whole_B + B
+    return whole_A, whole_B
+
+
+def transition_difference(vehicle: Vehicle) -> float:
+    """Largest difference of A and B from MuJoCo's, in the limit of a vanishing step (Richardson extrapolation)."""
+    exact = hover_model(vehicle, PERIOD)
+    coarse, fine = mujoco_transition(vehicle, 1e-3), mujoco_transition(vehicle, 5e-4)
+    limits = (2.0 * two - one for one, two in zip(coarse, fine, strict=True))
+    return float(max(np.abs(limit - part).max() for limit, part in zip(limits, (exact.A, exact.B), strict=True)))
 
 
 def test_jacobians_match_finite_differences_of_the_printed_model(vehicle: Vehicle) -> None:

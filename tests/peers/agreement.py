@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from peers.checks import Check, versioned
+from peers.checks import Check
 from peers.recorded import Query
 
 from mpc.ocp import Problem
@@ -16,16 +16,6 @@ from mpc.solvers import SOLVERS, QPSolver
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 
-HEAD: Final = (
-    "solver",
-    "version",
-    "QPs",
-    "failures",
-    "first input [rad/s]",
-    "stationarity",
-    "primal",
-    "complementarity",
-)
 SLOW: Final = {"osqp": 10, "highs": 10}
 """Solvers that are called every so many periods only; they take 0.1 s and more for each."""
 MAY_FAIL: Final = frozenset(SLOW)
@@ -51,19 +41,6 @@ class Verdict:
     failures: int
     difference: float
     residuals: KKTResiduals
-
-    @property
-    def row(self) -> tuple[str, ...]:
-        """The verdict under `HEAD`."""
-        worst = self.residuals
-        figures = (self.difference, worst.stationarity, worst.primal, worst.complementarity)
-        return (
-            f"`{self.solver}`",
-            versioned(SOLVERS[self.solver].package),
-            str(self.queried),
-            str(self.failures),
-            *(f"{figure:.1e}" for figure in figures),
-        )
 
     @property
     def checks(self) -> tuple[Check, ...]:

@@ -22,7 +22,6 @@ from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.scenario import Scenario
 
 SCENARIO: Final = "paper-constrained"
-HEAD: Final = ("", "on MuJoCo", "on RotorPy", "difference")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,14 +74,6 @@ class ClosedLoop:
         return tuple(
             Quantity(name=f"RMS error {name}", unit=unit, mujoco=ours["rmse"][name], rotorpy=its["rmse"][name])
             for name, unit in ours["unit"].items()
-        )
-
-    @property
-    def rows(self) -> tuple[tuple[str, ...], ...]:
-        """Peaks and errors under `HEAD`."""
-        return tuple(
-            (f"{each.name} [{each.unit}]", f"{each.mujoco:.4f}", f"{each.rotorpy:.4f}", f"{each.difference:.1e}")
-            for each in (*self.peaks, *self.rmse)
         )
 
     @property

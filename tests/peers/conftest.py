@@ -1,21 +1,23 @@
-"""Checks against peers: each is held to what it allows and to the page, and shown when all is done."""
+"""Checks against peers: each is held to what it allows, and shown and saved when all is done."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from peers import constrained_qp, recorded
-from peers.checks import HEAD, Check, outdated
+from peers.checks import HEAD, Check
 from peers.constrained_qp import ConstrainedQP
 from peers.recorded import Query
 from threadpoolctl import threadpool_limits
 
 from mpc.ocp import Problem
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "verification.md"
+MEASURED = Path(__file__).resolve().parents[2] / "runs" / "numbers" / "peers.json"
+"""What docs/remake.py fills the table of docs/verification.md from."""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -23,12 +25,6 @@ def _one_thread() -> Iterator[None]:
     """Linear algebra on one thread: the matrices are small, and the cores are for the other tests."""
     with threadpool_limits(limits=1):
         yield
-
-
-@pytest.fixture(scope="session")
-def page() -> str:
-    """The page that `make verification` wrote."""
-    return PAGE.read_text(encoding="utf-8")
 
 
 @pytest.fixture
@@ -40,16 +36,6 @@ def hold(record_property: Callable[[str, object], None]) -> Callable[[Check], No
         assert check.holds, " | ".join(check.row)
 
     return hold_one
-
-
-@pytest.fixture
-def on_page(page: str) -> Callable[[tuple[str, ...]], None]:
-    """Fail if the page does not have a row, with today's versions and magnitudes."""
-
-    def row_on_page(row: tuple[str, ...]) -> None:
-        assert outdated(row, page) is None, f"{PAGE.name} is out of date: make verification"
-
-    return row_on_page
 
 
 @pytest.fixture(scope="session")
@@ -75,7 +61,7 @@ def against_qpmpc(problem: Problem, queries: tuple[Query, ...]) -> ConstrainedQP
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Write every check that was measured, passed or not, as a table."""
+    """Write every check that was measured, passed or not, as a table; if all was run, save it."""
     reports = [report for kind in ("passed", "failed") for report in terminalreporter.getreports(kind)]
     rows = [value for report in reports for name, value in report.user_properties if name == "check"]
     if not rows:
@@ -84,3 +70,6 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
     terminalreporter.section("held against peers")
     for row in (HEAD, *rows):
         terminalreporter.line("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+    if terminalreporter.config.args == ["tests/peers"] and not terminalreporter.config.option.keyword:
+        MEASURED.parent.mkdir(parents=True, exist_ok=True)
+        MEASURED.write_text(json.dumps(sorted(rows), indent=1), encoding="utf-8")

@@ -63,17 +63,6 @@ class Comparison:
         what = f"gain, N = {self.horizon}, from the infinite horizon's, relative"
         return finite, Check(what=what, peer="scipy", measured=self.infinite, allowed=1e-3)
 
-    @property
-    def row(self) -> tuple[str, ...]:
-        """The comparison under `HEAD`."""
-        others = (self.one_step_more, self.infinite)
-        return (
-            str(self.horizon),
-            f"{self.difference:.1e}",
-            f"{self.rounding:.1e}",
-            *(f"{other:#.2g}" for other in others),
-        )
-
 
 def measure(problem: Problem) -> tuple[Comparison, ...]:
     """Compare for each of `HORIZONS`."""

@@ -15,7 +15,6 @@ from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-HEAD: Final = ("MuJoCo's step [ms]", "position [m]", "attitude [rad]")
 SEEDS: Final = range(20)
 HOLD: Final = 0.05
 """How long speeds are held [s]: 20 Hz."""
@@ -73,16 +72,6 @@ class OpenLoop:
     differences: tuple[Difference, ...]
     betrayal: Difference
     tilt: float
-
-    @property
-    def rows(self) -> tuple[tuple[str, ...], ...]:
-        """The differences under `HEAD`."""
-        off = f"{1e3 * TIMESTEPS[-1]:g}, Ixx off by {BETRAYAL:.0e}"
-        named = [
-            *((f"{1e3 * step:g}", of) for step, of in zip(TIMESTEPS, self.differences, strict=True)),
-            (off, self.betrayal),
-        ]
-        return tuple((name, f"{of.position:.1e}", f"{of.attitude:.1e}") for name, of in named)
 
     @property
     def checks(self) -> tuple[Check, ...]:

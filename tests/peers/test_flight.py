@@ -15,13 +15,8 @@ def measured() -> ClosedLoop:
     return closed_loop.measure()
 
 
-def test_the_whole_flight_is_the_same(
-    measured: ClosedLoop, hold: Callable[[Check], None], on_page: Callable[[tuple[str, ...]], None]
-) -> None:
+def test_the_whole_flight_is_the_same(measured: ClosedLoop, hold: Callable[[Check], None]) -> None:
     assert (measured.mujoco.reason, measured.rotorpy.reason) == (None, None)
     assert measured.rotorpy.control.t.size == measured.scenario.periods
     for check in measured.checks:
         hold(check)
-        on_page(check.row)
-    for row in measured.rows:
-        on_page(row)

@@ -14,15 +14,12 @@ from peers.nonlinear_optimum import ALLOWED, LAGGED, PAPER, PERIOD, STATES, Cour
 
 
 @pytest.mark.parametrize("case", [PAPER, LAGGED], ids=lambda case: case.name)
-def test_optima_and_real_time_iterations_are_the_same(
-    case: Case, hold: Callable[[Check], None], on_page: Callable[[tuple[str, ...]], None]
-) -> None:
+def test_optima_and_real_time_iterations_are_the_same(case: Case, hold: Callable[[Check], None]) -> None:
     agreement = measure(case)
     assert agreement.optima.size == agreement.steps.size == STATES[case]
     assert agreement.bounded > STATES[case], "hardly a bound is active: little is compared"
     for check in agreement.checks:
         hold(check)
-        on_page(check.row)
 
 
 def test_optima_are_those_of_do_mpc(hold: Callable[[Check], None]) -> None:

@@ -1,6 +1,6 @@
 """Faults at the solver, the sensors and the computer on the paper's course, disturbed or not: the contract holds.
 
-Eight here, over the whole flight; `make robustness` flies fifty for both controllers, one by one.
+Eight, over the whole flight, each after what came of the one before.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A soak of three short laps, in a process of its own; the hour is `make soak`."""
+"""A soak of three short laps, in a process of its own; the hour is `python tests/soak.py --minutes 60`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_leak_and_a_slowdown_are_reported() -> None:
 
 @pytest.mark.skipif(not soak.MEMORY.exists(), reason="this system does not report a process's memory")
 def test_three_laps_leave_memory_and_step_time_as_they_were() -> None:
-    """Step times of a busy machine wander by tens of percent; `make soak` requires a tenth."""
+    """Step times of a busy machine wander by tens of percent; the hour requires a tenth."""
     command = [sys.executable, str(SCRIPT), "--minutes", "3", "--lap", "15", "--drift", "0.6"]
     done = subprocess.run(command, cwd=SCRIPT.parent.parent, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr

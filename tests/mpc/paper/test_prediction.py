@@ -4,11 +4,28 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from make_numbers import prediction_error
 from support import paper_problem, random_problem
 
+from mpc.model import hover_model
 from mpc.paper.prediction import prediction, rollout
+from quadsim.sim.plant import Plant
+from quadsim.state import make_state
 from quadsim.vehicle import Vehicle
+
+
+def prediction_error(vehicle: Vehicle, steps: int, size: float) -> float:
+    """Largest difference between the linear prediction and MuJoCo after a deviation of relative size `size`."""
+    model = hover_model(vehicle, 0.05)
+    rng = np.random.default_rng(7)
+    state = make_state(position=(1.0, 2.0, 3.0)) + 0.1 * size * rng.uniform(-1, 1, 12)
+    plan = model.u_bar + 0.5 * size * rng.uniform(-1, 1, (steps, 4))
+    flown = []
+    with Plant(vehicle) as plant:
+        plant.reset(state)
+        for speeds in plan:
+            plant.advance(speeds, 50)
+            flown.append(plant.state())
+    return float(np.abs(rollout(model, state[None], plan[None])[0] - np.array(flown)).max())
 
 
 @pytest.mark.parametrize("horizon", [1, 2, 7, 50])

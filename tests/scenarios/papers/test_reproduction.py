@@ -25,7 +25,6 @@ from scenarios.run import fly_scenario
 from scenarios.schema.problems import ScenarioError
 from scenarios.shipped import paper_names, scenario_names
 
-ROOT = Path(__file__).resolve().parents[3]
 HEAD = 'title = "A paper"\nauthors = "N. N."\nabout = "A hover"\n'
 NUMBER = """
 [[numbers]]
@@ -67,12 +66,6 @@ def test_its_errors_have_the_digits_of_the_specification(loop4: Reproduction) ->
     assert ideal == pytest.approx(0.00012, abs=5e-6)
     assert drag == pytest.approx(0.11620, abs=5e-6)
     assert noise == pytest.approx(0.1164, abs=2e-4)
-
-
-def test_its_lines_on_the_page_are_todays(loop4: Reproduction) -> None:
-    page = (ROOT / "docs/papers.md").read_text(encoding="utf-8").splitlines()
-    for line in grid_to_markdown(loop4.grid).splitlines():
-        assert line in page, "docs/papers.md is out of date: make reproduce"
 
 
 def test_the_first_seconds_at_8_m_s_are_those_of_the_specification() -> None:

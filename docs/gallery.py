@@ -1,13 +1,12 @@
-"""Make docs/gallery.md and its figures, a picture and the numbers of every scenario that ships: `make docs`.
+"""Make docs/gallery.md, a picture and the numbers of every scenario that ships: `make docs`.
 
 Flies every scenario; neither the page nor the figures are stored in the repository.
 """
 
 from __future__ import annotations
 
+import json
 import shutil
-import subprocess
-import sys
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -15,10 +14,9 @@ from typing import get_args
 
 import matplotlib as mpl
 import numpy as np
-from make_numbers import markdown
-from make_scenarios import TITLES, nearest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from remake import ROOT, TITLES, scenario_cells
 
 import quadsim
 from quadsim.errors import RenderingUnavailableError
@@ -30,16 +28,16 @@ from scenarios.schema.scenario import Group
 
 DOCS = Path(__file__).resolve().parent
 PAGE, FIGURES = DOCS / "gallery.md", DOCS / "gallery"
+GOLDEN = json.loads((ROOT / "tests/golden/library.json").read_text(encoding="utf-8"))
 SIDES = np.array([-1.0, 1.0])
 FILMED = ("power-loop", "inverted-start", "window", "thrown-ball")
 """Scenarios whose films are on the page too, where films can be made."""
 HEAD = """# Gallery
 
 Every scenario that ships: its path (dashed: the reference), roll and pitch with their bounds, or the tilt where the
-vehicle may turn upside down, the verdict, and the constraint that came nearest to its bound, with its smallest margin
-at the physics rate.
-`quadsim run NAME` flies one, films it and writes its recording; `quadsim scenario NAME` prints its file.
-All numbers in tables: [scenarios](scenarios.md). Made by `make docs`.
+vehicle may turn upside down, the verdict, and the constraint that came nearest to its bound. `quadsim run NAME` flies
+one, films it and writes its recording; `quadsim scenario NAME` prints its file. What the words mean:
+[scenarios](scenarios.md).
 """
 
 
@@ -89,47 +87,15 @@ def entry(name: str) -> tuple[Group, str]:
     flight = quadsim.fly(name, progress=False)
     draw(flight, FIGURES / f"{name}.svg")
     clip = film(flight, FIGURES / f"{name}.mp4") if name in FILMED else ""
-    scenario, rmse = flight.scenario, ", ".join(f"{flight.metrics[f'rmse.{axis}']:.3f}" for axis in "xyz")
-    numbers = [
-        f"**{flight.outcome}**",
-        f"{flight.summary['duration']:g} s",
-        f"RMS error x, y, z {rmse} m",
-        nearest(flight),
-    ]
+    verdict, errors, nearest = scenario_cells(GOLDEN[name])
+    scenario, numbers = (
+        flight.scenario,
+        f"**{verdict}** · RMS error x, y, z {errors} m · nearest to its bound: {nearest}",
+    )
     return scenario.group, (
         f"### {name}\n\n{scenario.description}.\n\n![Path and attitude of {name}](gallery/{name}.svg)\n\n"
-        f"{' · '.join(numbers)}\n{clip and chr(10) + clip}"
+        f"{numbers}\n{clip and chr(10) + clip}"
     )
-
-
-def session() -> str:
-    """The five commands of own-vehicle.md with what they print, as in a terminal, in a folder of their own."""
-    page = (DOCS / "own-vehicle.md").read_text(encoding="utf-8")
-    lines = page.partition("```sh\n")[2].partition("```")[0].splitlines()
-    shown = []
-    with tempfile.TemporaryDirectory() as folder:
-        for line in lines:
-            command = f"{Path(sys.executable).parent}/{line}"
-            command += " --no-video --no-recording --no-figures" if line.startswith("quadsim run") else ""
-            done = subprocess.run(command, shell=True, cwd=folder, capture_output=True, text=True, check=True)
-            shown.append(f"$ {line}\n{done.stdout}")
-    return "\n".join(shown)
-
-
-def first_times() -> str:
-    """What a first user of the Python interface waits for, each in a process of its own [s]; medians of three."""
-    load = 'import quadsim; scenario = quadsim.load("hover")'
-    steps = {"import quadsim": "pass", "load of a scenario": "import quadsim", "fly of hover, 10 s": load}
-    timed = {"import quadsim": "import quadsim", "load of a scenario": load.partition("; ")[2]}
-    rows = [("what", "time [s]")]
-    for name, before in steps.items():
-        code = f"{before}\nimport time\nt = time.perf_counter()\n{timed.get(name, 'quadsim.fly(scenario)')}\n"
-        code += "print(time.perf_counter() - t)"
-        runs = [
-            subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True) for _ in range(3)
-        ]
-        rows.append((name, f"{np.median([float(run.stdout) for run in runs]):.3f}"))
-    return markdown(rows)
 
 
 def main() -> None:
@@ -143,8 +109,6 @@ def main() -> None:
         members = [text for of, text in entries if of == group]
         if members:
             parts += [f"## {TITLES.get(group, group)}\n", *members]
-    parts.append(f"## From a vehicle file to a good flight, in a terminal\n\n```text\n{session()}```\n")
-    parts.append(f"## What a first user waits for\n\n{first_times()}")
     PAGE.write_text("\n".join(parts), encoding="utf-8")
 
 

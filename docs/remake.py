@@ -1,0 +1,272 @@
+"""Fill the tables of README.md and docs/ from JSON: `make numbers`.
+
+A table stands between `<!-- NAME: filled by docs/remake.py from FILE -->` and `<!-- NAME end -->`.  Golden numbers are
+in the repository, under tests/golden; all other files are made by a command, under runs/.  A table whose file is not
+there stays as it is.
+
+    python docs/remake.py                    # fill all tables from the files that are there
+    python docs/remake.py speed mismatch     # run the commands that make these files first
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final, get_args
+
+from PIL import Image
+
+from scenarios.loading import load_scenario
+from scenarios.schema.scenario import Group
+
+ROOT: Final = Path(__file__).resolve().parent.parent
+MADE: Final = ROOT / "runs" / "numbers"
+BLOCK: Final = re.compile(r"<!-- (\S+): filled by docs/remake.py from (\S+) -->\n(.*?)<!-- \1 end -->", re.DOTALL)
+BENCHMARKS: Final = ("solvers", "flight", "film", "campaign", "mismatch", "speed")
+CAMPAIGNS: Final = ("paper-robustness", "paper-robustness-robust", "paper-nominal")
+TUNINGS: Final = ("hummingbird-figure-eight", "paper-robust")
+FIGURES: Final = {
+    "campaign-paper-nominal.png": "runs/campaigns/paper-nominal/campaign.png",
+    **{f"{name}.png": f"runs/numbers/{name}.png" for name in ("solvers", "mismatch", "speed")},
+}
+"""Pictures of docs/, and the files that they are copies of."""
+COLOURS: Final = 128
+TITLES: Final[dict[Group, str]] = {
+    "paper": "The paper's flights, and where its controller ends",
+    "papers": "Other papers, reproduced",
+    "courses": "Courses and vehicles",
+    "air": "Wind, drag and rotors that lag",
+    "faults": "Faults, loads and slow computers",
+    "ground": "Take-off, landing and the ground",
+    "space": "Obstacles, windows and corridors",
+    "sensors": "Sensors and estimation",
+}
+Row = Sequence[object]
+
+
+def commands(name: str) -> list[list[str]]:
+    """What makes the files of a name: a benchmark, `papers`, `first-flights`, `campaigns` or `tunings`."""
+    python, quadsim = sys.executable, str(Path(sys.executable).with_name("quadsim"))
+    match name:
+        case "papers":
+            return [[quadsim, "reproduce", "--json"]]
+        case "first-flights":
+            return [[python, "tests/first_flights.py"]]
+        case "campaigns":
+            return [[quadsim, "campaign", each, "--out", f"runs/campaigns/{each}", "--resume"] for each in CAMPAIGNS]
+        case "tunings":
+            return [[quadsim, "tune", each, "--out", f"runs/tunings/{each}", "--resume"] for each in TUNINGS]
+        case _:
+            return [[python, f"benchmarks/{name}.py", "--json", f"runs/numbers/{name}.json"]]
+
+
+def make(name: str) -> None:
+    """Run the commands of a name; what prints its JSON has it saved."""
+    MADE.mkdir(parents=True, exist_ok=True)
+    for command in commands(name):
+        if name in ("papers", "first-flights"):
+            done = subprocess.run(command, cwd=ROOT, check=True, text=True, stdout=subprocess.PIPE)
+            (MADE / f"{name}.json").write_text(done.stdout, encoding="utf-8")
+        else:
+            subprocess.run(command, cwd=ROOT, check=True)
+
+
+def markdown(head: Sequence[str], rows: Iterable[Row]) -> str:
+    """A Markdown table."""
+    lines = [[str(cell) for cell in row] for row in rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in [head, ["---"] * len(head), *lines])
+
+
+def results(flights: dict[str, Any]) -> str:
+    """The paper's flights side by side."""
+    names = ("paper-unconstrained", "paper-unconstrained-clipped", "paper-constrained")
+    every = [flights[name] for name in names]
+    rows: list[Row] = [
+        (f"RMS error {axis} [{'deg' if axis == 'yaw' else 'm'}]", *(f"{flight['rmse'][i]:.3f}" for flight in every))
+        for i, axis in enumerate(("x", "y", "z", "yaw"))
+    ]
+    rows.append(("largest error at the end [m, rad]", *(f"{flight['final_error']:.0e}" for flight in every)))
+    for name, title, unit in (
+        ("roll", "roll within 5 deg", "deg"),
+        ("pitch", "pitch within 5 deg", "deg"),
+        ("speed", "speeds within 0 .. 250 rad/s", "rad/s"),
+        ("slew", "steps within -10 .. 5 rad/s", "rad/s"),
+    ):
+        rows.append((title, *(_bound(flight["bounds"][name], unit) for flight in every)))
+    rows.append(("highest rotor speed acting [rad/s]", *(f"{flight['highest_speed']:.1f}" for flight in every)))
+    rows.append(("largest step commanded [rad/s]", *(f"{flight['largest_step']:.1f}" for flight in every)))
+    rows.append(("total variation of the commands [rad/s]", *(f"{flight['total_variation']:.0f}" for flight in every)))
+    rows.append(("optimum found in", *(f"{flight['optima']} of {flight['periods']} periods" for flight in every)))
+    return markdown(("", *names), rows)
+
+
+def _bound(found: dict[str, Any], unit: str) -> str:
+    margin, seconds = found["margin"], found["time_violated"]
+    if found["satisfied"]:
+        return f"held ({margin:.3f} {unit})"
+    return f"violated ({margin:.2f} {unit}), {f'{seconds:.2f} s' if seconds else 'by commands alone'}"
+
+
+def scenarios(golden: dict[str, Any]) -> str:
+    """The library's scenarios, a table for each group."""
+    head = ("scenario", "shows", "verdict", "RMS error x, y, z [m]", "nearest to its bound")
+    specs = {name: load_scenario(name) for name in golden}
+    parts = []
+    for group in get_args(Group):
+        rows = [
+            (f"`{name}`", specs[name].description, *scenario_cells(entry))
+            for name, entry in golden.items()
+            if specs[name].group == group
+        ]
+        if rows:
+            parts.append(f"### {TITLES.get(group, group)}\n\n{markdown(head, rows)}")
+    return "\n".join(parts)
+
+
+def scenario_cells(entry: dict[str, Any]) -> tuple[str, str, str]:
+    """A scenario's verdict, errors and nearest bound; "-" where the vehicle was lost."""
+    if "rmse" not in entry:
+        return entry["verdict"], "-", "-"
+    errors = ", ".join(f"{error:.3f}" for error in entry["rmse"])
+    return entry["verdict"], errors, f"{entry['nearest']} {entry['margin'] + 0.0:.2f} {entry['unit']}"
+
+
+def papers(reproduction: dict[str, Any]) -> str:
+    """Published numbers and ours, a table for each paper."""
+    parts = []
+    for paper in reproduction["papers"]:
+        rows = [(number["name"], number["unit"], *_number(number)) for number in paper["numbers"]]
+        table = markdown(("number", "unit", "published", "ours", "tolerance", "reproduced"), rows)
+        about = ", ".join(filter(None, [paper["authors"], paper["publication"]]))
+        parts.append(f"### {paper['title']}\n\n{about}{about and '.' + chr(10) * 2}{table}")
+    return "\n".join(parts)
+
+
+def _number(number: dict[str, Any]) -> tuple[str, ...]:
+    span = number["published"] if isinstance(number["published"], list) else [number["published"]]
+    published = " to ".join(f"{value:g}" for value in sorted({*span}))
+    relation = "" if number["relation"] == "equal" else f"{number['relation']} "
+    ours = "-" if number["ours"] is None else f"{number['ours'] + 0.0:.4g}"
+    return f"{relation}{published}", ours, f"{number['tolerance']:.2g}", "yes" if number["within"] else "no"
+
+
+def peers(checks: list[list[str]]) -> str:
+    """Every check of `make peers`."""
+    return markdown(("check", "peer", "measured", "allowed"), checks)
+
+
+def export(boards: list[dict[str, Any]]) -> str:
+    """What an exported controller takes on a board, of `make firmware`."""
+    rows = [
+        (
+            *(board["target"], board["precision"], f"{board['flash'] / 1e3:.0f}", f"{board['ram'] / 1e3:.0f}"),
+            *(f"{board[name] / 1e6:.2f}" for name in ("p50", "p99", "warm", "first")),
+        )
+        for board in boards
+    ]
+    instructions = ("instructions: median [M]", "p99", "most after the first", "the first")
+    return markdown(("target", "precision", "flash [kB]", "RAM [kB]", *instructions), rows)
+
+
+def first_flights(flights: list[dict[str, Any]]) -> str:
+    """How many first scenarios of each controller satisfied everything, and what the others failed."""
+    courses = [*dict.fromkeys(flight["course"] for flight in flights)]
+    rows = []
+    for law in dict.fromkeys(flight["law"] for flight in flights):
+        cells = []
+        for course in courses:
+            flown = [flight for flight in flights if (flight["law"], flight["course"]) == (law, course)]
+            held = sum(flight["outcome"] == "satisfied" for flight in flown)
+            cells.append(f"{held} of {len(flown)}, {100.0 * max(flight['largest'] for flight in flown):.1f} %")
+        rows.append((law, *cells))
+    return markdown(("controller", *courses), rows)
+
+
+def campaigns(summaries: dict[str, Any]) -> str:
+    """How often flights of the shipped campaigns failed, with 95 % intervals."""
+    rows = []
+    for name in CAMPAIGNS:
+        events = summaries[name]["events"]
+        violated = events["violation"]
+        interval = f"{100.0 * violated['lower']:.2f} to {100.0 * violated['upper']:.2f} %"
+        counts = (violated["flights"], events["failure"]["count"], events["lost"]["count"], violated["count"])
+        rows.append((name, *counts, interval))
+    return markdown(("campaign", "flights", "failed", "lost", "violated or lost", "95 % interval of its share"), rows)
+
+
+def tunings(summaries: dict[str, Any]) -> str:
+    """What the shipped tunings found, on fresh draws."""
+    rows = []
+    for name in TUNINGS:
+        for found in summaries[name]["objectives"]:
+            change = f"{100.0 * found['kept']:+.1f} %"
+            numbers = (f"{found['fresh_start']:.4g}", f"{found['fresh_best']:.4g}", change)
+            rows.append((name, f"{found['name']} [{found['unit']}]", *numbers, f"{100.0 * found['promised']:+.1f} %"))
+    return markdown(("tuning", "objective", "start", "best", "change", "promised by the search"), rows)
+
+
+TABLES: Final[dict[str, Callable[[Any], str]]] = {
+    "results": results,
+    "scenarios": scenarios,
+    "papers": papers,
+    "peers": peers,
+    "export": export,
+    "first-flights": first_flights,
+    "campaigns": campaigns,
+    "tunings": tunings,
+}
+
+
+def read(name: str, source: str) -> Any:
+    """A file's JSON, with `*` that of each campaign or tuning, by its name; None where a file is not there."""
+    members = {"campaigns": CAMPAIGNS, "tunings": TUNINGS}.get(name, (name,))
+    paths = {each: ROOT / source.replace("*", each) for each in members}
+    if not all(path.is_file() for path in paths.values()):
+        return None
+    data = {each: json.loads(path.read_text(encoding="utf-8")) for each, path in paths.items()}
+    return data if "*" in source else data[name]
+
+
+def filled(text: str) -> tuple[str, list[str]]:
+    """A page's text with its tables filled, and the files that are not there."""
+    missing = []
+
+    def fill(block: re.Match[str]) -> str:
+        name, source, _ = block.groups()
+        data = read(name, source)
+        if data is None:
+            missing.append(source)
+            return block[0]
+        return f"<!-- {name}: filled by docs/remake.py from {source} -->\n\n{TABLES[name](data)}\n<!-- {name} end -->"
+
+    return BLOCK.sub(fill, text), missing
+
+
+def main() -> None:
+    """Make what was named, then fill every page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    names = [*BENCHMARKS, "papers", "first-flights", "campaigns", "tunings"]
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(names))
+    chosen = parser.parse_args().names
+    if unknown := sorted({*chosen} - {*names}):
+        parser.error(f"NAME must be one of {', '.join(names)}; got {', '.join(unknown)}")
+    for name in chosen:
+        make(name)
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+        text, missing = filled(page.read_text(encoding="utf-8"))
+        page.write_text(text, encoding="utf-8")
+        for source in missing:
+            print(f"{page.relative_to(ROOT)}: stays as it is without {source}")
+    for name, drawn in FIGURES.items():
+        if (ROOT / drawn).is_file():
+            figure = Image.open(ROOT / drawn).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+            figure.save(ROOT / "docs" / name, optimize=True)
+
+
+if __name__ == "__main__":
+    main()

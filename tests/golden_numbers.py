@@ -1,0 +1,109 @@
+"""Golden numbers of tests/golden: what flights of the library gave when somebody last looked at them.
+
+A test that finds another number is a reason to look at the flight.  `python tests/golden_numbers.py NAME...` writes the
+entries of a new scenario, or of one that was changed on purpose.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.controller import ACCEPTED, SOLVED
+from quadsim.flight.audit import Finding
+from quadsim.flight.metrics import peak_tilt, tracking
+from scenarios.flight import Flight, summarise
+from scenarios.loading import load_scenario
+from scenarios.run import fly_scenario
+
+GOLDEN: Final = Path(__file__).resolve().parent / "golden"
+PAPER: Final = ("paper-unconstrained", "paper-unconstrained-clipped", "paper-constrained")
+"""Flights of the README's table."""
+
+
+def read(name: str) -> dict[str, Any]:
+    """The golden numbers of one file."""
+    numbers: dict[str, Any] = json.loads((GOLDEN / f"{name}.json").read_text(encoding="utf-8"))
+    return numbers
+
+
+def write(name: str, numbers: dict[str, Any]) -> None:
+    """One entry per line, in alphabetical order."""
+    lines = (f"{json.dumps(key)}: {json.dumps(entry)}" for key, entry in sorted(numbers.items()))
+    (GOLDEN / f"{name}.json").write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+
+
+def library_entry(flight: Flight) -> dict[str, Any]:
+    """Verdict and seconds flown; unless the vehicle was lost, also errors [m], tilt [deg] and the nearest bound."""
+    log = flight.log
+    entry: dict[str, Any] = {
+        "verdict": flight.outcome,
+        "flown": round(log.control.t.size * flight.scenario.control_period, 6),
+    }
+    if flight.outcome != "lost":
+        rmse, found = tracking(log.control)["rmse"], nearest(flight)
+        entry["rmse"] = [round(rmse[axis], 4) for axis in "xyz"]
+        entry["tilt"] = round(peak_tilt(log.plant.state), 2)
+        entry["qps"] = round(100.0 * log.control.status.count(SOLVED) / log.control.t.size, 1) if flight.solver else 0
+        entry["nearest"] = found.limit.name
+        entry["margin"] = round(min(found.worst_margin, found.worst_margin_sampled), 3)
+        entry["unit"] = found.limit.unit
+    return entry
+
+
+def nearest(flight: Flight) -> Finding:
+    """The required constraint that is broken most, or else is held by least, as a share of its range.
+
+    Bounds on speeds and steps are left out: the controller keeps them to the last digit, or is far from them.
+    """
+    required = (finding.limit.required and finding.limit.signal not in ("speed", "slew") for finding in flight.findings)
+    return min(itertools.compress(flight.findings, required), key=_share)
+
+
+def _share(finding: Finding) -> float:
+    limit = finding.limit
+    bounds = [abs(bound) for bound in (limit.lower, limit.upper) if math.isfinite(bound)]
+    left = min(finding.worst_margin + limit.tolerance, finding.worst_margin_sampled + limit.tolerance_sampled)
+    return round(left / (max(*bounds, limit.tolerance) or 1.0), 2)  # of equals the first: rounding decides nothing
+
+
+def paper_entry(flight: Flight) -> dict[str, Any]:
+    """Tracking [m, deg], the margins that decide, and the commands of one of the paper's flights [rad/s]."""
+    summary, control = summarise(flight), flight.log.control
+    rmse = summary["tracking"]["rmse"]
+    return {
+        "rmse": [round(rmse[axis], 5) for axis in "xyz"] + [round(math.degrees(rmse["yaw"]), 4)],
+        "final_error": float(f"{max(abs(value) for value in summary['tracking']['final_error'].values()):.1e}"),
+        "bounds": {
+            finding.limit.name: {
+                "satisfied": finding.satisfied,
+                "margin": round(finding.deciding_margin, 4) + 0.0,
+                "time_violated": round(finding.time_violated, 3),
+            }
+            for finding in flight.findings
+            if finding.limit.name in ("roll", "pitch", "speed", "slew")
+        },
+        "highest_speed": round(float(flight.log.plant.speeds.max()), 3),
+        "largest_step": round(float(np.abs(control.slews).max()), 3),
+        "total_variation": round(summary["control"]["total_variation"], 1),
+        "optima": sum(status in ACCEPTED for status in control.status),
+        "periods": control.t.size,
+    }
+
+
+def main(names: list[str]) -> None:
+    """Fly these scenarios and write their entries."""
+    flights = {name: fly_scenario(load_scenario(name)) for name in names}
+    write("library", read("library") | {name: library_entry(flight) for name, flight in flights.items()})
+    paper = {name: paper_entry(flight) for name, flight in flights.items() if name in PAPER}
+    write("paper", read("paper") | paper)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
