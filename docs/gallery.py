@@ -14,14 +14,11 @@ from typing import get_args
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from remake import ROOT, TITLES, scenario_cells
 
 import quadsim
 from quadsim.errors import RenderingUnavailableError
-from quadsim.report.figures.flight_figures import draw_signal
-from quadsim.report.palette import REFERENCE, line_colour
 from scenarios.flight import Flight
 from scenarios.machine import usable_cores
 from scenarios.schema.scenario import Group
@@ -47,8 +44,8 @@ def draw(flight: Flight, file: Path) -> None:
     left, right = figure.add_gridspec(1, 2, width_ratios=(1.0, 1.5))
     space = figure.add_subplot(left, projection="3d")
     reference, state = flight.reference, flight.plant
-    space.plot(reference["x"], reference["y"], reference["z"], color=REFERENCE, linestyle="--", linewidth=0.9)
-    space.plot(state["x"], state["y"], state["z"], color=line_colour(0), linewidth=1.1)
+    space.plot(reference["x"], reference["y"], reference["z"], color="0.5", linestyle="--", linewidth=0.9)
+    space.plot(state["x"], state["y"], state["z"], color="C0", linewidth=1.1)
     paths = np.stack([np.concatenate([reference[axis], state[axis]]) for axis in "xyz"])
     middle, widest = 0.5 * (paths.min(axis=1) + paths.max(axis=1)), max(1.0, np.ptp(paths, axis=1).max())
     half = 0.5 * np.maximum(np.ptp(paths, axis=1), 0.25 * widest)
@@ -57,17 +54,17 @@ def draw(flight: Flight, file: Path) -> None:
     space.ticklabel_format(useOffset=False)
     space.tick_params(labelsize=6, pad=-2)
     space.locator_params(nbins=4)
-    axes: Axes = figure.add_subplot(right)
-    if flight.log.plant.attitude is None:
-        shown = draw_signal(axes, flight.run, "roll")
-        pitch = axes.plot(state["t"], np.degrees(state["pitch"]), color=line_colour(2), linewidth=1.0, zorder=1.9)
-        shown = {"roll": shown.pop("flight"), "pitch": pitch[0], **shown}
-        axes.set_ylabel("roll, pitch [deg]")
-    else:  # may turn upside down
-        shown = draw_signal(axes, flight.run, "tilt")
-        shown = {"tilt": shown.pop("flight"), **shown}
-    axes.legend(shown.values(), shown, ncols=len(shown), frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
-    axes.set_xlabel("time [s]")
+    axes = figure.add_subplot(right)
+    shown = {"roll": state["roll"], "pitch": state["pitch"]}
+    if flight.log.plant.attitude is not None:  # may turn upside down
+        shown = {"tilt": np.arccos(np.cos(state["roll"]) * np.cos(state["pitch"]))}
+    for i, (name, angle) in enumerate(shown.items()):
+        axes.plot(state["t"], np.degrees(angle), color=f"C{i}", linewidth=1.0, label=name)
+    for limit in (finding.limit for finding in flight.audit if finding.limit.signal in shown):
+        for bound in (bound for bound in (limit.lower, limit.upper) if np.isfinite(bound)):
+            axes.hlines(bound, limit.start, min(limit.stop, state["t"][-1]), color="tab:red", linestyle=":")
+    axes.legend(ncols=2, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    axes.set(xlabel="time [s]", ylabel=f"{', '.join(shown)} [deg]")
     figure.savefig(file, format="svg", metadata={"Date": None})
 
 
@@ -88,12 +85,9 @@ def entry(name: str) -> tuple[Group, str]:
     draw(flight, FIGURES / f"{name}.svg")
     clip = film(flight, FIGURES / f"{name}.mp4") if name in FILMED else ""
     verdict, errors, nearest = scenario_cells(GOLDEN[name])
-    scenario, numbers = (
-        flight.scenario,
-        f"**{verdict}** · RMS error x, y, z {errors} m · nearest to its bound: {nearest}",
-    )
-    return scenario.group, (
-        f"### {name}\n\n{scenario.description}.\n\n![Path and attitude of {name}](gallery/{name}.svg)\n\n"
+    numbers = f"**{verdict}** · RMS error x, y, z {errors} m · nearest to its bound: {nearest}"
+    return flight.scenario.group, (
+        f"### {name}\n\n{flight.scenario.description}.\n\n![Path and attitude of {name}](gallery/{name}.svg)\n\n"
         f"{numbers}\n{clip and chr(10) + clip}"
     )
 

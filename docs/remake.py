@@ -210,6 +210,57 @@ def tunings(summaries: dict[str, Any]) -> str:
     return markdown(("tuning", "objective", "start", "best", "change", "promised by the search"), rows)
 
 
+def records(data: Any) -> str:
+    """A benchmark's records, one a row, under their keys."""
+    rows = _records(data)
+    keys = [*dict.fromkeys(key for row in rows for key in row)]
+    return markdown([key.replace("_", " ") for key in keys], [[_cell(row.get(key)) for key in keys] for row in rows])
+
+
+def _records(data: Any) -> list[dict[str, Any]]:
+    lists = [data] if isinstance(data, list) else [value for value in data.values() if isinstance(value, list)]
+    found: list[dict[str, Any]] = next(value for value in lists if value and isinstance(value[0], dict))
+    return [{key: value for key, value in row.items() if not isinstance(value, (dict, list))} for row in found]
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "-" if value is None else str(value)
+
+
+def mismatch(data: Any) -> str:
+    """What each controller did in each condition."""
+    parts = []
+    for key, form, title in (
+        ("end_error", ".3f", 'Distance from the reference at the end [m]; "lost" with the time:'),
+        ("peak_tilt", ".3g", "Peak roll or pitch at the physics rate [deg]:"),
+    ):
+        cells = {(row["condition"], row["controller"]): row["fate"] or format(row[key], form) for row in _records(data)}
+        parts.append(f"{title}\n\n{by_controller([''], cells)}")
+    return "\n".join(parts)
+
+
+def speed(data: Any) -> str:
+    """Mean position errors of each controller at each speed."""
+    cells = {
+        (row["course"], f"{row['speed']:g}", row["controller"]): "lost"
+        if row["error"] is None
+        else f"{row['error']:.3f}"
+        for row in _records(data)
+    }
+    return by_controller(["course", "m/s"], cells)
+
+
+def by_controller(head: list[str], cells: dict[tuple[str, ...], str]) -> str:
+    """A table with a column for each controller, which is the last of a cell's names."""
+    controllers, rows = dict.fromkeys(names[-1] for names in cells), dict.fromkeys(names[:-1] for names in cells)
+    return markdown(
+        [*head, *controllers],
+        [[*row, *(cells.get((*row, controller), "-") for controller in controllers)] for row in rows],
+    )
+
+
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "results": results,
     "scenarios": scenarios,
@@ -219,6 +270,9 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "first-flights": first_flights,
     "campaigns": campaigns,
     "tunings": tunings,
+    "mismatch": mismatch,
+    "speed": speed,
+    **dict.fromkeys(("solvers", "flight", "film", "campaign"), records),
 }
 
 

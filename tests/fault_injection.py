@@ -37,7 +37,6 @@ from scenarios.schema.scenario import Scenario
 
 PERIOD: Final = 0.05
 """Of control [s]."""
-"""The full robust controller, and the paper's; both guarded."""
 DISTURBANCES: Final = ("mass +30 %", "mass -30 %", "worn rotor", "lag 50 ms")
 """In which the robust controller meets faults, beside the nominal condition.  The paper's is lost in two of them."""
 EARLIEST: Final = {"worn rotor": 14.0}
@@ -171,11 +170,6 @@ def draw_flight(controller: str, condition: str, count: int, *, seed: int) -> li
         injections.append(Injection(controller=controller, fault=fault, start=round(start, 9), condition=condition))
         free += wait + fault.duration + SOON
     return injections
-
-
-def inject(injection: Injection, *, longest: float = LAST) -> Consequence:
-    """Fly one of them, until `AFTER` from its end; the flight without it lasts `longest` [s]."""
-    return fly_with([injection], longest=longest)[0]
 
 
 def fly_with(injections: Sequence[Injection], *, longest: float = LAST, shortcut: bool = False) -> list[Consequence]:
