@@ -156,8 +156,11 @@ def _number(number: dict[str, Any]) -> tuple[str, ...]:
 
 
 def peers(checks: list[list[str]]) -> str:
-    """Every check of `make peers`."""
-    return markdown(("check", "peer", "measured", "allowed"), checks)
+    """Every check of `make peers`; those of QP solvers last."""
+    shown = sorted(
+        (check for check in checks if not check[0].endswith(": failures")), key=lambda check: check[0][0] == "`"
+    )
+    return markdown(("check", "peer", "measured", "allowed"), shown)
 
 
 def export(boards: list[dict[str, Any]]) -> str:
@@ -243,7 +246,7 @@ def mismatch(data: Any) -> str:
 
 def speed(data: Any) -> str:
     """Mean position errors of each controller at each speed."""
-    cells = {
+    cells: dict[tuple[str, ...], str] = {
         (row["course"], f"{row['speed']:g}", row["controller"]): "lost"
         if row["error"] is None
         else f"{row['error']:.3f}"

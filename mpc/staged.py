@@ -37,7 +37,7 @@ ROUNDING: Final = 1e-14
 """Entries below this fraction of the largest of their block are products of rounding: left out of fixed matrices."""
 STEPS_OF_ONE_INPUT: Final = 10
 """M for one input; for more it falls with the root of their number.  Of stages of 1 to 25 steps, the resulting five of
-four rotors are the fastest for the paper's case; see docs/performance.md."""
+four rotors are the fastest for the paper's case."""
 
 
 def usual_steps(inputs: int) -> int:

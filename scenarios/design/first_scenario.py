@@ -25,7 +25,6 @@ from scenarios.design.tuning import (
     LAG_RATIO,
     MOVE_RATIO,
     PERIOD_SHARE,
-    STEEPEST,
     THRUST_SHARE,
     Tuning,
     tune,
@@ -45,7 +44,7 @@ STEP_RATIO: Final = 0.28  # bandwidth of the filter of steps over the loop's
 STEP: Final = 1.0  # [m]
 ROOM: Final = 0.15
 """The tracking requirement, the same for every controller: the largest error along x, y and z over the course's size.
-The robust controller's is 11 % on steps and 5 % on figure eights, at most (docs/first-flights.md)."""
+The robust controller's is 11 % on steps and 5 % on figure eights, at most (docs/own-vehicle.md)."""
 CLEARANCE: Final = 1.5
 """Height of the course above the floor over the largest error allowed, where that is more than `LOWEST`."""
 LOWEST: Final = 1.0  # height of a course [m]
@@ -121,9 +120,7 @@ class FirstScenario:
         return "\n".join(lines) + "\n"
 
 
-def first_scenario(
-    vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust", steepest: float = STEEPEST
-) -> FirstScenario:
+def first_scenario(vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust") -> FirstScenario:
     """A scenario that the vehicle flies well, with its controller's numbers made from the vehicle's.
 
     Args:
@@ -131,7 +128,6 @@ def first_scenario(
         file: where they are, as the scenario is to name it: a shipped vehicle or a path ending in `.toml`.
         course: one of `COURSES`.
         law: one of `LAWS`.
-        steepest: largest tilt bound [rad].
 
     Raises:
         UnknownNameError: there is no such course or law.
@@ -139,7 +135,7 @@ def first_scenario(
     for kind, name, known in (("course", course, COURSES), ("controller", law, LAWS)):
         if name not in known:
             raise UnknownNameError(kind, name, known)
-    tuning = tune(vehicle, steepest=steepest)
+    tuning = tune(vehicle)
     flown, duration, size = _course(course, vehicle, tuning)
     name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course}".lower())[:80]
     why = f"s, tau: the longest of the usual ones with tau w <= {PERIOD_SHARE:g}"

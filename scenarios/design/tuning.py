@@ -79,12 +79,8 @@ class Tuning:
         return math.tan(self.tilt)
 
 
-def tune(vehicle: Vehicle, *, steepest: float = STEEPEST) -> Tuning:
+def tune(vehicle: Vehicle) -> Tuning:
     """The numbers for a vehicle; see the module.
-
-    Args:
-        vehicle: the numbers.
-        steepest: largest tilt bound [rad].
 
     Raises:
         ParameterError: hover leaves no thrust or no torque in reserve.
@@ -94,7 +90,7 @@ def tune(vehicle: Vehicle, *, steepest: float = STEEPEST) -> Tuning:
         rule = f"further from its hover speed, {vehicle.hover_speed:.4g} rad/s, or nothing is left to control it with"
         side = "speed_max" if can.climb <= can.sink else "speed_min"
         raise ParameterError("vehicle", side, getattr(vehicle, side), rule)
-    tilt = min(steepest, math.acos(min(1.0, 1.0 / (THRUST_SHARE * can.thrust_to_weight))))
+    tilt = min(STEEPEST, math.acos(min(1.0, 1.0 / (THRUST_SHARE * can.thrust_to_weight))))
     # A vehicle that barely hovers keeps at least a third of the tilt that it can hold.
     tilt = max(tilt, can.steady_tilt / 3.0)
     bandwidth, limited_by, period = _bandwidth(can, tilt)
