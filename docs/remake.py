@@ -207,10 +207,14 @@ def tunings(summaries: dict[str, Any]) -> str:
     rows = []
     for name in TUNINGS:
         for found in summaries[name]["objectives"]:
-            change = f"{100.0 * found['kept']:+.1f} %"
-            numbers = (f"{found['fresh_start']:.4g}", f"{found['fresh_best']:.4g}", change)
-            rows.append((name, f"{found['name']} [{found['unit']}]", *numbers, f"{100.0 * found['promised']:+.1f} %"))
+            numbers = (f"{found[key]:.4g}" for key in ("fresh_start", "fresh_best"))
+            changes = (_change(found["fresh_start"], found["fresh_best"]), _change(found["start"], found["best"]))
+            rows.append((name, f"{found['name']} [{found['unit']}]", *numbers, *changes))
     return markdown(("tuning", "objective", "start", "best", "change", "promised by the search"), rows)
+
+
+def _change(start: float, best: float) -> str:
+    return f"{100.0 * (best - start) / abs(start):+.1f} %"
 
 
 def records(data: Any) -> str:
@@ -239,7 +243,9 @@ def mismatch(data: Any) -> str:
         ("end_error", ".3f", 'Distance from the reference at the end [m]; "lost" with the time:'),
         ("peak_tilt", ".3g", "Peak roll or pitch at the physics rate [deg]:"),
     ):
-        cells = {(row["condition"], row["controller"]): row["fate"] or format(row[key], form) for row in _records(data)}
+        cells: dict[tuple[str, ...], str] = {
+            (row["condition"], row["controller"]): row["fate"] or format(row[key], form) for row in _records(data)
+        }
         parts.append(f"{title}\n\n{by_controller([''], cells)}")
     return "\n".join(parts)
 
