@@ -77,7 +77,7 @@ SHORTEST: Final = 0.1
 """Least share of a Gauss-Newton step that Aitken's relaxation takes where several are."""
 CONVERGED: Final = 0.1
 """Largest dynamics defect of a plan that counts as converged (`quadsim.controller.SQP`).  Flights of the library exceed
-it in at most 9 periods, after steps of the course and upside down; one that tumbles, in all (docs/controllers.md)."""
+it in at most 9 periods, after steps of the course and upside down; one that tumbles, in all."""
 PATIENCE: Final = 8
 """After so many steps, none of them shorter than the shortest before, half as much of each is taken at most."""
 TILT_SIDES: Final = 12

@@ -439,7 +439,7 @@ def test_active_constraints_that_depend_on_each_other() -> None:
 
 @pytest.mark.parametrize(("ratio", "exact"), [(1.0, 1e-10), (1e9, 1e-5)])
 def test_every_way_ends_at_the_optimum(ratio: float, exact: float) -> None:
-    """Without a QP, axis by axis and by the whole QP: docs/controllers.md states these numbers."""
+    """Without a QP, axis by axis and by the whole QP."""
     errors: dict[Method, list[float]] = {method: [] for method in Method}
     queries = 0
     for seed in range(100):
