@@ -21,6 +21,7 @@ from quadsim.flight.metrics import peak_tilt, tracking
 from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
+from scenarios.shipped import scenario_names
 
 GOLDEN: Final = Path(__file__).resolve().parent / "golden"
 PAPER: Final = ("paper-unconstrained", "paper-unconstrained-clipped", "paper-constrained")
@@ -98,9 +99,10 @@ def paper_entry(flight: Flight) -> dict[str, Any]:
 
 
 def main(names: list[str]) -> None:
-    """Fly these scenarios and write their entries."""
+    """Fly these scenarios and write their entries; drop those of scenarios that are no more."""
     flights = {name: fly_scenario(load_scenario(name)) for name in names}
-    write("library", read("library") | {name: library_entry(flight) for name, flight in flights.items()})
+    library = read("library") | {name: library_entry(flight) for name, flight in flights.items()}
+    write("library", {name: entry for name, entry in library.items() if name in scenario_names()})
     paper = {name: paper_entry(flight) for name, flight in flights.items() if name in PAPER}
     write("paper", read("paper") | paper)
 
