@@ -251,13 +251,12 @@ def mismatch(data: Any) -> str:
 
 
 def speed(data: Any) -> str:
-    """Mean position errors of each controller at each speed."""
-    cells: dict[tuple[str, ...], str] = {
-        (row["course"], f"{row['speed']:g}", row["controller"]): "lost"
-        if row["error"] is None
-        else f"{row['error']:.3f}"
-        for row in _records(data)
-    }
+    """Mean position errors of each controller at each speed, of several seeds with half the 95 % interval."""
+    cells: dict[tuple[str, ...], str] = {}
+    for row in _records(data):
+        half = f" ± {row['half']:.3f}" if row["half"] else ""
+        text = "lost" if row["error"] is None else f"{row['error']:.3f}{half}"
+        cells[row["course"], f"{row['speed']:g}", row["controller"]] = text
     return by_controller(["course", "m/s"], cells)
 
 

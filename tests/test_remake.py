@@ -15,13 +15,16 @@ def test_records_become_rows_under_their_keys() -> None:
 
 def test_speeds_have_a_column_for_each_controller() -> None:
     flights = [
-        {"course": "loop", "speed": speed, "controller": name, "error": error}
-        for speed, name, error in ((4.0, "LQR", 1.0), (4.0, "PID", 0.02), (10.0, "LQR", None), (10.0, "PID", 0.42))
+        {"course": "loop", "speed": speed, "controller": name, "error": error, "half": half}
+        for speed, name, error, half in (
+            *((4.0, "LQR", 1.0, None), (4.0, "PID", 0.02, 0.001)),
+            *((10.0, "LQR", None, None), (10.0, "PID", 0.42, None)),
+        )
     ]
     assert remake.speed(flights).splitlines() == [
         "| course | m/s | LQR | PID |",
         "| --- | --- | --- | --- |",
-        "| loop | 4 | 1.000 | 0.020 |",
+        "| loop | 4 | 1.000 | 0.020 ± 0.001 |",
         "| loop | 10 | lost | 0.420 |",
     ]
 
