@@ -85,7 +85,9 @@ def entry(name: str) -> tuple[Group, str]:
     draw(flight, FIGURES / f"{name}.svg")
     clip = film(flight, FIGURES / f"{name}.mp4") if name in FILMED else ""
     verdict, errors, nearest = scenario_cells(GOLDEN[name])
-    numbers = f"**{verdict}** · RMS error x, y, z {errors} m · nearest to its bound: {nearest}"
+    numbers = f"**{verdict}**"
+    if errors != "-":
+        numbers += f" · RMS error x, y, z {errors} m · nearest to its bound: {nearest}"
     return flight.scenario.group, (
         f"### {name}\n\n{flight.scenario.description}.\n\n![Path and attitude of {name}](gallery/{name}.svg)\n\n"
         f"{numbers}\n{clip and chr(10) + clip}"
