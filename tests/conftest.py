@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import settings
-from support import draw_nothing, fly_here, sketch_figures, take_long_steps
+from support import draw_nothing, fly_here, take_long_steps
 
 from quadsim.controller import Controller
 from quadsim.flight import rundir
@@ -135,24 +135,9 @@ def short_run_directory(short_run: Run) -> Path:
 
 
 @pytest.fixture
-def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """See `support.sketch_figures`."""
-    sketch_figures(monkeypatch)
-
-
-@pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """See `support.draw_nothing`."""
     draw_nothing(monkeypatch)
-
-
-@pytest.fixture
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are not laid out, and their pictures have few pixels."""
-    from matplotlib.figure import Figure
-
-    monkeypatch.setattr("quadsim.report.figures.canvas.DPI", 30)
-    monkeypatch.setattr(Figure, "get_layout_engine", lambda _: None)
 
 
 @pytest.fixture

@@ -112,7 +112,8 @@ class Panel:
     @property
     def heading(self) -> str:
         """Title and unit."""
-        return f"{self.title} [{self.unit}]" if self.unit else self.title
+        unit = self.unit.replace(" ", "\u00a0")  # no line ends within it
+        return f"{self.title} [{unit}]" if unit else self.title
 
     @property
     def least_range(self) -> tuple[float, float] | None:

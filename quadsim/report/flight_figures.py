@@ -139,7 +139,9 @@ def times(runs: Sequence[Run]) -> Figure:
             if len(runs) == 1:
                 p50, p99 = np.percentile(values, [50, 99])
                 title = f"{what}: median {p50:.3g}, p99 {p99:.3g}, max {values.max():.3g}"
-        deadlines = {float(run.summary["controller"]["deadline_ms"]) for run in runs} if key == "step_ms" else ()
+        deadlines = (
+            {float(run.summary["controller"]["deadline_ms"]) for _, _, run in _flown(runs)} if key == "step_ms" else ()
+        )
         bounds = tuple(Bound(value=deadline, start=0.0, stop=_end(runs)) for deadline in sorted(deadlines))
         panels.append(Panel(title=title, y_label="time [ms]", y_log=True, series=tuple(curves), bounds=bounds))
     for title, key in (("iterations, of whoever answered", "iterations"), ("active constraints", "active")):

@@ -85,9 +85,9 @@ def to_plot(figure: Figure, *, labelled: bool = True, note: str = "") -> Plot:
         place = {"row": i // columns + 1, "col": i % columns + 1}
         _draw_panel(canvas, panel, place, points)
         if panel.equal:
-            canvas.update_yaxes(scaleanchor=f"x{i + 1 if i else ''}", **place)
+            canvas.update_yaxes(scaleanchor=f"x{i + 1}" if i else "x", **place)
         if figure.end is not None and not panel.x_label:
-            canvas.update_xaxes(matches="x", range=[-0.01 * figure.end, figure.end or 1.0], **place)
+            canvas.update_xaxes(matches="x" if i else None, range=[-0.01 * figure.end, figure.end or 1.0], **place)
             if i >= count - columns:
                 canvas.update_xaxes(title={"text": "time [s]", "standoff": 6}, **place)
     canvas.update_xaxes(tickangle=0, nticks=None if timed else 6)  # a turned label runs into the next row

@@ -156,7 +156,7 @@ def test_a_controller_of_the_user_names_itself_as_text(nasty: str) -> None:
     assert law.name == law.solver == printable(nasty)
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_folders_of_any_name_are_compared_and_checked(
     tmp_path: Path,
     short_run_directory: Path,

@@ -109,7 +109,7 @@ def test_the_page_shows_what_the_flights_show(estimated: Summary, reported: Path
     assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//""", text)
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("case", CASES)
 def test_campaigns_of_every_kind_have_a_page(make_campaign: MakeCampaign, tmp_path: Path, case: str) -> None:
     flights, severity = CASES[case]
@@ -124,7 +124,7 @@ def test_campaigns_of_every_kind_have_a_page(make_campaign: MakeCampaign, tmp_pa
     assert ("What is measured of a lost flight, its margins too, ends where it was aborted." in text) is lost
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_a_campaign_without_required_constraints_has_a_page(thousand: pa.Table, tmp_path: Path) -> None:
     some = thousand.slice(0, 50)
     for name in ("worst_margin", "worst_constraint"):
@@ -136,7 +136,7 @@ def test_a_campaign_without_required_constraints_has_a_page(thousand: pa.Table, 
     assert NAME in write(tmp_path / "out", some, summary=summary)
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_hostile_names_are_text(thousand: pa.Table, tmp_path: Path) -> None:
     names = [HOSTILE if name == "draw.wind" else name for name in thousand.column_names]
     table = thousand.rename_columns([name.replace(HOSTILE, f"draw.{HOSTILE}") for name in names])
@@ -146,7 +146,7 @@ def test_hostile_names_are_text(thousand: pa.Table, tmp_path: Path) -> None:
     assert "ValueError: &lt;b&gt;no&lt;/b&gt; step" in text
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_thousands_of_flights_stay_small(
     thousands: pa.Table, estimated: Summary, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,7 +202,7 @@ def test_a_lost_flight_does_not_flatten_the_others(thousand: pa.Table) -> None:
     )
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_outliers_are_drawn_at_the_edge_and_reported(
     thousand: pa.Table, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -280,7 +280,7 @@ def test_figures_are_the_same_every_time(
         assert (tmp_path / file).read_bytes() == (reported / file).read_bytes()
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_a_browser_draws_the_page_and_has_no_complaint(make_campaign: MakeCampaign, tmp_path: Path) -> None:
     write(tmp_path / "out", make_campaign(300), name=HOSTILE)
     page = tmp_path / "out" / "index.html"
