@@ -17,12 +17,13 @@ import pytest
 from tuning_formula import BEST_SPEED, BEST_Z, Formula, error_of, tune_by, write_tuning
 
 from quadsim.errors import InputError, MissingPackageError, OutputError
+from quadsim.outputs import SUMMARY_FILE
 from scenarios.campaign.results.table import read_table
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 from scenarios.tuning import run as module
 from scenarios.tuning.plan import START, TuningPlan, load_tuning
-from scenarios.tuning.run import SUMMARY_FILE, TuningResult
+from scenarios.tuning.run import TuningResult
 from scenarios.tuning.search import JOURNAL_FILE, Search
 
 
@@ -245,7 +246,12 @@ def test_optuna_opens_the_journal(whole: TuningResult) -> None:
 
 def test_a_start_outside_of_the_ranges_is_no_trial_of_the_search(tmp_path: Path) -> None:
     horizon = {"name": "n", "fields": ["controller.horizon"], "distribution": "integer", "low": 20, "high": 30}
-    solver = {"name": "s", "fields": ["controller.solver"], "distribution": "choice", "values": ["piqp", "daqp"]}
+    solver = {
+        "name": "s",
+        "fields": ["controller.solver"],
+        "distribution": "choice",
+        "values": ["piqp-dense", "piqp-multistage"],
+    }
     plan = load_tuning(str(write_tuning(tmp_path, search=[horizon, solver], trials=6)))
     start, *others = tune(plan, tmp_path / "t", Formula()).summary["candidates"]
     assert start["search"] == {"n": 4.0, "s": plan.start_values["s"]}
