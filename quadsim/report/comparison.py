@@ -23,15 +23,7 @@ if TYPE_CHECKING:
     from quadsim.flight.rundir import Run
 
 Summary = Mapping[str, Any]
-_VERDICTS: Final = {
-    "satisfied": "holds every required constraint",
-    "violated": "does not hold every required constraint",
-    "lost": "is lost",
-    "aborted": "is aborted",
-    "incomplete": "ends before every required constraint is reached",
-}
-FOR_GOOD: Final = "ends in permanent fallback"
-"""Of a flight whose verdict rests on that alone; see `quadsim.flight.metrics.unrecovered`."""
+_MOST_EVENTS: Final = 12  # of a flight that are named
 _Line = tuple[str, str, Callable[[Summary], Cell]]  # a row's label, its unit, and the cell of a summary
 
 
@@ -107,12 +99,9 @@ def verdict(summary: Summary) -> str:
     return "incomplete" if "incomplete" in verdicts else "satisfied"
 
 
-def verdict_sentence(summary: Summary) -> str:
-    """What the verdict rests on, after the name of the flight."""
-    found = verdict(summary)
-    if found == "violated" and "violated" not in _required_verdicts(summary):
-        return FOR_GOOD if summary["controller"].get("unrecovered") else "crashes"
-    return _VERDICTS[found]
+def violated_by_fallback(summary: Summary) -> bool:
+    """Whether a completed flight held its required constraints and is violated by its permanent fallback alone."""
+    return bool(summary["controller"].get("unrecovered")) and "violated" not in _required_verdicts(summary)
 
 
 def _required_verdicts(summary: Summary) -> set[str]:
@@ -139,6 +128,12 @@ def failure_sentences(summary: Summary) -> list[str]:
     periods, found = summary["controller"].get("unrecovered"), summary.get("diagnosis")
     sentences = [fallback_sentence(periods)] if periods else []
     return sentences + ([] if found is None else [found["sentence"], *filter(None, [found["advice"]])])
+
+
+def event_sentences(events: Sequence[Summary]) -> list[str]:
+    """What happened when, the first of them where there are many."""
+    sentences = [f"{event['text']} at {format_number(event['time'])} s" for event in events[:_MOST_EVENTS]]
+    return sentences + ([f"{len(events) - _MOST_EVENTS} more"] if len(events) > _MOST_EVENTS else [])
 
 
 def verdict_cell(summary: Summary) -> Cell:
@@ -188,15 +183,6 @@ def format_bounds(entry: Summary, unit: str = "") -> str:
     window = "" if not entry["start"] and entry["stop"] is None else f", from {entry['start']:g} s"
     window += "" if entry["stop"] is None else f" to {entry['stop']:g} s"
     return f"{bounds} {unit}".rstrip() + window
-
-
-def format_excess(entry: Summary) -> str:
-    """How far a constraint was exceeded; marked where that was at the samples alone, in what was commanded."""
-    margin, _ = deciding_margin(entry)
-    if margin is None:
-        return "by no number"
-    at_samples = margin != entry["worst_margin"]
-    return f"by {format_number(-margin)} {entry['unit']}{' at the samples' if at_samples else ''}"
 
 
 def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
@@ -367,6 +353,8 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
     ("verdict on the flight", "", verdict_cell),
     ("required constraints", "", required),
     ("audit", "", lambda summary: Cell(text="; ".join(summary.get("audit_notes", ())) or "as the controller bounds")),
+    ("why no optimum", "", _text(lambda summary: "; ".join(failure_sentences(summary)) or ABSENT)),
+    ("events", "", _text(lambda summary: "; ".join(event_sentences(summary.get("events", ()))) or ABSENT)),
     ("time flown", "s", _number("duration")),
     ("controller", "", _text(lambda summary: law_name(summary["controller"].get("name", ABSENT)))),
     ("QP solver, where a QP is left to one", "", _text(lambda summary: summary["controller"].get("solver") or ABSENT)),

@@ -254,8 +254,9 @@ def _of_run(i: int, label: str, x: Array, y: Array, **looks: Any) -> Series:
 
 def _several(title: str, unit: str, t: Array, values: Array, names: Sequence[str]) -> Panel:
     """Curves (M, n) in one panel with a legend of its own."""
+    first = 4 - len(names)  # x, y and z look alike with and without w
     curves = [
-        Series(x=t, y=column, colour=line_colour(1 + i), label=name, width=1.0)
+        Series(x=t, y=column, colour=line_colour(first + i), label=name, width=1.0)
         for i, (name, column) in enumerate(zip(names, values.T, strict=True))
     ]
     return Panel(title=title, unit=unit, series=tuple(curves), legend=True)

@@ -97,8 +97,9 @@ def draw(figure: Figure, *, interactive: bool = False) -> Canvas:
     for axes, panel in zip(grid.flat, figure.panels, strict=False):
         entries = _draw_panel(axes, panel)
         if panel.legend and entries:
-            axes.legend(entries.values(), entries, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4,
-                        fontsize=8.0, borderaxespad=0.1, columnspacing=1.0, handletextpad=0.4)  # fmt: skip
+            beside = {} if _is_headed(panel) else {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
+            axes.legend(entries.values(), entries, loc="lower right", ncols=1 if _is_headed(panel) else 4,
+                        fontsize=8.0, columnspacing=1.0, handletextpad=0.4, **beside)  # fmt: skip
         else:
             shown |= entries
         if not panel.x_label:
@@ -106,11 +107,12 @@ def draw(figure: Figure, *, interactive: bool = False) -> Canvas:
     for axes in grid.flat[len(figure.panels) :]:
         axes.set_axis_off()
     _share_time(timed, figure)
-    canvas.align_ylabels()
+    if not any(panel.y_names for panel in figure.panels):
+        canvas.align_ylabels()
     if figure.title:
         canvas.suptitle(figure.title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
     if shown:
-        canvas.legend(list(shown.values()), list(shown), loc="outside upper right", ncols=6)
+        canvas.legend(list(shown.values()), list(shown), loc="outside lower right", ncols=6)
     return canvas
 
 
@@ -127,6 +129,11 @@ def _share_time(panels: list[Axes], figure: Figure) -> None:
         panels[0].set_xlim(-0.008 * figure.end, figure.end or 1.0)
 
 
+def _is_headed(panel: Panel) -> bool:
+    """Whether its title stands above the panel, not beside its vertical axis."""
+    return bool(panel.y_label or panel.y_names)
+
+
 def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
     """Draw a panel; the legend's entries."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
@@ -139,7 +146,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
             band.x, band.low, band.high, color=band.colour, alpha=band.opacity, linewidth=0.9
         )
     for series in panel.series:
-        shown[series.label] = _draw_series(axes, series)
+        shown.setdefault(series.label, _draw_series(axes, series))
     for bound in panel.bounds:
         shown["bound"] = _draw_bound(axes, bound)
     if panel.x_log:
@@ -163,7 +170,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
         axes.set_xlim(*panel.x_range)
     if ends := panel.y_range or panel.least_range:
         axes.set_ylim(*ends)
-    if panel.y_label or panel.y_names:
+    if _is_headed(panel):
         axes.set_title(panel.heading)
     axes.set(
         xlabel=panel.x_label, ylabel=panel.y_label or ("" if panel.y_names else textwrap.fill(panel.heading, _LABEL))

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure as Canvas
 
 _ROW, _TOP, _BOTTOM = 210, 34, 46  # of a row of panels, and above and below them all [px]
+_GAP, _LABELLED_GAP = 56, 76  # between rows of panels, and where each has a label [px]
 _SCENE: Final = 560  # [px]
 _LOG_TICKS: Final = [float(digit * 10**power) for power in range(7) for digit in (1, 2, 5)]
 _MOST_POINTS: Final = 3000
@@ -74,7 +75,7 @@ def to_plot(figure: Figure, *, labelled: bool = True, note: str = "") -> Plot:
         cols=columns,
         subplot_titles=[html.escape(panel.heading) for panel in figure.panels],
         horizontal_spacing=0.08 if columns > 1 else 0.0,
-        vertical_spacing=(0.14 if timed else 0.3) / max(rows, 2),
+        vertical_spacing=(_GAP if timed else _LABELLED_GAP) / (_ROW * sum(heights)),
         row_heights=heights,
         specs=[[{} if columns * row + column < count else None for column in range(columns)] for row in range(rows)],
     )
