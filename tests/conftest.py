@@ -57,7 +57,7 @@ LONG = (
     *("scenarios/gym/test_environment.py", "test_learning_examples.py"),
     *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py", "scenarios/test_bad_controllers.py"),
     *("scenarios/campaign/statistics/test_drivers.py", "scenarios/papers/test_beyond.py"),
-    *("scenarios/tuning/test_run.py", "scenarios/tuning/report/test_tuning_page.py"),
+    *("scenarios/tuning/test_run.py",),
 )
 """Modules that take longest; those not named take less than four seconds each."""
 
