@@ -129,14 +129,14 @@ def write_comparison_report(comparison: Comparison, directory: Path, *, overwrit
     plots = tuple(to_plot(figure, note=note) for figure in campaign_figures.paired_margins(comparison))
     sections = [
         Section(title="What is compared", text=(pairing(comparison),), tables=tuple(difference_table(comparison))),
-        *(Section(title=table.title, tables=(table,)) for table in comparison_tables(comparison)),
+        Section(title="Which is better", text=(comparison.sentence,), tables=tuple(comparison_tables(comparison))),
         Section(title="Margins", plots=plots),
     ]
-    title, verdict = f"{comparison.names[1]} against {comparison.names[0]}", Cell(text=comparison.sentence)
+    title = f"{comparison.names[1]} against {comparison.names[0]}"
     files = {file: file for file in (COMPARISON_FILE, TABLE_FILE)}
     with writing(directory, overwrite=overwrite) as partial:
         (partial / COMPARISON_FILE).write_text(to_json(comparison.to_json()), encoding="utf-8")
         (partial / TABLE_FILE).write_text(comparison_markdown(comparison), encoding="utf-8")
-        page = render_page("campaign comparison", title, sections, verdict=verdict, files=files)
+        page = render_page("campaign comparison", title, sections, files=files)
         (partial / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
