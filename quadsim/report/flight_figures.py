@@ -61,7 +61,7 @@ def page_figures(runs: Sequence[Run]) -> list[Figure | Scene]:
         return []
     found: list[Figure | Scene] = [states(runs), inputs(runs), times(runs)]
     if len(runs) == 1:
-        found += effects(runs[0])
+        found += [*effects(runs[0]), *space(runs[0])]
     return [*found, path(runs)]
 
 

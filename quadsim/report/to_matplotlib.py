@@ -80,6 +80,13 @@ def to_png(figure: Figure, dpi: float | None = None) -> bytes:
 
 def draw(figure: Figure, *, interactive: bool = False) -> Canvas:
     """The figure as matplotlib's, which notebooks and `pyplot.show` show where it is interactive."""
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE):
+        return _draw(figure, interactive=interactive)
+
+
+def _draw(figure: Figure, *, interactive: bool) -> Canvas:
     from matplotlib.figure import Figure as Canvas
 
     rows = [figure.panels[i : i + figure.columns] for i in range(0, len(figure.panels), figure.columns)]

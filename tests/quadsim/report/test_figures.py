@@ -9,7 +9,7 @@ import pytest
 from matplotlib.image import imread
 
 from quadsim.errors import OutputError
-from quadsim.flight.audit import SIGNALS, Limit
+from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
 from quadsim.flight.rundir import Run
 from quadsim.report import flight_figures
 from quadsim.report.figure import Band, Bound, Figure, Panel, Scene, Series
@@ -17,6 +17,7 @@ from quadsim.report.flight_figures import effects, inputs, overview, page_figure
 from quadsim.report.palette import BOUND
 from quadsim.report.to_matplotlib import draw, to_png
 from quadsim.report.to_plotly import thin, to_plot
+from quadsim.space import Cylinder
 from quadsim.state import INDEX, Array
 
 
@@ -220,6 +221,17 @@ def test_a_place_that_cannot_be_written_is_reported(short_run: Run, tmp_path: Pa
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="cannot write"):
         write_figures(short_run, tmp_path / "file" / "figures")
+
+
+def test_a_run_among_obstacles_is_drawn_from_above_with_its_clearances(short_run: Run) -> None:
+    pillar = Cylinder(name="pillar", position=(1.0, 0.0, 1.0), radius=0.1, height=3.0)
+    limit = SpaceLimit(name="pillar", shape=pillar, radius=0.2)
+    (figure,) = flight_figures.space(dataclasses.replace(short_run, limits=(limit,)))
+    above, clearance = figure.panels
+    np.testing.assert_allclose(np.hypot(*(above.areas[0].outline - [1.0, 0.0]).T), 0.1)
+    assert [bound.value for bound in clearance.bounds] == [0.0]
+    assert to_plot(figure).json.count('"toself"') == 1
+    assert to_png(figure, dpi=30)
 
 
 def test_every_signal_can_be_drawn(short_run: Run) -> None:
