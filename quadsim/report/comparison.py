@@ -168,27 +168,25 @@ def tracking_values(summaries: Sequence[Summary], measure: str, channel: str) ->
     return "/".join(sorted(units)), values
 
 
-def present_keys(summaries: Sequence[Summary], *path: str) -> list[str]:
+def _present_keys(summaries: Sequence[Summary], *path: str) -> list[str]:
     """Keys that any summary has at a path, in order."""
     return list(dict.fromkeys(key for summary in summaries for key in nested(summary, *path) or {}))
 
 
-def format_bounds(entry: Summary, unit: str = "") -> str:
-    """Bounds of a constraint and the times it holds for, e.g. `-5 .. 5`, `at least -0.5` or `0 .. 1 m, from 59 s`."""
+def _bounds(entry: Summary) -> str:
+    """Bounds of a constraint and the times it holds for, e.g. `-5 .. 5`, `at least -0.5` or `0 .. 1, from 59 s`."""
     lower, upper = entry["lower"], entry["upper"]
+    bounds = f"{format_number(lower)} .. {format_number(upper)}"
     if lower is None or upper is None:
         bounds = f"at least {format_number(lower)}" if upper is None else f"at most {format_number(upper)}"
-    else:
-        bounds = f"{format_number(lower)} .. {format_number(upper)}"
-    window = "" if not entry["start"] and entry["stop"] is None else f", from {entry['start']:g} s"
-    window += "" if entry["stop"] is None else f" to {entry['stop']:g} s"
-    return f"{bounds} {unit}".rstrip() + window
+    window = f", from {entry['start']:g} s" if entry["start"] or entry["stop"] is not None else ""
+    return bounds + window + ("" if entry["stop"] is None else f" to {entry['stop']:g} s")
 
 
 def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
     measures = {"rmse": "RMS error", "max_error": "largest error", "final_error": "final error"}
     for measure, label in {**measures, "overshoot": "overshoot"}.items():
-        for channel in present_keys(summaries, "tracking", measure):
+        for channel in _present_keys(summaries, "tracking", measure):
             unit, values = tracking_values(summaries, measure, channel)
             yield _best_smallest("Tracking", f"{label}, {channel}", unit, summaries, values)
     # One row per step of the courses; `-` where an output does not settle or a run has no such step.
@@ -276,7 +274,7 @@ def _violation(entry: Summary) -> Cell:
     return Cell(text=format_number(seconds), mark=_verdict_mark(entry) if seconds > 0.0 else Mark.NONE)
 
 
-def lowest_speed(summary: Summary) -> Cell:
+def _lowest_speed(summary: Summary) -> Cell:
     """The lowest rotor speed that the course requires; none where it requires a negative thrust."""
     if any(problem.startswith("not flyable") for problem in nested(summary, "course", "problems") or ()):
         return Cell(text="not flyable", mark=Mark.BAD)
@@ -366,7 +364,7 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
 _COURSE: Final[tuple[_Line, ...]] = (
     ("largest tilt required", "deg", _number("course", "tilt")),
     ("highest speed required", "m/s", _number("course", "velocity")),
-    ("lowest rotor speed required", "rad/s", lowest_speed),
+    ("lowest rotor speed required", "rad/s", _lowest_speed),
     ("highest rotor speed required", "rad/s", _number("course", "rotor_max")),
     ("jumps", "", _listed("jumps", "at {:g} s", Mark.NONE)),
     ("beyond the bounds", "", _listed("problems", "{}", Mark.WARN)),
@@ -419,7 +417,7 @@ _TIMES: Final[tuple[_Line, ...]] = (
 _OWN: Final = "own"  # in place of a row's unit: the constraint's own
 _CONSTRAINT: Final[tuple[_Line, ...]] = (
     ("verdict", "", _verdict),
-    ("bounds", _OWN, lambda entry: Cell(text=format_bounds(entry))),
+    ("bounds", _OWN, lambda entry: Cell(text=_bounds(entry))),
     ("peak at the samples", _OWN, _number("peak_sampled")),
     ("peak at the physics rate", _OWN, _number("peak_plant")),
     ("worst margin at the samples", _OWN, _margin("worst_margin_sampled", "tolerance_sampled")),
