@@ -75,11 +75,6 @@ def make_parser() -> argparse.ArgumentParser:
     compare.add_argument("targets", metavar="RUN_OR_SCENARIO", nargs="+", help=targets)
     compare.add_argument("--out", metavar="DIR", required=True, help="directory of the page")
     compare.add_argument("--overwrite", **_OVERWRITE)
-    cost = (
-        "study what constraints cost; takes a minute (default: where a constrained and an unconstrained controller fly "
-        "the same course of at most 120 s)"
-    )
-    compare.add_argument("--cost", action=argparse.BooleanOptionalAction, default=None, help=cost)
     compare.add_argument("--markdown", action="store_true", help="print the table as Markdown")
 
     _add_live(command("live", help="fly in the browser: push, turn every knob, keep it as a scenario"))

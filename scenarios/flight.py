@@ -272,12 +272,14 @@ class Flight:
         Raises:
             UnknownNameError: there is no such signal.
         """
-        from quadsim.report.figures.flight_figures import plot_signals
+        from quadsim.report.flight_figures import signals as draw_signals
+        from quadsim.report.to_matplotlib import draw
 
         for name in signals:
             if name not in SIGNALS:
                 raise UnknownNameError("signal", name, SIGNALS)
-        return plot_signals(self.run, signals or ("x", "y", "z", "roll", "pitch", "yaw"))
+        figure = draw_signals(self.run, signals or ("x", "y", "z", "roll", "pitch", "yaw"))
+        return draw(figure, interactive=True).axes
 
     def save(
         self,
@@ -324,9 +326,10 @@ class Flight:
         errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz" if self.time.size)
         plot = ""
         if self.time.size:
-            from quadsim.report.figures.flight_figures import signals_png
+            from quadsim.report.flight_figures import signals
+            from quadsim.report.to_matplotlib import to_png
 
-            plot = b64encode(signals_png(self.run, ("x", "y", "z"))).decode()
+            plot = b64encode(to_png(signals(self.run, ("x", "y", "z")), dpi=70)).decode()
             plot = f'<img alt="position over time" src="data:image/png;base64,{plot}">'
         return (
             f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self.summary['duration']:g} s flown, "
@@ -497,7 +500,7 @@ def _add_products(flight: Flight, directory: Path, outputs: Outputs, progress: P
                     write_recording(run, folder / rundir.RECORDING_FILE)
         if outputs.figures is not False and flown:
             with product(rundir.FIGURES_DIR, outputs.figures) as folder:
-                from quadsim.report.figures.flight_figures import write_figures
+                from quadsim.report.flight_figures import write_figures
 
                 progress("figures", 0, 1)
                 write_figures(run, folder / rundir.FIGURES_DIR)

@@ -12,10 +12,9 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import settings
-from support import draw_nothing, fly_here, sketch_figures, take_long_steps
+from support import draw_nothing, fly_here, take_long_steps
 
 from quadsim.controller import Controller
 from quadsim.flight import rundir
@@ -23,8 +22,6 @@ from quadsim.flight.rundir import Run
 from quadsim.report.recording import write_recording
 from quadsim.sim.effects import Force
 from quadsim.vehicle import Vehicle
-from scenarios.cost.measure import ARM_LENGTHS, DRAGS
-from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
@@ -49,7 +46,7 @@ LONG = (
     *("scenarios/campaign/report/test_campaign_page.py", "quadsim/report/film/test_video.py"),
     *("quadsim/report/test_comparison_page.py", "scenarios/design/test_first_flights.py"),
     "scenarios/test_process.py",
-    *("test_documents.py", "scenarios/cost/test_measure.py", "scenarios/test_diagnosis.py", "scenarios/test_api.py"),
+    *("test_documents.py", "scenarios/test_diagnosis.py", "scenarios/test_api.py"),
     *("scenarios/test_faults.py", "quadsim/report/test_figures.py", "scenarios/bench/test_mismatch.py"),
     *("mpc/robust/test_robust.py", "scenarios/test_reaudit.py", "scenarios/test_run.py", "scenarios/test_cli.py"),
     *("mpc/test_staged.py", "scenarios/campaign/test_commands.py"),
@@ -57,7 +54,7 @@ LONG = (
     *("scenarios/gym/test_environment.py", "test_learning_examples.py"),
     *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py", "scenarios/test_bad_controllers.py"),
     *("scenarios/campaign/statistics/test_drivers.py", "scenarios/papers/test_beyond.py"),
-    *("scenarios/tuning/test_run.py", "scenarios/tuning/report/test_tuning_page.py"),
+    *("scenarios/tuning/test_run.py",),
 )
 """Modules that take longest; those not named take less than four seconds each."""
 
@@ -135,12 +132,6 @@ def short_run_directory(short_run: Run) -> Path:
 
 
 @pytest.fixture
-def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """See `support.sketch_figures`."""
-    sketch_figures(monkeypatch)
-
-
-@pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """See `support.draw_nothing`."""
     draw_nothing(monkeypatch)
@@ -148,11 +139,8 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are not laid out, and their pictures have few pixels."""
-    from matplotlib.figure import Figure
-
+    """Figures of benchmarks have few pixels."""
     monkeypatch.setattr("quadsim.report.figures.canvas.DPI", 30)
-    monkeypatch.setattr(Figure, "get_layout_engine", lambda _: None)
 
 
 @pytest.fixture
@@ -215,6 +203,9 @@ def unconstrained_flight(fly_once: Fly) -> Flight:
     return fly_once("paper-unconstrained")
 
 
+ARM_LENGTHS, DRAGS = (0.2, 0.3, 0.5), (0.012, 0.024, 0.048)  # L and d/b [m]; the paper gives none
+
+
 @pytest.fixture(scope="session")
 def varied_flights(fly_once: Fly, vehicle: Vehicle) -> dict[tuple[float, float], Flight]:
     """The constrained flight over arm length [m] and drag to thrust [m], which the paper leaves out."""
@@ -226,69 +217,3 @@ def varied_flights(fly_once: Fly, vehicle: Vehicle) -> dict[tuple[float, float],
         for arm in ARM_LENGTHS
         for drag in DRAGS
     }
-
-
-def make_outcome(scale: float = 1.0, *, reason: str | None = None, settled: float | None = 4.0) -> Outcome:
-    """A flight of ten periods whose measures are `scale` times 1, 2, 3 and so on."""
-    return Outcome(
-        reason=reason,
-        flown=0.5,
-        statuses={"infeasible": 1, "solved": 3, "unconstrained": 6},
-        fallbacks=1,
-        active=3,
-        numbers={key: scale * (i + 1.0) for i, key in enumerate(MEASURES)},
-        settling=[
-            {"channel": "x", "time": 0.0, "before": 0.0, "after": 1.0, "settled": settled},
-            {"channel": "x", "time": 10.0, "before": 1.0, "after": 0.0, "settled": 3.0},
-        ],
-    )
-
-
-@pytest.fixture
-def cost_study() -> CostStudy:
-    """A made-up study in which everything that can happen does: flights lost, plans held, steps that never settle."""
-    step_ms = np.linspace(1.0, 10.0, 10)
-    shortcut = ("unconstrained",) * 6 + ("solved",) * 3 + ("infeasible",)
-    lost = make_outcome(9.0, reason="the plant diverged", settled=None)
-    times = {"p50": 0.5, "p95": 0.8, "p99": 0.9, "max": 1.0}
-    return CostStudy(
-        name="bounded",
-        horizon=20,
-        deadline_ms=50.0,
-        duration=0.5,
-        constrained=make_outcome(2.0),
-        unconstrained=make_outcome(4.0, settled=8.0),
-        others={"free": make_outcome(3.0)},
-        reference=[{"settled": 5.0}, {"settled": None}],
-        candidates=(
-            CandidateTimes(name="gain", step_ms=0.01 * step_ms, statuses=("solved",) * 10, repeats=3),
-            CandidateTimes(name="as flown", step_ms=step_ms, statuses=shortcut, repeats=3),
-            CandidateTimes(name="QP by slow", step_ms=8.0 * step_ms, statuses=("solved",) * 10, repeats=1),
-        ),
-        left_out={"absent": "pip install it"},
-        tilt=Sweep(
-            name="tilt bound",
-            unit="deg",
-            base=5.0,
-            points=(
-                SweepPoint(value=2.0, constrained=make_outcome(3.0, settled=None), step_ms=times),
-                SweepPoint(value=5.0, constrained=make_outcome(2.0), step_ms=times),
-                SweepPoint(value=10.0, constrained=lost, step_ms={}),
-            ),
-        ),
-        horizons=Sweep(
-            name="horizon",
-            unit="periods",
-            base=20,
-            points=(
-                SweepPoint(value=10, constrained=make_outcome(3.0), step_ms=times, unconstrained=lost),
-                SweepPoint(value=20, constrained=make_outcome(2.0), step_ms=times, unconstrained=make_outcome(4.0)),
-            ),
-        ),
-        variations=(
-            Variation(arm_length=0.2, drag_to_thrust=0.012, outcome=make_outcome(2.0)),
-            Variation(arm_length=0.5, drag_to_thrust=0.024, outcome=make_outcome(2.5)),
-            Variation(arm_length=0.5, drag_to_thrust=0.048, outcome=lost),
-        ),
-        machine={"processor": "abacus", "cores": 2},
-    )

@@ -26,20 +26,6 @@ from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 
 
-def sketch_figures(patch: pytest.MonkeyPatch) -> None:
-    """Lay no figures out, and leave their PNG files empty: for tests of the SVG's text, or of other files."""
-    from matplotlib.figure import Figure
-
-    save = Figure.savefig
-
-    def sketch(figure: Figure, file: Any, *, format: str, **options: Any) -> None:
-        if format != "png":
-            save(figure, file, format=format, **options)
-
-    patch.setattr(Figure, "savefig", sketch)
-    patch.setattr(Figure, "get_layout_engine", lambda _: None)
-
-
 def fly_here(patch: pytest.MonkeyPatch) -> None:
     """Have this process fly many flights, in the place of workers: starting them takes time."""
 
@@ -55,11 +41,8 @@ def fly_here(patch: pytest.MonkeyPatch) -> None:
 
 
 def draw_nothing(patch: pytest.MonkeyPatch) -> None:
-    """Leave the files of figures empty, for tests of what is neither a figure nor its text."""
-    from matplotlib.figure import Figure
-
-    patch.setattr(Figure, "savefig", lambda *_arguments, **_options: None)
-    patch.setattr(Figure, "get_layout_engine", lambda _: None)
+    """Leave the files of figures empty, for tests of all else."""
+    patch.setattr("quadsim.report.to_matplotlib.to_png", lambda *_, **__: b"")
 
 
 def take_long_steps(patch: pytest.MonkeyPatch, world: str) -> None:

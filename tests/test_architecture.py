@@ -26,10 +26,10 @@ MPC_MAY_IMPORT = {
 RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it alone may import at its top what is heavy."""
 FOR_DRAWING = {
-    "matplotlib": r"quadsim\.report\.figures\..+|scenarios\..+_figures?",
-    "plotly": r"quadsim\.report\.plots\..+|scenarios\..+_plots",
+    "matplotlib": r"quadsim\.report\.(to_matplotlib|figures\.canvas)|scenarios\.bench\..+",
+    "plotly": r"quadsim\.report\.to_plotly",
 }
-"""Libraries to draw with, and the modules that may import them: those of flights, and each feature's own."""
+"""Libraries to draw with, and the module that imports each."""
 OF_ONE_ROOM = (
     "rerun",
     "imageio",
@@ -156,9 +156,7 @@ def test_a_library_for_outputs_is_imported_in_one_room_and_late(library: str, im
 
 
 @pytest.mark.parametrize("library", FOR_DRAWING)
-def test_a_library_to_draw_with_is_imported_by_figures_or_plots_alone_and_late(
-    library: str, imports: list[Import]
-) -> None:
+def test_a_library_to_draw_with_is_imported_by_its_renderer_alone_and_late(library: str, imports: list[Import]) -> None:
     uses = [item for item in imports if item.library == library]
     assert not [item for item in uses if item.at_start or not re.fullmatch(FOR_DRAWING[library], item.importer)]
 

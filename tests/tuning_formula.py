@@ -13,11 +13,9 @@ import pytest
 import tomlkit
 
 from scenarios.campaign.pilot import CampaignPilot
-from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.table import Row
 from scenarios.schema.scenario import Scenario
-from scenarios.tuning.pilot import TuningPilot
-from scenarios.tuning.plan import TuningPlan
+from scenarios.tuning.plan import TuningPilot, TuningPlan
 from scenarios.tuning.run import TuningResult, tune
 
 BEST_SPEED, BEST_Z = 0.05, 300.0  # where the formula is smallest
@@ -73,19 +71,17 @@ class Formula:
             if len(self.flown) == self.stops_after:
                 raise self.stopped_by
             self.flown.append(flight)
-            scenario = self._plan(pilot, flight).of(flight % pilot._plan.most if self._tuning(pilot) else flight)
+            scenario = self._scenario(pilot, flight)
             violated = self.violated(scenario)
             row = pilot.failed(flight, "", "violated" if violated else "satisfied")
             yield {**row, "status": "completed", "violated": violated, "failed": violated, "rmse.x": error_of(scenario)}
 
     @staticmethod
-    def _tuning(pilot: Any) -> bool:
-        return isinstance(pilot, TuningPilot)
-
-    def _plan(self, pilot: Any, flight: int) -> Plan:
-        found = pilot._pilot(flight // pilot._plan.most) if self._tuning(pilot) else pilot
-        assert isinstance(found, CampaignPilot)
-        return found.plan
+    def _scenario(pilot: TuningPilot | CampaignPilot, flight: int) -> Scenario:
+        if isinstance(pilot, CampaignPilot):
+            return pilot.plan.of(flight)
+        candidate, draw = divmod(flight, pilot._tuning.most)
+        return pilot._tuning.of(pilot._candidates[candidate]).of(draw)
 
 
 def tune_by(formula: Formula, plan: TuningPlan, directory: Path, **options: Any) -> TuningResult:

@@ -23,15 +23,7 @@ if TYPE_CHECKING:
     from quadsim.flight.rundir import Run
 
 Summary = Mapping[str, Any]
-_VERDICTS: Final = {
-    "satisfied": "holds every required constraint",
-    "violated": "does not hold every required constraint",
-    "lost": "is lost",
-    "aborted": "is aborted",
-    "incomplete": "ends before every required constraint is reached",
-}
-FOR_GOOD: Final = "ends in permanent fallback"
-"""Of a flight whose verdict rests on that alone; see `quadsim.flight.metrics.unrecovered`."""
+_MOST_EVENTS: Final = 12  # of a flight that are named
 _Line = tuple[str, str, Callable[[Summary], Cell]]  # a row's label, its unit, and the cell of a summary
 
 
@@ -107,12 +99,9 @@ def verdict(summary: Summary) -> str:
     return "incomplete" if "incomplete" in verdicts else "satisfied"
 
 
-def verdict_sentence(summary: Summary) -> str:
-    """What the verdict rests on, after the name of the flight."""
-    found = verdict(summary)
-    if found == "violated" and "violated" not in _required_verdicts(summary):
-        return FOR_GOOD if summary["controller"].get("unrecovered") else "crashes"
-    return _VERDICTS[found]
+def violated_by_fallback(summary: Summary) -> bool:
+    """Whether a completed flight held its required constraints and is violated by its permanent fallback alone."""
+    return bool(summary["controller"].get("unrecovered")) and "violated" not in _required_verdicts(summary)
 
 
 def _required_verdicts(summary: Summary) -> set[str]:
@@ -139,6 +128,12 @@ def failure_sentences(summary: Summary) -> list[str]:
     periods, found = summary["controller"].get("unrecovered"), summary.get("diagnosis")
     sentences = [fallback_sentence(periods)] if periods else []
     return sentences + ([] if found is None else [found["sentence"], *filter(None, [found["advice"]])])
+
+
+def event_sentences(events: Sequence[Summary]) -> list[str]:
+    """What happened when, the first of them where there are many."""
+    sentences = [f"{event['text']} at {format_number(event['time'])} s" for event in events[:_MOST_EVENTS]]
+    return sentences + ([f"{len(events) - _MOST_EVENTS} more"] if len(events) > _MOST_EVENTS else [])
 
 
 def verdict_cell(summary: Summary) -> Cell:
@@ -173,36 +168,25 @@ def tracking_values(summaries: Sequence[Summary], measure: str, channel: str) ->
     return "/".join(sorted(units)), values
 
 
-def present_keys(summaries: Sequence[Summary], *path: str) -> list[str]:
+def _present_keys(summaries: Sequence[Summary], *path: str) -> list[str]:
     """Keys that any summary has at a path, in order."""
     return list(dict.fromkeys(key for summary in summaries for key in nested(summary, *path) or {}))
 
 
-def format_bounds(entry: Summary, unit: str = "") -> str:
-    """Bounds of a constraint and the times it holds for, e.g. `-5 .. 5`, `at least -0.5` or `0 .. 1 m, from 59 s`."""
+def _bounds(entry: Summary) -> str:
+    """Bounds of a constraint and the times it holds for, e.g. `-5 .. 5`, `at least -0.5` or `0 .. 1, from 59 s`."""
     lower, upper = entry["lower"], entry["upper"]
+    bounds = f"{format_number(lower)} .. {format_number(upper)}"
     if lower is None or upper is None:
         bounds = f"at least {format_number(lower)}" if upper is None else f"at most {format_number(upper)}"
-    else:
-        bounds = f"{format_number(lower)} .. {format_number(upper)}"
-    window = "" if not entry["start"] and entry["stop"] is None else f", from {entry['start']:g} s"
-    window += "" if entry["stop"] is None else f" to {entry['stop']:g} s"
-    return f"{bounds} {unit}".rstrip() + window
-
-
-def format_excess(entry: Summary) -> str:
-    """How far a constraint was exceeded; marked where that was at the samples alone, in what was commanded."""
-    margin, _ = deciding_margin(entry)
-    if margin is None:
-        return "by no number"
-    at_samples = margin != entry["worst_margin"]
-    return f"by {format_number(-margin)} {entry['unit']}{' at the samples' if at_samples else ''}"
+    window = f", from {entry['start']:g} s" if entry["start"] or entry["stop"] is not None else ""
+    return bounds + window + ("" if entry["stop"] is None else f" to {entry['stop']:g} s")
 
 
 def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
     measures = {"rmse": "RMS error", "max_error": "largest error", "final_error": "final error"}
     for measure, label in {**measures, "overshoot": "overshoot"}.items():
-        for channel in present_keys(summaries, "tracking", measure):
+        for channel in _present_keys(summaries, "tracking", measure):
             unit, values = tracking_values(summaries, measure, channel)
             yield _best_smallest("Tracking", f"{label}, {channel}", unit, summaries, values)
     # One row per step of the courses; `-` where an output does not settle or a run has no such step.
@@ -290,7 +274,7 @@ def _violation(entry: Summary) -> Cell:
     return Cell(text=format_number(seconds), mark=_verdict_mark(entry) if seconds > 0.0 else Mark.NONE)
 
 
-def lowest_speed(summary: Summary) -> Cell:
+def _lowest_speed(summary: Summary) -> Cell:
     """The lowest rotor speed that the course requires; none where it requires a negative thrust."""
     if any(problem.startswith("not flyable") for problem in nested(summary, "course", "problems") or ()):
         return Cell(text="not flyable", mark=Mark.BAD)
@@ -367,6 +351,8 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
     ("verdict on the flight", "", verdict_cell),
     ("required constraints", "", required),
     ("audit", "", lambda summary: Cell(text="; ".join(summary.get("audit_notes", ())) or "as the controller bounds")),
+    ("why no optimum", "", _text(lambda summary: "; ".join(failure_sentences(summary)) or ABSENT)),
+    ("events", "", _text(lambda summary: "; ".join(event_sentences(summary.get("events", ()))) or ABSENT)),
     ("time flown", "s", _number("duration")),
     ("controller", "", _text(lambda summary: law_name(summary["controller"].get("name", ABSENT)))),
     ("QP solver, where a QP is left to one", "", _text(lambda summary: summary["controller"].get("solver") or ABSENT)),
@@ -378,7 +364,7 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
 _COURSE: Final[tuple[_Line, ...]] = (
     ("largest tilt required", "deg", _number("course", "tilt")),
     ("highest speed required", "m/s", _number("course", "velocity")),
-    ("lowest rotor speed required", "rad/s", lowest_speed),
+    ("lowest rotor speed required", "rad/s", _lowest_speed),
     ("highest rotor speed required", "rad/s", _number("course", "rotor_max")),
     ("jumps", "", _listed("jumps", "at {:g} s", Mark.NONE)),
     ("beyond the bounds", "", _listed("problems", "{}", Mark.WARN)),
@@ -431,7 +417,7 @@ _TIMES: Final[tuple[_Line, ...]] = (
 _OWN: Final = "own"  # in place of a row's unit: the constraint's own
 _CONSTRAINT: Final[tuple[_Line, ...]] = (
     ("verdict", "", _verdict),
-    ("bounds", _OWN, lambda entry: Cell(text=format_bounds(entry))),
+    ("bounds", _OWN, lambda entry: Cell(text=_bounds(entry))),
     ("peak at the samples", _OWN, _number("peak_sampled")),
     ("peak at the physics rate", _OWN, _number("peak_plant")),
     ("worst margin at the samples", _OWN, _margin("worst_margin_sampled", "tolerance_sampled")),

@@ -32,7 +32,7 @@ from scenarios.campaign.statistics.requirement import Judgement
 from scenarios.flight import to_pandas
 from scenarios.many import count_workers
 
-REPORT_FILES: Final = ("index.html", "campaign.png", "campaign.svg")
+REPORT_FILES: Final = ("index.html", "campaign.png")
 CHECK_EVERY: Final = 10
 """Flights after which the interval is looked at again, where it decides when to stop; of grids, whole turns."""
 

@@ -18,7 +18,14 @@ from quadsim.controller import OPTIMAL, Phase, counts, law_name
 from quadsim.errors import printable
 from quadsim.flight.audit import HELD
 from quadsim.flight.summary import constraint_verdict, deciding_margin
-from quadsim.report.comparison import FOR_GOOD, crash, failure_sentences, required, verdict, verdict_sentence
+from quadsim.report.comparison import (
+    crash,
+    event_sentences,
+    failure_sentences,
+    required,
+    verdict,
+    violated_by_fallback,
+)
 from quadsim.report.table import Cell, Grid, Mark, Row
 from scenarios.progress import Progress, silent
 
@@ -133,7 +140,7 @@ def outcome(summary: Mapping[str, Any]) -> Text:
     if verdict(summary) == "incomplete":
         colour = "green" if remark and as_expected else "yellow"
         return styled((f"incomplete, {required(summary).text}{remark}", colour))
-    if verdict_sentence(summary) == FOR_GOOD:
+    if violated_by_fallback(summary):
         phrase = "but in permanent fallback"
     return styled((f"{crash(summary) or 'completed'}, {phrase}{remark}", colour))
 
@@ -202,8 +209,6 @@ def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
 def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     """What a flight's effects did, where it has them: events, ground, late commands, errors of the estimate."""
     if events := summary.get("events"):
-        from quadsim.report.narrative import event_sentences
-
         yield f"events: {'; '.join(event_sentences(events))}"
     if "ground" in summary:
         ground = summary["ground"]

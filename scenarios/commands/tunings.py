@@ -12,7 +12,7 @@ from scenarios.many_flights import tune as carry_out
 
 def tune(options: Namespace) -> int:
     """`quadsim tune`."""
-    from scenarios.tuning.report.tuning_tables import sentences, tables, verdict_sentence
+    from scenarios.tuning.page import sentences, tables, verdict
 
     try:
         result = carry_out(
@@ -36,7 +36,7 @@ def tune(options: Namespace) -> int:
         print(json.dumps(result.summary, indent=2))
     else:
         out = console.stdout()
-        out.print(console.styled((result.summary["tuning"], "bold"), f": {verdict_sentence(result.summary)}"))
+        out.print(console.styled((result.summary["tuning"], "bold"), f": {verdict(result.summary)}"))
         for sentence in sentences(result.summary):
             out.print(sentence, soft_wrap=True)
         console.print_grids(tables(result.summary), shown(result.directory), prose=("fields",))

@@ -1,11 +1,11 @@
-"""What is to be small: expressions of a flight's numbers, and their statistic over flights."""
+"""What is to be small: arithmetic on a flight's numbers, and its statistic over draws that all candidates share."""
 
 from __future__ import annotations
 
 import ast
 import math
-import operator
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -17,35 +17,71 @@ from scenarios.campaign.results.events import is_number
 if TYPE_CHECKING:
     import pyarrow as pa
 
-_OPERATIONS: Final[dict[type[ast.operator], Callable[[float, float], float]]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
-}
+    from scenarios.tuning.plan import TuningPlan
+
+Rows = Sequence[Mapping[str, Any]]
+_OPERATORS: Final = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.USub, ast.UAdd)
 _FUNCTIONS: Final[dict[str, Callable[..., float]]] = {"sqrt": math.sqrt, "abs": abs, "min": min, "max": max}
 STATISTICS: Final[dict[str, Callable[[Array], float]]] = {
-    "mean": lambda values: float(values.mean()),
+    "mean": lambda values: float(np.mean(values)),
     "median": lambda values: float(np.median(values)),
-    "max": lambda values: float(values.max()),
+    "max": lambda values: float(np.max(values)),
 }
 
 
+@dataclass(frozen=True)
 class Expression:
     """Arithmetic on the columns of a flight's row; see `parse_expression`."""
 
-    def __init__(self, text: str, tree: ast.expr, columns: set[str]) -> None:
-        self.text, self._tree = text, tree
-        self.columns = columns  # that it names
+    tree: ast.Expression
+    columns: frozenset[str]  # that it names
 
     def value(self, row: Mapping[str, Any]) -> float:
         """Its value in one flight; NaN where the flight has no such number, or the value is not finite."""
+        code = compile(self.tree, "expression", "eval")
+        names = {name: row[name] for name in self.columns}
         try:
-            found = float(_evaluate(self._tree, row))
+            value = float(eval(code, {"__builtins__": {}, **_FUNCTIONS}, names))
         except (ArithmeticError, ValueError, TypeError):  # TypeError: of a number that the flight does not have
             return math.nan
-        return found if math.isfinite(found) else math.nan
+        return value if math.isfinite(value) else math.nan
+
+    def require_columns(self, columns: Mapping[str, pa.DataType]) -> None:
+        """Refuse columns that flights do not have, or that hold text.
+
+        Raises:
+            UnknownNameError: naming the first of them.
+        """
+        known = [name for name, kind in columns.items() if is_number(kind)]
+        for name in sorted(self.columns):
+            if name not in known:
+                raise UnknownNameError("column of numbers", name, known)
+
+
+class _Arithmetic(ast.NodeTransformer):
+    """Refuses all but arithmetic; `rmse.x` becomes one name, and every number a float."""
+
+    def __init__(self) -> None:
+        self.columns: set[str] = set()
+
+    def generic_visit(self, node: ast.AST) -> ast.AST:
+        match node:
+            case ast.Name() | ast.Attribute() if all(part.isidentifier() for part in ast.unparse(node).split(".")):
+                self.columns.add(name := ast.unparse(node))
+                return ast.Name(name, ast.Load())
+            case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+                return ast.Constant(float(number))  # 9**9**9 overflows at once
+            case ast.Call(ast.Name(name), [_, *others], []) if name in _FUNCTIONS:
+                if (name in ("min", "max")) == bool(others):
+                    node.args = [self.visit(argument) for argument in node.args]
+                    return node
+            case ast.BinOp(op=operator) | ast.UnaryOp(op=operator) if isinstance(operator, _OPERATORS):
+                return super().generic_visit(node)
+            case ast.Expression():
+                return super().generic_visit(node)
+        if isinstance(node, _OPERATORS):
+            return node
+        raise InputError(ast.unparse(node))
 
 
 def parse_expression(text: str) -> Expression:
@@ -54,69 +90,72 @@ def parse_expression(text: str) -> Expression:
     Raises:
         InputError: it is none; the message goes on from the field's name.
     """
+    arithmetic = _Arithmetic()
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        tree = ast.fix_missing_locations(arithmetic.visit(ast.parse(text.strip(), mode="eval")))
+        compile(tree, "expression", "eval")
+    except InputError as error:
+        rule = f"columns, numbers, + - * / ** and {', '.join(_FUNCTIONS)}"
+        raise InputError(f"must be made of {rule}; got {str(error)!r} in {text!r}") from error
+    except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError) as error:
         raise InputError(f"must be arithmetic on columns, such as 'rmse.x + rmse.y'; got {text!r}") from error
-    return Expression(text, tree, set(_columns(tree, text)))
+    return Expression(tree, frozenset(arithmetic.columns))
 
 
-def require_columns(expression: Expression, columns: Mapping[str, pa.DataType]) -> None:
-    """Refuse columns that flights do not have, or that hold text.
+@dataclass(frozen=True, kw_only=True)
+class Score:
+    """The results of a candidate's flights."""
 
-    Raises:
-        UnknownNameError: naming the first of them.
+    candidate: int
+    flights: int  # that it flew
+    count: int  # of them, those with the event that counts
+    completed: int  # of them, those that were completed and have every objective
+    values: tuple[float, ...]  # of the objectives, corrected for the draws that it did not meet; empty for none
+    excess: float  # share of flights with the event, less what is allowed; 1 where no flight was completed
+
+    @property
+    def feasible(self) -> bool:
+        """Whether no larger share of its flights has the event than is allowed."""
+        return self.excess <= 0.0
+
+
+def score(plan: TuningPlan, candidate: int, rows: Rows, start_rows: Rows) -> Score:
+    """The score of a candidate.
+
+    Few flights do not count for or against a candidate that happened to fly easy or hard draws: its statistic is
+    corrected by the start's over all draws, less the start's over the same draws (a control variate).
+
+    Args:
+        plan: the tuning.
+        candidate: its number.
+        rows: of its flights, on the first draws in their order.
+        start_rows: of the start, on all draws.
     """
-    known = [name for name, kind in columns.items() if is_number(kind)]
-    for name in sorted(expression.columns):
-        if name not in known:
-            raise UnknownNameError("column of numbers", name, known)
+    values, start = objective_values(plan, rows), objective_values(plan, start_rows)
+    whole, met = (np.asarray(np.isfinite(each).all(axis=1)) for each in (values, start))
+    both = whole & met[: len(rows)]
+    statistics = [STATISTICS[objective.statistic] for objective in plan.spec.objectives]
+    scores: tuple[float, ...] = ()
+    if both.any():
+        there = start[: len(rows)]
+        scores = tuple(of(values[both, i]) - of(there[both, i]) + of(start[met, i]) for i, of in enumerate(statistics))
+    elif whole.any():
+        scores = tuple(of(values[whole, i]) for i, of in enumerate(statistics))
+    count = sum(plan.guard.holds(row) for row in rows)
+    return Score(
+        candidate=candidate,
+        flights=len(rows),
+        count=count,
+        completed=int(whole.sum()),
+        values=scores,
+        excess=count / len(rows) - plan.requirement.share if scores else 1.0,
+    )
 
 
-def _columns(node: ast.AST, text: str) -> Iterator[str]:
-    """The columns that are named in what is arithmetic; all else is refused."""
-    match node:
-        case ast.Constant(value=bool() | str() | bytes() | None):
-            pass
-        case ast.Constant(value=int() | float()):
-            return
-        case ast.Name() | ast.Attribute() if (name := _dotted(node)) is not None:
-            yield name
-            return
-        case ast.BinOp(left, kind, right) if type(kind) in _OPERATIONS:
-            yield from _columns(left, text)
-            yield from _columns(right, text)
-            return
-        case ast.UnaryOp(ast.USub() | ast.UAdd(), operand):
-            yield from _columns(operand, text)
-            return
-        case ast.Call(ast.Name(name), [_, *_] as arguments, []) if name in _FUNCTIONS:
-            if (name in ("min", "max")) == (len(arguments) > 1):
-                for argument in arguments:
-                    yield from _columns(argument, text)
-                return
-    rule = f"columns, numbers, + - * / ** and {', '.join(_FUNCTIONS)}"
-    raise InputError(f"must be made of {rule}; got {ast.unparse(node)!r} in {text!r}")
-
-
-def _evaluate(node: ast.AST, row: Mapping[str, Any]) -> Any:
-    match node:
-        case ast.Constant(value):
-            return float(value)  # type: ignore[arg-type]
-        case ast.BinOp(left, kind, right):
-            return _OPERATIONS[type(kind)](_evaluate(left, row), _evaluate(right, row))
-        case ast.UnaryOp(kind, operand):
-            found = _evaluate(operand, row)
-            return -found if isinstance(kind, ast.USub) else found
-        case ast.Call(ast.Name(name), arguments):
-            return _FUNCTIONS[name](*(_evaluate(argument, row) for argument in arguments))
-    return row[_dotted(node) or ""]
-
-
-def _dotted(node: ast.AST) -> str | None:
-    """A name such as `rmse.x`; None for anything else."""
-    if isinstance(node, ast.Name):
-        return node.id
-    if isinstance(node, ast.Attribute) and (owner := _dotted(node.value)) is not None:
-        return f"{owner}.{node.attr}"
-    return None
+def objective_values(plan: TuningPlan, rows: Rows) -> Array:
+    """(flights, objectives) of some flights; NaN for one that was not completed."""
+    values = [
+        [expression.value(row) if row["status"] == "completed" else np.nan for expression in plan.expressions]
+        for row in rows
+    ]
+    return np.asarray(values, float).reshape(len(rows), len(plan.expressions))

@@ -1,43 +1,38 @@
-"""A tuning ready to be flown: its file, its campaign, and from these the scenario of each candidate."""
+"""A tuning ready to be flown: its file, its campaign, and from these the scenario and the flights of each candidate."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
 from pydantic import ValidationError
 
-from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
-from scenarios.campaign.plan import (
-    Plan,
-    cell,
-    changed,
-    check_ends,
-    column_type,
-    flown_scenario,
-    locate,
-    read_campaign,
-)
+from quadsim.errors import FileError, InputError, ParameterError
+from scenarios.campaign.pilot import CampaignPilot
+from scenarios.campaign.plan import Plan, cell, changed, check_ends, column_type, flown_scenario, locate, read_campaign
 from scenarios.campaign.results.events import Event, parse_event
+from scenarios.campaign.results.table import Row
 from scenarios.campaign.spec import Value, VaryBase
 from scenarios.campaign.statistics.requirement import Requirement, parse_requirement
 from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
+from scenarios.many import ERROR
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
 from scenarios.shipped import tuning_path
-from scenarios.tuning.objective import Expression, parse_expression, require_columns
+from scenarios.tuning.objective import Expression, parse_expression
 from scenarios.tuning.spec import OWN, TuningSpec
 
-SEARCHED: Final = "search."  # how the columns of searched values begin
-Values = Mapping[str, Value]  # of a candidate, by the names of the entries of `[[search]]`; empty of the start
+START: Final = 0  # the candidate that is the scenario as it is
+Values = Mapping[str, Value]
+"""Of a candidate, by the names of the entries of `[[search]]`; empty of the start."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +55,11 @@ class TuningPlan:
     @cached_property
     def schema(self) -> pa.Schema:
         """The columns of all flights of the search: a campaign's, and the candidate with its values."""
-        first, *others = self.start.schema
         own = [("candidate", "-", pa.int64())]
-        own += [(SEARCHED + entry.name, entry.unit, column_type(entry)) for entry in self.spec.search]
-        return pa.schema([first, *(pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in own), *others])
+        own += [(f"search.{entry.name}", entry.unit, column_type(entry)) for entry in self.spec.search]
+        fields = [pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in own]
+        first, *others = self.start.schema
+        return pa.schema([first, *fields, *others])
 
     @cached_property
     def requirement(self) -> Requirement:
@@ -73,7 +69,7 @@ class TuningPlan:
     @cached_property
     def guard(self) -> Event:
         """The event that counts in the search."""
-        return self.requirement.event if self.spec.guard is None else parse_event(self.spec.guard)
+        return parse_event(self.spec.guard or self.requirement.event.text)
 
     @cached_property
     def expressions(self) -> tuple[Expression, ...]:
@@ -88,7 +84,7 @@ class TuningPlan:
         """The scenario of a candidate.
 
         Raises:
-            InputError: it is none.
+            InputError: its values make none.
         """
         changes = [(entry, values[entry.name]) for entry in self.spec.search if entry.name in values]
         return changed(
@@ -96,65 +92,91 @@ class TuningPlan:
         )
 
     def of(self, values: Values, *, name: str | None = None, fresh: bool = False) -> Plan:
-        """The campaign of a candidate: on the draws of the search, or on fresh ones.
-
-        Raises:
-            InputError: what comes of its values is no scenario.
-        """
+        """The campaign of a candidate, on the draws of the search or on fresh ones; errors: `candidate`."""
         name = name or self.spec.name
         flights, seed = (self.spec.fresh.flights, self.spec.fresh.seed) if fresh else (self.most, self.spec.seed)
         changes = {"name": name, "description": self.spec.description, "flights": flights, "seed": seed}
         return Plan(self.spec.campaign.model_copy(update=changes), self.candidate(values, name))
 
-    def identity(self, candidate: int, values: Values) -> dict[str, Any]:
-        """The columns that identify a candidate."""
-        shown = values or self.start_values
-        searched = {SEARCHED + entry.name: shown.get(entry.name) for entry in self.spec.search}
-        return {
-            "candidate": candidate,
-            **{name: None if value is None else cell(value) for name, value in searched.items()},
-        }
+    def shown(self, values: Values) -> dict[str, Value | str | None]:
+        """The searched values of a candidate as tables have them; None where the start has no single one."""
+        own = values or self.start_values
+        return {entry.name: cell(own[entry.name]) if entry.name in own else None for entry in self.spec.search}
 
     @cached_property
     def start_values(self) -> Values:
-        """What the start has where it is searched; without entries for which it has no single such value."""
-        found: dict[str, Value] = {}
+        """The start's values of what is searched; without entries for which it has no single one."""
+        values: dict[str, Value] = {}
         for entry in self.spec.search:
             given = [1.0 if entry.relative else get_field(merge(self._data, {}), field) for field in entry.fields]
             if given[0] is not None and all(value == given[0] for value in given):
-                found[entry.name] = given[0]
-        return found
+                values[entry.name] = given[0]
+        return values
 
     def check(self) -> None:
         """Refuse, before anything is flown, what cannot be.
 
         Raises:
             InputError: an entry of `[[search]]`, at an end of its range, cannot be flown, or changes what flights are
-                held against; an objective or the requirement names no column of the results; or the campaign cannot
+                audited against; an objective or the requirement names no column of the results; or the campaign cannot
                 be flown.
         """
         self.start.check()
-        for i, expression in enumerate(self.expressions):
+        columns = self.start.columns
+        texts = {"require": self.requirement.event.text, "guard": self.guard.text}
+        checks: dict[str, Callable[[Mapping[str, pa.DataType]], object]] = {
+            name: partial(parse_event, text) for name, text in texts.items()
+        }
+        for objective, expression in zip(self.spec.objectives, self.expressions, strict=True):
+            checks[f"objectives.{objective.name}.expression"] = expression.require_columns
+        for field, check in checks.items():
             try:
-                require_columns(expression, self.start.columns)
-            except UnknownNameError as error:
-                raise InputError(f"objectives.{self.spec.objectives[i].name}.expression: {error}") from error
-        for field, event in (("require", self.requirement.event), ("guard", self.guard)):
-            try:
-                parse_event(event.text, self.start.columns)
+                check(columns)
             except InputError as error:
                 raise InputError(f"{field}: {error}") from error
         check_ends(self.spec.search, self._check_at, table="search")
 
     def _check_at(self, entry: VaryBase, value: Value) -> None:
-        found = self.candidate({entry.name: value}, self.spec.name)
-        if build_limits(found) != build_limits(self.scenario):
+        scenario = self.candidate({entry.name: value}, self.spec.name)
+        if build_limits(scenario) != build_limits(self.scenario):
             rule = (
-                "of fields that leave alone what flights are held against: constraints, obstacles, regions, and the "
+                "of fields that leave alone what flights are audited against: constraints, obstacles, regions, and the "
                 "controller's bounds and polytopes"
             )
             raise ParameterError(f"search.{entry.name}", "fields", entry.fields, rule)
-        check_parts(found)
+        check_parts(scenario)
+
+
+class TuningPilot:
+    """Flies candidates on draws that all share; flight c * `TuningPlan.most` + i is that of candidate c on draw i.
+
+    See `scenarios.campaign.pilot.Pilot`.
+    """
+
+    def __init__(self, tuning: TuningPlan, candidates: Mapping[int, Values]) -> None:
+        self.plan, self._tuning, self._candidates = tuning.start, tuning, candidates
+        self._pilots: dict[int, CampaignPilot] = {}  # made where they fly
+
+    def fly(self, flight: int) -> Row:
+        """The row of a flight; a candidate that is no scenario fails it."""
+        candidate, draw = divmod(flight, self._tuning.most)
+        try:
+            if candidate not in self._pilots:
+                self._pilots[candidate] = CampaignPilot(self._tuning.of(self._candidates[candidate]))
+        except InputError as error:
+            return self.failed(flight, str(error), ERROR)
+        return {**self._pilots[candidate].fly(draw), **self.identity(flight)}
+
+    def failed(self, flight: int, reason: str, verdict: str) -> Row:
+        """The row of a flight that raised, met a limit, or whose process died."""
+        row = CampaignPilot(self.plan).failed(flight % self._tuning.most, reason, verdict)
+        return {**row, **self.identity(flight)}
+
+    def identity(self, flight: int) -> Row:
+        """The columns that identify a flight of the search."""
+        candidate = flight // self._tuning.most
+        values = self._tuning.shown(self._candidates[candidate])
+        return {"flight": flight, "candidate": candidate, **{f"search.{name}": each for name, each in values.items()}}
 
 
 def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None) -> TuningPlan:
@@ -171,31 +193,20 @@ def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None
     path = tuning_path(name)
     try:
         data = read_scenario(path, tuning_path, locate=_locate)
-        _locate(data, path.parent)
-        if isinstance(campaign := data.get("campaign"), dict):
-            data["campaign"] = _whole_campaign(campaign)
     except OSError as error:
         raise FileError(path, f"cannot be read ({error.strerror})") from error
+    _locate(data, path.parent)
     data |= {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
-    return make_tuning(data, path)
-
-
-def make_tuning(data: Mapping[str, Any], path: Path) -> TuningPlan:
-    """A tuning from the tables of its file, whose campaign is whole.
-
-    Raises:
-        InputError: a field is not allowed, or what is searched cannot be flown.
-    """
-    filled = dict(data)
     if isinstance(campaign := data.get("campaign"), dict):
-        flights = data.get("flights") or TuningSpec.model_fields["flights"].default
-        most = flights[-1] if isinstance(flights, list) else flights  # errors name the tuning's
-        filled["campaign"] = {"name": "tuned", "flights": most if isinstance(most, int) else 1, **campaign}
+        match data.get("flights", TuningSpec.model_fields["flights"].default):
+            case [*_, int(most)]:
+                data["campaign"] = _whole_campaign(campaign, most)
+            case _:  # refused by the tuning's own field
+                data["campaign"] = _whole_campaign(campaign, 1)
     try:
-        spec = TuningSpec.model_validate(filled)
+        spec = TuningSpec.model_validate(data)
     except ValidationError as error:
-        problems = describe_all(error, filled, TuningSpec, file="tuning")
-        raise ScenarioError(path.name, problems) from error
+        raise ScenarioError(path.name, describe_all(error, data, TuningSpec, file="tuning")) from error
     try:
         plan = TuningPlan(spec, flown_scenario(spec.campaign, path))
         plan.check()
@@ -206,22 +217,16 @@ def make_tuning(data: Mapping[str, Any], path: Path) -> TuningPlan:
     return plan
 
 
-def _whole_campaign(campaign: Mapping[str, Any]) -> dict[str, Any]:
-    """The tables of `[campaign]`, merged over its base's.
-
-    Raises:
-        InputError: its base is none, or it has a field that is the tuning's.
-    """
-    given = [name for name in OWN if name in campaign]
-    if given:
+def _whole_campaign(campaign: Mapping[str, Any], flights: int) -> dict[str, Any]:
+    """The tables of `[campaign]` over those of its base, with a name and a number of flights."""
+    if given := [name for name in OWN if name in campaign]:
         raise InputError(f"campaign must not have {given[0]}: a tuning has its own")
     own = dict(campaign)
     base = own.pop("base", None)
-    if base is None:
-        return own
-    if not isinstance(base, str):
+    if base is not None and not isinstance(base, str):
         raise ParameterError("campaign", "base", base, "a campaign's name or a path ending in .toml")
-    return merge({name: value for name, value in read_campaign(base).items() if name not in OWN}, own)
+    others = {} if base is None else {name: value for name, value in read_campaign(base).items() if name not in OWN}
+    return {"name": "tuned", "flights": flights, **merge(others, own)}
 
 
 def _locate(data: dict[str, Any], directory: Path) -> None:

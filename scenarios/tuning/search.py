@@ -1,32 +1,31 @@
-"""Optuna: proposes candidates from the scores of earlier ones, in a journal that outlives the process."""
+"""The search: Optuna proposes candidates, and stops them on draws that all of them share."""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import logging
-import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import time as clock
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import pyarrow as pa
 
-from quadsim.errors import FileError, MissingPackageError
+from quadsim.errors import InputError, MissingPackageError
 from quadsim.outputs import Growing
 from scenarios.campaign.plan import cell
+from scenarios.campaign.results.store import Store
+from scenarios.campaign.results.table import Row
+from scenarios.campaign.run import Standing, Watch
 from scenarios.campaign.spec import ChoiceSpec, IntegerSpec, LogUniformSpec, Value
-from scenarios.tuning.ranking import Score
-from scenarios.tuning.spec import START, SearchSpec
+from scenarios.tuning.objective import Score, objective_values, score
+from scenarios.tuning.plan import START, TuningPilot, TuningPlan, Values
+from scenarios.tuning.spec import SearchSpec
 
 if TYPE_CHECKING:
-    from optuna.distributions import BaseDistribution
-    from optuna.study import Study
-    from optuna.trial import FrozenTrial
-
-    from scenarios.tuning.plan import TuningPlan, Values
+    from optuna.trial import Trial
 
 JOURNAL_FILE: Final = "journal.log"
-_LEAST: Final = 4  # fewest feasible trials for importances
+Fly = Callable[[TuningPilot, Sequence[int]], Generator[Row]]
 
 
 def require_optuna() -> Any:
@@ -43,153 +42,146 @@ def require_optuna() -> Any:
 
 
 class Search:
-    """The study of a tuning: trial n is candidate n, and trial 0 the start.
+    """The study and the flights of its candidates: trial n is candidate n, and trial 0 the start."""
 
-    Its journal has the form of Optuna's `JournalFileBackend`, and is written in whole steps: a batch that is proposed,
-    or the scores of one.
-
-    Args:
-        plan: the tuning.
-        files: its directory.
-
-    Raises:
-        MissingPackageError: Optuna is not installed.
-        FileError: the journal that is there is damaged.
-    """
-
-    def __init__(self, plan: TuningPlan, files: Growing) -> None:
-        self._optuna, self._plan, self._files = require_optuna(), plan, files
-        self._logs = _read(files)
-        self._written = len(self._logs)
-        self._excess: dict[int, float] = {}
-        optuna = self._optuna
-        with _quiet():
-            self._study: Study = optuna.create_study(
-                storage=optuna.storages.JournalStorage(_journal(self._logs)),
-                study_name=plan.spec.name,
-                directions=["minimize"] * len(plan.spec.objectives),
-                load_if_exists=True,
-            )
-        self._space = {entry.name: _distribution(optuna, entry) for entry in plan.spec.search}
-
-    @property
-    def proposed(self) -> int:
-        """Candidates that were proposed, with the start."""
-        return len(self._study.get_trials(deepcopy=False))
-
-    @property
-    def unfinished(self) -> bool:
-        """Whether a batch was proposed and is not scored yet."""
-        return any(not trial.state.is_finished() for trial in self._study.get_trials(deepcopy=False))
-
-    def begin(self, score: Score) -> None:
-        """Let the search know the start, if its values are within the ranges."""
-        if self.proposed:
-            return
-        params = self._start_parameters()
-        with _quiet():
-            if params:
-                self._study.enqueue_trial(params)
-                self._study.sampler = self._sampler()
-                self._study.ask(self._space)
-            else:
-                self._study.add_trial(self._optuna.create_trial(state=self._optuna.trial.TrialState.FAIL))
-        if params:
-            self.tell([score])
-        self._write()
-
-    def ask(self) -> dict[int, Values]:
-        """A batch of candidates, by their numbers: the one that is not scored yet, or a new one.
-
-        The same study gives the same batch in any process: each batch has a sampler with its own seed.
-        """
-        running = [trial for trial in self._study.get_trials(deepcopy=False) if not trial.state.is_finished()]
-        if running:
-            return {trial.number: self._values(trial) for trial in running}
-        with _quiet():
-            self._study.sampler = self._sampler()
-            proposed = [self._study.ask(self._space) for _ in range(self._plan.spec.batch)]
-        self._write()
-        trials = self._study.get_trials(deepcopy=False)
-        return {trial.number: self._values(trials[trial.number]) for trial in proposed}
-
-    def tell(self, scores: Sequence[Score]) -> None:
-        """The scores of a batch."""
-        with _quiet():
-            for score in scores:
-                self._excess[score.candidate] = score.excess
-                self._study.tell(score.candidate, list(score.values))
-        self._write()
-
-    def _sampler(self) -> Any:
-        """One for the next batch, with a seed of that batch."""
-        seed = np.random.SeedSequence([self._plan.spec.seed, self.proposed]).generate_state(1)
-        return self._optuna.samplers.TPESampler(
-            seed=int(seed[0]),
-            multivariate=True,
-            constant_liar=True,
-            n_startup_trials=self._plan.spec.batch,
-            constraints_func=lambda trial: (self._excess[trial.number],),
+    def __init__(self, plan: TuningPlan, files: Growing, fly: Fly, watch: Watch) -> None:
+        optuna = require_optuna()
+        self._plan, self._fly, self._watch, self._started = plan, fly, watch, clock.perf_counter()
+        self._store = Store(files, plan.schema)
+        self._rows: dict[int, Row] = {row["flight"]: row for row in self._store.table().to_pylist()}
+        self._flown = 0  # now
+        self.candidates: dict[int, Values] = {START: {}}
+        self.scores: dict[int, Score] = {}
+        journal, file = optuna.storages.journal, str(files.path / JOURNAL_FILE)
+        storage = journal.JournalFileBackend(file, journal.JournalFileOpenLock(file))
+        self.study = optuna.create_study(
+            storage=optuna.storages.JournalStorage(storage),
+            study_name=plan.spec.name,
+            directions=["minimize"] * len(plan.expressions),
+            sampler=optuna.samplers.TPESampler(
+                seed=int(np.random.SeedSequence(plan.spec.seed).generate_state(1)[0]),
+                multivariate=True,
+                constant_liar=True,
+                n_startup_trials=plan.spec.batch,
+            ),
+            pruner=optuna.pruners.WilcoxonPruner(),
         )
+        self._space = {entry.name: _distribution(optuna.distributions, entry) for entry in plan.spec.search}
 
-    def candidates(self) -> dict[int, Values]:
-        """Every candidate that was proposed, by its number; the start has no values."""
-        trials = self._study.get_trials(deepcopy=False)
-        return {START: {}, **{trial.number: self._values(trial) for trial in trials if trial.number != START}}
+    def run(self) -> pa.Table:
+        """Fly the start, then all batches; the table of their flights."""
+        plan = self._plan
+        self._fly_missing([START], plan.most)
+        if all(_contains(entry, plan.start_values.get(entry.name)) for entry in plan.spec.search):
+            self.study.enqueue_trial(plan.shown({}))
+            self._judge([self.study.ask(self._space)])
+        else:  # no trial of this search, which numbers its candidates from 1
+            self.study.add_trial(require_optuna().trial.create_trial(state=require_optuna().trial.TrialState.FAIL))
+            self._score(START, plan.most)
+        for _ in range(0, plan.spec.trials, plan.spec.batch):
+            trials = [self.study.ask(self._space) for _ in range(plan.spec.batch)]
+            self.candidates |= {trial.number: self._values(trial) for trial in trials}
+            self._judge(trials)
+        return self._store.close(max(self._rows) + 1)
 
-    def importance(self, scores: Sequence[Score], objective: int) -> dict[str, float]:
-        """The share of each field, by name, in what distinguishes good candidates; empty for too few.
+    def _judge(self, trials: Sequence[Trial]) -> None:
+        """All trials fly a few draws, those that are not worse than the best go on to more; then all are told."""
+        going, before = list(trials), 0
+        for flights in self._plan.spec.flights:
+            self._fly_missing([trial.number for trial in going], flights)
+            going = [trial for trial in going if self._goes_on(trial, before, flights)]
+            before = flights
+        for trial in trials:
+            found = self.scores[trial.number]
+            trial.set_constraint("failures", found.excess)
+            pruned = require_optuna().trial.TrialState.PRUNED  # where no flight has all objectives
+            self.study.tell(trial, found.values or None, state=None if found.values else pruned)
 
-        Source: Watanabe, Bansal and Hutter, PED-ANOVA, IJCAI 2023, over the feasible candidates.
+    def _goes_on(self, trial: Trial, before: int, flights: int) -> bool:
+        """Whether a trial flies on: it can still hold the requirement, and the pruner, by the draws since, agrees."""
+        if self._score(trial.number, flights).count > self._plan.requirement.share * self._plan.most:
+            return False
+        if len(self._plan.expressions) > 1:  # of which Optuna prunes none
+            return True
+        for draw, (value,) in enumerate(objective_values(self._plan, self._flights(trial.number, flights))):
+            if draw >= before and np.isfinite(value):
+                trial.report(float(value), draw)
+        return not trial.should_prune()
+
+    def _score(self, candidate: int, flights: int) -> Score:
+        rows, start = self._flights(candidate, flights), self._flights(START, self._plan.most)
+        self.scores[candidate] = score(self._plan, candidate, rows, start)
+        return self.scores[candidate]
+
+    def _flights(self, candidate: int, flights: int) -> list[Row]:
+        return [self._rows[candidate * self._plan.most + draw] for draw in range(flights)]
+
+    def _fly_missing(self, candidates: Sequence[int], flights: int) -> None:
+        """Have candidates fly their first draws, except those already flown.
+
+        Raises:
+            InputError: some were flown with other values.
         """
-        optuna = self._optuna
-        trials = self._study.get_trials(deepcopy=False)
-        feasible = [each for each in scores if each.feasible and trials[each.candidate].params]
-        if len(feasible) < _LEAST or len(self._space) < 2:
-            return {}
-        with _quiet():
-            study = optuna.create_study()
-            for each in feasible:
-                params = trials[each.candidate].params
-                study.add_trial(
-                    optuna.create_trial(params=params, distributions=self._space, value=each.values[objective])
-                )
-            found = optuna.importance.get_param_importances(
-                study, evaluator=optuna.importance.PedAnovaImportanceEvaluator()
-            )
-        return {name: float(share) for name, share in found.items()}
+        most = self._plan.most
+        pilot = TuningPilot(self._plan, {candidate: self.candidates[candidate] for candidate in candidates})
+        numbers = [candidate * most + draw for candidate in candidates for draw in range(flights)]
+        if any(pilot.identity(each).items() - self._rows[each].items() for each in numbers if each in self._rows):
+            raise InputError("--resume needs the candidates that flew there, and other ones were proposed")
+        missing = [number for number in numbers if number not in self._rows]
+        if not missing:
+            return
+        try:
+            with closing(self._fly(pilot, missing)) as rows:
+                for row in rows:
+                    self._store.add(row)
+                    self._rows[row["flight"]] = row
+                    self._report()
+        finally:
+            self._store.flush()
 
-    def _values(self, trial: FrozenTrial) -> Values:
+    def _report(self) -> None:
+        self._flown += 1
+        rate = self._flown / max(clock.perf_counter() - self._started, 1e-9)
+        failed = sum(bool(row["failed"]) for row in self._rows.values())
+        left_out = sum(self._plan.most - score.flights for score in self.scores.values())
+        flights = self._plan.most * (1 + self._plan.spec.trials) - left_out
+        self._watch(Standing(flown=len(self._rows), flights=flights, failed=failed, rate=rate))
+
+    def _values(self, trial: Trial) -> Values:
         """The values of a trial as a scenario has them."""
         values: dict[str, Value] = dict(trial.params)
         for entry in self._plan.spec.search:
             if isinstance(entry, ChoiceSpec):
-                values[entry.name] = next(each for each in entry.values if cell(each) == values[entry.name])
-        return {entry.name: values[entry.name] for entry in self._plan.spec.search}
+                values[entry.name] = {cell(value): value for value in entry.values}[trial.params[entry.name]]
+        return values
 
-    def _start_parameters(self) -> dict[str, Any]:
-        """The start as a trial's parameters; none where it is outside of what is searched."""
-        found = {}
-        for entry in self._plan.spec.search:
-            value = self._plan.start_values.get(entry.name)
-            if isinstance(entry, ChoiceSpec):
-                inside = value in entry.values
-            else:
-                inside = isinstance(value, int | float) and entry.low <= value <= entry.high
-            if value is None or not inside:
-                return {}
-            found[entry.name] = cell(value) if isinstance(entry, ChoiceSpec) else value
-        return found
+    def answer(self) -> tuple[int, list[int]]:
+        """The answer, and the Pareto front by its first objective: of one objective, the best.
 
-    def _write(self) -> None:
-        if len(self._logs) > self._written:
-            lines = (json.dumps(log, separators=(",", ":")) + "\n" for log in self._logs)
-            self._files.write({JOURNAL_FILE: "".join(lines).encode()})
-            self._written = len(self._logs)
+        The answer is the point of the front nearest to the best of each objective, as a share of its range, among those
+        that are no worse than the start in any.  Where no candidate is feasible, it is the one that fails least.
+        """
+        scores, start = self.scores, self.scores[START]
+        if len(self._plan.expressions) > 1:
+            front = [trial.number for trial in self.study.best_trials]
+        else:
+            whole = [each for each in scores.values() if each.feasible and each.flights == self._plan.most]
+            front = [each.candidate for each in whole if each.values == min(other.values for other in whole)][:1]
+        front.sort(key=lambda candidate: scores[candidate].values)
+        if not front:
+            least = min(scores.values(), key=lambda each: (each.excess, -each.flights, each.values, each.candidate))
+            return least.candidate, []
+        values = np.array([scores[candidate].values for candidate in front])
+        low, width = values.min(axis=0), np.ptp(values, axis=0)
+        distances = np.linalg.norm((values - low) / np.where(width > 0.0, width, 1.0), axis=1)
+        near = [front[i] for i in np.argsort(distances, kind="stable")]
+        if not start.feasible:
+            return near[0], front
+        no_worse = (c for c in near if all(np.less_equal(scores[c].values, start.values)))
+        return next(no_worse, START), front
 
 
-def _distribution(optuna: Any, entry: SearchSpec) -> BaseDistribution:
-    kinds = optuna.distributions
+def _distribution(kinds: Any, entry: SearchSpec) -> Any:
     match entry:
         case ChoiceSpec():
             return kinds.CategoricalDistribution([cell(value) for value in entry.values])
@@ -198,44 +190,7 @@ def _distribution(optuna: Any, entry: SearchSpec) -> BaseDistribution:
     return kinds.FloatDistribution(entry.low, entry.high, log=isinstance(entry, LogUniformSpec))
 
 
-def _read(files: Growing) -> list[Mapping[str, Any]]:
-    """The entries of the journal that is there.
-
-    Raises:
-        FileError: it is none.
-    """
-    path = files.path / JOURNAL_FILE
-    if not path.is_file():
-        return []
-    try:
-        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    except (OSError, ValueError) as error:
-        raise FileError(path, f"is no journal ({error})") from error
-
-
-def _journal(logs: list[Mapping[str, Any]]) -> Any:
-    """A back end of Optuna's journal storage with its entries in a list."""
-    from optuna.storages.journal import BaseJournalBackend
-
-    class InMemory(BaseJournalBackend):  # type: ignore[misc]
-        def read_logs(self, log_number_from: int) -> Iterable[dict[str, Any]]:
-            return [dict(log) for log in logs[log_number_from:]]
-
-        def append_logs(self, entries: list[dict[str, Any]]) -> None:
-            logs.extend(json.loads(json.dumps(entry)) for entry in entries)
-
-    return InMemory()
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress Optuna's notices, such as those on experimental parts."""
-    logger = logging.getLogger("optuna")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            yield
-        finally:
-            logger.setLevel(level)
+def _contains(entry: SearchSpec, value: Value | None) -> bool:
+    if isinstance(entry, ChoiceSpec):
+        return value in entry.values
+    return isinstance(value, int | float) and entry.low <= value <= entry.high

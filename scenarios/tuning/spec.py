@@ -24,12 +24,10 @@ from scenarios.schema.base import LARGEST_SEED, Spec
 from scenarios.schema.writing import to_toml
 from scenarios.tuning.objective import parse_expression
 
-START: Final = 0  # the candidate that is the scenario as it is
-MOST_TRIALS: Final = 100_000
-MOST_FIELDS: Final = 50
 OWN: Final = ("flights", "seed", "name", "description")
 """Fields of a campaign that a tuning has itself."""
 Seed = Annotated[int, Field(ge=0, le=LARGEST_SEED)]
+Flights = Annotated[int, Field(ge=1, le=MOST_FLIGHTS)]
 SearchSpec = Annotated[UniformSpec | LogUniformSpec | IntegerSpec | ChoiceSpec, Field(discriminator="distribution")]
 
 
@@ -44,9 +42,7 @@ class ObjectiveSpec(Spec):
         "where more is better"
     )
     unit: Annotated[str, Field(max_length=20)] = Field(default="-", description="of it, for tables and plots")
-    statistic: Literal["mean", "median", "max"] = Field(
-        default="mean", description="of the flights that were completed: their mean, median or max"
-    )
+    statistic: Literal["mean", "median", "max"] = Field(default="mean", description="of the flights that completed")
 
     @model_validator(mode="after")
     def _check(self) -> ObjectiveSpec:
@@ -58,7 +54,7 @@ class ObjectiveSpec(Spec):
 
 
 class FreshSpec(Spec):
-    """The draws, new to both, on which the answer is held against the start."""
+    """The draws, new to both, on which the answer is compared with the start."""
 
     flights: Annotated[int, Field(ge=2, le=MOST_FLIGHTS)] = Field(default=300, description="of each of the two")
     seed: Seed = Field(default=1, description="of these draws; not that of the search")
@@ -72,14 +68,13 @@ class TuningSpec(Spec):
     )
     description: str = Field(default="", description="one line")
     seed: Seed = Field(default=0, description="of the draws that all candidates meet, and of the search")
-    trials: Annotated[int, Field(ge=1, le=MOST_TRIALS)] = Field(
+    trials: Annotated[int, Field(ge=1, le=100_000)] = Field(
         description="candidates besides the start; a multiple of batch"
     )
     batch: Annotated[int, Field(ge=1, le=1000)] = Field(default=12, description="candidates that are proposed at once")
-    flights: Annotated[list[Annotated[int, Field(ge=1, le=MOST_FLIGHTS)]], MinLen(1), MaxLen(10)] = Field(
+    flights: Annotated[list[Flights], MinLen(1), MaxLen(10)] = Field(
         default=[4, 12, 36],
-        description="rising: every candidate of a batch flies the first number of draws, the best of them go on to the "
-        "next, as many as cost about the same again",
+        description="rising: all candidates fly the first number of draws, those that are no worse than the best go on",
     )
     require: str = Field(
         description='what no answer may fail, e.g. "P(violation) < 0.01 @ 95%": in the search by the share of flights, '
@@ -94,14 +89,14 @@ class TuningSpec(Spec):
     objectives: Annotated[list[ObjectiveSpec], MinLen(1), MaxLen(2)] = Field(
         description="one, or two for a Pareto front"
     )
-    search: Annotated[list[SearchSpec], MinLen(1), MaxLen(MOST_FIELDS)] = Field(description="what is searched")
+    search: Annotated[list[SearchSpec], MinLen(1), MaxLen(50)] = Field(description="what is searched")
     campaign: CampaignSpec = Field(description="what is flown: fields of a campaign file, or a campaign as its base")
 
     @model_validator(mode="after")
     def _check(self) -> TuningSpec:
         if self.trials % self.batch:
             raise ValueError(f"trials must be a multiple of batch, {self.batch}; got {self.trials}")
-        if any(after <= before for before, after in zip(self.flights, self.flights[1:], strict=False)):
+        if sorted(set(self.flights)) != self.flights:
             raise ValueError(f"flights must rise; got {self.flights}")
         if self.fresh.seed == self.seed:
             raise ValueError(f"fresh.seed must not be seed, {self.seed}, whose draws choose the answer")
@@ -117,18 +112,18 @@ class TuningSpec(Spec):
             required = parse_requirement(self.require)
         except InputError as error:
             raise ValueError(f"require: {error}") from error
+        if not required.at_most:
+            raise ValueError(f"require must keep a probability small, with < or <=; got {self.require!r}")
         try:
             parse_event(self.guard or required.event.text)
         except InputError as error:
             raise ValueError(f"guard: {error}") from error
-        if not required.at_most:
-            raise ValueError(f"require must keep a probability small, with < or <=; got {self.require!r}")
         return self
 
     def to_toml(self) -> str:
-        """The file with every field, defaults included; reading it gives this tuning again."""
-        document: Any = tomlkit.parse(to_toml(self))
+        """The file with every field, for a directory that has the start as `scenario.toml`."""
+        campaign = self.campaign.model_copy(update={"scenario": "scenario.toml", "set": {}})
+        document: Any = tomlkit.parse(to_toml(self.model_copy(update={"campaign": campaign})))
         for name in OWN:
             document["campaign"].remove(name)
-        text: str = document.as_string()
-        return text
+        return str(document.as_string())

@@ -103,7 +103,7 @@ def test_the_page_of_the_api_has_every_name() -> None:
 
 def test_commands_fly_load_and_measure_through_it_alone() -> None:
     """They import nothing that does so by itself; types of what is returned, and its tables, they may."""
-    inner = r"scenarios\.(?:run|loading|build|courses|parts|cost|design\.(?!vehicle_figures)|campaign\.(?:replay|plan))"
+    inner = r"scenarios\.(?:run|loading|build|courses|parts|design\.(?!vehicle_figures)|campaign\.(?:replay|plan))"
     for path in (EXAMPLES.parent / "scenarios/commands").glob("*.py"):
         imported = re.findall(r"^ *from (scenarios\.[\w.]+) import", path.read_text(encoding="utf-8"), re.MULTILINE)
         assert not [name for name in imported if re.match(inner, name)], path.name
@@ -382,7 +382,7 @@ def test_flights_are_compared(hover: Scenario, flight: Flight, tmp_path: Path) -
     assert found.page is None
     assert found.to_markdown().startswith("|")
     saved = other.save(tmp_path / "hover", video=False, recording=False)
-    page = quadsim.compare(saved, out=tmp_path / "page", cost=False, progress=False).page
+    page = quadsim.compare(saved, out=tmp_path / "page", progress=False).page
     assert page == tmp_path / "page" / "index.html"
     assert "hover" in page.read_text()
 

@@ -315,7 +315,7 @@ def test_junit_reports_an_aborted_flight_with_its_reason(here: Path, capsys: pyt
 # --- compare, video, view ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_compare_makes_a_page_and_prints_a_table(
     hover_directory: Path, short_run_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -528,7 +528,7 @@ def test_ctrl_c_while_figures_are_drawn_keeps_the_flight_and_its_status(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("quadsim.report.figures.flight_figures.write_figures", interrupted)
+    monkeypatch.setattr("quadsim.report.flight_figures.write_figures", interrupted)
     assert main(["run", "hover", *SHORT, "--no-recording"]) == EXIT_DONE
     assert capsys.readouterr().err == "quadsim: figures interrupted (Ctrl-C)\n"
     assert rundir.read_summary(here / "runs" / "hover")["products"] == {"figures": "interrupted (Ctrl-C)"}

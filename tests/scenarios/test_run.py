@@ -308,7 +308,7 @@ def test_a_run_whose_product_fails_keeps_all_else_and_names_it(
     def failing(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr("quadsim.report.figures.flight_figures.write_figures", failing)
+    monkeypatch.setattr("quadsim.report.flight_figures.write_figures", failing)
     run_scenario(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
     summary = rundir.read_summary(tmp_path / "run")
     assert summary["products"].keys() == {"figures", "flight.rrd"}
@@ -331,7 +331,7 @@ def test_a_defect_of_our_own_is_not_taken_for_a_flight(tmp_path: Path, monkeypat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("cores", [1, 2])
 def test_a_recording_that_was_asked_for_and_cannot_be_made_is_an_error_and_all_else_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
@@ -345,7 +345,7 @@ def test_a_recording_that_was_asked_for_and_cannot_be_made_is_an_error_and_all_e
     assert "flight.rrd" not in reaudit(target).summary["files"]
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("cores", [1, 2])
 def test_outputs_are_made_as_requested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int) -> None:
     """Where there are cores for it, the recording by a process of its own."""

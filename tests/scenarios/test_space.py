@@ -15,8 +15,8 @@ from quadsim.controller import Phase
 from quadsim.errors import FileError, InputError
 from quadsim.flight.audit import Finding, SpaceLimit
 from quadsim.flight.rundir import load_run
-from quadsim.report.figures.flight_figures import write_figures
-from quadsim.report.plots.flight_plots import comparison_plots
+from quadsim.report.figure import Scene
+from quadsim.report.flight_figures import page_figures, write_figures
 from quadsim.report.recording import write_recording
 from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.sim.plant import Plant
@@ -131,7 +131,7 @@ def test_obstacles_out_of_reach_change_nothing() -> None:
     assert among.outcome == "satisfied"
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_a_run_with_shapes_is_read_audited_again_and_drawn(crashed: Flight, tmp_path: Path) -> None:
     directory = tmp_path / "run"
     directory.mkdir()
@@ -140,8 +140,8 @@ def test_a_run_with_shapes_is_read_audited_again_and_drawn(crashed: Flight, tmp_
     assert run.limits == tuple(finding.limit for finding in crashed.findings)
     assert not reaudit(directory).satisfied
     assert {path.stem for path in write_figures(run, tmp_path / "figures")} >= {"space"}
-    (path,) = [plot for plot in comparison_plots([run]) if plot.key == "path"]
-    assert path.json.count('"mesh3d"') == 8  # four of the wall
+    (scene,) = [figure for figure in page_figures([run]) if isinstance(figure, Scene)]
+    assert len(scene.solids) == 8, "four of the wall"
     write_recording(run, tmp_path / "flight.rrd")
     assert has_space(run.limits)
     assert [len(edges) for _, edges in region_edges(run)] == [12, 12]

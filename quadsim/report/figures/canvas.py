@@ -1,20 +1,14 @@
-"""What all figures share: their style, and how they are saved."""
+"""How the figures of `quadsim bench` are styled and saved."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from quadsim.errors import OutputError
-from quadsim.flight.rundir import Run
-from quadsim.report.curves import least_range
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.typing import RcKeyType
 
@@ -75,30 +69,4 @@ def new_figure(title: str, width: float, height: float) -> Figure:
 
     figure = Figure(figsize=(width, height), layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
-    return figure
-
-
-def run_title(run: Run, what: str) -> str:
-    """Title of a figure of one run."""
-    ended = "" if run.log.reason is None else " (aborted)"
-    return f"{run.name}{ended}: {what}"
-
-
-def keep_least_span(axes: Axes, unit: str) -> None:
-    """Widen the vertical axis of a panel whose curves and bounds all stand still; see `quadsim.report.curves`."""
-    curves = [np.asarray(line.get_ydata(), float) for line in axes.get_lines()]
-    curves += [np.asarray(axes.dataLim.intervaly)] if axes.collections else []
-    ends = least_range(curves, unit)
-    if ends is not None:
-        axes.set_ylim(*ends)
-
-
-def finish_figure(figure: Figure, bottom: Sequence[Axes], shown: Mapping[str, Artist], end: float) -> Figure:
-    """The figure with its time axes labelled, and the legend above all panels, where it hides nothing."""
-    for axes in bottom:
-        axes.set_xlabel("time [s]")
-        axes.set_xlim(-0.008 * end, end or 1.0)  # a peak in the first period stands clear of the axis
-    figure.align_ylabels()
-    if shown:
-        figure.legend(list(shown.values()), list(shown), loc="outside upper right", ncols=len(shown))
     return figure

@@ -12,8 +12,7 @@ from quadsim.flight.audit import HELD
 from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
 from quadsim.flight.summary import constraint_verdict, deciding_margin
-from quadsim.report.comparison import fallback_sentence, tracking_values
-from quadsim.report.narrative import condition_sentences
+from quadsim.report.comparison import failure_sentences, fallback_sentence, tracking_values, verdict_cell
 from quadsim.report.recording.style import time_column
 from quadsim.state import Array
 
@@ -90,8 +89,9 @@ def _summary(run: Run) -> str:
         measured = {name: tracking_values([run.summary], "rmse", name) for name in tracking["rmse"]}
         errors = (f"{name} {_number(values[0])} {unit}" for name, (unit, values) in measured.items())
         lines += [f"Tracking error, RMS: {', '.join(errors)}.", ""]
-    for sentence in condition_sentences([(run.name, run.summary)]):
-        lines += [sentence, ""]
+    course = [run.summary["course"]["sentence"]] if "course" in run.summary else []
+    for text in (f"Verdict: {verdict_cell(run.summary).text}.", *failure_sentences(run.summary), *course):
+        lines += [text, ""]
     if "step_ms" in control:
         step = control["step_ms"]
         lines += [

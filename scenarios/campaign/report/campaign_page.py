@@ -1,4 +1,4 @@
-"""A campaign -> a page that works offline, and its figure."""
+"""A campaign -> a page that works offline, and its figure; two campaigns -> a page that compares them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ from urllib.parse import quote
 import pyarrow as pa
 
 from quadsim.outputs import to_json, writing
-from quadsim.report.figures.canvas import write_drawings
-from quadsim.report.pages.page import PAGE_FILE, render_page
-from quadsim.report.plots.panels import plotly_script
-from quadsim.report.table import Mark
-from scenarios.campaign.report import campaign_tables
-from scenarios.campaign.report.campaign_figure import draw_campaign
-from scenarios.campaign.report.campaign_plots import campaign_plots, comparison_margins_plot
-from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
+from quadsim.report.figure import Figure, Panel
+from quadsim.report.page import PAGE_FILE, Section, render_page
+from quadsim.report.table import Cell, Mark
+from quadsim.report.to_matplotlib import write_pngs
+from quadsim.report.to_plotly import Plot, to_plot
+from scenarios.campaign.report import campaign_figures, campaign_tables
+from scenarios.campaign.report.campaign_text import verdict_sentence
 from scenarios.campaign.report.comparison_tables import (
     comparison_markdown,
     comparison_tables,
@@ -26,7 +25,6 @@ from scenarios.campaign.report.comparison_tables import (
 )
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.statistics.comparison import Comparison
-from scenarios.campaign.statistics.scatters import clipping, clouds, margins, thinning
 
 _FILES: Final = {
     "campaign.toml": "campaign (TOML)",
@@ -36,11 +34,16 @@ _FILES: Final = {
     "summary.json": "summary (JSON)",
     "manifest.json": "manifest (JSON)",
     "campaign.png": "figure (PNG)",
-    "campaign.svg": "figure (SVG)",
 }
 """What the page links to, where it is there, and under which name."""
 COMPARISON_FILE: Final = "comparison.json"
 TABLE_FILE: Final = "comparison.md"
+_MARGINS: Final = (
+    "The worst margin is that of a flight's required constraints, tolerance included, as a share of half the "
+    "constraint's band: 1 in the middle, 0 (dashed) at the end of what is allowed, negative beyond. What is measured "
+    "of a lost flight ends where it was aborted."
+)
+_POINTS: Final = "Triangles at the edges are flights beyond the axes; at the foot also those without a margin."
 
 
 def write_report(
@@ -54,7 +57,7 @@ def write_report(
     failure: Sequence[str] = (),
     campaign: Path | None = None,
 ) -> Path:
-    """Write `index.html`, `campaign.png` and `campaign.svg` into a directory that is being made; the page.
+    """Write `index.html` and `campaign.png` into a directory that is being made; the page.
 
     The page links to the files of `campaign`, the campaign's own directory where that is another, as its commands do.
 
@@ -62,39 +65,49 @@ def write_report(
         OutputError: the directory cannot be written.
     """
     campaign = directory if campaign is None else campaign
-    write_drawings({"campaign": lambda: draw_campaign(name, table, summary)}, directory)
-    plots, drawn = campaign_plots(table, summary), margins(table)
-    page = render_page(
-        "campaign.html.j2",
-        "campaign",
-        title=name,
-        description=description,
-        verdict=verdict_sentence(summary),
-        mark=_mark(summary),
-        sentences=campaign_sentences(summary),
-        events=campaign_tables.event_table(summary, failure),
-        constraints=campaign_tables.constraint_table(summary),
-        metrics=campaign_tables.metric_table(summary),
-        drivers=campaign_tables.driver_table(summary),
-        splits=campaign_tables.split_table(summary),
-        groups=campaign_tables.group_table(summary),
-        levels=campaign_tables.level_tables(summary),
-        lost=summary["verdicts"]["lost"],
-        worst=campaign_tables.worst_table(summary, str(campaign)),
-        worst_draws=campaign_tables.worst_draws_table(summary),
-        manifest=campaign_tables.manifest_table(manifest),
-        plots=plots,
-        clipping="" if drawn is None else clipping(drawn, clouds(table, drawn)),
-        thinning=thinning(table),
-        files=[
-            (label, quote(file))
-            for file, label in _FILES.items()
-            if (directory / file).is_file() or (campaign / file).is_file()
-        ],
-        plotly=plotly_script() if plots else "",
-    )
+    sentence = verdict_sentence(summary)
+    write_pngs([campaign_figures.overview(table, summary, f"{name}: {sentence}")], directory)
+    tables = campaign_tables
+    sections = [
+        Section(
+            title="How often",
+            plots=_plots("convergence", "How the estimate settles", campaign_figures.convergence(summary)),
+            tables=(tables.event_table(summary, failure), tables.constraint_table(summary)),
+        ),
+        Section(
+            title="Distributions",
+            plots=_plots("metrics", "Flights by verdict", campaign_figures.histograms(table), _MARGINS),
+            folded=(tables.metric_table(summary),),
+        ),
+        Section(
+            title="What drives failure",
+            plots=(
+                *_plots("drivers", "Which parameters matter", campaign_figures.dependence(summary), columns=1),
+                *_plots("scatter", "Worst margin over each parameter", campaign_figures.scatters(table), _POINTS),
+            ),
+            tables=(tables.group_table(summary), *tables.level_tables(summary), tables.split_table(summary)),
+            folded=(tables.driver_table(summary),),
+        ),
+        Section(
+            title="Worst flights",
+            tables=(tables.worst_table(summary, str(campaign)), tables.worst_draws_table(summary)),
+        ),
+        Section(title="How it was made", tables=(tables.manifest_table(manifest),)),
+    ]
+    files = {
+        label: quote(file)
+        for file, label in _FILES.items()
+        if (directory / file).is_file() or (campaign / file).is_file()
+    }
+    verdict = Cell(text=sentence, mark=_mark(summary))
+    page = render_page("campaign", name, sections, description=description, verdict=verdict, files=files)
     (directory / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
+
+
+def _plots(key: str, title: str, panels: Sequence[Panel], note: str = "", *, columns: int = 2) -> tuple[Plot, ...]:
+    figure = Figure(key=key, title=title, panels=tuple(panels), columns=columns)
+    return (to_plot(figure, note=note),) if panels else ()
 
 
 def _mark(summary: Summary) -> Mark:
@@ -109,21 +122,21 @@ def write_comparison_report(comparison: Comparison, directory: Path, *, overwrit
     Raises:
         OutputError: the directory cannot be written, or holds something else.
     """
-    plot = comparison_margins_plot(comparison)
+    shown = comparison.shown_margins
+    note = (
+        "" if shown is None else f"Above the dashed line, {comparison.names[1]} has the larger margin. {shown.beyond}"
+    )
+    plots = tuple(to_plot(figure, note=note) for figure in campaign_figures.paired_margins(comparison))
+    sections = [
+        Section(title="What is compared", text=(pairing(comparison),), tables=tuple(difference_table(comparison))),
+        Section(title="Which is better", text=(comparison.sentence,), tables=tuple(comparison_tables(comparison))),
+        Section(title="Margins", plots=plots),
+    ]
+    title = f"{comparison.names[1]} against {comparison.names[0]}"
+    files = {file: file for file in (COMPARISON_FILE, TABLE_FILE)}
     with writing(directory, overwrite=overwrite) as partial:
         (partial / COMPARISON_FILE).write_text(to_json(comparison.to_json()), encoding="utf-8")
         (partial / TABLE_FILE).write_text(comparison_markdown(comparison), encoding="utf-8")
-        page = render_page(
-            "campaign_comparison.html.j2",
-            "campaign comparison",
-            title=f"{comparison.names[1]} against {comparison.names[0]}",
-            comparison=comparison,
-            pairing=pairing(comparison),
-            differences=difference_table(comparison),
-            tables=comparison_tables(comparison),
-            plot=plot,
-            files=(COMPARISON_FILE, TABLE_FILE),
-            plotly=plotly_script() if plot else "",
-        )
+        page = render_page("campaign comparison", title, sections, files=files)
         (partial / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE

@@ -16,18 +16,14 @@ import pyarrow as pa
 from quadsim.report.palette import BOUND, LINES
 from quadsim.state import Array
 from scenarios.campaign.results.events import Flags
-from scenarios.campaign.results.table import DRAW, Edges, Rows, draw_names, is_number, numbers, texts, unit_of, verdicts
-from scenarios.campaign.statistics.dependence import Trend, trend
-from scenarios.campaign.statistics.wording import count_of, label
+from scenarios.campaign.results.table import Edges, Rows, numbers
+from scenarios.campaign.statistics.wording import count_of
 
 LOWEST_MARGIN: Final = -2.0
 """Margins below this are drawn at the foot, so that a lost flight does not flatten all others."""
 _LEAST_DEPTH: Final = 0.25  # share of the height above 0 that is shown below it, however far from it the margins are
 _FENCE: Final = 5.0  # quartile ranges beyond the quartiles up to which values are drawn where they are
-COURSE: Final = "half of the flights are above"  # the meaning of a curve through the flights of a scatter
 _GAP: Final = 0.06  # from the axis' end to what is drawn at the edge, as a share of the axis
-_MOST_POINTS: Final = 18_000
-"""Points that all scatters of a page may have together: a page of 10 000 flights stays near 6 MB and quick to draw."""
 _MOST_PAIRS: Final = 4000  # that are drawn of a comparison
 
 
@@ -59,108 +55,6 @@ def margin_ends(values: Array) -> tuple[float, float]:
     high = max(0.0, float(finite[finite <= above].max()))
     below = max(min(fence, -_LEAST_DEPTH * high), lowest_shown(finite))
     return min(0.0, float(finite[finite >= below].min())), high
-
-
-@dataclass(frozen=True, kw_only=True)
-class Margins:
-    """The worst margins as they are drawn."""
-
-    # (K,) heights; at the foot where a flight has no margin, or one below the axis, at the top of one above it
-    y: Array
-    true: Array  # (K,) the margins, NaN where there is none
-    edge: Edges  # (K,) `down`, `up`, or empty where a flight is drawn where it is
-    shown: tuple[float, float]  # the ends between which margins are drawn where they are
-    ends: tuple[float, float]  # of the axis, with what is drawn at its edges
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cloud:
-    """A varied parameter of every flight, as horizontal positions."""
-
-    name: str  # the parameter
-    label: str  # its name, with its unit where it has one
-    x: Array  # (K,) its values; whole numbers, spread a little, where it is drawn from names
-    edge: Edges  # (K,) `left`, `right`, or empty where a flight is drawn where it is
-    true: Array  # (K,) its values; as `x` where it is drawn from names
-    names: tuple[str, ...]  # what stands at 0, 1, ...; empty where it is a number
-    course: Trend | None  # of the worst margin over it; None where there are too few flights, and of names
-
-
-def margins(table: pa.Table) -> Margins | None:
-    """The worst margins as they are drawn; None where no flight has any, as without a required constraint."""
-    true = numbers(table, "worst_margin")
-    true = np.where(np.isfinite(true), true, np.nan)
-    if np.isnan(true).all():
-        return None
-    low, high = margin_ends(true)
-    edge = np.where(np.isnan(true) | (true < low), "down", np.where(true > high, "up", ""))
-    gap = _GAP * ((high - low) or 1.0)
-    foot, top = low - gap * (edge == "down").any(), high + gap * (edge == "up").any()
-    y = np.select([edge == "down", edge == "up"], [foot, top], true)
-    return Margins(y=y, true=true, edge=edge, shown=(low, high), ends=(foot - 0.6 * gap, top + 0.6 * gap))
-
-
-def clouds(table: pa.Table, drawn: Margins) -> list[Cloud]:
-    """Every varied parameter, in order, with the course of the worst margin over it."""
-    found = []
-    for name in draw_names(table):
-        column = DRAW + name
-        text = label(name, unit_of(table, column))
-        if not is_number(table, column):
-            values = texts(table, column)
-            names = tuple(sorted(set(values)))
-            spread = np.random.default_rng(0).uniform(-0.3, 0.3, values.size)  # as every time
-            x = np.array([names.index(value) for value in values], float) + spread
-            unclipped = np.full(x.size, "")
-            found.append(Cloud(name=name, label=text, x=x, edge=unclipped, true=x, names=names, course=None))
-            continue
-        true = numbers(table, column)
-        low, high = robust_ends(true)
-        gap = _GAP * (high - low)
-        edge = np.where(true < low, "left", np.where(true > high, "right", ""))
-        x = np.select([edge == "left", edge == "right"], [low - gap, high + gap], true)
-        course = trend(x, drawn.y) if np.isfinite(x).all() else None
-        found.append(Cloud(name=name, label=text, x=x, edge=edge, true=true, names=(), course=course))
-    return found
-
-
-def edges(cloud: Cloud, drawn: Margins) -> Edges:
-    """(K,) where a point lies beyond the axes: `down`, `up`, `left`, `right`, or empty where it does not."""
-    return np.where(drawn.edge == "", cloud.edge, drawn.edge)
-
-
-def shown_flights(table: pa.Table) -> dict[str, Rows]:
-    """Rows of the flights that scatters show, by verdict: all, or at most a quarter of what a page bears of each."""
-    limit = min(max(_MOST_POINTS // max(len(draw_names(table)), 1), 400), 2000)
-    rows = {verdict: np.flatnonzero(found) for verdict, found in verdicts(table).items()}
-    if table.num_rows <= limit:
-        return rows
-    return {verdict: _evenly(found, limit // 4) for verdict, found in rows.items()}
-
-
-def thinning(table: pa.Table) -> str:
-    """What the scatters leave out, as a sentence; empty where they show all."""
-    shown = shown_flights(table)
-    parts = [
-        f"{shown[verdict].size} of {count_of(int(found.sum()), f'{verdict} flight')}"
-        for verdict, found in verdicts(table).items()
-        if shown[verdict].size < found.sum()
-    ]
-    return f"Drawn are {', '.join(parts)}, evenly spread by number; all others are shown in full." if parts else ""
-
-
-def clipping(drawn: Margins, parameters: list[Cloud]) -> str:
-    """Which flights are drawn at the edges, how many, and how far out they are; empty where there are none."""
-    none, (low, high) = np.isnan(drawn.true), drawn.shown
-    parts = _count_beyond(drawn.true, (drawn.edge == "down") & ~none, "below", low)
-    if none.any():
-        parts.append(f"{count_of(int(none.sum()), 'flight')} without a margin, at the foot")
-    parts += _count_beyond(drawn.true, drawn.edge == "up", "above", high)
-    for cloud in parameters:
-        for edge, side, end in (("left", "below", np.min), ("right", "above", np.max)):
-            beyond = cloud.edge == edge
-            parts += _count_beyond(cloud.true, beyond, side, end(cloud.true[~beyond]), of=cloud.name)
-    return f"Triangles at the edges mark flights beyond the axes: {'; '.join(parts)}." if parts else ""
 
 
 def _count_beyond(

@@ -1,4 +1,4 @@
-"""The rows and sentences of a comparison agree with the summaries."""
+"""The rows of a comparison agree with the summaries."""
 
 import copy
 import dataclasses
@@ -9,7 +9,6 @@ import pytest
 
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import comparison_rows, distinct_courses, run_names
-from quadsim.report.narrative import comparison_sentences
 from quadsim.report.table import Mark, Row, format_number, to_markdown
 
 
@@ -115,14 +114,6 @@ def test_a_bound_exceeded_in_the_commands_alone_is_marked(short_run: Run) -> Non
     clipped = dataclasses.replace(short_run, summary=summary)
     verdict = row(comparison_rows([clipped]), "verdict", "Constraint speed").cells[0].text
     assert verdict == "exceeded, not required (margin -120 rad/s at the samples, tolerance 1e-06)"
-    assert any("exceeds it by 120 rad/s at the samples." in sentence for sentence in comparison_sentences([clipped]))
-
-
-def test_different_courses_are_pointed_out(short_run: Run) -> None:
-    control = dataclasses.replace(short_run.log.control, reference=short_run.log.control.reference + 1.0)
-    other = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, control=control))
-    assert not any("courses" in sentence for sentence in comparison_sentences([short_run, short_run]))
-    assert any("2 different courses" in sentence for sentence in comparison_sentences([short_run, other]))
 
 
 def test_a_constraint_that_a_run_lacks_is_shown_as_absent(short_run: Run) -> None:
@@ -130,25 +121,6 @@ def test_a_constraint_that_a_run_lacks_is_shown_as_absent(short_run: Run) -> Non
     rows = comparison_rows([free, short_run])
     assert row(rows, "verdict", "Constraint roll").cells[0].text == "-"
     assert row(rows, "required constraints").cells[0].text == "none"
-
-
-def test_sentences_state_the_difference_in_numbers(short_run: Run, worse_run: Run, aborted_run: Run) -> None:
-    sentences = "\n".join(comparison_sentences([short_run, worse_run, aborted_run]))
-    assert "paper-constrained and worse were flown to the end." in sentences
-    assert f"lost was aborted after 6 s: {aborted_run.summary['reason']}." in sentences
-    assert "worse exceeds it by 2.5 deg, for 0.75 s in all" in sentences
-    assert "worse violates it by 2.5 rad/s" in sentences
-    assert "In the median, worse takes 3 times as long as" in sentences
-    assert "1 deadline missed." in sentences
-
-
-def test_one_run_and_an_empty_one_have_sentences_too(short_run: Run, empty_run: Run) -> None:
-    (outcome, *_rest) = comparison_sentences([short_run])
-    assert outcome == "paper-constrained was flown to the end."
-    sentences = comparison_sentences([empty_run])
-    assert sentences[0] == "ended-at-once was aborted after 0 s: at t = 0.000 s: the command is not finite."
-    (unreached,) = (sentence for sentence in sentences if "before it was held" in sentence)
-    assert unreached.startswith("ended-at-once ended before it was held to roll, pitch,")
 
 
 def test_names_are_distinct(short_run: Run, aborted_run: Run) -> None:

@@ -1,4 +1,4 @@
-"""A comparison's rows and sentences on verdicts, courses, ground, measured states and late commands."""
+"""A comparison's rows on verdicts, courses, ground, measured states and late commands."""
 
 import copy
 import dataclasses
@@ -7,8 +7,13 @@ from typing import Any
 import pytest
 
 from quadsim.flight.rundir import Run
-from quadsim.report.comparison import comparison_rows, failure_sentences, verdict, verdict_cell, verdict_sentence
-from quadsim.report.narrative import comparison_sentences
+from quadsim.report.comparison import (
+    comparison_rows,
+    failure_sentences,
+    verdict,
+    verdict_cell,
+    violated_by_fallback,
+)
 from quadsim.report.table import Mark, Row
 
 COURSE = {
@@ -68,6 +73,7 @@ def cells(rows: list[Row], group: str, label: str) -> list[str]:
 
 def test_rows_agree_with_the_summary_and_have_a_dash_where_it_has_no_entry(bare_run: Run) -> None:
     rows = comparison_rows([having(bare_run, "full", **EVERYTHING), bare_run])
+    assert cells(rows, "Flight", "events") == ["rotor 2 loses 20 % at 2 s; a push of 4 N for 0.2 s at 3.5 s", "-"]
     assert cells(rows, "Course", "largest tilt required") == ["5.61", "-"]
     assert cells(rows, "Course", "jumps") == ["at 1 s; at 7 s", "-"]
     assert cells(rows, "Course", "beyond the bounds") == ["pitch up to 5.61 deg (bound 5)", "-"]
@@ -100,29 +106,24 @@ def test_a_flight_that_never_touches_the_ground_or_crashes_on_it(bare_run: Run) 
     assert cells(rows, "Ground", "touchdown at") == ["-", "15.88"]
     (end,) = (row for row in rows if row.label == "at the end")
     assert [cell.mark for cell in end.cells] == [Mark.NONE, Mark.BAD]
-    sentences = comparison_sentences([aloft, crashed])
-    assert "aloft is flying at the end." in sentences
-    assert any(sentence.startswith("crashed takes off") and sentence.endswith("and crashes.") for sentence in sentences)
 
 
 @pytest.mark.parametrize(
-    ("status", "satisfied", "expected", "as_expected", "text", "mark", "sentence"),
+    ("status", "satisfied", "expected", "as_expected", "text", "mark"),
     [
-        ("completed", True, "satisfied", True, "satisfied, as expected", Mark.GOOD, None),
-        ("completed", False, "violated", True, "violated, as expected", Mark.NONE, ", as its scenario states."),
-        ("aborted", False, "lost", True, "lost, as expected", Mark.NONE, "flight is lost, as its scenario states."),
-        ("completed", True, "lost", False, "satisfied, expected: lost", Mark.BAD, "; its scenario states the verdict"),
+        ("completed", True, "satisfied", True, "satisfied, as expected", Mark.GOOD),
+        ("completed", False, "violated", True, "violated, as expected", Mark.NONE),
+        ("aborted", False, "lost", True, "lost, as expected", Mark.NONE),
+        ("completed", True, "lost", False, "satisfied, expected: lost", Mark.BAD),
     ],
 )
 def test_a_verdict_is_held_against_the_one_the_scenario_states(
-    bare_run: Run, status: str, satisfied: bool, expected: str, as_expected: bool, text: str, mark: Mark, sentence: str
+    bare_run: Run, status: str, satisfied: bool, expected: str, as_expected: bool, text: str, mark: Mark
 ) -> None:
     constraints = [with_margin(bare_run.summary["constraints"][0], 1.0 if satisfied else -1.0)]
     run = having(bare_run, "flight", status=status, constraints=constraints, expected=expected, as_expected=as_expected)
     found = verdict_cell(run.summary)
     assert (found.text, found.mark) == (text, mark)
-    sentences = [each for each in comparison_sentences([run]) if "scenario states" in each]
-    assert (not sentences) if sentence is None else (sentence in sentences[0])
 
 
 def test_a_required_constraint_that_was_not_reached_makes_a_flight_incomplete(bare_run: Run) -> None:
@@ -131,7 +132,6 @@ def test_a_required_constraint_that_was_not_reached_makes_a_flight_incomplete(ba
     unreached = {**with_margin(entry, 1.0), **beyond, "name": "arrival", "satisfied": False}
     flown = having(bare_run, "short", constraints=[with_margin(entry, 1.0), unreached], expected="satisfied")
     assert (verdict(flown.summary), verdict_cell(flown.summary).mark) == ("incomplete", Mark.BAD)
-    assert "short ends before every required constraint is reached" in " ".join(comparison_sentences([flown]))
     assert verdict({**flown.summary, "constraints": [with_margin(entry, -1.0), unreached]}) == "violated"
     assert verdict({**flown.summary, "constraints": [{**unreached, "required": False}]}) == "satisfied"
 
@@ -141,43 +141,6 @@ def test_a_verdict_needs_no_expectation_and_minds_required_constraints_alone(bar
     summary = {**bare_run.summary, "constraints": [{**with_margin(entry, -1.0), "required": False}]}
     assert verdict(summary) == "satisfied"
     assert verdict_cell(summary).mark is Mark.NONE
-
-
-def test_sentences_report_what_each_flight_met(bare_run: Run) -> None:
-    sentences = comparison_sentences([having(bare_run, "one", **EVERYTHING), having(bare_run, "two", course=COURSE)])
-    assert "one and two: the course requires up to 5.61 deg of tilt." in sentences, "one course, stated once"
-    assert "On the way of one: rotor 2 loses 20 % at 2 s; a push of 4 N for 0.2 s at 3.5 s." in sentences
-    assert (
-        "one takes off at 2.155 s, meets the ground at 15.88 s (0.05 m/s downwards, 1.2 deg of tilt) and is landed at "
-        "the end."
-    ) in sentences
-    assert (
-        "The controller of one received the position with an RMS error of 0.013 m and the attitude with one of "
-        "0.573 deg, and no number in 10 periods."
-    ) in sentences
-    assert (
-        "Commands of one come 12 ms after their measurement in the median and 60 ms at most; 3 too late to be used."
-    ) in sentences
-
-
-def test_of_many_events_the_first_are_listed(bare_run: Run) -> None:
-    many = [{"time": float(i), "text": "a push of 1 N"} for i in range(30)]
-    (text,) = (each for each in comparison_sentences([having(bare_run, "one", events=many)]) if "On the way" in each)
-    assert text.count("a push of 1 N at") == 12
-    assert text.endswith("at 11 s; 18 more.")
-
-
-def test_bounds_that_differ_are_listed_with_each_run(bare_run: Run) -> None:
-    entry = {**bare_run.summary["constraints"][0], "name": "roll", "satisfied": False, "worst_margin": -1.0}
-    entry |= {"worst_margin_sampled": -1.0, "time_violated": 0.0, "required": True, "start": 0.0, "stop": None}
-    wide = {**entry, "lower": -20.0, "upper": None, "start": 8.0}
-    one, two = (having(bare_run, name, constraints=[each]) for name, each in (("one", entry), ("two", wide)))
-    sentences = comparison_sentences([one, two])
-    assert (
-        "roll, whose bounds differ: one (-5 .. 5 deg) violates it by 1 deg; two (at least -20 deg, from 8 s) violates "
-        "it by 1 deg."
-    ) in sentences
-    assert "roll, -5 .. 5 deg: one violates it by 1 deg." in comparison_sentences([one])
 
 
 DIAGNOSIS = {
@@ -201,14 +164,11 @@ def test_fallback_for_good_is_no_success_and_is_reported_with_its_reason(bare_ru
     )
     crashed = having(bare_run, "crashed", constraints=held, ground={**GROUND, "crashed": True})
     assert [verdict(run.summary) for run in (good, stuck, crashed)] == ["satisfied", "violated", "violated"]
-    assert verdict_sentence(stuck.summary) == "ends in permanent fallback"
-    assert verdict_sentence(crashed.summary) == "crashes"
-    assert verdict_sentence(having(stuck, "both", constraints=broken).summary).startswith("does")
-    sentences = comparison_sentences([good, stuck])
-    assert "stuck ends in permanent fallback; its scenario states the verdict satisfied." in sentences
+    assert violated_by_fallback(stuck.summary)
+    assert not violated_by_fallback(crashed.summary)
+    assert not violated_by_fallback(having(stuck, "both", constraints=broken).summary)
     reasons = ["318 periods in fallback, never recovered", DIAGNOSIS["sentence"], DIAGNOSIS["advice"]]
     assert failure_sentences(stuck.summary) == reasons
-    assert f"stuck: {'; '.join(map(str, reasons))}." in sentences
-    assert not [sentence for sentence in sentences if sentence.startswith("good:")]
+    assert cells(comparison_rows([good, stuck]), "Flight", "why no optimum") == ["-", "; ".join(map(str, reasons))]
     assert cells(comparison_rows([good, stuck]), "Solver", "in permanent fallback") == ["0", "318"]
     assert failure_sentences(having(good, "solver", diagnosis={**DIAGNOSIS, "advice": ""}).summary) == [reasons[1]]

@@ -1,7 +1,6 @@
 """The comparison page: complete or not there, escaped, offline, and without a complaint from a browser."""
 
 import dataclasses
-import json
 import re
 import shutil
 from collections.abc import Iterator
@@ -14,27 +13,22 @@ from support import draw_nothing
 
 from quadsim.errors import OutputError, ParameterError
 from quadsim.flight.rundir import Run
-from quadsim.report.pages import comparison_page
-from quadsim.report.pages.comparison_page import write_comparison
-from quadsim.report.plots.flight_plots import comparison_plots, thin
-from scenarios.cost.section import cost_section
-from scenarios.cost.study import CostStudy
+from quadsim.report import comparison_page
+from quadsim.report.comparison_page import _plots, write_comparison
 
 HOSTILE = "<script>alert(1)</script> & \"more\" 'quoted'"
 PROBE = """<script>
 (async () => {
   while (!("drawn" in document.documentElement.dataset)) await new Promise((done) => setTimeout(done, 50));
-  await Plotly.relayout("course", { "xaxis.range": [1, 2] });
+  await Plotly.relayout("states", { "xaxis.range": [1, 2] });
   document.querySelector("[data-run=run0]").click();
   await new Promise((done) => setTimeout(done, 500));
-  const panels = ["attitude", "speeds", "slews", "times"].map((id) => document.getElementById(id));
+  const panels = ["states", "inputs", "solve_times"].map((id) => document.getElementById(id));
   const seen = panels[0].data.filter((trace) => trace.legendgroup).map((trace) => String(trace.visible ?? true));
-  const costs = ["cost-steps", "cost-tilt", "cost-horizon"];
   const report = document.createElement("output");
   report.textContent = [
     "ranges " + panels.map((panel) => panel.layout.xaxis.range.join("-")).join(" "),
     "visible " + seen.join(" "),
-    "costs " + costs.map((id) => document.querySelectorAll(`#${id} .trace`).length).join(" "),
     "svgs " + document.querySelectorAll(".main-svg .trace").length,
     "buttons " + [...document.querySelectorAll(".modebar-btn")].map((button) => button.dataset.title).join(","),
   ].join("; ");
@@ -54,7 +48,7 @@ def _undrawn() -> Iterator[None]:
 @pytest.fixture
 def unplotted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without plots of the flights, for tests of all else."""
-    monkeypatch.setattr(comparison_page, "comparison_plots", lambda runs: [])
+    monkeypatch.setattr(comparison_page, "page_figures", lambda runs: [])
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +59,7 @@ def filmed_run(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
     (directory / "flight.mp4").write_bytes(b"film")
     (directory / "flight.rrd").write_bytes(b"recording")
     (directory / "figures").mkdir()
-    (directory / "figures" / "figure4_states.svg").write_text("<svg/>")
+    (directory / "figures" / "figure4_states.png").write_bytes(b"picture")
     return dataclasses.replace(short_run, directory=directory)
 
 
@@ -94,7 +88,7 @@ def test_the_page_stands_beside_its_files(page_of_two: Path) -> None:
     assert (page.parent.name, page.name) == ("out", "index.html")
     assert page.stat().st_size < 8e6
     assert {path.name for path in page.parent.iterdir()} == {
-        *("index.html", "comparison.png", "comparison.svg", "comparison.md", "summary.json"),
+        *("index.html", "comparison.png", "comparison.md", "summary.json"),
         *("paper-constrained.mp4", "paper-constrained", "lost"),
     }
     assert (page.parent / "paper-constrained.mp4").read_bytes() == b"film"
@@ -110,27 +104,6 @@ def test_the_text_gives_outcomes_reasons_and_numbers(page_of_two: Path) -> None:
     assert "This run has no video" in text
     assert "paper-constrained/flight.rrd" in text
     assert "lost/flight.rrd" not in text
-
-
-@pytest.mark.usefixtures("unplotted")
-def test_a_study_of_costs_has_a_section_and_files(
-    short_run: Run, cost_study: CostStudy, page: Path, tmp_path: Path
-) -> None:
-    hostile = dataclasses.replace(cost_study, name=HOSTILE)
-    studied = write_comparison([short_run], tmp_path / "out", cost_section(hostile))
-    text = without_scripts(studied.read_text())
-    assert "What do constraints cost?" in text
-    assert "&lt;script&gt;alert(1)" in text
-    assert text.count('<table class="grid">') == 5
-    assert text.count('<details class="folded" open>') == 2
-    assert '<td class="bad">lost at 0.5 s</td>' in text
-    assert {path.name for path in studied.parent.iterdir() if path.name.startswith("cost")} == {
-        *("cost.json", "cost.md"),
-        *(f"cost_{what}.{kind}" for what in ("steps", "tilt", "horizon") for kind in ("png", "svg")),
-    }
-    for url in re.findall(r'(?:href|src)="([^"#]+)"', text):
-        assert url == "data:," or (studied.parent / url).is_file(), url
-    assert "What do constraints cost?" not in page.read_text()
 
 
 def test_nothing_is_fetched(page: Path) -> None:
@@ -192,7 +165,7 @@ def test_nothing_is_left_of_a_comparison_that_fails(
     def full_disk(*_arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("quadsim.report.pages.comparison_page.shutil.copyfile", full_disk)
+    monkeypatch.setattr("quadsim.report.comparison_page.shutil.copyfile", full_disk)
     with pytest.raises(OutputError, match="No space left"):
         write_comparison([short_run], tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
@@ -203,69 +176,38 @@ def test_no_runs_are_an_error(tmp_path: Path) -> None:
         write_comparison([], tmp_path / "out")
 
 
-def test_thinning_keeps_ends_and_extremes() -> None:
-    values = np.random.default_rng(0).normal(size=10_007)
-    thinned = thin(values, 500)
-    assert thinned.size <= 502
-    assert np.all(np.diff(thinned) > 0)
-    assert {0, values.size - 1, int(values.argmin()), int(values.argmax())} <= set(thinned.tolist())
-    assert np.array_equal(thin(values[:300], 300), np.arange(300))
-
-
-def test_thinning_keeps_gaps() -> None:
-    values = np.sin(np.arange(10_000.0))
-    values[[10, 5000]] = np.nan
-    thinned = thin(values, 500)
-    assert thinned.size <= 504
-    assert {10, 5000} <= set(thinned.tolist())
-    assert np.nanmax(values[thinned]) == np.nanmax(values)
-
-
 @pytest.mark.usefixtures("unplotted")
 def test_the_page_shows_the_verdict_against_the_one_expected(short_run: Run, tmp_path: Path) -> None:
     summary = {**short_run.summary, "expected": "lost", "as_expected": False, "constraints": []}
     page = write_comparison([dataclasses.replace(short_run, summary=summary)], tmp_path / "out").read_text()
-    assert 'verdict:\n      <span class="bad">satisfied, expected: lost</span>' in page
+    assert 'verdict: <span class="bad">satisfied, expected: lost</span>' in page
 
 
-def test_plots_of_what_stands_still_have_a_least_span(short_run: Run) -> None:
-    plant = short_run.log.plant
-    still = dataclasses.replace(plant, state=np.full_like(plant.state, 1e-9))
-    control = dataclasses.replace(short_run.log.control, reference=np.zeros_like(short_run.log.control.reference))
-    log = dataclasses.replace(short_run.log, plant=still, control=control)
-    course, *_ = comparison_plots([dataclasses.replace(short_run, limits=(), log=log)])
-    layout = json.loads(course.json)["layout"]
-    assert [layout[axis]["autorangeoptions"]["include"] for axis in ("yaxis", "yaxis4")] == [
-        [-0.005, 0.005],
-        [-0.05, 0.05],
-    ]
-    moving, *_ = comparison_plots([short_run])
-    axes = json.loads(moving.json)["layout"]
-    assert [axis for axis in ("yaxis3", "yaxis4") if "autorangeoptions" in axes[axis]] == [], "z and yaw move"
-
-
-def test_many_runs_keep_the_page_small(short_run: Run) -> None:
+def test_plots_of_many_long_runs_stay_small(short_run: Run) -> None:
     t = np.linspace(0.0, 360.0, 72_001)
     rows = np.arange(t.size) % short_run.log.plant.t.size
     plant = dataclasses.replace(
         short_run.log.plant, t=t, state=short_run.log.plant.state[rows], speeds=short_run.log.plant.speeds[rows]
     )
     long = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant))
-    assert sum(len(plot.json) for plot in comparison_plots([long] * 10)) < 3e6
+    assert sum(len(plot.json) for plot in _plots([long] * 10)) < 3e6
 
 
-def test_a_browser_draws_the_page_and_has_no_complaint(
-    short_run: Run, aborted_run: Run, cost_study: CostStudy, tmp_path: Path
-) -> None:
-    page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out", cost_section(cost_study))
+def test_different_courses_are_pointed_out(short_run: Run, tmp_path: Path) -> None:
+    control = dataclasses.replace(short_run.log.control, reference=short_run.log.control.reference + 1.0)
+    other = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, control=control))
+    assert "The runs follow 2 different courses" in write_comparison([short_run, other], tmp_path / "out").read_text()
+
+
+def test_a_browser_draws_the_page_and_has_no_complaint(short_run: Run, aborted_run: Run, tmp_path: Path) -> None:
+    page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out")
     page.write_text(page.read_text().replace("</body>", f"{PROBE}</body>"))
     dom, console = open_page(page, tmp_path / "profile")
     assert console == []
     report = re.findall(r"<output>(.*?)</output>", dom)[-1]
-    assert "ranges 1-2 1-2 1-2 1-2" in report
+    assert "ranges 1-2 1-2 1-2" in report
     assert "visible false true false true" in report
     assert int(re.findall(r"svgs (\d+)", report)[0]) > 40
-    assert "costs 3 16 16" in report  # the candidates, and the curves of six panels
     buttons = re.findall(r"buttons ([^;]*)", report)[0].replace("a png", "a PNG")  # of an older plotly
     assert set(buttons.split(",")) == {
         *("Download plot as a PNG", "Zoom", "Pan", "Zoom in", "Zoom out", "Autoscale", "Reset axes"),

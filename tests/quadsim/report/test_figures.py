@@ -1,8 +1,7 @@
-"""The figures: there, not blank, of the right content, and the same bytes each time."""
+"""Figures of flights: their data, units and bounds, and that both libraries draw what they describe."""
 
 import dataclasses
-import xml.etree.ElementTree as ElementTree
-from functools import partial
+import json
 from pathlib import Path
 
 import numpy as np
@@ -10,105 +9,28 @@ import pytest
 from matplotlib.image import imread
 
 from quadsim.errors import OutputError
-from quadsim.flight.audit import Limit
+from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
 from quadsim.flight.rundir import Run
-from quadsim.report.figures import flight_figures
-from quadsim.report.figures.canvas import write_drawings
-from quadsim.report.figures.flight_figures import comparison_figure, draw_effects, has_effects, write_figures
-from quadsim.report.palette import BOUND, line_colour
-from quadsim.state import INDEX
-
-
-@pytest.fixture(scope="module")
-def figures(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    return {path.name: path for path in write_figures(short_run, tmp_path_factory.mktemp("figures") / "new")}
-
-
-def texts(svg: Path) -> set[str]:
-    return {
-        text for element in ElementTree.parse(svg).iter("{http://www.w3.org/2000/svg}text") if (text := element.text)
-    }
-
-
-def lines_of_colour(svg: Path, colour: str) -> int:
-    return svg.read_text().count(f"stroke: {colour}")
-
-
-def states_svg(run: Run, directory: Path) -> Path:
-    """The figure of the states alone, as text."""
-    return write_drawings({"states": lambda: flight_figures._draw_states(run)}, directory)[1]
+from quadsim.report import flight_figures
+from quadsim.report.figure import Band, Bound, Figure, Panel, Scene, Series
+from quadsim.report.flight_figures import effects, inputs, overview, page_figures, states, times, write_figures
+from quadsim.report.palette import BOUND
+from quadsim.report.to_matplotlib import draw, to_png
+from quadsim.report.to_plotly import thin, to_plot
+from quadsim.space import Cylinder
+from quadsim.state import INDEX, Array
 
 
 def named(run: Run, scenario: str) -> Run:
     return dataclasses.replace(run, summary={**run.summary, "scenario": scenario})
 
 
-def test_the_papers_scenario_gives_the_papers_figure_numbers(figures: dict[str, Path]) -> None:
-    assert list(figures) == [
-        f"{name}.{kind}" for name in ("figure4_states", "figure5_inputs", "solve_times") for kind in ("png", "svg")
-    ]
+def panels(figure: Figure) -> dict[str, Panel]:
+    return {panel.heading: panel for panel in figure.panels}
 
 
-@pytest.mark.usefixtures("undrawn")
-def test_another_scenario_gives_plain_names(short_run: Run, tmp_path: Path) -> None:
-    stems = [path.stem for path in write_figures(named(short_run, "hover"), tmp_path)]
-    assert stems == ["states", "states", "inputs", "inputs", "solve_times", "solve_times"]
-
-
-def test_pictures_are_large_and_not_blank(figures: dict[str, Path]) -> None:
-    for path in figures.values():
-        if path.suffix == ".png":
-            picture = imread(path)[..., :3]
-            assert picture.shape[1] >= 1400
-            assert 0.01 < np.mean(np.any(picture < 0.95, axis=-1)) < 0.5
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        (
-            "figure4_states",
-            {"x [m]", "y [m]", "z [m]", "roll [deg]", "pitch [deg]", "yaw [deg]", "reference, filtered"},
-        ),
-        ("figure5_inputs", {"rotor speed [rad/s]", "step per period [rad/s]", "rotor 1", "rotor 4", "bound"}),
-        ("solve_times", {"time [ms]", "iterations", "active constraints", "deadline: 50 ms"}),
-    ],
-)
-def test_panels_and_units_are_labelled(figures: dict[str, Path], name: str, expected: set[str]) -> None:
-    assert expected | {"time [s]"} <= texts(figures[f"{name}.svg"])
-
-
-@pytest.mark.usefixtures("sketched")
-def test_bounds_are_drawn_where_the_flight_has_them(short_run: Run, figures: dict[str, Path], tmp_path: Path) -> None:
-    bounds_and_legend = 2 * 2 + 1
-    assert lines_of_colour(figures["figure4_states.svg"], BOUND) == bounds_and_legend
-    assert lines_of_colour(figures["figure5_inputs.svg"], BOUND) == bounds_and_legend
-    states = states_svg(dataclasses.replace(short_run, limits=()), tmp_path)
-    assert lines_of_colour(states, BOUND) == 0
-    assert "bound" not in texts(states)
-
-
-@pytest.mark.usefixtures("sketched")
-def test_a_bound_that_begins_after_the_flight_is_left_out(short_run: Run, tmp_path: Path) -> None:
-    late = dataclasses.replace(short_run, limits=(Limit(name="late", signal="roll", upper=5.0, start=100.0),))
-    assert lines_of_colour(states_svg(late, tmp_path), BOUND) == 0
-
-
-def test_the_same_flight_gives_the_same_bytes(short_run: Run, figures: dict[str, Path], tmp_path: Path) -> None:
-    drawings = {"figure5_inputs": flight_figures._draw_inputs, "solve_times": flight_figures._draw_solve_times}
-    for again in write_drawings({name: partial(draw, short_run) for name, draw in drawings.items()}, tmp_path):
-        assert again.read_bytes() == figures[again.name].read_bytes(), again.name
-
-
-@pytest.mark.usefixtures("sketched")
-def test_an_aborted_flight_is_drawn_as_far_as_it_went(short_run: Run, tmp_path: Path) -> None:
-    log = dataclasses.replace(short_run.log, reason="at t = 6.000 s: lost")
-    states = states_svg(dataclasses.replace(short_run, log=log), tmp_path)
-    assert "paper-constrained (aborted): position and attitude" in texts(states)
-
-
-def test_an_ideal_flight_has_no_figure_of_effects(figures: dict[str, Path]) -> None:
-    assert "effects.png" not in figures
+def curves(panel: Panel) -> dict[str, Series]:
+    return {series.label: series for series in panel.series}
 
 
 def with_effects(run: Run, *, wrench: bool = False, wind: bool = False, lag: bool = False, state: bool = False) -> Run:
@@ -126,50 +48,173 @@ def with_effects(run: Run, *, wrench: bool = False, wind: bool = False, lag: boo
     return dataclasses.replace(run, log=dataclasses.replace(run.log, plant=plant, control=control))
 
 
-SPEEDS = {"rotor 1 [rad/s]", "rotor 4 [rad/s]", "commanded", "acting"}
-FORCES = {"external force, world", "[N]", "external torque, body", "[N m]", "x", "y", "z"}
-AIR = {"wind, world", "[m/s]", "x", "y", "z"}
-STATE = {"position as measured,", "less the true one [m]", "less the true one [deg]", "x", "y", "z", "roll", "yaw"}
-
-
-@pytest.mark.usefixtures("sketched")
-@pytest.mark.parametrize(("effect", "expected"), [("lag", SPEEDS), ("wrench", FORCES), ("wind", AIR), ("state", STATE)])
-def test_effects_are_drawn_where_there_are_any(short_run: Run, tmp_path: Path, effect: str, expected: set[str]) -> None:
-    """Each by itself, with its panels and no others."""
-    run = with_effects(short_run, **{effect: True})
-    assert has_effects(run)
-    write_drawings({"effects": lambda: draw_effects(run)}, tmp_path)
-    found = texts(tmp_path / "effects.svg")
-    assert expected | {"time [s]", "paper-constrained: effects"} <= found
-    others = (SPEEDS | FORCES | AIR | STATE) - expected
-    assert not others & found
-
-
-@pytest.mark.usefixtures("coarse")
-def test_all_effects_are_drawn_together(short_run: Run, tmp_path: Path) -> None:
-    run = with_effects(short_run, wrench=True, wind=True, lag=True, state=True)
-    write_drawings({"effects": lambda: draw_effects(run)}, tmp_path)
-    assert texts(tmp_path / "effects.svg") >= SPEEDS | FORCES | AIR | STATE
-    picture = imread(tmp_path / "effects.png")[..., :3]
-    assert 0.01 < np.mean(np.any(picture < 0.95, axis=-1)) < 0.5
+def test_the_papers_scenario_gives_the_papers_figure_numbers(short_run: Run, tmp_path: Path) -> None:
+    paths = write_figures(short_run, tmp_path)
+    assert [path.name for path in paths] == ["figure4_states.png", "figure5_inputs.png", "solve_times.png"]
+    for path in paths:
+        picture = imread(path)[..., :3]
+        assert picture.shape[1] >= 1400
+        assert 0.01 < np.mean(np.any(picture < 0.95, axis=-1)) < 0.5, "not blank"
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_effects_are_a_figure_of_the_run(short_run: Run, tmp_path: Path) -> None:
-    assert tmp_path / "effects.png" in write_figures(with_effects(short_run, wind=True), tmp_path)
+def test_another_scenario_gives_plain_names_and_its_effects(short_run: Run, tmp_path: Path) -> None:
+    run = with_effects(named(short_run, "hover"), wind=True)
+    assert [path.stem for path in write_figures(run, tmp_path)] == ["states", "inputs", "solve_times", "effects"]
 
 
-def test_no_figures_without_a_control_period(empty_run: Run, tmp_path: Path) -> None:
-    assert write_figures(empty_run, tmp_path) == []
+def test_the_same_flight_gives_the_same_bytes(short_run: Run) -> None:
+    figure = inputs([short_run])
+    assert to_png(figure) == to_png(figure)
 
 
-@pytest.mark.usefixtures("sketched")
-def test_a_comparison_names_every_run_once(short_run: Run, tmp_path: Path) -> None:
-    png, svg = comparison_figure([short_run, named(short_run, "other $x$ <b>")], tmp_path)
-    assert png.name == "comparison.png"
-    assert {"paper-constrained", "other $x$ <b>", "bound", "roll [deg]"} <= texts(svg)
-    bounds_of_roll_pitch_speed_and_legend = 3 * 2 + 1
-    assert lines_of_colour(svg, BOUND) == bounds_of_roll_pitch_speed_and_legend
+def test_states_are_those_of_the_plant_with_units_references_and_bounds(short_run: Run) -> None:
+    found = panels(states([short_run]))
+    assert list(found) == ["x [m]", "roll [deg]", "y [m]", "pitch [deg]", "z [m]", "yaw [deg]"]
+    plant, control = short_run.log.plant, short_run.log.control
+    np.testing.assert_array_equal(curves(found["z [m]"])["flight"].y, plant.state[:, INDEX["z"]])
+    np.testing.assert_allclose(curves(found["pitch [deg]"])["flight"].y, np.degrees(plant.state[:, INDEX["pitch"]]))
+    np.testing.assert_array_equal(curves(found["z [m]"])["reference, filtered"].y, control.reference[:, 2])
+    assert [(bound.value, bound.start, bound.stop) for bound in found["roll [deg]"].bounds] == [
+        (-5.0, 0.0, short_run.end),
+        (5.0, 0.0, short_run.end),
+    ]
+    late = dataclasses.replace(short_run, limits=(Limit(name="late", signal="roll", upper=5.0, start=100.0),))
+    assert panels(states([late]))["roll [deg]"].bounds == (), "it begins after the flight"
+
+
+def test_inputs_are_the_commands_of_each_rotor(short_run: Run) -> None:
+    speeds = short_run.log.control.speeds
+    alone = curves(panels(inputs([short_run]))["rotor speed [rad/s]"])
+    np.testing.assert_array_equal(alone["rotor 3"].y, speeds[:, 2])
+    overlaid = panels(inputs([short_run, named(short_run, "other")]))["rotor speed, rotor 3 [rad/s]"]
+    assert {label: series.group for label, series in curves(overlaid).items()} == {
+        "paper-constrained": "run0",
+        "other": "run1",
+    }
+    np.testing.assert_array_equal(curves(overlaid)["other"].y, speeds[:, 2])
+    assert {bound.value for bound in overlaid.bounds} == {0.0, 250.0}
+
+
+def test_clock_times_stand_beside_the_deadline(short_run: Run) -> None:
+    step, solve, _, active = times([short_run]).panels
+    assert [bound.value for bound in step.bounds] == [50.0]
+    assert step.y_log
+    assert solve.bounds == ()
+    np.testing.assert_array_equal(active.series[0].y, short_run.log.control.active)
+
+
+def test_a_roll_that_wraps_is_no_line_across_the_panel(short_run: Run) -> None:
+    state = short_run.log.plant.state.copy()
+    state[:, INDEX["roll"]] = (4.0 * short_run.log.plant.t + np.pi) % (2.0 * np.pi) - np.pi
+    log = dataclasses.replace(short_run.log, plant=dataclasses.replace(short_run.log.plant, state=state))
+    values = curves(panels(states([dataclasses.replace(short_run, log=log)]))["roll [deg]"])["flight"].y
+    assert np.nanmax(values) - np.nanmin(values) > 350.0
+    assert np.nanmax(np.abs(np.diff(values))) < 10.0
+
+
+@pytest.mark.parametrize(
+    ("effect", "expected"),
+    [
+        ("lag", [f"rotor {i} [rad/s]" for i in range(1, 5)]),
+        ("wrench", ["external force, world [N]", "external torque, body [N\u00a0m]"]),
+        ("wind", ["wind, world [m/s]"]),
+        ("state", ["error of the measured position [m]", "error of the measured attitude [deg]"]),
+    ],
+)
+def test_effects_are_drawn_where_there_are_any(short_run: Run, effect: str, expected: list[str]) -> None:
+    assert effects(short_run) == [], "an ideal flight"
+    (figure,) = effects(with_effects(short_run, **{effect: True}))
+    assert list(panels(figure)) == expected
+    assert len(draw(figure).axes) >= len(expected)
+
+
+def test_states_are_drawn_as_measured_beside_the_true_ones(short_run: Run) -> None:
+    measured = with_effects(short_run, state=True)
+    found = curves(panels(states([measured]))["roll [deg]"])
+    np.testing.assert_allclose(found["measured"].y, np.degrees(measured.log.control.state[:, INDEX["roll"]]))
+    assert "measured" not in states([short_run]).labels
+
+
+def test_an_aborted_flight_is_drawn_as_far_as_it_went(
+    short_run: Run, empty_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(flight_figures, "write_pngs", lambda figures, _: drawn.extend(figures) or [])
+    log = dataclasses.replace(short_run.log, reason="at t = 6.000 s: lost")
+    write_figures(dataclasses.replace(short_run, log=log), tmp_path)
+    assert drawn[0].title == "paper-constrained (aborted): position and attitude"
+    assert write_figures(empty_run, tmp_path) == [], "it has no control period"
+    assert page_figures([empty_run]) == []
+
+
+def test_a_comparison_names_every_run_and_shows_the_range_of_its_rotors(short_run: Run) -> None:
+    figure = overview([short_run, named(short_run, "other $x$ <b>")])
+    assert list(figure.labels) == ["reference, filtered", "paper-constrained", "other $x$ <b>"]
+    (band, _) = figure.panels[-1].bands
+    np.testing.assert_array_equal(band.high, short_run.log.control.speeds.max(axis=1))
+    assert to_png(figure, dpi=30)
+
+
+def test_a_scene_has_the_course_and_each_path(short_run: Run) -> None:
+    *_, scene = page_figures([short_run])
+    assert isinstance(scene, Scene)
+    course, flight = scene.paths
+    np.testing.assert_array_equal(course[0], short_run.log.control.reference[:, :3])
+    np.testing.assert_array_equal(flight[0][:, 2], short_run.log.plant.state[:, INDEX["z"]])
+
+
+@pytest.mark.parametrize("x_label", ["", "n"])
+def test_both_libraries_draw_the_same_numbers(x_label: str) -> None:
+    x = np.arange(4.0)
+
+    def series(y: Array, style: str) -> Series:
+        return Series(x=x, y=y, colour="#123456", label=style, style=style)  # type: ignore[arg-type]
+
+    styles = {"line": x**2, "steps": x + 1.0, "points": x - 2.0}
+    panel = Panel(
+        title="a <b>",
+        unit="m",
+        series=tuple(series(y, style) for style, y in styles.items()),
+        bounds=(Bound(value=5.0, start=1.0, stop=2.0),),
+        bands=(Band(x=x, low=-x, high=x, colour="#654321"),),
+        x_label=x_label,
+        y_range=(-3.0, 9.0),
+    )
+    figure = Figure(key="k", title="t", panels=(panel,), columns=1, end=None if x_label else 3.0)
+    (axes,) = draw(figure).axes
+    lines = {line.get_drawstyle() + line.get_linestyle(): np.asarray(line.get_ydata()) for line in axes.get_lines()}
+    assert axes.get_ylabel() == "a <b> [m]"
+    assert axes.get_ylim() == (-3.0, 9.0)
+    np.testing.assert_array_equal(lines["default-"], styles["line"])
+    np.testing.assert_array_equal(lines["steps-post-"], styles["steps"])
+    drawn = json.loads(to_plot(figure).json)
+    assert "&lt;b&gt;" in drawn["layout"]["annotations"][0]["text"]
+    assert drawn["layout"]["yaxis"]["range"] == [-3.0, 9.0]
+    assert [trace["name"] for trace in drawn["data"] if "name" in trace] == [*styles, "bound"]
+    (bound,) = (trace for trace in drawn["data"] if trace.get("name") == "bound")
+    assert (bound["x"], bound["y"], bound["line"]["color"]) == ([1.0, 2.0], [5.0, 5.0], BOUND)
+
+
+def test_rounding_is_drawn_as_a_level_line(short_run: Run) -> None:
+    plant = dataclasses.replace(short_run.log.plant, state=1e-12 * np.ones_like(short_run.log.plant.state))
+    control = dataclasses.replace(short_run.log.control, reference=np.zeros_like(short_run.log.control.reference))
+    log = dataclasses.replace(short_run.log, plant=plant, control=control)
+    figure = states([dataclasses.replace(short_run, limits=(), log=log)])
+    assert draw(figure).axes[0].get_ylim() == (-0.005, 0.005)
+    layout = json.loads(to_plot(figure).json)["layout"]
+    assert layout["yaxis"]["autorangeoptions"]["include"] == [-0.005, 0.005]
+    assert panels(states([short_run]))["z [m]"].least_range is None, "it moves"
+
+
+def test_thinning_keeps_ends_extremes_and_gaps() -> None:
+    values = np.random.default_rng(0).normal(size=10_007)
+    values[[10, 5000]] = np.nan
+    thinned = thin(values, 500)
+    assert thinned.size <= 506
+    assert np.all(np.diff(thinned) > 0)
+    assert {0, 10, 5000, 10_006, int(np.nanargmin(values)), int(np.nanargmax(values))} <= set(thinned.tolist())
+    np.testing.assert_array_equal(thin(values[:300], 300), np.arange(300))
 
 
 def test_a_place_that_cannot_be_written_is_reported(short_run: Run, tmp_path: Path) -> None:
@@ -178,46 +223,17 @@ def test_a_place_that_cannot_be_written_is_reported(short_run: Run, tmp_path: Pa
         write_figures(short_run, tmp_path / "file" / "figures")
 
 
-def standing(run: Run) -> Run:
-    """The flight as if it had stood still but for rounding, and not been held to anything."""
-    rng = np.random.default_rng(0)
-    plant = dataclasses.replace(run.log.plant, state=1e-12 * rng.normal(size=run.log.plant.state.shape))
-    control = dataclasses.replace(run.log.control, reference=np.zeros_like(run.log.control.reference))
-    return dataclasses.replace(run, limits=(), log=dataclasses.replace(run.log, plant=plant, control=control))
+def test_a_run_among_obstacles_is_drawn_from_above_with_its_clearances(short_run: Run) -> None:
+    pillar = Cylinder(name="pillar", position=(1.0, 0.0, 1.0), radius=0.1, height=3.0)
+    limit = SpaceLimit(name="pillar", shape=pillar, radius=0.2)
+    (figure,) = flight_figures.space(dataclasses.replace(short_run, limits=(limit,)))
+    above, clearance = figure.panels
+    np.testing.assert_allclose(np.hypot(*(above.areas[0].outline - [1.0, 0.0]).T), 0.1)
+    assert [bound.value for bound in clearance.bounds] == [0.0]
+    assert to_plot(figure).json.count('"toself"') == 1
+    assert to_png(figure, dpi=30)
 
 
-@pytest.mark.usefixtures("sketched")
-def test_rounding_is_drawn_as_a_level_line(short_run: Run, tmp_path: Path) -> None:
-    found = texts(states_svg(standing(short_run), tmp_path))
-    assert {"0.004", "0.04"} <= found, "metres and degrees"
-    assert not any(text.startswith("1e") for text in found)
-
-
-def test_a_roll_that_wraps_is_no_line_across_the_panel(short_run: Run) -> None:
-    state = short_run.log.plant.state.copy()
-    state[:, INDEX["roll"]] = (4.0 * short_run.log.plant.t + np.pi) % (2.0 * np.pi) - np.pi
-    log = dataclasses.replace(short_run.log, plant=dataclasses.replace(short_run.log.plant, state=state))
-    drawn = flight_figures._draw_states(dataclasses.replace(short_run, log=log))
-    (roll,) = (axes for axes in drawn.axes if axes.get_ylabel() == "roll [deg]")
-    values = np.asarray(roll.get_lines()[0].get_ydata())
-    assert np.nanmax(values) - np.nanmin(values) > 350.0
-    assert np.nanmax(np.abs(np.diff(values))) < 10.0
-
-
-@pytest.mark.usefixtures("sketched")
-def test_states_are_drawn_as_measured_beside_the_true_ones(
-    short_run: Run, figures: dict[str, Path], tmp_path: Path
-) -> None:
-    assert "measured" not in texts(figures["figure4_states.svg"])
-    states = states_svg(with_effects(short_run, state=True), tmp_path)
-    assert {"flight", "measured"} <= texts(states)
-    drawn = lines_of_colour(states, line_colour(1))
-    assert drawn - lines_of_colour(figures["figure4_states.svg"], line_colour(1)) == 6 + 1, "six panels and the legend"
-
-
-def test_each_panel_of_effects_has_a_legend_of_its_own(short_run: Run) -> None:
-    figure = draw_effects(with_effects(short_run, wind=True, state=True))
-    legends = {axes.get_ylabel().split()[0]: axes.get_legend() for axes in figure.axes}
-    named = {what: [text.get_text() for text in legend.get_texts()] for what, legend in legends.items() if legend}
-    assert named == {"wind,": ["x", "y", "z"], "position": ["x", "y", "z"], "attitude": ["roll", "pitch", "yaw"]}
-    assert not figure.legends
+def test_every_signal_can_be_drawn(short_run: Run) -> None:
+    figure = flight_figures.signals(short_run, list(SIGNALS))
+    assert [panel.unit for panel in figure.panels] == [signal.unit for signal in SIGNALS.values()]

@@ -159,7 +159,6 @@ def test_two_campaigns_are_compared_flight_by_flight(
         (["replay", "little.toml"], "is not a campaign"),
         (["compare", "{flown}/first", "--out", "pairs"], "compare takes two campaigns, each by itself, not 1"),
         (["compare", "{flown}/first", "hover", "--out", "pairs"], "hover: is not a campaign"),
-        (["compare", "{flown}/first", "{flown}/second", "--cost", "--out", "pairs"], "--cost must be absent"),
         (["replay", "{flown}/first", "--flight", "6"], "--flight must be one of the flights 0 to 5"),
     ],
 )

@@ -261,7 +261,7 @@ def test_a_width_that_is_no_share_is_refused(plan: Plan, tmp_path: Path, width: 
     assert not (tmp_path / "c").exists()
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     result = fly_campaign(plan, tmp_path / "c", Alone(), report=True)
     manifest = read_manifest(result.directory)
@@ -381,7 +381,7 @@ def test_files_of_the_user_are_not_written_over(tmp_path: Path) -> None:
     assert path.read_text() == before
 
 
-@pytest.mark.usefixtures("sketched")
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_of_fewer_flights_goes(plan: Plan, tmp_path: Path) -> None:
     fly_campaign(plan, tmp_path / "c", Alone(), report=True)
     fly_campaign(make_plan(tmp_path, flights=14), tmp_path / "c", Alone(), resume=True)

@@ -383,8 +383,8 @@ def test_the_summary_reports_what_the_flight_met(short_run: Run) -> None:
     summary = {**short_run.summary, "expected": "lost", "as_expected": False}
     summary["course"] = {"sentence": "The course requires nothing."}
     text = texts._summary(dataclasses.replace(short_run, summary=summary))
-    assert "its scenario states the verdict lost." in text
-    assert "paper-constrained: the course requires nothing." in text
+    assert "Verdict: incomplete, expected: lost." in text
+    assert "The course requires nothing." in text
     yaw = math.degrees(short_run.summary["tracking"]["rmse"]["yaw"])
     assert f"yaw {yaw:.3g} deg" in text
 

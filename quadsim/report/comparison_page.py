@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 import re
+import shlex
 import shutil
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from urllib.parse import quote
 
 from quadsim.errors import OutputError, ParameterError
@@ -16,15 +16,24 @@ from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING
 from quadsim.flight.rundir import FIGURES_DIR, RECORDING_FILE, SCENARIO_FILE, SUMMARY_FILE, VIDEO_FILE, Run
 from quadsim.flight.summary import require_inside
 from quadsim.outputs import writing
-from quadsim.report.comparison import comparison_rows, mismatch, outcome, required, run_names, verdict_cell
-from quadsim.report.figures.flight_figures import comparison_figure
-from quadsim.report.narrative import comparison_sentences
-from quadsim.report.pages.page import PAGE_FILE, render_page
+from quadsim.report.comparison import (
+    comparison_rows,
+    distinct_courses,
+    mismatch,
+    outcome,
+    required,
+    run_names,
+    verdict_cell,
+)
+from quadsim.report.figure import Scene
+from quadsim.report.flight_figures import overview, page_figures
+from quadsim.report.page import PAGE_FILE, RunView, Section, render_page
 from quadsim.report.palette import line_colour
-from quadsim.report.plots.flight_plots import comparison_plots
-from quadsim.report.plots.panels import Plot, plotly_script
-from quadsim.report.table import Grid, to_markdown
+from quadsim.report.table import to_markdown
+from quadsim.report.to_matplotlib import write_pngs
+from quadsim.report.to_plotly import Plot, scene_to_plot, to_plot
 
+OVERVIEW_FILE: Final = "comparison.png"
 TABLE_FILE: Final = "comparison.md"
 
 _FILES: Final = {
@@ -39,33 +48,15 @@ _FILES: Final = {
 """What is copied of a run directory beside its video and figures, and how links name it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CostSection:
-    """What the page shows of a study of what constraints cost; the targets of `files` are relative URLs."""
-
-    name: str
-    sentences: tuple[str, ...]
-    tables: tuple[Grid, ...]
-    plots: tuple[Plot, ...]
-    files: tuple[tuple[str, str], ...]
-
-
-def write_comparison(
-    runs: Sequence[Run],
-    directory: Path,
-    cost: Callable[[Path], CostSection] | None = None,
-    *,
-    overwrite: bool = False,
-) -> Path:
+def write_comparison(runs: Sequence[Run], directory: Path, *, overwrite: bool = False) -> Path:
     """Write a comparison of runs, which appears complete or not at all.
 
-    The directory holds `index.html`, the overlay `comparison.png` and `.svg`, the table `comparison.md`, and of each
-    run its video `NAME.mp4` and a folder `NAME` of its other files; it can be moved or zipped as it is.
+    The directory holds `index.html`, the overlay `comparison.png`, the table `comparison.md`, and of each run its video
+    `NAME.mp4` and a folder `NAME` of its other files; it can be moved or zipped as it is.
 
     Args:
         runs: one or more; aborted ones, and ones without video, recording or constraints, are welcome.
         directory: what to write.
-        cost: writes the files of a study of what constraints cost into a directory, and gives the page's section.
         overwrite: whether to replace an earlier output there.
 
     Returns:
@@ -83,31 +74,30 @@ def write_comparison(
         require_inside(run.directory)  # copying follows links
         if run.directory.resolve().is_relative_to(target):
             raise OutputError(directory, f"it holds the run {run.directory}, which must stay; choose another --out")
-    names = run_names(runs)
-    rows = comparison_rows(runs)
+    names, rows = run_names(runs), comparison_rows(runs)
     with writing(directory, overwrite=overwrite) as partial:
-        comparison_figure(runs, partial)
+        write_pngs([overview(runs)], partial)
         (partial / TABLE_FILE).write_text(to_markdown(rows, names), encoding="utf-8")
         views = [
             _place(run, name, folder, line_colour(i), partial)
             for i, (run, name, folder) in enumerate(zip(runs, names, _folder_names(names), strict=True))
         ]
-        plots = comparison_plots(runs)
-        page = render_page(
-            "comparison.html.j2",
-            "comparison",
-            title=" and ".join(names) if len(names) < 3 else f"{len(names)} runs: {', '.join(names)}",
-            runs=views,
-            sentences=comparison_sentences(runs),
-            groups=[(group, list(of_group)) for group, of_group in itertools.groupby(rows, lambda row: row.group)],
-            plots=plots,
-            cost=None if cost is None else cost(partial),
-            plotly=plotly_script() if plots or cost is not None else "",
-            figure="comparison.svg",
-            table=TABLE_FILE,
-        )
+        courses = len(distinct_courses(runs))
+        warning = f"The runs follow {courses} different courses, so their errors are not like for like."
+        plots = Section(title="Plots", plots=tuple(_plots(runs)), text=(warning,) if courses > 1 else ())
+        title = " and ".join(names) if len(names) < 3 else f"{len(names)} runs: {', '.join(names)}"
+        files = {"overlay of all runs (PNG)": OVERVIEW_FILE, "table (Markdown)": TABLE_FILE}
+        page = render_page("comparison", title, [plots], runs=views, rows=rows, files=files)
         (partial / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
+
+
+def _plots(runs: Sequence[Run]) -> Iterator[Plot]:
+    for figure in page_figures(runs):
+        if isinstance(figure, Scene):
+            yield scene_to_plot(figure)
+        else:
+            yield to_plot(figure, labelled=len(runs) == 1)
 
 
 def _folder_names(names: Sequence[str]) -> list[str]:
@@ -120,38 +110,34 @@ def _folder_names(names: Sequence[str]) -> list[str]:
     return folders
 
 
-def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) -> dict[str, Any]:
-    """Copy what a run has to offer beside the page; the template's context of the run, with relative URLs."""
+def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) -> RunView:
+    """Copy what a run has to offer beside the page."""
     place = page_directory / folder
     place.mkdir()
-    files = []
+    files = {}
     for file, label in _FILES.items():
         if (run.directory / file).is_file():
             shutil.copyfile(run.directory / file, place / file)
-            files.append((label, quote(f"{folder}/{file}")))
+            files[label] = quote(f"{folder}/{file}")
     if (run.directory / FIGURES_DIR).is_dir():
         shutil.copytree(run.directory / FIGURES_DIR, place / FIGURES_DIR)
-        figures = sorted((place / FIGURES_DIR).glob("*.svg"))
-        files += [(f"figure: {path.stem}", quote(path.relative_to(page_directory).as_posix())) for path in figures]
-    video = None
-    if (run.directory / VIDEO_FILE).is_file():
-        video = f"{folder}.mp4"
-        shutil.copyfile(run.directory / VIDEO_FILE, page_directory / video)
-    return {
-        "name": name,
-        "colour": colour,
-        "directory": run.directory,
-        "description": run.summary.get("description", ""),
-        "outcome": outcome(run.summary),
-        "required": required(run.summary),
-        "verdict": verdict_cell(run.summary),
-        "vehicle": ", modelled with ".join(
-            [f"Vehicle: {run.vehicle.description or run.vehicle.name}, {run.vehicle.mass:g} kg", *mismatch(run.summary)]
-        ),
-        "made_with": _made_with(run),
-        "video": None if video is None else quote(video),
-        "files": files,
-    }
+        for path in sorted((place / FIGURES_DIR).glob("*.png")):
+            files[f"figure: {path.stem}"] = quote(path.relative_to(page_directory).as_posix())
+    has_video = (run.directory / VIDEO_FILE).is_file()
+    if has_video:
+        shutil.copyfile(run.directory / VIDEO_FILE, page_directory / f"{folder}.mp4")
+    summary = run.summary
+    vehicle = f"Vehicle: {run.vehicle.description or run.vehicle.name}, {run.vehicle.mass:g} kg"
+    return RunView(
+        name=name,
+        colour=colour,
+        description=summary.get("description", ""),
+        cells={"flight": outcome(summary), "required constraints": required(summary), "verdict": verdict_cell(summary)},
+        facts=(", modelled with ".join([vehicle, *mismatch(summary)]), _made_with(run)),
+        video=quote(f"{folder}.mp4") if has_video else None,
+        video_command=f"quadsim video {shlex.quote(str(run.directory))}",
+        files=files,
+    )
 
 
 def _made_with(run: Run) -> str:

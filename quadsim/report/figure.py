@@ -1,0 +1,161 @@
+"""A figure as plain data: panels of curves, bounds, bands and areas.
+
+`quadsim.report.to_matplotlib` draws it for files and notebooks, `quadsim.report.to_plotly` for pages.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from quadsim.report.curves import least_range
+from quadsim.state import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """Values y over x, both (K,); NaN is a gap.
+
+    Attributes:
+        style: a line; steps, each held until the next x; points; or bars of one width, centred on x.
+        label: entry in the legend; series of the same label share one entry.
+        group: what a toggle of the page switches, e.g. `run0`.
+        width: of a line, or diameter of a marker [pt].
+        marker: a symbol by plotly's name.
+        base: (K,) where bars begin, for stacked ones.
+        flights: (K,) number of the flight behind each point, which a page shows on hover.
+    """
+
+    x: Array
+    y: Array
+    colour: str
+    style: Literal["line", "steps", "points", "bars"] = "line"
+    label: str = ""
+    group: str = ""
+    dashed: bool = False
+    width: float = 1.3
+    marker: str = "circle"
+    opacity: float = 1.0
+    base: Array | None = None
+    flights: Array | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bound:
+    """A bound at a value of y, from `start` to `stop` on the x axis; a vertical one is at a value of x, throughout."""
+
+    value: float
+    start: float = -np.inf
+    stop: float = np.inf
+    vertical: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Band:
+    """What lies between `low` and `high`, (K,) over x (K,)."""
+
+    x: Array
+    low: Array
+    high: Array
+    colour: str
+    label: str = ""
+    group: str = ""
+    opacity: float = 0.25
+
+
+@dataclass(frozen=True, kw_only=True)
+class Area:
+    """A filled outline (n, 2)."""
+
+    outline: Array
+    colour: str
+    label: str = ""
+    opacity: float = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Panel:
+    """Axes with what is drawn in them.
+
+    Attributes:
+        title: what y is; beside the axis, or above the panel where `x_label` names its own horizontal axis.
+        unit: of y; an axis of a known unit has a least span, below which there is only rounding.
+        x_range, y_range: ends of the axes; None fits them to what is drawn.
+        x_names, y_names: names of 0, 1, ... on an axis, in place of numbers.
+        equal: whether both axes have one scale.
+        whole: whether y counts things.
+        legend: whether the labels are explained in the panel, not in the legend of all panels.
+        height: of its row, relative to others.
+    """
+
+    title: str
+    unit: str = ""
+    series: tuple[Series, ...] = ()
+    bounds: tuple[Bound, ...] = ()
+    bands: tuple[Band, ...] = ()
+    areas: tuple[Area, ...] = ()
+    x_label: str = ""
+    y_label: str = ""
+    x_log: bool = False
+    y_log: bool = False
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
+    x_names: tuple[str, ...] = ()
+    y_names: tuple[str, ...] = ()
+    equal: bool = False
+    whole: bool = False
+    legend: bool = False
+    height: float = 1.0
+
+    @property
+    def heading(self) -> str:
+        """Title and unit."""
+        unit = self.unit.replace(" ", "\u00a0")  # no line ends within it
+        return f"{self.title} [{unit}]" if unit else self.title
+
+    @property
+    def least_range(self) -> tuple[float, float] | None:
+        """Ends of y that curves and bounds which all stand still need; None where the axis fits itself."""
+        curves = [series.y for series in self.series] + [np.array([bound.value]) for bound in self.bounds]
+        return least_range([*curves, *(edge for band in self.bands for edge in (band.low, band.high))], self.unit)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Figure:
+    """Panels, row by row.
+
+    Attributes:
+        key: name of its file, and its identifier in a page.
+        end: last instant of a horizontal axis of time that all panels without an `x_label` share [s]; None without one.
+    """
+
+    key: str
+    title: str
+    panels: tuple[Panel, ...]
+    columns: int = 2
+    end: float | None = None
+
+    @property
+    def labels(self) -> dict[str, str]:
+        """The colour of each label, in order."""
+        drawn: list[Series | Band | Area] = []
+        for panel in self.panels:
+            drawn += [*panel.areas, *panel.bands, *panel.series]
+        return {item.label: item.colour for item in drawn if item.label}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Paths and solids in space, which pages show.
+
+    Attributes:
+        paths: lines (K, 3) [m] with label, colour, group and whether they are dashed; NaN is a gap.
+        solids: points (K, 3) [m] whose convex hull is a solid, with its name.
+    """
+
+    key: str
+    title: str
+    paths: tuple[tuple[Array, str, str, str, bool], ...]
+    solids: tuple[tuple[Array, str], ...] = ()

@@ -1,0 +1,291 @@
+"""Flights -> their figures: one flight in the colours of its rotors and parts, several overlaid in a colour each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.flight.audit import SIGNALS, SpaceLimit
+from quadsim.flight.rundir import Run
+from quadsim.report.comparison import distinct_courses, run_names
+from quadsim.report.curves import bounds_of, break_at_wraps, commanded_speeds, effect_curves, reference_curve
+from quadsim.report.figure import Area, Band, Bound, Figure, Panel, Scene, Series
+from quadsim.report.palette import BOUND, OBSTACLE, REFERENCE, line_colour
+from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
+from quadsim.report.to_matplotlib import write_pngs
+from quadsim.state import POSITION, REFERENCE_NAMES, STATE_NAMES, Array
+from quadsim.vehicle import N_ROTORS
+
+PAPER_FIGURES: Final = {
+    "paper-unconstrained": ("figure2_", "figure3_"),
+    "paper-constrained": ("figure4_", "figure5_"),
+}
+"""Before the keys of the figures of states and of inputs, by scenario: their numbers in the paper."""
+_REFERENCE: Final[dict[str, Any]] = {"colour": REFERENCE, "label": "reference, filtered", "dashed": True, "width": 1.1}
+_NEAR: Final = 3.0  # clearance [m] below which a moving obstacle is drawn, and up to which curves are shown
+_EVERY: Final = 0.25  # how often it is drawn [s]
+_MOST_NAMED: Final = 9  # obstacles and regions of which each is named in the legend
+_DIRECTIONS: Final = 300  # in which the points of a solid are taken whose hull is drawn
+
+
+def write_figures(run: Run, directory: Path) -> list[Path]:
+    """Write the figures of one run as PNG; none where no control period was flown.
+
+    The two scenarios of the paper carry its figure numbers in their file names, e.g. `figure4_states.png`.
+
+    Raises:
+        OutputError: the directory cannot be written.
+    """
+    if not run.log.control.t.size:
+        return []
+    prefixes = dict(zip(("states", "inputs"), PAPER_FIGURES.get(run.name, ("", "")), strict=True))
+    ended = "" if run.log.reason is None else " (aborted)"
+    figures = [states([run]), inputs([run]), times([run]), *effects(run), *space(run)]
+    return write_pngs(
+        (
+            replace(each, key=prefixes.get(each.key, "") + each.key, title=f"{run.name}{ended}: {each.title}")
+            for each in figures
+        ),
+        directory,
+    )
+
+
+def page_figures(runs: Sequence[Run]) -> list[Figure | Scene]:
+    """What a page shows of runs that flew at least one control period; nothing without such a run."""
+    flown = [run for run in runs if run.log.control.t.size]
+    if not flown:
+        return []
+    found: list[Figure | Scene] = [states(runs), inputs(runs), times(runs)]
+    if len(runs) == 1:
+        found += [*effects(runs[0]), *space(runs[0])]
+    return [*found, path(runs)]
+
+
+def overview(runs: Sequence[Run]) -> Figure:
+    """Position, roll and pitch of runs, and between which speeds their rotors turned."""
+    names = ("x", "roll", "y", "pitch", "z")
+    speeds = tuple(
+        Band(
+            x=run.log.control.t,
+            low=run.log.control.speeds.min(axis=1),
+            high=run.log.control.speeds.max(axis=1),
+            colour=line_colour(i),
+            label=name,
+            opacity=0.6,
+        )
+        for i, name, run in _flown(runs)
+    )
+    rotors = Panel(title="lowest to highest rotor speed", unit="rad/s", bands=speeds, bounds=_bounds(runs, "speed"))
+    return _timed("comparison", "", (*(_signal(runs, name) for name in names), rotors), runs)
+
+
+def signals(run: Run, names: Sequence[str]) -> Figure:
+    """Signals of the audit over time, a panel each."""
+    return _timed("signals", "", tuple(_signal([run], name) for name in names), [run], columns=1)
+
+
+def states(runs: Sequence[Run]) -> Figure:
+    """Position and attitude; tilt and quaternion too where an attitude may turn upside down."""
+    plants = [run.log.plant for run in runs]
+    if all(plant.attitude is None for plant in plants):
+        panels = [_signal(runs, name) for name in ("x", "roll", "y", "pitch", "z", "yaw")]
+    elif len(runs) > 1:
+        panels = [_signal(runs, name) for name in ("x", "tilt", "y", "roll", "z", "pitch", "yaw")]
+    else:
+        t, attitude, rates = plants[0].t, plants[0].attitude, plants[0].body_rates
+        assert attitude is not None
+        assert rates is not None
+        more = (
+            _several("quaternion", "", t, attitude, "wxyz"),
+            _several("body rates", "deg/s", t, np.degrees(rates), "xyz"),
+        )
+        panels = [_signal(runs, name) for name in ("x", "tilt", "y", "z")]
+        panels = [*panels[:3], more[0], panels[3], more[1]]
+    return _timed("states", "position and attitude", tuple(panels), runs)
+
+
+def inputs(runs: Sequence[Run]) -> Figure:
+    """Rotor speeds and their steps: all rotors of one run in one panel; of several runs, a panel for each rotor."""
+    titles = {"speed": "rotor speed", "slew": "step per period"}
+    if len(runs) == 1:
+        panels = [replace(_signal(runs, name), title=title, height=1.3) for name, title in titles.items()]
+        return _timed("inputs", "rotor speeds and their steps", tuple(panels), runs, columns=1)
+    panels = []
+    for rotor in range(N_ROTORS):
+        for name, title in titles.items():
+            curves = tuple(
+                _of_run(i, label, run.log.control.t, SIGNALS[name].sampled(run.log.control)[:, rotor], style="steps")
+                for i, label, run in _flown(runs)
+            )
+            title = f"{title}, rotor {rotor + 1}"
+            panels.append(Panel(title=title, unit="rad/s", series=curves, bounds=_bounds(runs, name)))
+    return _timed("inputs", "rotor speeds and their steps", tuple(panels), runs)
+
+
+def times(runs: Sequence[Run]) -> Figure:
+    """Clock times against the deadline, iterations and active constraints."""
+    panels = []
+    for what, key in (("whole step", "step_ms"), ("optimum alone", "solve_ms")):
+        curves, title = [], what
+        for i, label, run in _flown(runs):
+            values = getattr(run.log.timing, key)
+            # a clock may read 0, which has no place on a logarithmic axis
+            shown = np.where(values > 0.0, values, np.nan)
+            curves.append(_of_run(i, label, run.log.timing.t, shown, style="points", width=2.0))
+            if len(runs) == 1:
+                p50, p99 = np.percentile(values, [50, 99])
+                title = f"{what}: median {p50:.3g}, p99 {p99:.3g}, max {values.max():.3g}"
+        deadlines = (
+            {float(run.summary["controller"]["deadline_ms"]) for _, _, run in _flown(runs)} if key == "step_ms" else ()
+        )
+        bounds = tuple(Bound(value=deadline, start=0.0, stop=_end(runs)) for deadline in sorted(deadlines))
+        panels.append(Panel(title=title, y_label="time [ms]", y_log=True, series=tuple(curves), bounds=bounds))
+    for title, key in (("iterations, of whoever answered", "iterations"), ("active constraints", "active")):
+        counts = tuple(
+            _of_run(i, label, run.log.control.t, getattr(run.log.control, key).astype(float), style="steps")
+            for i, label, run in _flown(runs)
+        )
+        panels.append(Panel(title=title, y_label="count", series=counts, whole=True))
+    return _timed("solve_times", "time to compute a command", tuple(panels), runs)
+
+
+def effects(run: Run) -> list[Figure]:
+    """Commanded and acting rotor speeds, forces, torques, wind, errors of the measured state: those that there are."""
+    plant, control = run.log.plant, run.log.control
+    commanded = commanded_speeds(run.log)
+    panels = (
+        [] if commanded is None else [_acting(rotor, plant.t, commanded, plant.speeds) for rotor in range(N_ROTORS)]
+    )
+    panels += [_several(each.title, each.unit, plant.t, each.values, "xyz") for each in effect_curves(run.log)]
+    if not control.measured_perfectly:
+        for what, names in {"position": ("x", "y", "z"), "attitude": ("roll", "pitch", "yaw")}.items():
+            errors = [SIGNALS[f"{name}_estimate_error"] for name in names]
+            values = np.stack([error.sampled(control) for error in errors], axis=1)
+            panels.append(_several(f"error of the measured {what}", errors[0].unit, control.t, values, names))
+    return [_timed("effects", "effects", tuple(panels), [run])] if panels else []
+
+
+def space(run: Run) -> list[Figure]:
+    """A flight among obstacles and regions from above, and how far it stays clear of each; none without any."""
+    if not has_space(run.limits):
+        return []
+    limits = [limit for limit in run.limits if isinstance(limit, SpaceLimit)]
+    clearances = {limit.name: limit.source.finest(run.log) for limit in limits}
+    areas = []
+    for obstacle in obstacles_in(run.limits):
+        t, values = clearances[obstacle.name]
+        near = t[values < _NEAR]
+        for instant in np.arange(near[0], near[-1], _EVERY) if obstacle.moves and near.size else [0.0]:
+            for outline, _ in outlines(obstacle, instant, 0.0, np.inf):
+                opacity = 0.3 if obstacle.moves else 0.55
+                areas.append(Area(outline=outline, colour=OBSTACLE, opacity=opacity, label="obstacle"))
+    regions = [
+        Series(x=edge[:, 0], y=edge[:, 1], colour=BOUND, label="region", dashed=True, width=0.9)
+        for _, edges in region_edges(run)
+        for edge in edges
+    ]
+    course, position = run.log.control.reference, run.log.plant.state[:, POSITION]
+    lines = [
+        Series(x=course[:, 0], y=course[:, 1], **_REFERENCE),
+        Series(x=position[:, 0], y=position[:, 1], colour=line_colour(0), label="flight"),
+    ]
+    above = Panel(title="from above", x_label="x [m]", y_label="y [m]", equal=True, height=2.0,
+                  areas=tuple(areas), series=(*regions, *lines))  # fmt: skip
+    curves = []
+    for i, limit in enumerate(limits):
+        t, values = clearances[limit.name]
+        shown = np.where(limit.holds_at(t), values, np.nan)
+        label = limit.name if len(limits) <= _MOST_NAMED else ""
+        curves.append(Series(x=t, y=shown, colour=line_colour(i), label=label, width=1.0))
+    drawn = np.concatenate([curve.y[np.isfinite(curve.y)] for curve in curves])
+    low, high = (float(drawn.min()), float(drawn.max())) if drawn.size else (0.0, 0.0)
+    ends = (min(0.0, low) - 0.1, min(high, _NEAR) + 0.1)
+    clear = Panel(title="clearance", unit="m", series=tuple(curves), bounds=(Bound(value=0.0),), y_range=ends,
+                  legend=True, height=1.5)  # fmt: skip
+    return [_timed("space", "from above, and clearances", (above, clear), [run], columns=1)]
+
+
+def path(runs: Sequence[Run]) -> Scene:
+    """Flights and their courses in space, among obstacles where they are at first, and the edges of regions."""
+    solids, paths = [], []
+    directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+    for limits in dict.fromkeys(run.limits for run in runs if has_space(run.limits)):
+        for obstacle in obstacles_in(limits):
+            for solid in obstacle.solids:
+                corners = np.unique(solid.support(directions).round(4), axis=0)
+                solids.append((corners + obstacle.position, obstacle.name))
+        for limit, edges in region_edges(next(run for run in runs if run.limits == limits)):
+            lines = np.insert(edges, 2, np.nan, axis=1).reshape(-1, 3)
+            paths.append((lines, limit.name, BOUND, "", True))
+    for run in distinct_courses(runs):
+        paths.append((run.log.control.reference[:, :3], "reference", REFERENCE, "", True))
+    for i, label, run in _flown(runs):
+        paths.append((run.log.plant.state[:, POSITION], label, line_colour(i), f"run{i}", False))
+    return Scene(key="path", title="path in space", paths=tuple(paths), solids=tuple(solids))
+
+
+def _signal(runs: Sequence[Run], name: str) -> Panel:
+    """A signal of the audit with references and bounds, and of a run alone the state as measured where that differs."""
+    signal, curves = SIGNALS[name], []
+    for run in distinct_courses(runs) if name in REFERENCE_NAMES else ():
+        curves.append(Series(x=run.log.control.t, y=reference_curve(run.log.control, name), **_REFERENCE))
+    for i, label, run in _flown(runs):
+        control = run.log.control
+        sampled = signal.sampled(control)
+        if len(runs) == 1 and name in STATE_NAMES and not control.measured_perfectly:
+            t, values = break_at_wraps(control.t, signal.sampled(replace(control, truth=control.state)), signal.unit)
+            curves.append(Series(x=t, y=values, colour=line_colour(1), label="measured", width=0.7))
+        if sampled.ndim == 1 and signal.plant is not None:
+            curves.append(_of_run(i, label, *break_at_wraps(run.log.plant.t, signal.plant(run.log.plant), signal.unit)))
+            continue
+        for j, values in enumerate(np.atleast_2d(sampled.T)):
+            curve = _of_run(i, label, control.t, values, style="steps")
+            if sampled.ndim == 2:  # where rotors turn alike, each is seen beneath the next
+                curve = replace(curve, colour=line_colour(j), label=f"rotor {j + 1}", width=2.2 - 0.5 * j)
+            curves.append(curve)
+    return Panel(title=name, unit=signal.unit, series=tuple(curves), bounds=_bounds(runs, name))
+
+
+def _of_run(i: int, label: str, x: Array, y: Array, **looks: Any) -> Series:
+    return Series(x=x, y=y, colour=line_colour(i), label=label, group=f"run{i}", **looks)
+
+
+def _several(title: str, unit: str, t: Array, values: Array, names: Sequence[str]) -> Panel:
+    """Curves (M, n) in one panel with a legend of its own."""
+    first = 4 - len(names)  # x, y and z look alike with and without w
+    curves = [
+        Series(x=t, y=column, colour=line_colour(first + i), label=name, width=1.0)
+        for i, (name, column) in enumerate(zip(names, values.T, strict=True))
+    ]
+    return Panel(title=title, unit=unit, series=tuple(curves), legend=True)
+
+
+def _acting(rotor: int, t: Array, commanded: Array, speeds: Array) -> Panel:
+    """The commanded and the acting speed of a rotor."""
+    command = Series(x=t, y=commanded[:, rotor], colour=REFERENCE, label="commanded", style="steps", width=1.0)
+    acting = Series(x=t, y=speeds[:, rotor], colour=line_colour(0), label="acting", width=1.0)
+    return Panel(title=f"rotor {rotor + 1}", unit="rad/s", series=(command, acting))
+
+
+def _bounds(runs: Sequence[Run], signal: str) -> tuple[Bound, ...]:
+    limits = [limit for run in runs for limit in run.limits]
+    found = bounds_of(limits, signal, _end(runs))
+    return tuple(Bound(value=value, start=start, stop=stop) for value, start, stop in found)
+
+
+def _end(runs: Sequence[Run]) -> float:
+    return max(run.end for run in runs)
+
+
+def _flown(runs: Sequence[Run]) -> Iterator[tuple[int, str, Run]]:
+    """Number, name and run of those that flew a period; a run alone is `flight`."""
+    names = ("flight",) if len(runs) == 1 else run_names(runs)
+    return ((i, name, run) for i, (name, run) in enumerate(zip(names, runs, strict=True)) if run.log.control.t.size)
+
+
+def _timed(key: str, title: str, panels: tuple[Panel, ...], runs: Sequence[Run], columns: int = 2) -> Figure:
+    return Figure(key=key, title=title, panels=panels, columns=columns, end=_end(runs))

@@ -1,0 +1,100 @@
+"""Pages that open without a network, all from one template: of flights, campaigns, comparisons and tunings."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from quadsim.errors import printable
+from quadsim.report.table import Cell, Grid, Row
+from quadsim.report.to_plotly import Plot, plotly_script
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+PAGE_FILE: Final = "index.html"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A heading with text, plots and tables beneath it, in this order; one with none of them is left out."""
+
+    title: str
+    text: tuple[str, ...] = ()  # a paragraph each
+    plots: tuple[Plot, ...] = ()
+    tables: tuple[Grid, ...] = ()  # one without lines is left out
+    folded: tuple[Grid, ...] = ()  # likewise; shown on demand
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunView:
+    """A run as a page shows it; URLs are relative to the page."""
+
+    name: str
+    colour: str
+    description: str
+    cells: Mapping[str, Cell]  # outcome and verdicts, by what they are
+    facts: tuple[str, ...]  # vehicle, versions and machine
+    video: str | None  # URL; None without one
+    video_command: str  # makes the video
+    files: Mapping[str, str]  # URL of each, by its label
+
+
+def render_page(
+    kind: str,
+    title: str,
+    sections: Sequence[Section],
+    *,
+    description: str = "",
+    verdict: Cell | None = None,
+    runs: Sequence[RunView] = (),
+    rows: Sequence[Row] = (),
+    files: Mapping[str, str] | None = None,
+) -> str:
+    """A page of a kind, e.g. `campaign`.
+
+    Args:
+        kind: what it is of.
+        title: its heading.
+        sections: what it shows.
+        description: a sentence below the title.
+        verdict: the answer in one line.
+        runs: flights side by side, each with a card, a video and files; plots toggle the group `run0` and so on.
+        rows: the table of these flights.
+        files: URL of each file beside the page, by its label.
+    """
+    groups = [(group, list(of_group)) for group, of_group in itertools.groupby(rows, lambda row: row.group)]
+    shown = [part for part in map(_without_empty, sections) if part.text or part.plots or part.tables or part.folded]
+    return _environment().get_template("page.html.j2").render(
+        kind=kind, title=title, sections=shown, description=description, verdict=verdict, runs=runs, groups=groups,
+        files=files or {}, plotly=plotly_script() if any(section.plots for section in shown) else "",
+    )  # fmt: skip
+
+
+def _without_empty(section: Section) -> Section:
+    tables, folded = (tuple(grid for grid in grids if grid.lines) for grids in (section.tables, section.folded))
+    return Section(title=section.title, text=section.text, plots=section.plots, tables=tables, folded=folded)
+
+
+@functools.cache  # it compiles the template once
+def _environment() -> Environment:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    return Environment(
+        loader=FileSystemLoader(Path(__file__).resolve().parent / "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_shown,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def _shown(value: Any) -> Any:
+    """Text and paths without what steers a reader's eye, or what no file can hold; markup of ours as it is."""
+    is_text = isinstance(value, str | Path) and not hasattr(value, "__html__")
+    return printable(str(value), keep="\n") if is_text else value

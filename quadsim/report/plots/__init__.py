@@ -1,1 +1,0 @@
-"""Zoomable plots for a page that works offline."""

@@ -1,0 +1,212 @@
+"""Figures as PNG and in notebooks, by matplotlib; the same numbers give the same bytes."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from quadsim.errors import OutputError
+from quadsim.report.figure import Bound, Figure, Panel, Series
+from quadsim.report.palette import BOUND
+
+if TYPE_CHECKING:
+    from matplotlib.artist import Artist
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+    from matplotlib.typing import RcKeyType
+
+DPI: Final = 160
+STYLE: Final[dict[RcKeyType, Any]] = {
+    "axes.axisbelow": True,
+    "axes.edgecolor": "#5b6067",
+    "axes.grid": True,
+    "axes.labelsize": 9.5,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 9.5,
+    "font.size": 9.0,
+    "grid.color": "#e3e5e8",
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "path.simplify_threshold": 0.2,
+    "text.parse_math": False,
+    "xtick.color": "#5b6067",
+    "xtick.labelcolor": "#1c1e21",
+    "ytick.color": "#5b6067",
+    "ytick.labelcolor": "#1c1e21",
+}
+_WIDTH, _ROW, _HEAD = 9.6, 1.95, 0.7  # of a figure, of a row of panels and of what stands above and below them [in]
+_LABEL: Final = 26  # characters beside a vertical axis
+_DASHES: Final = (0, (5, 2))
+_MARKERS: Final = {
+    **{"circle": "o", "diamond": "D", "diamond-open": "D", "circle-open": "o", "square": "s", "x": "x", "cross": "P"},
+    **{"pentagon": "p", "triangle-up": "^", "triangle-down": "v", "triangle-left": "<", "triangle-right": ">"},
+}
+
+
+def write_pngs(figures: Iterable[Figure], directory: Path) -> list[Path]:
+    """Write each figure as `KEY.png`; the files written.
+
+    Raises:
+        OutputError: the directory, one that is being made, cannot be written, or holds a file of that name.
+    """
+    paths = []
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for figure in figures:
+            paths.append(directory / f"{figure.key}.png")
+            with paths[-1].open("xb") as file:
+                file.write(to_png(figure))
+    except OSError as error:
+        raise OutputError(directory, error.strerror or str(error)) from error
+    return paths
+
+
+def to_png(figure: Figure, dpi: float | None = None) -> bytes:
+    """The figure as a PNG of so many pixels per inch, `DPI` unless told."""
+    import matplotlib
+
+    png = io.BytesIO()
+    with matplotlib.rc_context(STYLE):
+        draw(figure).savefig(png, format="png", dpi=dpi or DPI)
+    return png.getvalue()
+
+
+def draw(figure: Figure, *, interactive: bool = False) -> Canvas:
+    """The figure as matplotlib's, which notebooks and `pyplot.show` show where it is interactive."""
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE):
+        return _draw(figure, interactive=interactive)
+
+
+def _draw(figure: Figure, *, interactive: bool) -> Canvas:
+    from matplotlib.figure import Figure as Canvas
+
+    rows = [figure.panels[i : i + figure.columns] for i in range(0, len(figure.panels), figure.columns)]
+    heights = [max(panel.height for panel in row) for row in rows]
+    size = (_WIDTH, _HEAD + _ROW * sum(heights))
+    if interactive:
+        from matplotlib import pyplot
+
+        canvas = pyplot.figure(figsize=size, layout="constrained")
+    else:
+        canvas = Canvas(figsize=size, layout="constrained")
+    grid = canvas.subplots(len(rows), figure.columns, squeeze=False, height_ratios=heights)
+    shown: dict[str, Artist] = {}
+    timed: list[Axes] = []
+    for axes, panel in zip(grid.flat, figure.panels, strict=False):
+        entries = _draw_panel(axes, panel)
+        if panel.legend and entries:
+            beside = {} if _is_headed(panel) else {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
+            axes.legend(entries.values(), entries, loc="lower right", ncols=1 if _is_headed(panel) else 4,
+                        fontsize=8.0, columnspacing=1.0, handletextpad=0.4, **beside)  # fmt: skip
+        else:
+            shown |= entries
+        if not panel.x_label:
+            timed.append(axes)
+    for axes in grid.flat[len(figure.panels) :]:
+        axes.set_axis_off()
+    _share_time(timed, figure)
+    if not any(panel.y_names for panel in figure.panels):
+        canvas.align_ylabels()
+    if figure.title:
+        canvas.suptitle(figure.title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
+    if shown:
+        canvas.legend(list(shown.values()), list(shown), loc="outside lower right", ncols=6)
+    return canvas
+
+
+def _share_time(panels: list[Axes], figure: Figure) -> None:
+    """Link the axes of time, and label the lowest of each column."""
+    for axes in panels[1:]:
+        axes.sharex(panels[0])
+    for i, axes in enumerate(panels):
+        if i >= len(panels) - figure.columns:
+            axes.set_xlabel("time [s]")
+        else:
+            axes.tick_params(labelbottom=False)
+    if panels and figure.end is not None:  # a peak in the first period stands clear of the axis
+        panels[0].set_xlim(-0.008 * figure.end, figure.end or 1.0)
+
+
+def _is_headed(panel: Panel) -> bool:
+    """Whether its title stands above the panel, not beside its vertical axis."""
+    return bool(panel.y_label or panel.y_names)
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
+    """Draw a panel; the legend's entries."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+    shown: dict[str, Artist] = {}
+    for area in panel.areas:
+        shown[area.label] = axes.fill(*area.outline.T, color=area.colour, alpha=area.opacity, linewidth=0.0)[0]
+    for band in panel.bands:
+        shown[band.label] = axes.fill_between(
+            band.x, band.low, band.high, color=band.colour, alpha=band.opacity, linewidth=0.9
+        )
+    for series in panel.series:
+        shown.setdefault(series.label, _draw_series(axes, series))
+    for bound in panel.bounds:
+        shown["bound"] = _draw_bound(axes, bound)
+    if panel.x_log:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+    if panel.y_log:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+    elif panel.whole:
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+        axes.set_ylim(bottom=0.0, top=max(1.0, axes.get_ylim()[1]))
+    if panel.x_names:
+        axes.set_xticks(range(len(panel.x_names)), panel.x_names)
+    if panel.y_names:
+        axes.set_yticks(range(len(panel.y_names)), panel.y_names)
+    if panel.equal:
+        axes.set_aspect("equal", adjustable="datalim")
+    if panel.x_range:
+        axes.set_xlim(*panel.x_range)
+    if ends := panel.y_range or panel.least_range:
+        axes.set_ylim(*ends)
+    if _is_headed(panel):
+        axes.set_title(panel.heading)
+    axes.set(
+        xlabel=panel.x_label, ylabel=panel.y_label or ("" if panel.y_names else textwrap.fill(panel.heading, _LABEL))
+    )
+    shown.pop("", None)
+    return shown
+
+
+def _draw_series(axes: Axes, series: Series) -> Artist:
+    x, y = series.x, series.y
+    looks: dict[str, Any] = {"color": series.colour, "alpha": series.opacity}
+    if series.style == "bars":
+        width = float(np.diff(x).min()) if x.size > 1 else 0.8
+        bars: Artist = axes.bar(x, y, width, series.base if series.base is not None else 0.0, **looks).patches[0]
+        return bars
+    if series.style == "points":
+        looks |= {"marker": _MARKERS[series.marker], "markersize": series.width, "linestyle": "none"}
+        looks["markeredgewidth"] = 0.9 if series.marker == "x" or series.marker.endswith("-open") else 0.0
+        looks |= {"markerfacecolor": "none"} if series.marker.endswith("-open") else {}
+    else:
+        looks |= {"linewidth": series.width, "linestyle": _DASHES if series.dashed else "-"}
+        looks |= {"drawstyle": "steps-post"} if series.style == "steps" else {}
+    return axes.plot(x, y, **looks)[0]
+
+
+def _draw_bound(axes: Axes, bound: Bound) -> Artist:
+    looks: Any = {"color": BOUND, "linestyle": "--", "linewidth": 1.1}
+    if bound.vertical:
+        return axes.axvline(bound.value, **looks)
+    if not np.isfinite([bound.start, bound.stop]).all():
+        return axes.axhline(bound.value, **looks)
+    return axes.hlines(bound.value, bound.start, bound.stop, **looks)
