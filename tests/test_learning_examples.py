@@ -13,6 +13,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 import imitation
 import safety_filter
 
+import quadsim
+
 
 def test_the_gradient_is_that_of_the_mean_squared_error() -> None:
     network, rng = imitation.Network((5, 4, 3, 2)), np.random.default_rng(0)
@@ -70,8 +72,13 @@ def test_the_filter_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
     assert alone.endswith("lost; no filter")
 
 
-def test_the_count_of_violations_that_samples_miss_is_todays() -> None:
-    import make_gym
-
-    table = make_gym.markdown(make_gym.between_samples()[0])
-    assert table in make_gym.PAGE.read_text(encoding="utf-8"), "docs/gym.md is out of date: make gym"
+def test_the_teacher_labels_its_own_flight_and_the_students() -> None:
+    scenario = imitation.course(0).replace({"duration": 1.0})
+    hover = quadsim.load_vehicle("lopes2011").hover_speed
+    _, speeds = imitation.answers(scenario, hover)
+    assert np.array_equal(speeds, quadsim.fly(scenario, progress=False).command)
+    student = imitation.Student(imitation.Network((imitation.INPUTS, 4, 4)), quadsim.load_vehicle("lopes2011"))
+    seen, labels = imitation.answers(scenario, hover, student)
+    assert len(seen) == len(labels) > 1
+    assert np.array_equal(labels[0], speeds[0])
+    assert not np.array_equal(labels[1], speeds[1])
