@@ -16,7 +16,6 @@ from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import cell
 from scenarios.campaign.results.store import Store
 from scenarios.campaign.results.table import Row
-from scenarios.campaign.run import Standing, Watch
 from scenarios.campaign.spec import ChoiceSpec, IntegerSpec, LogUniformSpec, Value
 from scenarios.many import ERROR
 from scenarios.tuning.objective import Score, objective_values, score
@@ -75,9 +74,18 @@ class TuningPilot:
 
 
 class Search:
-    """The study and the flights of its candidates: trial n is candidate n, and trial 0 the start."""
+    """The study and the flights of its candidates: trial n is candidate n, and trial 0 the start.
 
-    def __init__(self, plan: TuningPlan, files: Growing, fly: Callable[..., Generator[Row]], watch: Watch) -> None:
+    Args:
+        plan: the tuning.
+        files: its directory.
+        fly: gives the rows of a pilot's flights.
+        watch: called with what `scenarios.campaign.run.Standing` has.
+    """
+
+    def __init__(
+        self, plan: TuningPlan, files: Growing, fly: Callable[..., Generator[Row]], watch: Callable[..., None]
+    ) -> None:
         optuna = require_optuna()
         self._plan, self._fly, self._watch, self._started = plan, fly, watch, clock.perf_counter()
         self._store = Store(files, plan.schema)
@@ -168,17 +176,16 @@ class Search:
                 for row in rows:
                     self._store.add(row)
                     self._rows[row["flight"]] = row
-                    self._report()
+                    self._flown += 1
+                    self._watch(
+                        flown=len(self._rows),
+                        flights=most * (1 + self._plan.spec.trials)
+                        - sum(most - s.flights for s in self.scores.values()),
+                        failed=sum(bool(row["failed"]) for row in self._rows.values()),
+                        rate=self._flown / max(clock.perf_counter() - self._started, 1e-9),
+                    )
         finally:
             self._store.flush()
-
-    def _report(self) -> None:
-        self._flown += 1
-        rate = self._flown / max(clock.perf_counter() - self._started, 1e-9)
-        failed = sum(bool(row["failed"]) for row in self._rows.values())
-        left_out = sum(self._plan.most - score.flights for score in self.scores.values())
-        flights = self._plan.most * (1 + self._plan.spec.trials) - left_out
-        self._watch(Standing(flown=len(self._rows), flights=flights, failed=failed, rate=rate))
 
     def _values(self, trial: Trial) -> Values:
         """The values of a trial as a scenario has them."""
