@@ -90,7 +90,7 @@ class Search:
         self._plan, self._fly, self._watch, self._started = plan, fly, watch, clock.perf_counter()
         self._store = Store(files, plan.schema)
         self._rows: dict[int, Row] = {row["flight"]: row for row in self._store.table().to_pylist()}
-        self._flown = 0  # now
+        self._flown = self._spared = 0  # flights: now, and those that stopped candidates left out
         self.candidates: dict[int, Values] = {START: {}}
         self.scores: dict[int, Score] = {}
         journal, file = optuna.storages.journal, str(files.path / JOURNAL_FILE)
@@ -134,6 +134,7 @@ class Search:
             before = flights
         for trial in trials:
             found = self.scores[trial.number]
+            self._spared += self._plan.most - found.flights
             trial.set_constraint("failures", found.excess)
             pruned = require_optuna().trial.TrialState.PRUNED  # where no flight has all objectives
             self.study.tell(trial, found.values or None, state=None if found.values else pruned)
@@ -179,8 +180,7 @@ class Search:
                     self._flown += 1
                     self._watch(
                         flown=len(self._rows),
-                        flights=most * (1 + self._plan.spec.trials)
-                        - sum(most - s.flights for s in self.scores.values()),
+                        flights=most * (1 + self._plan.spec.trials) - self._spared,
                         failed=sum(bool(row["failed"]) for row in self._rows.values()),
                         rate=self._flown / max(clock.perf_counter() - self._started, 1e-9),
                     )
