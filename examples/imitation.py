@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 import quadsim
 import quadsim.gym
+from quadsim.errors import FlightError
 
 Array = NDArray[np.float64]
 
@@ -130,20 +131,37 @@ class Student:
         return self.speeds(features(state, reference, now.acting, self.hover))
 
 
+def answers(
+    scenario: quadsim.Scenario, hover: float, student: Student | None = None
+) -> tuple[list[Array], list[Array]]:
+    """Features and the teacher's rotor speeds, period by period, of its own flight or of a student's."""
+    env = quadsim.gym.make_env(scenario, **OBSERVED)
+    observed, _ = env.reset()
+    seen, speeds, ended = [], [], False
+    while not ended:
+        try:
+            action = env.unwrapped.controller_action()
+        except FlightError:  # the teacher has no answer to where the student flew
+            break
+        if env.unwrapped.controller_status in ("solved", "unconstrained"):
+            seen.append(of_observation(observed, hover))
+            speeds.append(action)
+        action = action if student is None else student.speeds(of_observation(observed, hover))
+        observed, _, terminated, truncated, _ = env.step(action)
+        ended = terminated or truncated
+    env.close()
+    return seen, speeds
+
+
 def learn(*, courses: int = 12, rounds: int = 3, epochs: int = 100) -> Student:
     """A student of the paper's controller: of its own flights first, then of its labels for the student's."""
     vehicle = quadsim.load_vehicle("lopes2011")
-    student, seed = Student(Network((INPUTS, 64, 64, 4)), vehicle), 1000
+    student, hover = Student(Network((INPUTS, 64, 64, 4)), vehicle), vehicle.hover_speed
     x, y = np.empty((0, INPUTS)), np.empty((0, 4))
     for round_ in range(rounds + 1):
-        for _ in range(courses):
-            agent = None if round_ == 0 else lambda seen: student.speeds(of_observation(seen, vehicle.hover_speed))
-            table = quadsim.gym.expert(course(seed), agent=agent, **OBSERVED).to_pydict()
-            good = [i for i, status in enumerate(table["status"]) if status in ("solved", "unconstrained")]
-            seen = [of_observation(np.array(table["observation"][i]), vehicle.hover_speed) for i in good]
-            x = np.concatenate([x, seen])
-            y = np.concatenate([y, (np.array(table["action"])[good] - vehicle.hover_speed) / 10.0])
-            seed += 1
+        for i in range(courses):
+            seen, speeds = answers(course(1000 + round_ * courses + i), hover, student if round_ else None)
+            x, y = np.concatenate([x, seen]), np.concatenate([y, (np.array(speeds) - hover) / 10.0])
         error = student.network.fit(x, y, epochs=epochs)
         print(f"round {round_}: {len(x)} samples, RMS error {10.0 * error:.3f} rad/s")
     return student

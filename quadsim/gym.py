@@ -22,13 +22,11 @@ if TYPE_CHECKING:
     from scenarios.gym.registration import make_env as make_env
     from scenarios.gym.registration import make_vec as make_vec
     from scenarios.gym.safety import MPCSafetyFilter as MPCSafetyFilter
-    from scenarios.gym.teacher import expert as expert
 
 _MODULES = {
     "MPCSafetyFilter": "scenarios.gym.safety",
     "QuadrotorEnv": "scenarios.gym.environment",
     "environment_id": "scenarios.gym.registration",
-    "expert": "scenarios.gym.teacher",
     "make_env": "scenarios.gym.registration",
     "make_vec": "scenarios.gym.registration",
 }

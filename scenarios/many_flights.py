@@ -188,8 +188,8 @@ def tune(
         progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
 
     Returns:
-        `best` (the scenario that was found), `summary` (the search, the fresh flights, how optimistic the one was of
-        the other), `comparison` (flight by flight), `holds`, and the `directory`.
+        `best` (the scenario that was found), `summary` (the search and the fresh flights),
+        `comparison` (flight by flight), `holds`, and the `directory`.
 
     Raises:
         InputError: something cannot be flown so.

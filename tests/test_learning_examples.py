@@ -87,3 +87,15 @@ def test_samples_miss_violations_that_margins_report() -> None:
     env.close()
     assert missed == pytest.approx(40, abs=5)
     assert worst == pytest.approx(-0.018, abs=0.002)
+
+
+def test_the_teacher_labels_its_own_flight_and_the_students() -> None:
+    scenario = imitation.course(0).replace({"duration": 1.0})
+    hover = quadsim.load_vehicle("lopes2011").hover_speed
+    _, speeds = imitation.answers(scenario, hover)
+    assert np.array_equal(speeds, quadsim.fly(scenario, progress=False).command)
+    student = imitation.Student(imitation.Network((imitation.INPUTS, 4, 4)), quadsim.load_vehicle("lopes2011"))
+    seen, labels = imitation.answers(scenario, hover, student)
+    assert len(seen) == len(labels) > 1
+    assert np.array_equal(labels[0], speeds[0])
+    assert not np.array_equal(labels[1], speeds[1])

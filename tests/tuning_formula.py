@@ -15,8 +15,9 @@ import tomlkit
 from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.results.table import Row
 from scenarios.schema.scenario import Scenario
-from scenarios.tuning.plan import TuningPilot, TuningPlan
+from scenarios.tuning.plan import TuningPlan
 from scenarios.tuning.run import TuningResult, tune
+from scenarios.tuning.search import TuningPilot
 
 BEST_SPEED, BEST_Z = 0.05, 300.0  # where the formula is smallest
 TUNING: dict[str, Any] = {

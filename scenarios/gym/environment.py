@@ -3,37 +3,38 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from quadsim.controller import Command, Controller, Moment, Phase
+from quadsim.controller import Command, Moment, Phase
 from quadsim.errors import FlightError, InputError, ParameterError
 from quadsim.flight.audit import Limit
 from quadsim.flight.log import FlightLog, PlantLog
+from quadsim.report.film.camera import Camera
 from quadsim.sim.loop import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array
 from scenarios.api import as_scenario
 from scenarios.build import build_controller
+from scenarios.campaign.plan import Plan, make_plan, read_campaign
 from scenarios.flight import Flight
-from scenarios.gym.actions import Action, make_actions
-from scenarios.gym.observations import USUAL, Observations
-from scenarios.gym.randomisation import make_plan
-from scenarios.gym.rendering import Screen, has_display, make_screen
+from scenarios.gym.spaces import USUAL, Action, Actions, Observations
 from scenarios.limits import build_limits
+from scenarios.loading import parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import StartedFlight, start
 from scenarios.schema.base import LARGEST_SEED
+from scenarios.schema.bases import merge
 from scenarios.schema.scenario import Scenario
 
 Reward = Callable[[Array, Array, Array], float]
 """From the true state (12,) after a step, the reference (4,) there, and the rotor speeds commanded (4,) [rad/s]."""
-RENDER_MODES: Final = ("rgb_array", "human") if has_display() else ("rgb_array",)  # `human` where there is a display
 
 
 def nearness(state: Array, reference: Array, speeds: Array) -> float:
@@ -48,7 +49,7 @@ def nearness(state: Array, reference: Array, speeds: Array) -> float:
 class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     """A scenario, one step per control period.
 
-    Observations and actions are as chosen; see `scenarios.gym.observations` and `scenarios.gym.actions`.  An episode
+    Observations and actions are as chosen; see `scenarios.gym.spaces`.  An episode
     is terminated when the vehicle is lost by a criterion of `[lost]`, has crashed, or has diverged, and truncated at
     the scenario's duration, which a campaign's `[set]` may change.
 
@@ -62,11 +63,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     - `cost`: how many were.
     - `time` [s], `phase` (`flying`, `landed`, ...), `reason` (why the flight ended; empty while it has not).
 
-    Attributes:
-        scenario: what is flown in this episode.
-        limits: its constraints, as the audit has them.
-        actions: what actions are.
-        observations: what is observed, with the unit of each entry.
+    Attributes: `scenario` and `limits` of this episode, `actions`, and `observations` with the unit of each entry.
 
     Examples:
         >>> import numpy as np
@@ -79,7 +76,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         >>> env.close()
     """
 
-    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 20}  # noqa: RUF012  as Gymnasium has it
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012  as Gymnasium has it
 
     def __init__(
         self,
@@ -104,7 +101,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             vary: a campaign, its name or file, whose `[set]` changes the scenario and whose `[[vary]]` is drawn anew
                 at each reset.
             reward: of a step; see `Reward`.
-            render_mode: `rgb_array`, `human`, or None.
+            render_mode: `rgb_array` or None; `human` by the wrapper that `gymnasium.make` adds, with pygame.
             width: of pictures [pixels].
             height: likewise.
 
@@ -112,23 +109,22 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             InputError: one of these is not possible.
         """
         scenario = as_scenario(scenario)
-        self._plan = None if vary is None else make_plan(scenario, str(vary))
+        self._plan = None if vary is None else _varying(scenario, str(vary))
         self._base = scenario if self._plan is None else self._plan.scenario
-        if render_mode not in (None, *RENDER_MODES):
-            rule = f"{' or '.join(RENDER_MODES)}, or None" + ("" if has_display() else "; human needs a display")
-            raise ParameterError("", "render_mode", render_mode, rule)
+        if render_mode not in (None, "rgb_array"):
+            raise ParameterError("", "render_mode", render_mode, "rgb_array or None")
         horizon = self._base.controller.horizon
         preview = horizon if preview is None else preview
         if not 1 <= preview <= horizon:
             raise ParameterError("", "preview", preview, f"from 1 to controller.horizon = {horizon} periods")
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._base.control_period))}
         self.observations = Observations(observation, preview)
-        self.actions = make_actions(action, self._base, build_vehicle(self._base))
+        self.actions = Actions(action, self._base, build_vehicle(self._base))
         self.action_space, self.observation_space = self.actions.space, self.observations.space
         self.render_mode, self._size = render_mode, (width, height)
         self._preview, self._reward, self._action = preview, reward, action
         self._flight: StartedFlight | None = None
-        self._screen: Screen | None = None
+        self._camera: Camera | None = None
         self._started = False
         self.scenario, self.limits = self._base, build_limits(self._base)
 
@@ -171,16 +167,14 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self.scenario = scenario
         vehicle = build_vehicle(scenario)
         if self._plan is not None:
-            self.actions = make_actions(self._action, scenario, vehicle)
-        law = OnDemand(lambda: build_controller(scenario, vehicle), scenario.controller.horizon)
-        self._law = None if scenario.controller_changes else law  # events that change it need the controller itself
-        self._flight = start(scenario, self._law)
+            self.actions = Actions(self._action, scenario, vehicle)
+        # events that change the controller need a real one
+        law: Any = None if scenario.controller_changes else Agent(scenario.controller.horizon)
+        self._flight = start(scenario, law)
         self.limits = self._flight.limits
-        self._queried: _Queried | None = None
+        self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
         self._seen, plant = self._flight.observation, self._flight.loop.log().plant
         self._truth, self._rotors = plant.state[-1], plant.speeds[-1]
-        if self.render_mode == "human":
-            self._draw()
         return self._vector(self._seen), self._info(*_start_margins(self.limits, plant))
 
     def step(self, action: Action) -> tuple[Array, float, bool, bool, dict[str, Any]]:
@@ -197,12 +191,12 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             raise ResetNeeded(f"the episode has ended ({flight.loop.reason or 'the scenario is over'}); call reset()")
         if np.shape(action) != self.action_space.shape:
             raise ParameterError("", "action", np.shape(action), f"of shape {self.action_space.shape}")
-        queried, seen = self._queried, self._seen
-        command = (
-            queried.command
-            if queried is not None and queried.k == flight.k and np.array_equal(queried.action, action)
-            else self.actions.command(action, seen.moment.body_rates, flight.loop.controller.horizon)
-        )
+        seen = self._seen
+        match self._answered:
+            case (flight.k, answered, command) if np.array_equal(answered, action):
+                pass
+            case _:
+                command = self.actions.command(action, seen.moment.body_rates, flight.loop.controller.horizon)
         nothing = np.full(len(self.limits), np.inf)
         try:
             sample = flight.loop.step(command)
@@ -217,8 +211,6 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             rows = seen.preview
             self._seen = replace(seen, state=state, reference=rows[0], preview=rows[1:], moment=moment)
         terminated = flight.loop.reason is not None or self._seen.moment.phase is Phase.CRASHED
-        if self.render_mode == "human":
-            self._draw()
         reward = float(self._reward(state, self._seen.reference, sample.speeds))
         truncated = flight.done and not terminated
         return self._vector(self._seen), reward, terminated, truncated, self._info(*_margins(self.limits, period))
@@ -234,18 +226,21 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             FlightError: the controller has no answer; a flight of its own would end here.
         """
         flight = self.started
-        if self._queried is None or self._queried.k != flight.k:
+        if self._answered is None or self._answered[0] != flight.k:
             seen = self._seen
             self.actions.of(np.zeros(4))  # which those without equivalent speeds refuse
+            if isinstance(agent := flight.loop.controller, Agent):
+                flight.loop.controller = build_controller(self.scenario, flight.vehicle)
+                flight.loop.controller.reset(agent.speeds)
             command = flight.loop.controller.step(seen.moment, seen.state, seen.preview)
             self.action_for(command)
-        assert self._queried is not None
-        return self._queried.action
+        assert self._answered is not None
+        return self._answered[1]
 
     @property
     def controller_status(self) -> str:
         """The status of the last query; see `quadsim.controller.Command`."""
-        return "" if self._queried is None else self._queried.command.status
+        return "" if self._answered is None else self._answered[2].status
 
     def action_for(self, command: Command) -> Action:
         """The action equivalent to a command: taken next, that very command is flown, with its plan and status.
@@ -254,29 +249,35 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             ParameterError: actions are thrust and rates.
         """
         low, high = self.action_space.low, self.action_space.high
-        self._queried = _Queried(self.started.k, np.clip(self.actions.of(command.speeds), low, high), command)
-        return self._queried.action
+        action = np.clip(self.actions.of(command.speeds), low, high)
+        self._answered = (self.started.k, action, command)
+        return action
 
     def flight(self) -> Flight:
         """This episode so far as a flight: audited, to be saved and drawn like any other."""
-        flight = self.started.flight()
-        return flight if self._law is None else replace(flight, controller=self._law.name, solver=self._law.solver)
+        law = self.started.loop.controller
+        return replace(self.started.flight(), controller=law.name, solver=law.solver)
 
     def render(self) -> np.ndarray[Any, np.dtype[np.uint8]] | None:
-        """The picture (height, width, 3) in the mode `rgb_array`; the window of `human` is drawn by each step.
+        """The picture (height, width, 3), drawn by a process of its own; None without a render mode.
 
         Raises:
             RenderingUnavailableError: nothing can render here.
         """
-        return self._draw() if self.render_mode == "rgb_array" else None
+        if self.render_mode is None:
+            return None
+        if self._camera is None:
+            width, height = self._size
+            self._camera = Camera(self.started.actual, self.scenario.obstacles, width=width, height=height)
+        return self._camera.picture(self._truth, self._rotors, self._seen.reference, self.started.loop.time)
 
     def close(self) -> None:
-        """Give native memory, the renderer and the window back."""
+        """Give native memory and the renderer back."""
         if self._flight is not None:
             self._flight.close()
-        if self._screen is not None:
-            self._screen.close()
-            self._screen = None
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
 
     def _drawn(self, seed: int | None, first: bool, options: dict[str, Any]) -> Scenario:
         """The scenario of the episode that starts."""
@@ -289,7 +290,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
                 raise ParameterError("options", "flight", flight, f"from 0 to {count - 1}")
             return self._plan.of(int(flight))
         if "flight" in options:
-            raise ParameterError("options", "flight", options["flight"], "absent where no campaign varies anything")
+            raise ParameterError("options", "flight", options["flight"], "absent where nothing varies")
         if seed is None:
             seed = self._base.seed if first else int(self.np_random.integers(2**31))
         return self._base.model_copy(update={"seed": seed})
@@ -320,57 +321,22 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             "reason": loop.reason or "",
         }
 
-    def _draw(self) -> np.ndarray[Any, np.dtype[np.uint8]] | None:
-        if self._screen is None:
-            self._screen = make_screen(self.render_mode, self.scenario, self.started.actual, *self._size)
-        return self._screen.show(self._truth, self._rotors, self._seen.reference, self.started.loop.time)
 
+class Agent:
+    """Stands for a controller where actions fly; the scenario's own is built when it is first asked."""
 
-@dataclass(frozen=True)
-class _Queried:
-    """What the controller answered in a period."""
+    name, solver = "agent", ""
 
-    k: int
-    action: Action
-    command: Command
-
-
-class OnDemand:
-    """A scenario's controller that is made at its first call: agents fly without it."""
-
-    def __init__(self, build: Callable[[], Controller], horizon: int) -> None:
-        self._build, self.horizon = build, horizon
-        self._inner: Controller | None = None
-
-    @property
-    def name(self) -> str:
-        """That of the controller; `agent` where it was never called."""
-        return "agent" if self._inner is None else self._inner.name
-
-    @property
-    def solver(self) -> str:
-        """Likewise; empty."""
-        return "" if self._inner is None else self._inner.solver
+    def __init__(self, horizon: int) -> None:
+        self.horizon = horizon
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
-        self._speeds = speeds.copy()
-        if self._inner is not None:
-            self._inner.reset(speeds)
+        self.speeds = speeds.copy()
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """See `quadsim.controller.Controller.step`."""
-        if self._inner is None:
-            self._inner = self._build()
-            self._inner.reset(self._speeds)
-        return self._inner.step(now, state, reference)
-
-    def __getattr__(self, name: str) -> Any:
-        """What else the controller has, once it is there: `predict`, `unanswered`."""
-        inner = self.__dict__.get("_inner")
-        if inner is None:
-            raise AttributeError(name)
-        return getattr(inner, name)
+        """Never called: each step has a command."""
+        raise NotImplementedError
 
 
 def _margins(limits: Sequence[Limit], period: FlightLog) -> tuple[Array, Array]:
@@ -387,9 +353,19 @@ def _margins(limits: Sequence[Limit], period: FlightLog) -> tuple[Array, Array]:
 
 def _start_margins(limits: Sequence[Limit], plant: PlantLog) -> tuple[Array, Array]:
     """(m,), twice, of the state at the start; inf of what exists at control samples alone."""
-    found = [
-        np.inf if limit.source.plant is None or not limit.holds_at(plant.t)[0]
-        else float(limit.margin(limit.source.plant(plant))[0])
-        for limit in limits
-    ]  # fmt: skip
-    return np.array(found, float), np.array(found, float)
+    margins = np.full(len(limits), np.inf)
+    for i, limit in enumerate(limits):
+        if limit.source.plant is not None and limit.holds_at(plant.t)[0]:
+            margins[i] = limit.margin(limit.source.plant(plant))[0]
+    return margins, margins
+
+
+def _varying(scenario: Scenario, campaign: str) -> Plan:
+    """The draws of a campaign, with its `[set]`, for a scenario that need not be its own."""
+    data = read_campaign(campaign)
+    if data.get("set"):
+        merged = merge(tomllib.loads(scenario.to_toml()), data["set"])
+        scenario = parse_scenario(merged, source=f"{scenario.name}, as {campaign} sets it")
+    return make_plan(
+        scenario, {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
+    )

@@ -44,12 +44,8 @@ def register_library() -> None:
 
 
 def _description(name: str, scenario: Scenario | str, periods: int) -> dict[str, Any]:
-    return {
-        "id": environment_id(name),
-        "entry_point": ENTRY_POINT,
-        "max_episode_steps": periods,
-        "kwargs": {"scenario": scenario},
-    }
+    kwargs = {"scenario": scenario}
+    return {"id": environment_id(name), "entry_point": ENTRY_POINT, "max_episode_steps": periods, "kwargs": kwargs}
 
 
 def _specification(scenario: Scenario | str | Path) -> EnvSpec:

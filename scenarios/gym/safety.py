@@ -12,8 +12,8 @@ from gymnasium.error import ResetNeeded
 from quadsim.controller import UNCONSTRAINED, Command
 from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle
-from scenarios.gym.actions import Action
 from scenarios.gym.environment import QuadrotorEnv
+from scenarios.gym.spaces import Action
 from scenarios.parts.controllers import make_filter
 from scenarios.schema.robust import RobustSpec
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import ast
 import math
+import re
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -20,8 +21,11 @@ if TYPE_CHECKING:
     from scenarios.tuning.plan import TuningPlan
 
 Rows = Sequence[Mapping[str, Any]]
-_OPERATORS: Final = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.USub, ast.UAdd)
 _FUNCTIONS: Final[dict[str, Callable[..., float]]] = {"sqrt": math.sqrt, "abs": abs, "min": min, "max": max}
+_TOKEN: Final = re.compile(
+    r"\s*(?:(?P<name>[a-z_][\w.]*)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)|(?P<operator>\*\*|[-+*/(),])|(?P<other>\S))",
+    re.IGNORECASE,
+)
 STATISTICS: Final[dict[str, Callable[[Array], float]]] = {
     "mean": lambda values: float(np.mean(values)),
     "median": lambda values: float(np.median(values)),
@@ -33,15 +37,13 @@ STATISTICS: Final[dict[str, Callable[[Array], float]]] = {
 class Expression:
     """Arithmetic on the columns of a flight's row; see `parse_expression`."""
 
-    tree: ast.Expression
+    source: str  # in Python, of `row`
     columns: frozenset[str]  # that it names
 
     def value(self, row: Mapping[str, Any]) -> float:
         """Its value in one flight; NaN where the flight has no such number, or the value is not finite."""
-        code = compile(self.tree, "expression", "eval")
-        names = {name: row[name] for name in self.columns}
         try:
-            value = float(eval(code, {"__builtins__": {}, **_FUNCTIONS}, names))
+            value = float(eval(self.source, {"__builtins__": {}, **_FUNCTIONS}, {"row": row}))
         except (ArithmeticError, ValueError, TypeError):  # TypeError: of a number that the flight does not have
             return math.nan
         return value if math.isfinite(value) else math.nan
@@ -53,53 +55,34 @@ class Expression:
             UnknownNameError: naming the first of them.
         """
         known = [name for name, kind in columns.items() if is_number(kind)]
-        for name in sorted(self.columns):
-            if name not in known:
-                raise UnknownNameError("column of numbers", name, known)
-
-
-class _Arithmetic(ast.NodeTransformer):
-    """Refuses all but arithmetic; `rmse.x` becomes one name, and every number a float."""
-
-    def __init__(self) -> None:
-        self.columns: set[str] = set()
-
-    def generic_visit(self, node: ast.AST) -> ast.AST:
-        match node:
-            case ast.Name() | ast.Attribute() if all(part.isidentifier() for part in ast.unparse(node).split(".")):
-                self.columns.add(name := ast.unparse(node))
-                return ast.Name(name, ast.Load())
-            case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
-                return ast.Constant(float(number))  # 9**9**9 overflows at once
-            case ast.Call(ast.Name(name), [_, *others], []) if name in _FUNCTIONS:
-                if (name in ("min", "max")) == bool(others):
-                    node.args = [self.visit(argument) for argument in node.args]
-                    return node
-            case ast.BinOp(op=operator) | ast.UnaryOp(op=operator) if isinstance(operator, _OPERATORS):
-                return super().generic_visit(node)
-            case ast.Expression():
-                return super().generic_visit(node)
-        if isinstance(node, _OPERATORS):
-            return node
-        raise InputError(ast.unparse(node))
+        for name in sorted(self.columns.difference(known)):
+            raise UnknownNameError("column of numbers", name, known)
 
 
 def parse_expression(text: str) -> Expression:
-    """An expression from its text, e.g. `sqrt(rmse.x**2 + rmse.y**2)`.
+    """An expression from its text, e.g. `sqrt(rmse.x**2 + rmse.y**2)`: names, numbers as floats, operators, no more.
 
     Raises:
         InputError: it is none; the message goes on from the field's name.
     """
-    arithmetic = _Arithmetic()
+    columns, words = set(), []
+    for token in _TOKEN.finditer(text.strip()):
+        name, number, word = token["name"], token["number"], token[0].strip()
+        if token["other"]:
+            rule = f"columns, numbers, + - * / ** and {', '.join(_FUNCTIONS)}"
+            raise InputError(f"must be made of {rule}; got {word!r} in {text!r}")
+        if name and name not in _FUNCTIONS:
+            columns.add(name)
+        words.append(f"row[{name!r}]" if name in columns else repr(float(number)) if number else word)
+    source = " ".join(words)
     try:
-        tree = ast.fix_missing_locations(arithmetic.visit(ast.parse(text.strip(), mode="eval")))
-        compile(tree, "expression", "eval")
-    except InputError as error:
-        rule = f"columns, numbers, + - * / ** and {', '.join(_FUNCTIONS)}"
-        raise InputError(f"must be made of {rule}; got {str(error)!r} in {text!r}") from error
-    except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError) as error:
+        with warnings.catch_warnings(action="ignore"):  # such as that a number is no function
+            float(eval(source, {"__builtins__": {}, **_FUNCTIONS}, {"row": dict.fromkeys(columns, 1.0)}))
+    except (ArithmeticError, ValueError):
+        pass  # for these numbers
+    except (SyntaxError, TypeError, NameError, RecursionError, MemoryError) as error:
         raise InputError(f"must be arithmetic on columns, such as 'rmse.x + rmse.y'; got {text!r}") from error
-    return Expression(tree, frozenset(arithmetic.columns))
+    return Expression(source, frozenset(columns))
 
 
 @dataclass(frozen=True, kw_only=True)

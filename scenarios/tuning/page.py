@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
-from quadsim.report.to_plotly import embed
+from quadsim.report.to_plotly import Plot, embed
 from scenarios.campaign.statistics.wording import label
 from scenarios.tuning.plan import START
 
@@ -82,10 +82,10 @@ def write_page(directory: Path, *, study: Study, summary: Summary, folders: Sequ
 
     names = [label(each["name"], each["unit"]) for each in summary["objectives"]]
     if len(names) > 1:
-        plots = [embed(visualization.plot_pareto_front(study, target_names=names), "candidates", "Pareto front", 430)]
+        plots = [_plot(visualization.plot_pareto_front(study, target_names=names), "candidates", "Pareto front", 430)]
     else:
         history = visualization.plot_optimization_history(study, target_name=names[0])
-        plots = [embed(history, "candidates", "candidates", 430)]
+        plots = [_plot(history, "candidates", "candidates", 430)]
     feasible = {each["candidate"] for each in summary["candidates"] if each["feasible"]}
     for i, name in enumerate(names if len(feasible) >= FEWEST and len(summary["search"]) > 1 else ()):
 
@@ -95,9 +95,9 @@ def write_page(directory: Path, *, study: Study, summary: Summary, folders: Sequ
         shares = visualization.plot_param_importances(
             study, evaluator=PedAnovaImportanceEvaluator(), target=value, target_name=name
         )
-        plots.append(embed(shares, f"importance{i}", f"importance for {name}", 120 + 34 * len(summary["search"])))
+        plots.append(_plot(shares, f"importance{i}", f"importance for {name}", 170 + 34 * len(summary["search"])))
         slices = visualization.plot_slice(study, target=value, target_name=name)
-        plots.append(embed(slices, f"slice{i}", f"{name} by field", 380))
+        plots.append(_plot(slices, f"slice{i}", f"{name} by field", 380))
     holds = summary["fresh"]["best"]["requirement"]["holds"]
     pages = [*folders, *(() if summary["answer"] == START else ("comparison",))]
     page = render_page(
@@ -112,6 +112,11 @@ def write_page(directory: Path, *, study: Study, summary: Summary, folders: Sequ
         files={**{name: name for name in _FILES}, **{folder: f"{folder}/index.html" for folder in pages}},
     )
     (directory / PAGE_FILE).write_text(page, encoding="utf-8")
+
+
+def _plot(figure: Any, key: str, title: str, height: int) -> Plot:
+    figure.update_layout(title_text="", margin={"t": 12, "b": 52})  # the page has the title
+    return embed(figure, key, title, height)
 
 
 def _change(start: float | None, best: float | None) -> str:

@@ -13,15 +13,12 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from quadsim.errors import FileError, InputError, ParameterError
-from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import Plan, cell, changed, check_ends, column_type, flown_scenario, locate, read_campaign
 from scenarios.campaign.results.events import Event, parse_event
-from scenarios.campaign.results.table import Row
 from scenarios.campaign.spec import Value, VaryBase
 from scenarios.campaign.statistics.requirement import Requirement, parse_requirement
 from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
-from scenarios.many import ERROR
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
@@ -145,38 +142,6 @@ class TuningPlan:
             )
             raise ParameterError(f"search.{entry.name}", "fields", entry.fields, rule)
         check_parts(scenario)
-
-
-class TuningPilot:
-    """Flies candidates on draws that all share; flight c * `TuningPlan.most` + i is that of candidate c on draw i.
-
-    See `scenarios.campaign.pilot.Pilot`.
-    """
-
-    def __init__(self, tuning: TuningPlan, candidates: Mapping[int, Values]) -> None:
-        self.plan, self._tuning, self._candidates = tuning.start, tuning, candidates
-        self._pilots: dict[int, CampaignPilot] = {}  # made where they fly
-
-    def fly(self, flight: int) -> Row:
-        """The row of a flight; a candidate that is no scenario fails it."""
-        candidate, draw = divmod(flight, self._tuning.most)
-        try:
-            if candidate not in self._pilots:
-                self._pilots[candidate] = CampaignPilot(self._tuning.of(self._candidates[candidate]))
-        except InputError as error:
-            return self.failed(flight, str(error), ERROR)
-        return {**self._pilots[candidate].fly(draw), **self.identity(flight)}
-
-    def failed(self, flight: int, reason: str, verdict: str) -> Row:
-        """The row of a flight that raised, met a limit, or whose process died."""
-        row = CampaignPilot(self.plan).failed(flight % self._tuning.most, reason, verdict)
-        return {**row, **self.identity(flight)}
-
-    def identity(self, flight: int) -> Row:
-        """The columns that identify a flight of the search."""
-        candidate = flight // self._tuning.most
-        values = self._tuning.shown(self._candidates[candidate])
-        return {"flight": flight, "candidate": candidate, **{f"search.{name}": each for name, each in values.items()}}
 
 
 def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None) -> TuningPlan:

@@ -20,7 +20,7 @@ from scenarios.campaign import manifest as records
 from scenarios.campaign.pilot import fly_flights
 from scenarios.campaign.plan import plan_differences
 from scenarios.campaign.report.campaign_page import write_comparison_report
-from scenarios.campaign.run import Watch, fly_campaign, put_report
+from scenarios.campaign.run import Standing, Watch, fly_campaign, put_report
 from scenarios.campaign.statistics.comparison import Comparison, compare
 from scenarios.campaign.statistics.inference import paired_difference
 from scenarios.campaign.statistics.requirement import judge
@@ -96,7 +96,7 @@ def tune(
         files.write({MANIFEST_FILE: to_json(manifest).encode()})
         fly = partial(fly_flights, workers=workers, cluster=cluster)
         with _quiet():
-            search = Search(plan, files, fly, watch)
+            search = Search(plan, files, fly, lambda **standing: watch(Standing(**standing)))
             table = search.run()
         answer, front = search.answer()
         name, candidates = plan.spec.name, search.candidates

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,20 +12,20 @@ import pyarrow as pa
 
 from quadsim.errors import InputError, MissingPackageError
 from quadsim.outputs import Growing
+from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.plan import cell
 from scenarios.campaign.results.store import Store
 from scenarios.campaign.results.table import Row
-from scenarios.campaign.run import Standing, Watch
 from scenarios.campaign.spec import ChoiceSpec, IntegerSpec, LogUniformSpec, Value
+from scenarios.many import ERROR
 from scenarios.tuning.objective import Score, objective_values, score
-from scenarios.tuning.plan import START, TuningPilot, TuningPlan, Values
+from scenarios.tuning.plan import START, TuningPlan, Values
 from scenarios.tuning.spec import SearchSpec
 
 if TYPE_CHECKING:
     from optuna.trial import Trial
 
 JOURNAL_FILE: Final = "journal.log"
-Fly = Callable[[TuningPilot, Sequence[int]], Generator[Row]]
 
 
 def require_optuna() -> Any:
@@ -41,15 +41,56 @@ def require_optuna() -> Any:
     return optuna
 
 
-class Search:
-    """The study and the flights of its candidates: trial n is candidate n, and trial 0 the start."""
+class TuningPilot:
+    """Flies candidates on draws that all share; flight c * `TuningPlan.most` + i is that of candidate c on draw i.
 
-    def __init__(self, plan: TuningPlan, files: Growing, fly: Fly, watch: Watch) -> None:
+    See `scenarios.campaign.pilot.Pilot`.
+    """
+
+    def __init__(self, tuning: TuningPlan, candidates: Mapping[int, Values]) -> None:
+        self.plan, self._tuning, self._candidates = tuning.start, tuning, candidates
+        self._pilots: dict[int, CampaignPilot] = {}  # made where they fly
+
+    def fly(self, flight: int) -> Row:
+        """The row of a flight; a candidate that is no scenario fails it."""
+        candidate, draw = divmod(flight, self._tuning.most)
+        try:
+            if candidate not in self._pilots:
+                self._pilots[candidate] = CampaignPilot(self._tuning.of(self._candidates[candidate]))
+        except InputError as error:
+            return self.failed(flight, str(error), ERROR)
+        return {**self._pilots[candidate].fly(draw), **self.identity(flight)}
+
+    def failed(self, flight: int, reason: str, verdict: str) -> Row:
+        """The row of a flight that raised, met a limit, or whose process died."""
+        row = CampaignPilot(self.plan).failed(flight % self._tuning.most, reason, verdict)
+        return {**row, **self.identity(flight)}
+
+    def identity(self, flight: int) -> Row:
+        """The columns that identify a flight of the search."""
+        candidate = flight // self._tuning.most
+        values = self._tuning.shown(self._candidates[candidate])
+        return {"flight": flight, "candidate": candidate, **{f"search.{name}": each for name, each in values.items()}}
+
+
+class Search:
+    """The study and the flights of its candidates: trial n is candidate n, and trial 0 the start.
+
+    Args:
+        plan: the tuning.
+        files: its directory.
+        fly: gives the rows of a pilot's flights.
+        watch: called with what `scenarios.campaign.run.Standing` has.
+    """
+
+    def __init__(
+        self, plan: TuningPlan, files: Growing, fly: Callable[..., Generator[Row]], watch: Callable[..., None]
+    ) -> None:
         optuna = require_optuna()
         self._plan, self._fly, self._watch, self._started = plan, fly, watch, clock.perf_counter()
         self._store = Store(files, plan.schema)
         self._rows: dict[int, Row] = {row["flight"]: row for row in self._store.table().to_pylist()}
-        self._flown = 0  # now
+        self._flown = self._spared = 0  # flights: now, and those that stopped candidates left out
         self.candidates: dict[int, Values] = {START: {}}
         self.scores: dict[int, Score] = {}
         journal, file = optuna.storages.journal, str(files.path / JOURNAL_FILE)
@@ -93,6 +134,7 @@ class Search:
             before = flights
         for trial in trials:
             found = self.scores[trial.number]
+            self._spared += self._plan.most - found.flights
             trial.set_constraint("failures", found.excess)
             pruned = require_optuna().trial.TrialState.PRUNED  # where no flight has all objectives
             self.study.tell(trial, found.values or None, state=None if found.values else pruned)
@@ -135,17 +177,15 @@ class Search:
                 for row in rows:
                     self._store.add(row)
                     self._rows[row["flight"]] = row
-                    self._report()
+                    self._flown += 1
+                    self._watch(
+                        flown=len(self._rows),
+                        flights=most * (1 + self._plan.spec.trials) - self._spared,
+                        failed=sum(bool(row["failed"]) for row in self._rows.values()),
+                        rate=self._flown / max(clock.perf_counter() - self._started, 1e-9),
+                    )
         finally:
             self._store.flush()
-
-    def _report(self) -> None:
-        self._flown += 1
-        rate = self._flown / max(clock.perf_counter() - self._started, 1e-9)
-        failed = sum(bool(row["failed"]) for row in self._rows.values())
-        left_out = sum(self._plan.most - score.flights for score in self.scores.values())
-        flights = self._plan.most * (1 + self._plan.spec.trials) - left_out
-        self._watch(Standing(flown=len(self._rows), flights=flights, failed=failed, rate=rate))
 
     def _values(self, trial: Trial) -> Values:
         """The values of a trial as a scenario has them."""

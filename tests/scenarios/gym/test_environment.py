@@ -21,7 +21,6 @@ from quadsim.errors import InputError, ParameterError, RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
 from quadsim.state import INDEX
 from scenarios.campaign.plan import load_plan
-from scenarios.gym import environment
 from scenarios.shipped import scenario_names
 
 HOVER = np.zeros(4, np.float32)
@@ -238,8 +237,6 @@ def test_wrong_options_are_named() -> None:
     env.reset()
     with pytest.raises(ParameterError, match=r"action must be of shape \(4,\); got \(3,\)"):
         env.step(np.zeros(3))
-    with pytest.raises(ParameterError, match="episodes must be at least 1"):
-        quadsim.gym.expert("hover", episodes=0)
     with pytest.raises(ParameterError, match="num_envs must be at least 1"):
         quadsim.gym.make_vec("hover", 0)
     with pytest.raises(InputError, match="options must not have wind; they may have flight"):
@@ -251,13 +248,6 @@ def test_wrong_options_are_named() -> None:
         varied.reset(options={"flight": -1})
     with pytest.raises(ParameterError, match=r"options.flight must be from 0 to"):
         varied.reset(options={"flight": 1.7})
-
-
-def test_no_display_no_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(environment, "RENDER_MODES", ("rgb_array",))
-    monkeypatch.setattr(environment, "has_display", lambda: False)
-    with pytest.raises(ParameterError, match="human needs a display"):
-        quadsim.gym.QuadrotorEnv("hover", render_mode="human")
 
 
 def test_the_inner_loop_flies_thrust_and_body_rates() -> None:

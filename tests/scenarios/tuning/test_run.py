@@ -19,6 +19,7 @@ from tuning_formula import BEST_SPEED, BEST_Z, Formula, error_of, tune_by, write
 from quadsim.errors import InputError, MissingPackageError, OutputError
 from quadsim.outputs import SUMMARY_FILE
 from scenarios.campaign.results.table import read_table
+from scenarios.campaign.run import Standing
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 from scenarios.tuning import run as module
@@ -132,6 +133,16 @@ def test_an_interrupted_search_ends_as_it_would_have(plan: TuningPlan, whole: Tu
     flown += last.flown
     fresh = 2 * plan.spec.fresh.flights
     assert len(flown) == whole.table.num_rows + fresh  # nothing was flown twice
+
+
+def test_the_progress_never_passes_what_there_is_to_fly(tmp_path: Path) -> None:
+    seen: list[Standing] = []
+    plan = load_tuning(str(write_tuning(tmp_path, trials=12, fresh={"flights": 2})))
+    result = tune(plan, tmp_path / "t", Formula(), watch=seen.append)
+    search = seen[: result.table.num_rows]
+    assert [standing.flown for standing in search] == list(range(1, len(search) + 1))
+    assert all(standing.flown <= standing.flights for standing in search)
+    assert search[0].flights == 13 * plan.most
 
 
 KILLED = """

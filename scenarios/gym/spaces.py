@@ -1,0 +1,142 @@
+"""What an agent observes, and what its actions are: rotor speeds, deviations from hover, or thrust and body rates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+
+from mpc.answer import ActuatorBounds
+from mpc.body_rates import STATUS, BodyRateLoop
+from quadsim.controller import Command
+from quadsim.errors import ParameterError, UnknownNameError
+from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, STATE_NAMES, STATE_UNITS, Array
+from quadsim.vehicle import N_ROTORS, Vehicle
+from scenarios.parts.controllers import make_bounds
+from scenarios.schema.optimisation import BoundedSpec
+from scenarios.schema.scenario import Scenario
+
+Action = NDArray[np.floating]
+
+ACTIONS: Final = ("deviations", "speeds", "rates")
+PARTS: Final = ("state", "preview", "ahead", "command")
+USUAL: Final = ("state", "preview", "command")
+LARGEST: Final = 1e6  # magnitude that the plant takes for divergence
+LARGEST_RATES: Final = (6.0, 6.0, 2.0)  # body rates at an action of 1 [rad/s]
+BANDWIDTH: Final = 20.0  # of the body rate loop [1/s]
+INNER_PERIOD: Final = 0.002  # longest time between two calls of the body rate loop [s]
+
+
+class Actions:
+    """From actions (4,) to commands and back, within the controller's bounds on rotor speeds or else the vehicle's.
+
+    - `speeds`: rotor speeds [rad/s], as they are.
+    - `deviations`: in [-1, 1]; 0 is hover, -1 and 1 the lowest and the highest speed, linear on either side.
+    - `rates`: in [-1, 1]; collective thrust, 0 the weight and -1 and 1 the least and the most that rotors have, and
+      body rates as shares of `LARGEST_RATES`, flown by an inner loop.
+
+    Raises:
+        UnknownNameError: there is no such kind.
+        ParameterError: the bounds leave no room around hover.
+    """
+
+    def __init__(self, kind: str, scenario: Scenario, vehicle: Vehicle) -> None:
+        if kind not in ACTIONS:
+            raise UnknownNameError("action", str(kind), ACTIONS)
+        spec = scenario.controller
+        if isinstance(spec, BoundedSpec):
+            bounds, owner = ActuatorBounds.of(make_bounds(spec)), "controller.input_bounds"
+        else:
+            bounds, owner = ActuatorBounds.of_vehicle(vehicle), f"vehicle {vehicle.name}"
+        low, high, hover = bounds.u_min, bounds.u_max, vehicle.hover_speed
+        self._kind = kind
+        if kind == "speeds":
+            self.space = Box(low, high, dtype=np.float64)
+            return
+        if not low.max() < hover < high.min():
+            given = [float(low[0]), float(high[0])]
+            raise ParameterError(owner, "speed", given, f"below and above the hover speed, {hover:.4g} rad/s")
+        self.space = Box(-1.0, 1.0, (N_ROTORS,), dtype=np.float32)
+        self._hover, self._down, self._up = hover, hover - low, high - hover
+        if kind == "rates":
+            timestep = scenario.plant.timestep
+            rate = 1.0 / (max(1, round(INNER_PERIOD / timestep)) * timestep)
+            self._loop = BodyRateLoop(vehicle, rate=rate, bandwidth=BANDWIDTH, bounds=bounds)
+            self._weight = vehicle.mass * vehicle.gravity
+            self._thrusts = [vehicle.thrust_coefficient * float(np.sum(ends**2)) for ends in (low, high)]
+
+    def command(self, action: Action, body_rates: Array | None, horizon: int) -> Command:
+        """The command, a plan of this many rows, for an action at body rates (3,) [rad/s], if these are known."""
+        if self._kind == "rates":
+            thrust, *rates = np.asarray(action, float).tolist()
+            self._loop.thrust = self._weight + abs(thrust) * (self._thrusts[thrust > 0.0] - self._weight)
+            self._loop.rates = np.multiply(rates, LARGEST_RATES)
+            return self._loop.command(np.zeros(3) if body_rates is None else body_rates, horizon)
+        speeds = np.array(action, np.float64)
+        if self._kind == "deviations":
+            speeds = self._hover + speeds * np.where(speeds < 0.0, self._down, self._up)
+        return Command(speeds=speeds, plan=np.broadcast_to(speeds, (horizon, N_ROTORS)), status=STATUS)
+
+    def of(self, speeds: Array) -> Action:
+        """The action that commands rotor speeds (4,) [rad/s]; beyond [-1, 1] where these are beyond their bounds.
+
+        Raises:
+            ParameterError: actions are not rotor speeds.
+        """
+        if self._kind == "rates":
+            rule = "deviations or speeds: rotor speeds are no thrust and rates to hold"
+            raise ParameterError("", "action", "rates", rule)
+        if self._kind == "speeds":
+            return np.array(speeds, float)
+        deviation = speeds - self._hover
+        return (deviation / np.where(deviation < 0.0, self._down, self._up)).astype(np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entry:
+    """One entry of the observation: its name, such as `vx`, `x[3]` (three periods ahead) or `u1`, and its unit."""
+
+    name: str
+    unit: str
+
+
+class Observations:
+    """The parts that were chosen, one after the other, as float64.
+
+    - `state`: the twelve states as measured or estimated, `quadsim.state.STATE_NAMES` [m, m/s, rad, rad/s].
+    - `preview`: the filtered reference x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+n}, row by row.
+    - `ahead`: the same less the measured x, y, z, yaw: how far, and where to.
+    - `command`: u(k-1), the rotor speeds in force [rad/s].
+
+    Attributes:
+        layout: an `Entry` for each entry.
+        space: up to `LARGEST`, which no flight passes; what a faulty sensor gives, such as NaN, is not in it.
+    """
+
+    def __init__(self, parts: Sequence[str], preview: int) -> None:
+        if not parts or len(set(parts)) < len(parts):
+            raise ParameterError("", "observation", list(parts), f"one or more of {', '.join(PARTS)}, once each")
+        for part in parts:
+            if part not in PARTS:
+                raise UnknownNameError("part of the observation", str(part), PARTS)
+        named = [(name, STATE_UNITS[i]) for name, i in zip(REFERENCE_NAMES, REFERENCE_STATES, strict=True)]
+        rows = [(f"{name}[{i}]", unit) for i in range(1, preview + 1) for name, unit in named]
+        entries = {
+            "state": list(zip(STATE_NAMES, STATE_UNITS, strict=True)),
+            "preview": rows,
+            "ahead": [(f"{name} ahead", unit) for name, unit in rows],
+            "command": [(f"u{i + 1}", "rad/s") for i in range(N_ROTORS)],
+        }
+        self._parts = tuple(parts)
+        self.layout = tuple(Entry(name=name, unit=unit) for part in parts for name, unit in entries[part])
+        self.space = Box(-LARGEST, LARGEST, (len(self.layout),), dtype=np.float64)
+
+    def of(self, state: Array, preview: Array, command: Array) -> Array:
+        """The observation of a state (12,), a preview (n, 4) and a command (4,)."""
+        ahead = preview - state[list(REFERENCE_STATES)]
+        values = {"state": state, "preview": preview.ravel(), "ahead": ahead.ravel(), "command": command}
+        return np.concatenate([values[part] for part in self._parts])
