@@ -13,7 +13,6 @@ import pyarrow as pa
 from quadsim.report.figure import Band, Bound, Figure, Panel, Series
 from quadsim.report.palette import BOUND, LINES, REFERENCE
 from quadsim.state import Array
-from scenarios.campaign.report.campaign_tables import drivers
 from scenarios.campaign.results.table import (
     DRAW,
     Rows,
@@ -27,6 +26,7 @@ from scenarios.campaign.results.table import (
 )
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.comparison import Comparison
+from scenarios.campaign.statistics.estimates import drivers
 from scenarios.campaign.statistics.inference import ALPHA
 from scenarios.campaign.statistics.wording import label, side_by_side
 

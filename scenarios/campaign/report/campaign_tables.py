@@ -9,6 +9,7 @@ from typing import Any, Final
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.results.verdicts import HARMLESS, INCOMPLETE
+from scenarios.campaign.statistics.estimates import drivers
 from scenarios.campaign.statistics.inference import ALPHA
 from scenarios.campaign.statistics.wording import count_of, interval, label, p_value, percent
 
@@ -39,22 +40,6 @@ def driver_sentence(summary: Summary) -> str:
     noun = "The worst margin" if outcome == "worst_margin" else "Failure"
     listed = ", ".join(f"{name} (rho {found['rho']:+.2f}, xi {found['xi']:.2f})" for name, found in sure.items())
     return f"{noun} depends on {listed or 'no varied parameter beyond chance'}."
-
-
-def drivers(summary: Summary) -> dict[str, Mapping[str, Any]]:
-    """The varied parameters on which an outcome may depend at all, the strongest first.
-
-    They are ordered by how `worst_margin` depends on them, or else `failed`.
-    """
-    related = {
-        name: found for name, found in summary["parameters"].items() if found.get("worst_margin") or found.get("failed")
-    }
-
-    def weakness(parameter: tuple[str, Mapping[str, Any]]) -> tuple[float, float]:
-        found = parameter[1]["worst_margin"] or parameter[1]["failed"]
-        return min(found["p_holm"], found["p_xi_holm"]), -max(abs(found["rho"]), found["xi"])
-
-    return dict(sorted(related.items(), key=weakness))
 
 
 def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:

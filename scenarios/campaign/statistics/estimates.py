@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -16,6 +17,7 @@ from scenarios.campaign.results.table import (
     DRAW,
     MARGIN,
     SATISFIED,
+    Summary,
     constraint_names,
     draw_names,
     flags,
@@ -188,6 +190,22 @@ def parameters(table: pa.Table) -> dict[str, Any]:
     for entry in tested:
         entry |= {"p_holm": next(corrected), "p_xi_holm": next(corrected)}
     return found
+
+
+def drivers(summary: Summary) -> dict[str, Mapping[str, Any]]:
+    """The varied parameters on which an outcome may depend at all, the strongest first.
+
+    They are ordered by how `worst_margin` depends on them, or else `failed`.
+    """
+    related = {
+        name: found for name, found in summary["parameters"].items() if found.get("worst_margin") or found.get("failed")
+    }
+
+    def weakness(parameter: tuple[str, Mapping[str, Any]]) -> tuple[float, float]:
+        found = parameter[1]["worst_margin"] or parameter[1]["failed"]
+        return min(found["p_holm"], found["p_xi_holm"]), -max(abs(found["rho"]), found["xi"])
+
+    return dict(sorted(related.items(), key=weakness))
 
 
 def _levels(table: pa.Table, name: str, failed: Flags) -> dict[str, Any]:
