@@ -13,8 +13,14 @@ from typing import Any, Final
 from rich.progress import BarColumn, Progress, TextColumn
 
 from quadsim.report.table import Grid
-from scenarios.campaign.report.campaign_tables import constraint_table, event_table, replay_command, worst_table
-from scenarios.campaign.report.campaign_text import campaign_sentences, verdict_sentence
+from scenarios.campaign.report.campaign_tables import (
+    constraint_table,
+    driver_sentence,
+    event_table,
+    replay_command,
+    verdict_sentence,
+    worst_table,
+)
 from scenarios.campaign.report.comparison_tables import comparison_tables, difference_table, pairing
 from scenarios.campaign.run import Standing, Watch
 from scenarios.campaign.statistics.comparison import Comparison
@@ -72,8 +78,8 @@ def print_campaign(
     """What came of a campaign."""
     out = stdout()
     out.print(styled((summary["campaign"], "bold"), f": {verdict_sentence(summary)}"), soft_wrap=True)
-    for sentence in campaign_sentences(summary):
-        out.print(sentence, soft_wrap=True)
+    if summary["parameters"]:
+        out.print(driver_sentence(summary), soft_wrap=True)
     tables = [event_table(summary, failure), constraint_table(summary), worst_table(summary, where)]
     brief = [replace(grid, note="", lines=grid.lines[:MOST_LINES]) for grid in tables if grid.lines]
     shown = [_with_short_ends(grid, out.width) if grid.key == "worst" else grid for grid in brief]

@@ -11,9 +11,8 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.report.figure import Band, Bound, Figure, Panel, Series
-from quadsim.report.palette import LINES, REFERENCE
+from quadsim.report.palette import BOUND, LINES, REFERENCE
 from quadsim.state import Array
-from scenarios.campaign.report.campaign_curves import drivers
 from scenarios.campaign.results.table import (
     DRAW,
     Rows,
@@ -27,8 +26,8 @@ from scenarios.campaign.results.table import (
 )
 from scenarios.campaign.results.verdicts import VERDICTS
 from scenarios.campaign.statistics.comparison import Comparison
+from scenarios.campaign.statistics.estimates import drivers
 from scenarios.campaign.statistics.inference import ALPHA
-from scenarios.campaign.statistics.scatters import lowest_shown, margin_ends, robust_ends
 from scenarios.campaign.statistics.wording import label, side_by_side
 
 MAIN_METRICS: Final = (
@@ -43,8 +42,13 @@ _BINS: Final = 40
 _MOST_DRIVERS, _MOST_SCATTERS = 10, 3  # in the overview
 _MOST_POINTS: Final = 18_000
 """Points that all scatters of a page may have together: a page of 10 000 flights stays near 6 MB and quick to draw."""
+_MOST_PAIRS: Final = 4000  # that are drawn of a comparison
 _TICK_ROOM: Final = 46  # characters that have room below a panel
 _GAP: Final = 0.06  # from the axis' end to what is drawn at the edge, as a share of the axis
+_LOWEST_MARGIN: Final = -2.0
+"""Margins below this are drawn at the foot, so that a lost flight does not flatten all others."""
+_LEAST_DEPTH: Final = 0.25  # share of the height above 0 that is shown below it, however far from it the margins are
+_FENCE: Final = 5.0  # quartile ranges beyond the quartiles up to which values are drawn where they are
 
 
 def overview(table: pa.Table, summary: Summary, title: str) -> Figure:
@@ -97,7 +101,7 @@ def histograms(table: pa.Table) -> list[Panel]:
         finite = values[np.isfinite(values)]
         if finite.size < 2 or np.ptp(finite) == 0.0:
             continue
-        least = lowest_shown(finite) if name == "worst_margin" else -np.inf
+        least = _lowest_shown(finite) if name == "worst_margin" else -np.inf
         edges = _edges(finite, least, whole=pa.types.is_integer(table.schema.field(name).type))
         inside, below = np.clip(values, edges[0], edges[-1]), np.zeros(edges.size - 1)
         bars = []
@@ -153,7 +157,7 @@ def scatters(table: pa.Table) -> list[Panel]:
     margins = np.where(np.isfinite(margins), margins, np.nan)
     if np.isnan(margins).all():
         return []
-    low, high = margin_ends(margins)
+    low, high = _margin_ends(margins)
     heights = np.where(np.isnan(margins), -np.inf, margins)
     shown, flights, panels = _shown_flights(table), numbers(table, "flight"), []
     for name in draw_names(table):
@@ -165,7 +169,7 @@ def scatters(table: pa.Table) -> list[Panel]:
             names = tuple(sorted(set(listed)))
             spread = np.random.default_rng(0).uniform(-0.3, 0.3, listed.size)  # the same every time
             values = np.array([names.index(each) for each in listed], float) + spread
-        x, beyond_x = _clip(values, *robust_ends(values), "left", "right")
+        x, beyond_x = _clip(values, *_robust_ends(values), "left", "right")
         y, beyond_y = _clip(heights, low, high, "down", "up")
         beyond = np.where(beyond_y == "", beyond_x, beyond_y)
         points = []
@@ -197,25 +201,64 @@ def scatters(table: pa.Table) -> list[Panel]:
 
 def paired_margins(comparison: Comparison) -> Iterator[Figure]:
     """The worst margins of all pairs, one campaign against the other; nothing where too few pairs have both."""
-    shown = comparison.shown_margins
-    if shown is None:
+    both = np.flatnonzero(np.isfinite(comparison.margins).all(axis=1))
+    if both.size < 2:
         return
-    ends = shown.lowest, shown.highest
+    low, high = _margin_ends(comparison.margins[both].ravel())
+    rows = both[np.unique(np.linspace(0.0, both.size - 1.0, min(both.size, _MOST_PAIRS)).astype(int))]
+    x, beyond_x = _clip(comparison.margins[rows, 0], low, high, "left", "right")
+    y, beyond_y = _clip(comparison.margins[rows, 1], low, high, "down", "up")
+    beyond = np.where(beyond_y == "", beyond_x, beyond_y)
+    room = 0.6 * _GAP * ((high - low) or 1.0)
+    ends = float(min(x.min(), y.min())) - room, float(max(x.max(), y.max())) + room
     series = [Series(x=np.array(ends), y=np.array(ends), colour=REFERENCE, dashed=True)]
-    for kind, colour in shown.colours.items():
+    a, b = comparison.names
+    kinds = {
+        **{"none failed": (False, False, LINES[0]), f"{a} alone failed": (True, False, LINES[2])},
+        **{f"{b} alone failed": (False, True, LINES[1]), "both failed": (True, True, BOUND)},
+    }
+    for kind, (in_a, in_b, colour) in kinds.items():
         for edge in ("", "down", "up", "left", "right"):
-            there = (shown.kind == kind) & (shown.edge == edge)
+            there = (comparison.failed[rows] == (in_a, in_b)).all(axis=1) & (beyond == edge)
             if there.any():
-                x, y = shown.margins[there].T
                 marker = f"triangle-{edge}" if edge else "circle"
                 series.append(
-                    Series(x=x, y=y, flights=shown.flights[there], colour=colour, label=kind, style="points",
-                           marker=marker, width=5.0 if edge else 3.7, opacity=0.75)
+                    Series(x=x[there], y=y[there], flights=comparison.numbers[rows][there], colour=colour, label=kind,
+                           style="points", marker=marker, width=5.0 if edge else 3.7, opacity=0.75)
                 )  # fmt: skip
-    first, second = (f"worst margin, {name}" for name in comparison.names)
-    panel = Panel(title="a point per pair", x_label=first, y_label=second, series=tuple(series), x_range=ends,
-                  y_range=ends, height=2.2)  # fmt: skip
+    panel = Panel(title="a point per pair", x_label=f"worst margin, {a}", y_label=f"worst margin, {b}",
+                  series=tuple(series), x_range=ends, y_range=ends, height=2.2)  # fmt: skip
     yield Figure(key="margins", title="worst margin, flight by flight", panels=(panel,), columns=1)
+
+
+def _robust_ends(values: Array) -> tuple[float, float]:
+    """The smallest and the largest of some values, some of them finite, without those far out."""
+    finite = values[np.isfinite(values)]
+    low, high = _fences(finite)
+    inside = finite[(finite >= low) & (finite <= high)]
+    return float(inside.min()), float(inside.max())
+
+
+def _lowest_shown(values: Array) -> float:
+    """The lowest of such margins that may be shown where it is: `_LOWEST_MARGIN`, but where most are lower still."""
+    finite = values[np.isfinite(values)]
+    return _LOWEST_MARGIN if np.median(finite) > _LOWEST_MARGIN else float(np.percentile(finite, 5))
+
+
+def _fences(finite: Array) -> tuple[float, float]:
+    """Five quartile ranges beyond the quartiles."""
+    p5, q1, q3, p95 = np.percentile(finite, [5, 25, 75, 95])
+    reach = _FENCE * ((q3 - q1) or (p95 - p5)) or np.inf
+    return q1 - reach, q3 + reach
+
+
+def _margin_ends(values: Array) -> tuple[float, float]:
+    """The ends between which worst margins are drawn where they are; 0, the end of what is allowed, is among them."""
+    finite = values[np.isfinite(values)]
+    fence, above = _fences(finite)
+    high = max(0.0, float(finite[finite <= above].max()))
+    below = max(min(fence, -_LEAST_DEPTH * high), _lowest_shown(finite))
+    return min(0.0, float(finite[finite >= below].min())), high
 
 
 def _clip(values: Array, low: float, high: float, below: str, above: str) -> tuple[Array, np.ndarray]:
@@ -239,7 +282,7 @@ def _shown_flights(table: pa.Table) -> dict[str, Rows]:
 
 def _edges(values: Array, least: float, *, whole: bool) -> Array:
     """Bins of one width over the values, without the few that are far out; 0 is an edge where it is among them."""
-    low, high = robust_ends(values)
+    low, high = _robust_ends(values)
     low = max(low, least)
     bins = min(_BINS, max(8, int(2.0 * np.sqrt(values.size))))
     if whole:

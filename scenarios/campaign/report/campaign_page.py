@@ -16,7 +16,7 @@ from quadsim.report.table import Cell, Mark
 from quadsim.report.to_matplotlib import write_pngs
 from quadsim.report.to_plotly import Plot, to_plot
 from scenarios.campaign.report import campaign_figures, campaign_tables
-from scenarios.campaign.report.campaign_text import verdict_sentence
+from scenarios.campaign.report.campaign_tables import verdict_sentence
 from scenarios.campaign.report.comparison_tables import (
     comparison_markdown,
     comparison_tables,
@@ -85,7 +85,7 @@ def write_report(
                 *_plots("drivers", "Which parameters matter", campaign_figures.dependence(summary), columns=1),
                 *_plots("scatter", "Worst margin over each parameter", campaign_figures.scatters(table), _POINTS),
             ),
-            tables=(tables.group_table(summary), *tables.level_tables(summary), tables.split_table(summary)),
+            tables=(tables.group_table(summary),),
             folded=(tables.driver_table(summary),),
         ),
         Section(
@@ -122,9 +122,9 @@ def write_comparison_report(comparison: Comparison, directory: Path, *, overwrit
     Raises:
         OutputError: the directory cannot be written, or holds something else.
     """
-    shown = comparison.shown_margins
     note = (
-        "" if shown is None else f"Above the dashed line, {comparison.names[1]} has the larger margin. {shown.beyond}"
+        f"Above the dashed line, {comparison.names[1]} has the larger margin. Triangles at the edges are pairs beyond "
+        "the axes."
     )
     plots = tuple(to_plot(figure, note=note) for figure in campaign_figures.paired_margins(comparison))
     sections = [

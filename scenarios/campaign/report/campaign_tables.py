@@ -1,4 +1,4 @@
-"""A campaign's summary and manifest -> tables."""
+"""A campaign's summary and manifest -> tables, and its outcome in a sentence."""
 
 from __future__ import annotations
 
@@ -7,45 +7,61 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
-from scenarios.campaign.report.campaign_curves import drivers, sure_splits
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.results.verdicts import HARMLESS, INCOMPLETE
+from scenarios.campaign.statistics.estimates import drivers
 from scenarios.campaign.statistics.inference import ALPHA
-from scenarios.campaign.statistics.wording import interval, label, p_value, percent
+from scenarios.campaign.statistics.wording import count_of, interval, label, p_value, percent
 
 _MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN}
-_GROUPS: Final = {
-    3: ("lowest third", "middle", "highest third"),
-    5: ("lowest fifth", "second", "third", "fourth", "highest fifth"),
-}
+_ALWAYS: Final = ("failure", "violation", "lost")  # events that are listed even where they never happened
+
+
+def verdict_sentence(summary: Summary) -> str:
+    """How many flights failed, and how sure that is: `37 of 1000 flights failed: 3.7 % (95 %: 2.6 to 5.1 %)`."""
+    failure = summary["events"]["failure"]
+    left_out = summary["flights"] - failure["flights"]
+    apart = f"; {count_of(left_out, 'incomplete flight')} not counted" if left_out else ""
+    text = f"{failure['count']} of {count_of(failure['flights'], 'flight')} failed"
+    if failure["flights"]:
+        share, ends = _shares(failure)
+        text += f": {share} ({100.0 * summary['confidence']:g} %: {ends})"
+    return text + apart
+
+
+def driver_sentence(summary: Summary) -> str:
+    """The varied parameters on which the worst margin, or else failure, depends beyond chance, the strongest first."""
+    outcome = "worst_margin" if any(found["worst_margin"] for found in drivers(summary).values()) else "failed"
+    sure = {
+        name: found[outcome]
+        for name, found in drivers(summary).items()
+        if found[outcome] and min(found[outcome]["p_holm"], found[outcome]["p_xi_holm"]) < ALPHA
+    }
+    noun = "The worst margin" if outcome == "worst_margin" else "Failure"
+    listed = ", ".join(f"{name} (rho {found['rho']:+.2f}, xi {found['xi']:.2f})" for name, found in sure.items())
+    return f"{noun} depends on {listed or 'no varied parameter beyond chance'}."
 
 
 def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
-    """How often each event happened; `failure` names the events that count as failure."""
-    lines = tuple(
-        line(
-            *(name, str(found["count"]), *_shares(found)),
-            *(percent(found["lower_one_sided"]), percent(found["upper_one_sided"])),
-        )
-        for name, found in summary["events"].items()
-    )
+    """How often each event that happened did; `failure` names the events that count as failure."""
     sure = f"{100.0 * summary['confidence']:g} %"
     counted = f" ({', '.join(failure)})" if failure else ""
     return Grid(
         key="events",
         title="How often",
         head=("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}"),
-        lines=lines,
-        note=(
-            f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold, or "
-            "the flight was lost, raised an error or met a limit of time or memory. Incomplete: the flight ended "
-            "before it reached a required constraint, without a failure; the shares of failure and violation leave it "
-            "out. Intervals are "
-            "Clopper-Pearson's: two-sided, and "
-            "one-sided in the last two columns. They take flights as independent draws; draws spread evenly (Latin "
-            "hypercube, Sobol', Halton) make the estimates more precise than that, and a grid gives the share over its "
-            "own points."
+        lines=tuple(
+            line(
+                *(name, str(found["count"]), *_shares(found)),
+                *(percent(found["lower_one_sided"]), percent(found["upper_one_sided"])),
+            )
+            for name, found in summary["events"].items()
+            if found["count"] or name in _ALWAYS
         ),
+        note=f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold, or "
+        "the flight was lost, raised an error or met a limit. Shares of both leave out incomplete flights, which ended "
+        "before a required constraint was reached. Intervals are Clopper-Pearson's, of independent draws; the last two "
+        "columns are one-sided. Spread draws are more precise than that.",
     )
 
 
@@ -67,9 +83,8 @@ def constraint_table(summary: Summary) -> Grid:
             *(f"{100.0 * summary['confidence']:g} % interval", "worst margin", "in flight"),
         ),
         lines=tuple(lines),
-        note="Margins are signed, at the physics rate and without the tolerance; negative is beyond the bound. Shares "
-        "are of the flights that reached the constraint or were lost before it. Margins of a lost flight end where it "
-        "was aborted: what came after is not in them.",
+        note="Margins are at the physics rate, without the tolerance; negative is beyond the bound. Shares are of the "
+        "flights that reached the constraint or were lost before it.",
     )
 
 
@@ -87,9 +102,7 @@ def metric_table(summary: Summary) -> Grid:
         title="All metrics",
         head=("metric", *measures, "flights"),
         lines=lines,
-        note="Over the flights that have the number, lost ones included. worst_margin: the smallest margin of the "
-        "required constraints, tolerance included, as a share of half the constraint's band: 1 in the middle, 0 at the "
-        "end of what is allowed, negative beyond. What is measured of a lost flight ends where it was aborted.",
+        note="Over the flights that have the number, lost ones, up to where they were aborted, included.",
     )
 
 
@@ -112,9 +125,8 @@ def worst_table(summary: Summary, directory: str) -> Grid:
         title="Worst flights",
         head=("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason"),
         lines=lines,
-        note="Lost flights first, then those that raised an error, took too long or too much memory, violated a "
-        "constraint, ended before one was reached, and held all; among these, "
-        "failed ones first, then the smaller worst margin. Margins of a lost flight end where it was aborted." + again,
+        note="Lost flights first, then errors, limits, violations and the rest; among these, failed ones first, then "
+        "the smaller worst margin." + again,
     )
 
 
@@ -182,43 +194,9 @@ def driver_table(summary: Summary) -> Grid:
             *("failure: rho", "after Holm", "xi", "after Holm"),
         ),
         lines=tuple(lines),
-        note=(
-            "rho: Spearman's rank correlation, which sees what rises or falls throughout and is blind to a parameter "
-            "that does harm at both of its ends. xi: Chatterjee's (2021), which sees any dependence: about 0 for none, "
-            "1 where the varied parameter alone decides. p-values are corrected by Holm's method for all tests of the "
-            f"campaign, those of thresholds included; bold: beyond chance at {100.0 * ALPHA:g} %. A flight that was "
-            "lost before it had a margin ranks below all others."
-        ),
-    )
-
-
-def split_table(summary: Summary) -> Grid:
-    """The thresholds on varied parameters that separate flights with an event from those without, beyond chance."""
-    listed = list(sure_splits(summary))
-    sure = f"{100.0 * summary['confidence']:g} % interval"
-    lines = tuple(
-        line(
-            event,
-            f"{name} > {split['threshold']:.15g}{'' if unit == '-' else f' {unit}'}",
-            *_side(split["low"]),
-            *_side(split["high"]),
-            f"{format_number(split['below'])} and {format_number(split['above'])}",
-            p_value(split["p_holm"]),
-        )
-        for event, name, unit, split in listed
-    )
-    return Grid(
-        key="splits",
-        title="Where it happens: one threshold",
-        head=("event", "threshold", "up to it", sure, "above it", sure, "between flights at", "after Holm"),
-        lines=lines,
-        note=(
-            "Of each varied parameter the threshold at which Fisher's exact test is surest. p: the chance that the "
-            "best of all thresholds is as sure where the event does not depend on the parameter, exact, then corrected "
-            "by Holm's method for all tests of the campaign. The intervals, Clopper-Pearson's, take the threshold as "
-            "given: it was chosen by these flights, so they look a little sharper than they are. Thresholds on "
-            "parameters beyond the first of an event may be the same flights seen again."
-        ),
+        note="rho: Spearman's rank correlation. xi: Chatterjee's (2021), of any dependence, also of harm at both ends "
+        "of a range. p-values are corrected by Holm's method for all of this table; bold: beyond chance at "
+        f"{100.0 * ALPHA:g} %.",
     )
 
 
@@ -226,43 +204,22 @@ def group_table(summary: Summary) -> Grid:
     """How often flights failed over each varied parameter, lowest values first; of none or all failed, no lines."""
     failure = summary["events"]["failure"]
     listed = {
-        name: found
+        label(name, found["unit"]): [_group(group) for group in found["groups"]]
+        if found["kind"] == "number"
+        else [f"{level}: {percent(share['share'])}" for level, share in found["levels"].items()]
         for name, found in summary["parameters"].items()
-        if found.get("groups") and 0 < failure["count"] < failure["flights"]
+        if 0 < failure["count"] < failure["flights"]
     }
-    size = max((len(found["groups"]) for found in listed.values()), default=0)
-    lines = tuple(
-        line(
-            label(name, found["unit"]),
-            *(_group(group) for group in found["groups"]),
-            *[ABSENT] * (size - len(found["groups"])),
-        )
-        for name, found in listed.items()
-    )
+    listed = {name: cells for name, cells in listed.items() if cells}
+    size = max(map(len, listed.values()), default=0)
     return Grid(
         key="groups",
         title="Failures over each varied parameter",
-        head=("varied parameter", *_GROUPS.get(size, [f"{k + 1}." for k in range(size)])),
-        lines=lines,
-        note="Share of failed flights among those with such a value; flights are in groups of about equal size, or by "
-        f"value where there are few values. Over all flights it is {percent(failure['share'])}.",
+        head=("varied parameter", *(f"{k + 1}." for k in range(size))),
+        lines=tuple(line(name, *cells, *[ABSENT] * (size - len(cells))) for name, cells in listed.items()),
+        note="Share of failed flights among those with such values; groups are of about equal size, or by value where "
+        f"there are few. Over all flights it is {percent(failure['share'])}.",
     )
-
-
-def level_tables(summary: Summary) -> list[Grid]:
-    """How often flights failed with each name or truth value that was drawn."""
-    grids: list[Grid] = []
-    for parameter, found in summary["parameters"].items():
-        name = label(parameter, found["unit"])
-        if found["kind"] == "number" or not found["levels"]:
-            continue
-        lines = tuple(
-            line(level, f"{share['count']} of {share['flights']}", *_shares(share))
-            for level, share in found["levels"].items()
-        )
-        head = (name, "failed", "share", f"{100.0 * summary['confidence']:g} % interval")
-        grids.append(Grid(key=f"levels-{len(grids)}", title=f"Failures by {name}", head=head, lines=lines))
-    return grids
 
 
 def _association(found: Mapping[str, Any] | None) -> tuple[Cell, ...]:
@@ -274,11 +231,6 @@ def _association(found: Mapping[str, Any] | None) -> tuple[Cell, ...]:
         Cell(text=f"{found['xi']:.2f}", mark=Mark.BEST if found["p_xi_holm"] < ALPHA else Mark.NONE),
         p_value(found["p_xi_holm"]),
     )
-
-
-def _side(share: Mapping[str, Any]) -> tuple[str, str]:
-    listed = f"{share['count']} of {share['flights']} ({percent(share['share'])})"
-    return listed, interval(share["lower"], share["upper"])
 
 
 def _group(group: Mapping[str, Any]) -> str:

@@ -33,19 +33,13 @@ def difference_table(comparison: Comparison) -> list[Grid]:
 
 def pairing(comparison: Comparison) -> str:
     """What the pairs have in common, and what they have not."""
-    phrase = f"Pairs have their seed in common, and all of {', '.join(comparison.shared_draws)}"
-    if not comparison.shared_draws:
-        phrase = "Pairs have their seed in common"
+    phrase = f"Pairs share {', '.join(('their seed', *comparison.shared_draws))}"
     if comparison.own_draws:
         phrase += f"; one campaign alone draws {', '.join(comparison.own_draws)}"
     if comparison.left_out:
-        phrase += (
-            f"; {comparison.left_out} flights of one alone, or with an incomplete flight in the pair, are left out"
-        )
+        phrase += f"; {comparison.left_out} flights are left out, as one of their pair is absent or incomplete"
     if comparison.differences is not None:
-        count = len(comparison.differences)
-        fields = f"{count} fields" if count > 1 else "one field"
-        phrase += f". The campaigns differ in {fields}" if count else ". The campaigns differ in no field"
+        phrase += f". Fields in which the campaigns differ: {len(comparison.differences)}"
     return f"{phrase}."
 
 
@@ -58,11 +52,10 @@ def _events(comparison: Comparison) -> Grid:
             *("event", a, b, f"{a} alone", f"{b} alone", "both"),
             *("p", "after Holm", "difference [points]", f"{_SURE} interval"),
         ),
-        lines=tuple(_event(event) for event in comparison.events),
-        note="p: McNemar's exact test, two-sided, on the pairs in which one alone had the event, each event by itself; "
-        "the verdict is by that of failure. After Holm: corrected for all events of this table that one flight of a "
-        f"pair alone had; bold: beyond chance at {100.0 * ALPHA:g} %. Difference: share of "
-        f"{b} less that of {a}, in percentage points, with Tango's score interval (1998) for pairs.",
+        lines=tuple(_event(event) for event in comparison.events if any(event.counts)),
+        note="p: McNemar's exact test, two-sided, of each event by itself; the verdict is by that of failure. After "
+        "Holm: corrected for all events that one flight of a pair alone had; bold: beyond chance at "
+        f"{100.0 * ALPHA:g} %. Difference: {b} less {a}, with Tango's score interval for pairs.",
     )
 
 
@@ -79,32 +72,20 @@ def _metrics(comparison: Comparison) -> Grid:
     return Grid(
         key="metrics",
         title="Metrics",
-        head=(
-            *("metric", f"{a}, mean", f"{b}, mean", "mean difference", f"{_SURE} interval"),
-            *("median difference", f"{_SURE} interval", "pairs"),
-        ),
+        head=("metric", f"{a}, mean", f"{b}, mean", "mean difference", f"{_SURE} interval", "pairs"),
         lines=tuple(_metric(metric) for metric in comparison.metrics),
-        note=(
-            f"Over the {comparison.completed} of {comparison.flights} pairs in which both flights were completed. "
-            f"Differences are {b} less {a}; bold where the interval does not hold 0. Intervals: Student's t of the "
-            "mean, order statistics of the median; each by itself, not corrected for how many there are. For "
-            "worst_margin more is better, for all others less."
-        ),
+        note=f"Over the {comparison.completed} of {comparison.flights} pairs in which both flights were completed. "
+        f"Differences are {b} less {a}; bold where Student's t interval does not hold 0.",
     )
 
 
 def _metric(metric: MetricComparison) -> tuple[Cell, ...]:
     found = metric.difference
-    return line(
-        *(label(metric.name, metric.unit), format_number(metric.mean_a), format_number(metric.mean_b)),
-        *_difference(found.mean, found.lower, found.upper),
-        *_difference(found.median, found.median_lower, found.median_upper),
-        str(found.pairs),
-    )
-
-
-def _difference(value: float | None, lower: float | None, upper: float | None) -> tuple[Cell, ...]:
-    if lower is None or upper is None:
-        return line(format_number(value), ABSENT)
-    mark = Mark.BEST if lower > 0.0 or upper < 0.0 else Mark.NONE
-    return line(Cell(text=format_number(value), mark=mark), f"{format_number(lower)} to {format_number(upper)}")
+    means = (format_number(value) for value in (metric.mean_a, metric.mean_b))
+    if found.lower is None or found.upper is None:
+        difference, ends = Cell(text=format_number(found.mean)), ABSENT
+    else:
+        mark = Mark.BEST if found.lower > 0.0 or found.upper < 0.0 else Mark.NONE
+        difference = Cell(text=format_number(found.mean), mark=mark)
+        ends = f"{format_number(found.lower)} to {format_number(found.upper)}"
+    return line(label(metric.name, metric.unit), *means, difference, ends, str(found.pairs))

@@ -67,7 +67,6 @@ Summary = Mapping[str, Any]
 Texts = np.ndarray[Any, np.dtype[np.object_]]
 _NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
 Rows = np.ndarray[Any, np.dtype[np.intp]]
-Edges = np.ndarray[Any, np.dtype[np.str_]]
 
 
 def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit]) -> pa.Schema:

@@ -6,7 +6,7 @@ far smaller differences than two campaigns side by side would.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError
+from quadsim.state import Array
 from scenarios.campaign.results.events import EVENT_NAMES, Flags, parse_event
 from scenarios.campaign.results.table import (
     DRAW,
@@ -28,7 +29,6 @@ from scenarios.campaign.results.table import (
 )
 from scenarios.campaign.statistics import inference
 from scenarios.campaign.statistics.estimates import FAILURE
-from scenarios.campaign.statistics.scatters import ShownMargins, paired_margins
 from scenarios.campaign.statistics.wording import p_value, signed_interval, signed_points
 
 COMPARED: Final = (
@@ -40,8 +40,6 @@ COMPARED: Final = (
     "fallback_periods",
 )
 """Metrics that are compared, where both campaigns have them."""
-
-
 Differences = tuple[tuple[str, Any, Any], ...]
 """Fields, with the value of the first and of the second; None where it is absent."""
 
@@ -68,85 +66,9 @@ class EventComparison:
         return self.both + self.only_a, self.both + self.only_b
 
     @property
-    def cells(self) -> tuple[int, int, int]:
-        """Pairs in which it happened to both, to the first alone, and to the second alone."""
-        return self.both, self.only_a, self.only_b
-
-    @property
     def pairs(self) -> int:
         """All pairs."""
         return self.both + self.only_a + self.only_b + self.neither
-
-
-def events_of(a: pa.Table, b: pa.Table) -> dict[str, tuple[Flags, Flags]]:
-    """Everything that may have happened to a flight, (K,) of each campaign: failure first, constraints last."""
-    named = {name: parse_event(name) for name in EVENT_NAMES}
-    found = {name: (event.column(a), event.column(b)) for name, event in named.items()}
-    for name in constraint_names(a):
-        column = SATISFIED + name
-        found[f"{name} not held"] = (~flags(a, column, absent=False), ~flags(b, column, absent=False))
-    return found
-
-
-def compare_events(events: Mapping[str, tuple[Flags, Flags]]) -> tuple[EventComparison, ...]:
-    """Every event with its test, corrected for all of them but those that no flight of a pair had alone.
-
-    These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).  Events
-    are given by name, as (K,) whether each happened to the flights of the first and of the second campaign.
-    """
-    alone = {event: (int((a & ~b).sum()), int((b & ~a).sum())) for event, (a, b) in events.items()}
-    tested = [event for event, counts in alone.items() if any(counts)]
-    corrected = dict(zip(tested, inference.holm([inference.mcnemar(*alone[event]) for event in tested]), strict=True))
-    found = []
-    for event, (a, b) in events.items():
-        only_a, only_b = alone[event]
-        both = int((a & b).sum())
-        lower, upper = inference.paired_shares(only_a, only_b, a.size)
-        found.append(
-            EventComparison(
-                event=event,
-                both=both,
-                only_a=only_a,
-                only_b=only_b,
-                neither=a.size - both - only_a - only_b,
-                p=inference.mcnemar(only_a, only_b),
-                p_holm=corrected.get(event, 1.0),
-                difference=(only_b - only_a) / a.size,
-                lower=lower,
-                upper=upper,
-            )
-        )
-    return tuple(found)
-
-
-def other_differences(events: Sequence[EventComparison], names: tuple[str, str]) -> str:
-    """What else than the first event happened more often to one of two campaigns, beyond chance or not, as a sentence.
-
-    A second event of the same numbers as the first, as violation is where it alone counts as failure, is not reported.
-    """
-    first, *others = events
-    others = [event for event in others if event.only_a != event.only_b]
-    others = [event for event in others if event.event != "violation" or event.cells != first.cells]
-    sure = [_with_counts(event) for event in others if event.p_holm < inference.ALPHA]
-    rest = [_with_counts(event) for event in others if event.p_holm >= inference.ALPHA]
-    parts = []
-    if sure:
-        parts.append(f"beyond chance in {', '.join(sure)}")
-    if rest:
-        parts.append(f"in count, but not beyond chance, in {', '.join(rest)}")
-    if not parts:
-        return ""
-    tests = sum(1 for event in events if event.only_a + event.only_b)
-    return (
-        f"Flights with {names[1]} and with {names[0]} {'also ' if first.p < inference.ALPHA else ''}differ "
-        f"{'; and '.join(parts)} (McNemar's exact test of each event, after Holm's correction for {tests})."
-    )
-
-
-def _with_counts(event: EventComparison) -> str:
-    """An event with its counts, the second campaign's first, as in the sentence around it."""
-    count_a, count_b = event.counts
-    return f"{event.event} ({count_b} and {count_a}, {p_value(event.p_holm)})"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +96,9 @@ class Comparison:
         differences: fields in which their scenarios and draws differ, with both values; None where not known.
         events: failure, then every other event that has a name, then for each constraint that it was not held.
         metrics: the main metrics.
-        shown_margins: what is drawn of them; None where fewer than two pairs have margins.
+        numbers: (flights,) of the pairs.
+        margins: (flights, 2) worst margins; NaN where a flight has none.
+        failed: (flights, 2) which flights failed.
     """
 
     names: tuple[str, str]
@@ -186,7 +110,9 @@ class Comparison:
     differences: Differences | None
     events: tuple[EventComparison, ...]
     metrics: tuple[MetricComparison, ...]
-    shown_margins: ShownMargins | None = field(repr=False, compare=False)
+    numbers: Array = field(repr=False, compare=False)
+    margins: Array = field(repr=False, compare=False)
+    failed: Flags = field(repr=False, compare=False)
 
     @property
     def verdict(self) -> str:
@@ -209,27 +135,21 @@ class Comparison:
         )
         return (
             f"{phrase}: of {self.flights} paired flights, {count_b} failed with {b} and {count_a} with {a} "
-            f"({failure.only_b} with {b} alone, {failure.only_a} with {a} alone; McNemar's exact test, "
-            f"{p_value(failure.p)}). The difference is {signed_points(failure.difference)} percentage points "
-            f"({100.0 * inference.CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)}). "
-            f"{other_differences(self.events, self.names)}"
-        ).rstrip()
+            f"(McNemar's exact test, {p_value(failure.p)}). The difference is {signed_points(failure.difference)} "
+            f"percentage points ({100.0 * inference.CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)})."
+        )
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for a file; differences are of the second campaign less the first."""
+        named = ("flights", "left_out", "completed", "shared_draws", "own_draws")
+        differences = [{"field": name, "values": [first, second]} for name, first, second in self.differences or ()]
         return {
             "names": list(self.names),
             "verdict": self.verdict,
             "sentence": self.sentence,
             "confidence": inference.CONFIDENCE,
-            "flights": self.flights,
-            "left_out": self.left_out,
-            "completed": self.completed,
-            "shared_draws": list(self.shared_draws),
-            "own_draws": list(self.own_draws),
-            "differences": None
-            if self.differences is None
-            else [{"field": field, "values": [first, second]} for field, first, second in self.differences],
+            **{name: list(of) if isinstance(of := getattr(self, name), tuple) else of for name in named},
+            "differences": None if self.differences is None else differences,
             "events": {event.event: asdict(event) for event in self.events},
             "metrics": {metric.name: asdict(metric) for metric in self.metrics},
         }
@@ -275,7 +195,6 @@ def compare(
     for column in ("seed", *(DRAW + name for name in shared_draws)):
         _require_alike(a, b, column, names)
     completed = (texts(a, "status") == "completed") & (texts(b, "status") == "completed")
-    events = events_of(a, b)
     return Comparison(
         names=names,
         flights=a.num_rows,
@@ -284,13 +203,15 @@ def compare(
         shared_draws=shared_draws,
         own_draws=tuple(sorted(set(draws_a) ^ set(draws_b))),
         differences=differences,
-        events=compare_events(events),
+        events=_compare_events(a, b),
         metrics=tuple(
             _compare_metric(a, b, name, completed)
             for name in COMPARED
             if name in a.column_names and name in b.column_names
         ),
-        shown_margins=paired_margins(a, b, events["failure"], names),
+        numbers=numbers(a, "flight"),
+        margins=np.stack([numbers(table, "worst_margin") for table in (a, b)], axis=1),
+        failed=np.stack([FAILURE.column(table) for table in (a, b)], axis=1),
     )
 
 
@@ -323,6 +244,39 @@ def _require_alike(a: pa.Table, b: pa.Table, column: str, names: Sequence[str]) 
                 "campaigns of one seed and the same draws can be compared in pairs; fly one of them again with the "
                 "other's seed, sampling and [[vary]]"
             )
+
+
+def _compare_events(a: pa.Table, b: pa.Table) -> tuple[EventComparison, ...]:
+    """Every event with its test, corrected for all of them but those that no flight of a pair had alone.
+
+    These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).
+    """
+    happened = {name: tuple(parse_event(name).column(table) for table in (a, b)) for name in EVENT_NAMES}
+    for name in constraint_names(a):
+        happened[f"{name} not held"] = tuple(~flags(table, SATISFIED + name, absent=False) for table in (a, b))
+    alone = {event: (int((in_a & ~in_b).sum()), int((in_b & ~in_a).sum())) for event, (in_a, in_b) in happened.items()}
+    p = {event: inference.mcnemar(*counts) for event, counts in alone.items()}
+    tested = [event for event, counts in alone.items() if any(counts)]
+    corrected = dict(zip(tested, inference.holm([p[event] for event in tested]), strict=True))
+    found = []
+    for event, (in_a, in_b) in happened.items():
+        (only_a, only_b), both, pairs = alone[event], int((in_a & in_b).sum()), a.num_rows
+        lower, upper = inference.paired_shares(only_a, only_b, pairs)
+        found.append(
+            EventComparison(
+                event=event,
+                both=both,
+                only_a=only_a,
+                only_b=only_b,
+                neither=pairs - both - only_a - only_b,
+                p=p[event],
+                p_holm=corrected.get(event, 1.0),
+                difference=(only_b - only_a) / pairs,
+                lower=lower,
+                upper=upper,
+            )
+        )
+    return tuple(found)
 
 
 def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> MetricComparison:

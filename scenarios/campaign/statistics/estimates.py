@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -17,6 +17,7 @@ from scenarios.campaign.results.table import (
     DRAW,
     MARGIN,
     SATISFIED,
+    Summary,
     constraint_names,
     draw_names,
     flags,
@@ -29,15 +30,12 @@ from scenarios.campaign.results.table import (
     verdicts,
 )
 from scenarios.campaign.results.verdicts import INCOMPLETE, VERDICTS
-from scenarios.campaign.statistics.dependence import any_dependence, best_splits, rank_correlation, trend
+from scenarios.campaign.statistics.dependence import dependence
 from scenarios.campaign.statistics.inference import CONFIDENCE, holm, lower_bounds, share_of, upper_bounds
-from scenarios.campaign.statistics.scatters import margin_ends
 
 FAILURE: Final = parse_event("failure")
 WORST_FLIGHTS: Final = 10
 _CURVE_POINTS: Final = 80
-SPLIT_EVENTS: Final = ("failure", "violation", "lost")
-"""Events for which a threshold is looked for, where they are not the same flights as an earlier one's."""
 _GROUPS: Final = ((50, 5), (12, 3))
 """Flights from which a varied parameter's values are looked at in this many groups of about equal size."""
 
@@ -82,10 +80,9 @@ def worst_flight(table: pa.Table) -> int:
 def ranking(table: pa.Table) -> np.ndarray[Any, np.dtype[np.intp]]:
     """(K,) rows of the table, from the worst flight on.
 
-    Lost flights come before those that raised, these before those that met a limit of time or memory, and these before
-    violated and satisfied ones; among these, failed ones come
-    first, then the smaller worst margin.  Flights without a margin come after those with one, by their RMS error in
-    position, the largest first.  What is still equal is in the order of the flights' numbers.
+    By verdict (`Verdict.badness`); of one verdict, failed ones come first, then the smaller worst margin.  Flights
+    without a margin come after those with one, by their RMS error in position, the largest first.  What is still equal
+    is in the order of the flights' numbers.
     """
     known = {name: verdict.badness for name, verdict in VERDICTS.items()}
     badness = np.array([known.get(name, max(known.values())) for name in texts(table, "verdict")], int)
@@ -167,83 +164,48 @@ def _convergence(table: pa.Table) -> dict[str, Any]:
 def parameters(table: pa.Table) -> dict[str, Any]:
     """A campaign's summary of each varied parameter, as plain data for JSON.
 
-    Of a number: its `unit`; under `worst_margin` and `failed` Spearman's `rho` with that outcome and Chatterjee's `xi`
-    of that outcome, with their p-values `p` and `p_xi`; under `splits`, by event, the threshold that best separates
-    flights with the event (`dependence.Split`); failures by `groups` of its values from the lowest on;
-    under `turn`, where the course of the worst margin turns, `highest` or `lowest` at a value, or None.  All p-values
-    of all parameters, outcomes and measures together are corrected by Holm's method: `p_holm`, `p_xi_holm`.
+    Of a number: its `unit`; under `worst_margin` and `failed` how that depends on it (`dependence.Dependence`), None
+    where there is nothing to relate; failures by `groups` of its values from the lowest on.  All p-values of all
+    parameters, outcomes and measures together are corrected by Holm's method: `p_holm`, `p_xi_holm`.
     Of what is drawn from names or truth values: the failures by level.
     """
     failed = flags(table, "failed", absent=True)
-    names = draw_names(table)
-    drawn = {name: numbers(table, DRAW + name) for name in names if is_number(table, DRAW + name)}
-    found: dict[str, Any] = {name: _levels(table, name, failed) for name in names if name not in drawn}
-    margin = ranked_margins(table)
-    outcomes = {"worst_margin": margin, "failed": failed.astype(float)}
-    splits = {event: best_splits(drawn, happened) for event, happened in _events(table)}
-    for name, values in drawn.items():
-        found[name] = {
-            "kind": "number",
-            "unit": unit_of(table, DRAW + name),
-            **{outcome: _association(values, reached) for outcome, reached in outcomes.items()},
-            "splits": {event: asdict(split) for event, of in splits.items() if (split := of[name]) is not None},
-            "turn": _turn(values, margin),
-            "groups": _groups(values, failed),
-        }
-    _correct(found)
-    return {name: found[name] for name in names}
-
-
-def ranked_margins(table: pa.Table) -> Array:
-    """(K,) the worst margin of each flight for ranks: -inf of one that was lost before it had any, NaN of one without.
-
-    Where no flight has a margin, all are NaN.
-    """
     margin = numbers(table, "worst_margin")
-    if np.isnan(margin).all():
-        return margin
-    return np.where(np.isnan(margin) & verdicts(table)["lost"], -np.inf, margin)
+    if not np.isnan(margin).all():  # one that was lost before it had any ranks below all others
+        margin = np.where(np.isnan(margin) & verdicts(table)["lost"], -np.inf, margin)
+    found: dict[str, Any] = {}
+    tested: list[dict[str, Any]] = []
+    for name in draw_names(table):
+        if not is_number(table, DRAW + name):
+            found[name] = _levels(table, name, failed)
+            continue
+        values = numbers(table, DRAW + name)
+        found[name] = {"kind": "number", "unit": unit_of(table, DRAW + name)}
+        for outcome, reached in (("worst_margin", margin), ("failed", failed.astype(float))):
+            related = dependence(values, reached, np.random.default_rng(0))  # the same every time
+            found[name][outcome] = None if related is None else asdict(related)
+            tested += [] if related is None else [found[name][outcome]]
+        found[name]["groups"] = _groups(values, failed)
+    corrected = iter(holm([entry[key] for entry in tested for key in ("p", "p_xi")]))
+    for entry in tested:
+        entry |= {"p_holm": next(corrected), "p_xi_holm": next(corrected)}
+    return found
 
 
-def _events(table: pa.Table) -> Iterator[tuple[str, Flags]]:
-    distinct: list[Flags] = []
-    for event in SPLIT_EVENTS:
-        happened = parse_event(event).column(table)
-        if not any(np.array_equal(happened, earlier) for earlier in distinct):
-            distinct.append(happened)
-            yield event, happened
+def drivers(summary: Summary) -> dict[str, Mapping[str, Any]]:
+    """The varied parameters on which an outcome may depend at all, the strongest first.
 
+    They are ordered by how `worst_margin` depends on them, or else `failed`.
+    """
+    related = {
+        name: found for name, found in summary["parameters"].items() if found.get("worst_margin") or found.get("failed")
+    }
 
-def _association(values: Array, outcome: Array) -> dict[str, Any] | None:
-    """Both measures of how an outcome depends on a varied parameter; None where there is nothing to relate."""
-    correlation = rank_correlation(values, outcome)
-    dependence = any_dependence(values, outcome, np.random.default_rng(0))  # as every time
-    if correlation is None or dependence is None:
-        return None
-    return asdict(correlation) | {"xi": dependence.xi, "p_xi": dependence.p}
+    def weakness(parameter: tuple[str, Mapping[str, Any]]) -> tuple[float, float]:
+        found = parameter[1]["worst_margin"] or parameter[1]["failed"]
+        return min(found["p_holm"], found["p_xi_holm"]), -max(abs(found["rho"]), found["xi"])
 
-
-def _correct(found: dict[str, Any]) -> None:
-    """Put every p-value's correction for the number of all of them beside it, in place."""
-    tests: list[tuple[dict[str, Any], str]] = []
-    for parameter in found.values():
-        for outcome in ("worst_margin", "failed"):
-            if parameter.get(outcome):
-                tests += [(parameter[outcome], "p"), (parameter[outcome], "p_xi")]
-        tests += [(split, "p") for split in parameter.get("splits", {}).values()]
-    for (entry, key), corrected in zip(tests, holm([entry[key] for entry, key in tests]), strict=True):
-        entry[f"{key}_holm"] = corrected
-
-
-def _turn(values: Array, margin: Array) -> dict[str, Any] | None:
-    there = ~np.isnan(margin)
-    if not np.isfinite(margin).any():
-        return None
-    course = trend(values[there], np.clip(margin[there], *margin_ends(margin)))
-    if course is None or course.turn is None:
-        return None
-    kind, at = course.turn
-    return {"kind": kind, "at": at}
+    return dict(sorted(related.items(), key=weakness))
 
 
 def _levels(table: pa.Table, name: str, failed: Flags) -> dict[str, Any]:

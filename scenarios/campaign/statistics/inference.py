@@ -42,15 +42,12 @@ class PairedDifference:
     mean: float | None = None  # their mean; None of no pairs
     lower: float | None = None  # lower end of the mean's t interval; None of fewer than two pairs
     upper: float | None = None  # its upper end
-    median: float | None = None  # their median
-    # lower end of the median's distribution-free interval; None where too few pairs give none
-    median_lower: float | None = None
-    median_upper: float | None = None  # its upper end
 
 
 def upper_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> Array:
     """One-sided upper bounds on proportions, one or (K,): the largest p that gives so few with chance 1 - confidence.
 
+    In closed form, as scipy's `proportion_ci` searches to 1e-12 alone, which is too coarse for shares near 1e-9.
     Source: Clopper and Pearson, Biometrika 26 (1934); 1 where all happened, and of no trials.
     """
     counts, trials = np.asarray(counts, float), np.asarray(trials, float)
@@ -108,12 +105,15 @@ def paired_shares(only_a: int, only_b: int, pairs: int) -> tuple[float, float]:
     Source: Tango, Statistics in Medicine 17 (1998).
     """
     z = float(scipy.stats.norm.ppf(0.5 * (1.0 + CONFIDENCE)))
-    estimate = (only_b - only_a) / pairs
+    estimate, square = (only_b - only_a) / pairs, 2.0 * pairs
 
     def excess(difference: float) -> float:
         """How far the score statistic is beyond z, without its denominator."""
-        spread = _score_variance(difference, only_a, only_b, pairs)
-        return abs(only_b - only_a - pairs * difference) - z * math.sqrt(max(spread, 0.0))
+        linear = (square - only_b + only_a) * difference - only_b - only_a
+        constant = -only_a * difference * (1.0 - difference)
+        share_a = (math.sqrt(max(linear * linear - 4.0 * square * constant, 0.0)) - linear) / (2.0 * square)
+        variance = pairs * (2.0 * share_a + difference * (1.0 - difference))  # by the restricted likelihood
+        return abs(only_b - only_a - pairs * difference) - z * math.sqrt(max(variance, 0.0))
 
     def end(limit: float) -> float:
         if excess(limit) <= 0.0:
@@ -124,39 +124,12 @@ def paired_shares(only_a: int, only_b: int, pairs: int) -> tuple[float, float]:
     return end(-1.0), end(1.0)
 
 
-def _score_variance(difference: float, only_a: int, only_b: int, pairs: int) -> float:
-    """Variance of only_b - only_a where the true difference is the one given, by its restricted likelihood."""
-    square = 2.0 * pairs
-    linear = -only_b - only_a + (2.0 * pairs - only_b + only_a) * difference
-    constant = -only_a * difference * (1.0 - difference)
-    root = math.sqrt(max(linear * linear - 4.0 * square * constant, 0.0))
-    share_a = (root - linear) / (2.0 * square)
-    return pairs * (2.0 * share_a + difference * (1.0 - difference))
-
-
 def paired_difference(a: Array, b: Array) -> PairedDifference:
-    """Mean and median of b - a, (K,) finite each, with their intervals.
-
-    The mean's is Student's t interval.  The median's has order statistics at its ends, by inverting the sign test, and
-    assumes nothing about the distribution (Conover, Practical Nonparametric Statistics, 1999, 3.2).
-    """
+    """Mean of b - a, (K,) finite each, with Student's t interval."""
     differences = np.asarray(b, float) - np.asarray(a, float)
     n = differences.size
-    if not n:
-        return PairedDifference(pairs=0)
-    mean = float(differences.mean())
-    half = None
-    if n > 1:
-        spread = float(differences.std(ddof=1)) / math.sqrt(n)
-        half = float(scipy.stats.t.ppf(0.5 * (1.0 + CONFIDENCE), n - 1)) * spread
-    ends = scipy.stats.quantile_test(differences, q=0.0, p=0.5).confidence_interval(CONFIDENCE)
-    median_lower, median_upper = (float(end) if math.isfinite(end) else None for end in ends)
-    return PairedDifference(
-        pairs=n,
-        mean=mean,
-        lower=None if half is None else mean - half,
-        upper=None if half is None else mean + half,
-        median=float(np.median(differences)),
-        median_lower=median_lower,
-        median_upper=median_upper,
-    )
+    mean = float(differences.mean()) if n else None
+    if mean is None or n < 2:
+        return PairedDifference(pairs=n, mean=mean)
+    half = float(scipy.stats.t.ppf(0.5 * (1.0 + CONFIDENCE), n - 1)) * float(differences.std(ddof=1)) / math.sqrt(n)
+    return PairedDifference(pairs=n, mean=mean, lower=mean - half, upper=mean + half)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Final
 
 from quadsim.report.table import ABSENT
 
@@ -44,14 +44,6 @@ def count_of(count: int, thing: str) -> str:
     return f"{count} {thing}{'' if count == 1 else 's'}"
 
 
-def listing(names: Sequence[str], most: int | None = None) -> str:
-    """Names in a sentence, `a, b and c`, the last of too many as a count: `a, b and 7 others`."""
-    shown = (
-        list(names) if most is None or len(names) <= most else [*names[: most - 1], f"{len(names) - most + 1} others"]
-    )
-    return " and ".join(filter(None, [", ".join(shown[:-1]), shown[-1]]))
-
-
 def side_by_side(names: Sequence[str], room: int) -> list[str]:
     """Names for ticks of an axis with room for `room` characters, in two lines each; what is too long ends in `…`."""
     each = max(_SHORTEST, room // max(len(names), 1) - 1)
@@ -61,11 +53,6 @@ def side_by_side(names: Sequence[str], room: int) -> list[str]:
         lines = textwrap.wrap(text, each)
         found.append("\n".join(lines if len(lines) < 3 else (text[:each], text[each:])))
     return found
-
-
-def share_with_interval(found: Mapping[str, Any], confidence: float) -> str:
-    """A proportion and its interval: `3.7 % (95 %: 2.6 to 5.1 %)`."""
-    return f"{percent(found['share'])} ({100 * confidence:g} %: {interval(found['lower'], found['upper'])})"
 
 
 def p_value(p: float) -> str:

@@ -51,13 +51,12 @@ def test_losses_are_compared_beside_failures(make_campaign: MakeCampaign) -> Non
     assert found.verdict == "not distinguishable"
     lost = next(event for event in found.events if event.event == "lost")
     assert (lost.counts, lost.p, lost.p_holm) == ((4, 0), 0.125, 0.125)
-    text = "Flights with robust and with paper differ in count, but not beyond chance, in lost (0 and 4, p = 0.12) ("
-    assert text in found.sentence
     many = ["lost"] * 12 + ["violated"] * 28
     found = compare(changed(one, "verdict", many), changed(other, "verdict", ["violated"] * 40), NAMES)
     assert "not distinguishable by their failures" in found.sentence
-    assert "differ beyond chance in lost (0 and 12, p < 0.001) (McNemar's exact test of each event" in found.sentence
-    assert "| lost | 12 (30.0 %) | 0 (0 %) | 12 | 0 | 0 | p < 0.001 | **p < 0.001** |" in comparison_markdown(found)
+    table = comparison_markdown(found)
+    assert "| lost | 12 (30.0 %) | 0 (0 %) | 12 | 0 | 0 | p < 0.001 | **p < 0.001** |" in table
+    assert "| timeout |" not in table, "it never happened"
 
 
 def test_every_event_and_constraint_is_compared_and_corrected(thousand: pa.Table, better: pa.Table) -> None:
@@ -96,9 +95,7 @@ def test_flights_of_one_campaign_alone_are_left_out(thousand: pa.Table, better: 
     found = compare(thousand, better.take(order), NAMES)
     assert (found.flights, found.left_out) == (600, 400)
     assert found.events == compare(thousand.slice(0, 600), better.slice(0, 600), NAMES).events
-    assert "400 flights of one alone, or with an incomplete flight in the pair, are left out" in comparison_markdown(
-        found
-    )
+    assert "400 flights are left out" in comparison_markdown(found)
 
 
 def test_campaigns_of_one_name_are_distinguished(thousand: pa.Table, better: pa.Table) -> None:
@@ -149,13 +146,13 @@ def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.T
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
     assert plain["verdict"] == "better"
     text = comparison_markdown(found)
-    assert text.startswith("# robust against paper\n\nPairs have their seed in common")
+    assert text.startswith("# robust against paper\n\nPairs share their seed")
     assert "\n\nrobust is better than paper" in text
-    assert "differ in" not in text.partition("robust is better")[0], "nobody said what differs"
+    assert "differ:" not in text.partition("robust is better")[0], "nobody said what differs"
     same, other = (compare(thousand, better, NAMES, differences=d) for d in ((), (("effects.air", None, 3e-4),) * 2))
-    assert "The campaigns differ in no field." in comparison_markdown(same)
+    assert "Fields in which the campaigns differ: 0." in comparison_markdown(same)
     before = comparison_markdown(other).partition("robust is better")[0]
-    assert "The campaigns differ in 2 fields." in before
+    assert "Fields in which the campaigns differ: 2." in before
     assert "| effects.air | absent | 0.0003 |" in before
     assert "| failure | 30 (3.0 %) |" in text
     assert "| worst_margin |" in text

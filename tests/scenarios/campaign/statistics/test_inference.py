@@ -134,25 +134,19 @@ def test_paired_difference_is_scipys() -> None:
     found = paired_difference(a, b)
     interval = stats.ttest_rel(b, a).confidence_interval(0.95)
     assert (found.mean, found.lower, found.upper) == pytest.approx((np.mean(b - a), interval.low, interval.high))
-    assert found.median == np.median(b - a)
-    ordered = np.sort(b - a)
-    rank = int(stats.binom.ppf(0.025, 60, 0.5))  # the sign test, inverted
-    assert (found.median_lower, found.median_upper) == (ordered[rank - 1], ordered[-rank])
 
 
 def test_paired_difference_covers() -> None:
     rng = np.random.default_rng(6)
     found = [paired_difference(np.zeros(40), rng.exponential(size=40)) for _ in range(600)]
-    medians = [one.median_lower <= math.log(2.0) <= one.median_upper for one in found]
-    means = [one.lower <= 1.0 <= one.upper for one in found]
-    assert np.mean(medians) >= 0.94
-    assert 0.89 < np.mean(means) < 0.97  # of a skewed law, the t interval is a little short
+    covered = [one.lower is not None and one.upper is not None and one.lower <= 1.0 <= one.upper for one in found]
+    assert 0.89 < np.mean(covered) < 0.97  # of a skewed law, the t interval is a little short
 
 
 def test_paired_difference_of_few() -> None:
     none = paired_difference(np.empty(0), np.empty(0))
-    assert (none.pairs, none.mean, none.lower, none.median) == (0, None, None, None)
+    assert (none.pairs, none.mean, none.lower) == (0, None, None)
     one = paired_difference(np.array([1.0]), np.array([3.0]))
-    assert (one.mean, one.lower, one.median, one.median_lower) == (2.0, None, 2.0, None)
+    assert (one.mean, one.lower) == (2.0, None)
     same = paired_difference(np.ones(30), np.ones(30))
-    assert (same.mean, same.lower, same.upper, same.median_lower) == (0.0, 0.0, 0.0, 0.0)
+    assert (same.mean, same.lower, same.upper) == (0.0, 0.0, 0.0)
