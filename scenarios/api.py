@@ -315,7 +315,6 @@ def compare(
     *targets: Flight | Scenario | str | Path,
     out: str | Path | None = None,
     overwrite: bool = False,
-    cost: bool | None = None,
     progress: Progress | bool = True,
 ) -> Comparison | CampaignComparison:
     """Flights side by side, or two campaigns flight by flight.
@@ -325,8 +324,6 @@ def compare(
             campaigns.
         out: where to write the page, its figures and its table; nothing is written where absent.
         overwrite: whether to replace an earlier output there.
-        cost: whether to study what constraints cost; None: on a page, where a constrained and an unconstrained
-            controller fly the same course of at most 120 s.
         progress: as of `fly`.
 
     Raises:
@@ -344,11 +341,9 @@ def compare(
 
     target = None if out is None else absolute(out)
     if any(isinstance(each, str | Path) and is_campaign(Path(each)) for each in targets):
-        if cost:
-            raise ParameterError("", "--cost", True, "absent when campaigns are compared")
         return compare_campaigns([Path(str(each)) for each in targets], target, overwrite=overwrite)
     with reporting(progress) as report:
-        return compare_flights(targets, target, cost, report, overwrite=overwrite)
+        return compare_flights(targets, target, report, overwrite=overwrite)
 
 
 def check(directory: str | Path) -> Reaudit:

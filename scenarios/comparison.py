@@ -53,7 +53,6 @@ class Comparison:
 def compare_flights(
     targets: Sequence[Target],
     out: Path | None = None,
-    cost: bool | None = None,
     progress: Progress = silent,
     *,
     overwrite: bool = False,
@@ -63,8 +62,6 @@ def compare_flights(
     Args:
         targets: one or more.
         out: the directory of the page; what has to be flown is saved beside it, in `OUT-runs`.
-        cost: whether to study what constraints cost; None: where a constrained and an unconstrained controller fly the
-            same course of at most 120 s.
         progress: called with (what, done, total).
         overwrite: whether to replace an earlier output in the page's place.
 
@@ -74,21 +71,16 @@ def compare_flights(
     """
     from quadsim.report.comparison import comparison_rows, run_names
     from quadsim.report.pages.comparison_page import write_comparison
-    from scenarios.cost.measure import find_study, study_cost
-    from scenarios.cost.section import cost_section
 
     notes = [note for target in targets for note in _checked(target)]
     named = [_name_of(target) for target in targets]
-    studied = find_study(named, requested=cost) if out is not None else []
     with contextlib.ExitStack() as stack:
         scratch = stack.enter_context(tempfile.TemporaryDirectory())
         if out is not None:
             stack.enter_context(reserving(out, overwrite=overwrite))
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
         runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
-        study = study_cost(studied[0], studied[1:], progress=progress) if studied else None
-        section = None if study is None else cost_section(study)
-        page = None if out is None else write_comparison(runs, out, section, overwrite=overwrite)
+        page = None if out is None else write_comparison(runs, out, overwrite=overwrite)
     return Comparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page, notes=tuple(notes))
 
 

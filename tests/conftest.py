@@ -12,10 +12,9 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import settings
-from support import draw_nothing, fly_here, sketch_figures, take_long_steps
+from support import draw_nothing, fly_here, sketch_figures
 
 from quadsim.controller import Controller
 from quadsim.flight import rundir
@@ -23,8 +22,6 @@ from quadsim.flight.rundir import Run
 from quadsim.report.recording import write_recording
 from quadsim.sim.effects import Force
 from quadsim.vehicle import Vehicle
-from scenarios.cost.measure import ARM_LENGTHS, DRAGS
-from scenarios.cost.study import MEASURES, CandidateTimes, CostStudy, Outcome, Sweep, SweepPoint, Variation
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
@@ -45,17 +42,17 @@ settings.load_profile("quadsim")
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
 LONG = (
     *("scenarios/test_many.py", "scenarios/test_library.py"),
-    *("scenarios/campaign/test_run.py", "test_commands.py", "scenarios/bench/test_bench.py"),
+    *("scenarios/campaign/test_run.py", "test_commands.py"),
     *("scenarios/campaign/report/test_campaign_page.py", "quadsim/report/film/test_video.py"),
     *("quadsim/report/test_comparison_page.py", "scenarios/design/test_first_flights.py"),
     "scenarios/test_process.py",
-    *("test_documents.py", "scenarios/cost/test_measure.py", "scenarios/test_diagnosis.py", "scenarios/test_api.py"),
-    *("scenarios/test_faults.py", "quadsim/report/test_figures.py", "scenarios/bench/test_mismatch.py"),
+    *("test_documents.py", "scenarios/test_diagnosis.py", "scenarios/test_api.py"),
+    *("quadsim/report/test_figures.py"),
     *("mpc/robust/test_robust.py", "scenarios/test_reaudit.py", "scenarios/test_run.py", "scenarios/test_cli.py"),
     *("mpc/test_staged.py", "scenarios/campaign/test_commands.py"),
     *("test_packaging.py", "mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
     *("scenarios/gym/test_environment.py", "test_learning_examples.py"),
-    *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py", "scenarios/test_bad_controllers.py"),
+    *("mpc/fallback/test_fallback_flights.py", "scenarios/test_bad_controllers.py"),
     *("scenarios/campaign/statistics/test_drivers.py", "scenarios/papers/test_beyond.py"),
     *("scenarios/tuning/test_run.py", "scenarios/tuning/report/test_tuning_page.py"),
 )
@@ -174,18 +171,6 @@ def campaigns_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def cheap_benchmarks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`bench ladder` and `bench speed` with `--quick` fly here, less; small films: that they run is what is tested."""
-    fly_here(monkeypatch)
-    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.QUICK_DURATION", 1.0)
-    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.TIMED", 1)
-    monkeypatch.setattr("scenarios.bench.speed.QUICK_SPEEDS", (6.0,))
-    take_long_steps(monkeypatch, "loop, drag")
-    monkeypatch.setattr("scenarios.bench.film.WIDTH", 320)
-    monkeypatch.setattr("scenarios.bench.film.HEIGHT", 180)
-
-
-@pytest.fixture
 def fly_known(fly_once: Fly) -> Fly:
     """Stands in for `scenarios.run.fly_scenario`: a scenario as the library has it is flown once per session."""
 
@@ -213,82 +198,3 @@ def constrained_flight(fly_once: Fly) -> Flight:
 def unconstrained_flight(fly_once: Fly) -> Flight:
     """The paper's whole unconstrained flight."""
     return fly_once("paper-unconstrained")
-
-
-@pytest.fixture(scope="session")
-def varied_flights(fly_once: Fly, vehicle: Vehicle) -> dict[tuple[float, float], Flight]:
-    """The constrained flight over arm length [m] and drag to thrust [m], which the paper leaves out."""
-    own = (vehicle.arm_length, vehicle.drag_to_thrust)
-    return {
-        (arm, drag): fly_once("paper-constrained")
-        if (arm, drag) == own
-        else fly_once("paper-constrained", f"vehicle.arm_length={arm}", f"vehicle.drag_to_thrust={drag}")
-        for arm in ARM_LENGTHS
-        for drag in DRAGS
-    }
-
-
-def make_outcome(scale: float = 1.0, *, reason: str | None = None, settled: float | None = 4.0) -> Outcome:
-    """A flight of ten periods whose measures are `scale` times 1, 2, 3 and so on."""
-    return Outcome(
-        reason=reason,
-        flown=0.5,
-        statuses={"infeasible": 1, "solved": 3, "unconstrained": 6},
-        fallbacks=1,
-        active=3,
-        numbers={key: scale * (i + 1.0) for i, key in enumerate(MEASURES)},
-        settling=[
-            {"channel": "x", "time": 0.0, "before": 0.0, "after": 1.0, "settled": settled},
-            {"channel": "x", "time": 10.0, "before": 1.0, "after": 0.0, "settled": 3.0},
-        ],
-    )
-
-
-@pytest.fixture
-def cost_study() -> CostStudy:
-    """A made-up study in which everything that can happen does: flights lost, plans held, steps that never settle."""
-    step_ms = np.linspace(1.0, 10.0, 10)
-    shortcut = ("unconstrained",) * 6 + ("solved",) * 3 + ("infeasible",)
-    lost = make_outcome(9.0, reason="the plant diverged", settled=None)
-    times = {"p50": 0.5, "p95": 0.8, "p99": 0.9, "max": 1.0}
-    return CostStudy(
-        name="bounded",
-        horizon=20,
-        deadline_ms=50.0,
-        duration=0.5,
-        constrained=make_outcome(2.0),
-        unconstrained=make_outcome(4.0, settled=8.0),
-        others={"free": make_outcome(3.0)},
-        reference=[{"settled": 5.0}, {"settled": None}],
-        candidates=(
-            CandidateTimes(name="gain", step_ms=0.01 * step_ms, statuses=("solved",) * 10, repeats=3),
-            CandidateTimes(name="as flown", step_ms=step_ms, statuses=shortcut, repeats=3),
-            CandidateTimes(name="QP by slow", step_ms=8.0 * step_ms, statuses=("solved",) * 10, repeats=1),
-        ),
-        left_out={"absent": "pip install it"},
-        tilt=Sweep(
-            name="tilt bound",
-            unit="deg",
-            base=5.0,
-            points=(
-                SweepPoint(value=2.0, constrained=make_outcome(3.0, settled=None), step_ms=times),
-                SweepPoint(value=5.0, constrained=make_outcome(2.0), step_ms=times),
-                SweepPoint(value=10.0, constrained=lost, step_ms={}),
-            ),
-        ),
-        horizons=Sweep(
-            name="horizon",
-            unit="periods",
-            base=20,
-            points=(
-                SweepPoint(value=10, constrained=make_outcome(3.0), step_ms=times, unconstrained=lost),
-                SweepPoint(value=20, constrained=make_outcome(2.0), step_ms=times, unconstrained=make_outcome(4.0)),
-            ),
-        ),
-        variations=(
-            Variation(arm_length=0.2, drag_to_thrust=0.012, outcome=make_outcome(2.0)),
-            Variation(arm_length=0.5, drag_to_thrust=0.024, outcome=make_outcome(2.5)),
-            Variation(arm_length=0.5, drag_to_thrust=0.048, outcome=lost),
-        ),
-        machine={"processor": "abacus", "cores": 2},
-    )

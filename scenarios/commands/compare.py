@@ -12,7 +12,7 @@ from scenarios.comparison import Comparison
 
 def compare(options: Namespace) -> int:
     """`quadsim compare`."""
-    found = compare_all(*options.targets, out=options.out, overwrite=options.overwrite, cost=options.cost)
+    found = compare_all(*options.targets, out=options.out, overwrite=options.overwrite)
     if isinstance(found, Comparison):
         for note in found.notes:
             console.say(note)

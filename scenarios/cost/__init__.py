@@ -1,1 +1,0 @@
-"""What do constraints cost?  Flights and times measured, and the page's section made from them."""
