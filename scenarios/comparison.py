@@ -73,7 +73,6 @@ def compare_flights(
     from quadsim.report.pages.comparison_page import write_comparison
 
     notes = [note for target in targets for note in _checked(target)]
-    named = [_name_of(target) for target in targets]
     with contextlib.ExitStack() as stack:
         scratch = stack.enter_context(tempfile.TemporaryDirectory())
         if out is not None:
@@ -92,12 +91,6 @@ def _checked(target: Target) -> Sequence[str]:
         return [f"{target}: {note}" for note in reaudit(Path(target), products=False).notes]
     load_scenario(str(target))
     return ()
-
-
-def _name_of(target: Target) -> str:
-    if isinstance(target, Flight):
-        return target.scenario.name if target.directory is None else str(target.directory)
-    return target.name if isinstance(target, Scenario) else str(target)
 
 
 def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool) -> rundir.Run:

@@ -3,25 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from pkgutil import resolve_name
 from types import ModuleType
-from typing import Any
 
-import make_cost
-import make_numbers as numbers
 import matplotlib as mpl
-import numpy as np
 import pytest
-from support import fly_here
 
-from quadsim.report.table import grid_to_markdown
-from scenarios.cost import cost_flights
-from scenarios.cost.cost_tables import cost_tables
-from scenarios.cost.measure import study_cost
-from scenarios.cost.study import CandidateTimes, Variation
-from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 
@@ -30,63 +18,6 @@ MADE = {"gallery.md"}
 """Pages that `make docs` makes."""
 ENTRY_POINTS = {"quadsim.controllers"}
 """Groups of entry points, which are written like modules."""
-
-
-def test_results_in_the_readme_are_what_the_flights_give(fly_once: Callable[..., Flight]) -> None:
-    names = ("paper-unconstrained", "paper-unconstrained-clipped", "paper-constrained")
-    table = numbers.markdown(numbers.results({name: fly_once(name) for name in names}))
-    for document in ("README.md", "docs/numbers.md"):
-        assert table in (ROOT / document).read_text(encoding="utf-8"), f"{document} is out of date: make numbers"
-
-
-def test_targets_in_the_documents_are_met_and_todays(
-    constrained_flight: Flight,
-    varied_flights: dict[tuple[float, float], Flight],
-    fly_once: Callable[..., Flight],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The flights over L and d/b are those of tests/scenarios/test_paper.py; two seconds do for the two solvers."""
-    difference = numbers.solver_difference(2.0)
-    assert 0.0 < difference <= 0.01
-    monkeypatch.setattr(numbers, "solver_difference", lambda: difference)
-    monkeypatch.setattr(numbers, "fly", fly_once)
-    variations = [
-        Variation(arm_length=arm, drag_to_thrust=drag, outcome=cost_flights._outcome(flight.scenario, flight.log))
-        for (arm, drag), flight in varied_flights.items()
-    ]
-    table = numbers.markdown(numbers.targets(constrained_flight, variations))
-    page = (ROOT / "docs/numbers.md").read_text(encoding="utf-8")
-    # The last digits of residues near rounding are the processor's; everything else is to be found as it stands.
-    stable = [line for line in table.splitlines() if not re.search(r"mjd_transitionFD|differ by|at the end", line)]
-    assert [line for line in stable if line not in page] == []
-
-
-def test_what_constraints_cost_is_what_the_flights_give(
-    fly_known: Callable[..., Flight], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All that no clock decides, of the flight and its counterpart; the sweeps are those of `make numbers`.
-
-    What the steps take is made up.
-    """
-    fly_here(monkeypatch)
-    monkeypatch.setattr(cost_flights, "fly_scenario", fly_known)
-    steps: dict[str, Any] = {"step_ms": np.ones(1200), "statuses": ("solved",) * 1200, "repeats": 1}
-    timed = [CandidateTimes(name=name, **steps) for name in ("gain", "as flown")]
-    few = {"tilts": (), "horizons": (), "arm_lengths": (), "drags": (), "timed": timed}
-    study = study_cost(load_scenario("paper-constrained"), [load_scenario("paper-unconstrained")], **few)
-    flights = {grid.key: grid for grid in cost_tables(study)}["bounds"]
-    page = (ROOT / "docs/constraints-cost.md").read_text(encoding="utf-8")
-    lines = [line for line in grid_to_markdown(flights).splitlines() if "error at the end" not in line]
-    assert [line for line in lines if line not in page] == []
-    answers = [
-        line for line in numbers.markdown(make_cost.answer(study)).splitlines() if "[m]" in line or "rad/s" in line
-    ]
-    assert len(answers) == 3
-    assert [line for line in answers if line not in page] == []
-
-
-def test_convergence_in_the_documents_is_what_the_gains_give() -> None:
-    assert numbers.markdown(numbers.lqr_convergence()) in (ROOT / "docs/numbers.md").read_text(encoding="utf-8")
 
 
 def test_the_examples_in_the_page_on_effects_are_a_scenario(tmp_path: Path) -> None:

@@ -17,8 +17,6 @@ from quadsim.flight.rundir import Run
 from quadsim.report.pages import comparison_page
 from quadsim.report.pages.comparison_page import write_comparison
 from quadsim.report.plots.flight_plots import comparison_plots, thin
-from scenarios.cost.section import cost_section
-from scenarios.cost.study import CostStudy
 
 HOSTILE = "<script>alert(1)</script> & \"more\" 'quoted'"
 PROBE = """<script>
@@ -110,27 +108,6 @@ def test_the_text_gives_outcomes_reasons_and_numbers(page_of_two: Path) -> None:
     assert "This run has no video" in text
     assert "paper-constrained/flight.rrd" in text
     assert "lost/flight.rrd" not in text
-
-
-@pytest.mark.usefixtures("unplotted")
-def test_a_study_of_costs_has_a_section_and_files(
-    short_run: Run, cost_study: CostStudy, page: Path, tmp_path: Path
-) -> None:
-    hostile = dataclasses.replace(cost_study, name=HOSTILE)
-    studied = write_comparison([short_run], tmp_path / "out", cost_section(hostile))
-    text = without_scripts(studied.read_text())
-    assert "What do constraints cost?" in text
-    assert "&lt;script&gt;alert(1)" in text
-    assert text.count('<table class="grid">') == 5
-    assert text.count('<details class="folded" open>') == 2
-    assert '<td class="bad">lost at 0.5 s</td>' in text
-    assert {path.name for path in studied.parent.iterdir() if path.name.startswith("cost")} == {
-        *("cost.json", "cost.md"),
-        *(f"cost_{what}.{kind}" for what in ("steps", "tilt", "horizon") for kind in ("png", "svg")),
-    }
-    for url in re.findall(r'(?:href|src)="([^"#]+)"', text):
-        assert url == "data:," or (studied.parent / url).is_file(), url
-    assert "What do constraints cost?" not in page.read_text()
 
 
 def test_nothing_is_fetched(page: Path) -> None:
@@ -254,18 +231,15 @@ def test_many_runs_keep_the_page_small(short_run: Run) -> None:
     assert sum(len(plot.json) for plot in comparison_plots([long] * 10)) < 3e6
 
 
-def test_a_browser_draws_the_page_and_has_no_complaint(
-    short_run: Run, aborted_run: Run, cost_study: CostStudy, tmp_path: Path
-) -> None:
-    page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out", cost_section(cost_study))
+def test_a_browser_draws_the_page_and_has_no_complaint(short_run: Run, aborted_run: Run, tmp_path: Path) -> None:
+    page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out")
     page.write_text(page.read_text().replace("</body>", f"{PROBE}</body>"))
     dom, console = open_page(page, tmp_path / "profile")
     assert console == []
     report = re.findall(r"<output>(.*?)</output>", dom)[-1]
     assert "ranges 1-2 1-2 1-2 1-2" in report
-    assert "visible false true false true" in report
+    assert "visible false true" in report
     assert int(re.findall(r"svgs (\d+)", report)[0]) > 40
-    assert "costs 3 16 16" in report  # the candidates, and the curves of six panels
     buttons = re.findall(r"buttons ([^;]*)", report)[0].replace("a png", "a PNG")  # of an older plotly
     assert set(buttons.split(",")) == {
         *("Download plot as a PNG", "Zoom", "Pan", "Zoom in", "Zoom out", "Autoscale", "Reset axes"),
