@@ -37,7 +37,7 @@ def main(picture: str = "constraint_cost.png", duration: float = 60.0) -> None:
         )
         rmse = [flight.metrics[f"rmse.{axis}"] for axis in "xyz"]
         tilt = max(abs(flight.plant[name]).max() for name in ("roll", "pitch")) * 180.0 / math.pi
-        step = abs(flight.command[1:] - flight.command[:-1]).max()
+        step = max(abs(flight.summary["control"][name]) for name in ("slew_min", "slew_max"))
         times = flight.summary["controller"]["step_ms"]
         numbers = (*rmse, tilt, step, times["p50"], times["p99"])
         print("{:>8}   {:7.3f} {:6.3f} {:6.3f} {:13.2f} {:20.1f} {:16.2f} {:6.2f}".format(bound, *numbers))
