@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from timing import Record, options, run, step_quantiles, time_in_turns
 
-from mpc.solvers import SOLVERS
 from quadsim.controller import ACCEPTED, Command, Controller, Moment
 from quadsim.errors import FlightError, InputError, MissingPackageError
 from quadsim.flight.log import ControlLog
@@ -63,7 +62,7 @@ class Replayed:
 def entries(scenario: Scenario) -> dict[str, Scenario]:
     """The scenario as it is, and with each installed solver and no shortcuts."""
     entries = {FLOWN: scenario}
-    for name in dict.fromkeys([*SOLVERS, *catalogue().solvers]):
+    for name in catalogue().solvers:
         changed = scenario.replace({"controller.solver": name, "controller.shortcut": False})
         try:
             build_controller(changed, build_vehicle(changed))

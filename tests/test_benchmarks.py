@@ -81,3 +81,12 @@ def test_wrong_input_is_one_message(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "out.json").exists()
+
+
+def test_the_example_of_what_constraints_cost_runs(tmp_path: Path) -> None:
+    picture = tmp_path / "cost.png"
+    command = [sys.executable, "examples/constraint_cost.py", str(picture), "2.0"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "inf" in done.stdout
+    assert picture.is_file()
