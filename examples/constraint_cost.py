@@ -60,4 +60,5 @@ def main(picture: str = "constraint_cost.png", duration: float = 60.0) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2], *map(float, sys.argv[2:3]))
+    given = sys.argv[1:]
+    main(given[0] if given else "constraint_cost.png", float(given[1]) if len(given) > 1 else 60.0)

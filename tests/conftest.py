@@ -42,7 +42,7 @@ settings.load_profile("quadsim")
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
 LONG = (
     *("scenarios/test_many.py", "scenarios/test_library.py"),
-    *("scenarios/campaign/test_run.py", "test_commands.py"),
+    *("scenarios/campaign/test_run.py", "test_benchmarks.py", "test_commands.py"),
     *("scenarios/campaign/report/test_campaign_page.py", "quadsim/report/film/test_video.py"),
     *("quadsim/report/test_comparison_page.py", "scenarios/design/test_first_flights.py"),
     "scenarios/test_process.py",
