@@ -47,7 +47,7 @@ LONG = (
     *("quadsim/report/test_comparison_page.py", "scenarios/design/test_first_flights.py"),
     "scenarios/test_process.py",
     *("test_documents.py", "scenarios/test_diagnosis.py", "scenarios/test_api.py"),
-    *("quadsim/report/test_figures.py"),
+    "quadsim/report/test_figures.py",
     *("mpc/robust/test_robust.py", "scenarios/test_reaudit.py", "scenarios/test_run.py", "scenarios/test_cli.py"),
     *("mpc/test_staged.py", "scenarios/campaign/test_commands.py"),
     *("test_packaging.py", "mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
