@@ -30,12 +30,6 @@ if TYPE_CHECKING:
     from scenarios.api import resolve as resolve
     from scenarios.api import start as start
     from scenarios.api import view as view
-    from scenarios.benchmarks import bench_campaign as bench_campaign
-    from scenarios.benchmarks import bench_flight as bench_flight
-    from scenarios.benchmarks import bench_ladder as bench_ladder
-    from scenarios.benchmarks import bench_render as bench_render
-    from scenarios.benchmarks import bench_solvers as bench_solvers
-    from scenarios.benchmarks import bench_speed as bench_speed
     from scenarios.catalogue import Catalogue as Catalogue
     from scenarios.catalogue import LibraryScenario as LibraryScenario
     from scenarios.catalogue import catalogue as catalogue
@@ -75,14 +69,6 @@ _MODULES = {
         "resolve",
         "start",
         "view",
-    ),
-    "scenarios.benchmarks": (
-        "bench_campaign",
-        "bench_flight",
-        "bench_ladder",
-        "bench_render",
-        "bench_solvers",
-        "bench_speed",
     ),
     "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
     "scenarios.export.exporter": ("export",),

@@ -136,7 +136,6 @@ def make_parser() -> argparse.ArgumentParser:
     _add_settings(export)
 
     _add_tune(command("tune", help="search fields of a scenario; the answer is held against the start on fresh draws"))
-    _add_bench(command("bench", help="measure QP solvers, a flight, a film, and what controllers survive"))
 
     doctor = command("doctor", help="what this machine can do")
     doctor.add_argument("--json", action="store_true", help="as JSON on stdout")
@@ -188,59 +187,6 @@ def _add_tune(tune: argparse.ArgumentParser) -> None:
     add("--resume", action="store_true", help="continue what is there")
     add("--report", action=argparse.BooleanOptionalAction, default=True, help="write the report, HTML pages")
     add("--json", **_SUMMARY)
-
-
-def _add_bench(bench: argparse.ArgumentParser) -> None:
-    kind = bench.add_subparsers(dest="kind", metavar="WHAT", required=True).add_parser
-    numbers: dict[str, Any] = {"type": _whole_numbers, "metavar": "N,N,..."}
-
-    solvers = kind("solvers", help="every installed QP solver on the queries of one flight, in one run")
-    add = solvers.add_argument
-    add("--out", metavar="DIR", default="runs/bench-solvers", help="directory (default: %(default)s)")
-    add("--repeats", **_NUMBER, default=5, help="repetitions of each measurement (default: 5)")
-    horizons = "horizons for the growth of the step, or none (default: 10,20,50,100,200)"
-    add("--horizons", **numbers, default=[10, 20, 50, 100, 200], help=horizons)
-    this = "time this one; may be repeated (default: all)"
-    add("--solver", dest="solvers", metavar="NAME", action="append", help=this)
-    add("--stride", **_NUMBER, default=1, help="time one segment of 20 periods in every N (default: 1, all)")
-
-    flight = kind("flight", help="where the time of a flight goes")
-    flight.add_argument("--repeats", **_NUMBER, default=5, help="flights (default: 5)")
-
-    render = kind("render", help="what a film costs")
-    render.add_argument("--seconds", type=float, metavar="S", default=4.0, help="of film (default: 4)")
-    render.add_argument("--workers", **_NUMBER, help="rendering processes (default: one per core)")
-
-    ladder = kind("ladder", help="what each controller survives, from rotor lag to a worn rotor")
-    ladder.add_argument("--out", metavar="DIR", default="runs/bench-ladder", help="directory (default: %(default)s)")
-    ladder.add_argument("--workers", **_NUMBER, help="processes (default: one per core)")
-    ladder.add_argument("--quick", action="store_true", help="three controllers, three conditions, 12 s each")
-
-    speed = kind("speed", help="how well each controller follows agile courses, flown ever faster")
-    speed.add_argument("--workers", **_NUMBER, help="processes (default: one per core)")
-    speed.add_argument("--quick", action="store_true", help="two controllers on one course, at two speeds")
-
-    campaign = kind("campaign", help="what many flights cost, by one worker and by two")
-    campaign.add_argument("--flights", **_NUMBER, default=40, help="per worker and round (default: 40)")
-    campaign.add_argument("--rounds", **_NUMBER, default=3, help="of one worker and two (default: 3)")
-    sizes = "flights of ever larger campaigns, or none (default: 10,100,1000,10000)"
-    campaign.add_argument("--sizes", **numbers, default=[10, 100, 1000, 10000], help=sizes)
-
-    for parser in (solvers, flight, render, ladder, campaign):
-        parser.add_argument(
-            "--scenario", metavar="SCENARIO", default="paper-constrained", help="(default: %(default)s)"
-        )
-        _add_settings(parser)
-    for parser in (solvers, flight, render, ladder, speed, campaign):
-        parser.add_argument("--json", action="store_true", help="print what was measured alone, as JSON on stdout")
-
-
-def _whole_numbers(text: str) -> list[int]:
-    """Numbers between commas; `none` for no number."""
-    try:
-        return [] if text == "none" else [int(part) for part in text.split(",")]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be whole numbers between commas, or none; got {text!r}") from None
 
 
 def _add_products(parser: argparse.ArgumentParser) -> None:

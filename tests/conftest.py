@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from support import draw_nothing, fly_here, take_long_steps
+from support import draw_nothing, fly_here
 
 from quadsim.controller import Controller
 from quadsim.flight import rundir
@@ -42,17 +42,17 @@ settings.load_profile("quadsim")
 NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
 LONG = (
     *("scenarios/test_many.py", "scenarios/test_library.py"),
-    *("scenarios/campaign/test_run.py", "test_commands.py", "scenarios/bench/test_bench.py"),
+    *("scenarios/campaign/test_run.py", "test_benchmarks.py", "test_commands.py"),
     *("scenarios/campaign/report/test_campaign_page.py", "quadsim/report/film/test_video.py"),
     *("quadsim/report/test_comparison_page.py", "scenarios/design/test_first_flights.py"),
     "scenarios/test_process.py",
     *("test_documents.py", "scenarios/test_diagnosis.py", "scenarios/test_api.py"),
-    *("scenarios/test_faults.py", "quadsim/report/test_figures.py", "scenarios/bench/test_mismatch.py"),
+    "quadsim/report/test_figures.py",
     *("mpc/robust/test_robust.py", "scenarios/test_reaudit.py", "scenarios/test_run.py", "scenarios/test_cli.py"),
     *("mpc/test_staged.py", "scenarios/campaign/test_commands.py"),
     *("test_packaging.py", "mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
     *("scenarios/gym/test_environment.py", "test_learning_examples.py"),
-    *("mpc/fallback/test_fallback_flights.py", "scenarios/test_soak.py", "scenarios/test_bad_controllers.py"),
+    *("mpc/fallback/test_fallback_flights.py", "scenarios/test_bad_controllers.py"),
     *("scenarios/campaign/statistics/test_drivers.py", "scenarios/papers/test_beyond.py"),
     *("scenarios/tuning/test_run.py",),
 )
@@ -138,12 +138,6 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures of benchmarks have few pixels."""
-    monkeypatch.setattr("quadsim.report.figures.canvas.DPI", 30)
-
-
-@pytest.fixture
 def recorded_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Recordings are written in this process, which imports rerun once, not in one of their own each."""
 
@@ -159,18 +153,6 @@ def recorded_here(monkeypatch: pytest.MonkeyPatch) -> None:
 def campaigns_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """See `support.fly_here`."""
     fly_here(monkeypatch)
-
-
-@pytest.fixture
-def cheap_benchmarks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """`bench ladder` and `bench speed` with `--quick` fly here, less; small films: that they run is what is tested."""
-    fly_here(monkeypatch)
-    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.QUICK_DURATION", 1.0)
-    monkeypatch.setattr("scenarios.bench.mismatch.benchmark.TIMED", 1)
-    monkeypatch.setattr("scenarios.bench.speed.QUICK_SPEEDS", (6.0,))
-    take_long_steps(monkeypatch, "loop, drag")
-    monkeypatch.setattr("scenarios.bench.film.WIDTH", 320)
-    monkeypatch.setattr("scenarios.bench.film.HEIGHT", 180)
 
 
 @pytest.fixture
@@ -214,6 +196,6 @@ def varied_flights(fly_once: Fly, vehicle: Vehicle) -> dict[tuple[float, float],
         (arm, drag): fly_once("paper-constrained")
         if (arm, drag) == own
         else fly_once("paper-constrained", f"vehicle.arm_length={arm}", f"vehicle.drag_to_thrust={drag}")
-        for arm in ARM_LENGTHS
-        for drag in DRAGS
+        for arm in (0.2, 0.3, 0.5)
+        for drag in (0.012, 0.024, 0.048)
     }

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from polish import polish
 from scipy.optimize import linprog
 
 from mpc.constraints import Constraint
@@ -19,7 +20,6 @@ from mpc.ocp import Problem, Rest
 from mpc.qp import QP, Solution, kkt_residuals
 from mpc.solvers.daqp_dense import DaqpDense
 from quadsim.state import Array
-from scenarios.bench.polish import polish
 
 
 @dataclass(frozen=True, kw_only=True)

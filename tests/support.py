@@ -45,14 +45,6 @@ def draw_nothing(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("quadsim.report.to_matplotlib.to_png", lambda *_, **__: b"")
 
 
-def take_long_steps(patch: pytest.MonkeyPatch, world: str) -> None:
-    """Fly a world of `quadsim bench speed` with five steps of the physics per control period instead of fifty."""
-    from scenarios.bench.speed import WORLDS
-
-    changes = WORLDS[world].changes
-    patch.setitem(changes, "plant", {**changes["plant"], "timestep": 0.005})
-
-
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:
     """The optimisation of one of the paper's scenarios."""
     scenario = load_scenario(name, settings)

@@ -26,7 +26,7 @@ MPC_MAY_IMPORT = {
 RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it alone may import at its top what is heavy."""
 FOR_DRAWING = {
-    "matplotlib": r"quadsim\.report\.(to_matplotlib|figures\.canvas)|scenarios\.bench\..+",
+    "matplotlib": r"quadsim\.report\.to_matplotlib",
     "plotly": r"quadsim\.report\.to_plotly",
 }
 """Libraries to draw with, and the module that imports each."""

@@ -84,14 +84,11 @@ def promised_file(options: Namespace) -> Path | None:
             return Path(options.out) / "index.html"
         case "video":
             return Path(options.run) / "flight.mp4"
-        case "bench" if options.kind == "solvers":
-            return Path(options.out) / "bench.json"
     return None
 
 
 @pytest.fixture
 def workplace(
-    cheap_benchmarks: None,
     fly_known: Callable[..., Flight],
     flown: Path,
     campaign: Path,
@@ -115,7 +112,6 @@ def workplace(
     for name in ("paper-unconstrained", "paper-constrained"):
         shutil.copytree(flown, tmp_path / "runs" / name)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("scenarios.bench.speed.QUICK_LAWS", ("LQR",))
     monkeypatch.setattr("scenarios.papers.reproduction.fly_scenario", fly_known)
     monkeypatch.setattr("scenarios.api.fly_scenario", fly_known)
 
@@ -156,8 +152,8 @@ def test_documented_scenarios_and_settings_are_valid(line: str) -> None:
 @pytest.mark.parametrize("line", RUNNABLE)
 def test_documented_command_runs(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = arguments_of(line)
-    command = " ".join(arguments[: 2 if arguments[0] == "bench" else 1])
-    if command in ("video", "bench render"):
+    command = arguments[0]
+    if command == "video":
         try:
             rendering_backend()
         except RenderingUnavailableError as error:

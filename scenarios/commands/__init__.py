@@ -24,7 +24,6 @@ COMMANDS: Final[Mapping[str, str]] = {
     "tune": "tunings:tune",
     "reproduce": "papers:reproduce",
     "export": "export:export",
-    "bench": "bench:bench",
     "doctor": "doctor:doctor",
 }
 """Where each is, `module:function` in this package."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from polish import polish
 from support import flight_queries, paper_problem, paper_reference
 
 from mpc.constraints import Constraint
@@ -17,7 +18,6 @@ from mpc.solvers.piqp_backends import PiqpDense
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array
-from scenarios.bench.polish import polish
 from scenarios.flight import Flight
 
 STATE = np.zeros(12)

@@ -13,6 +13,7 @@ import scipy.optimize
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ocp_peer import Period
+from polish import polish
 from support import changing_period, flight_queries, paper_problem, paper_reference, random_problem, with_terms
 
 from mpc.constraints import Penalty
@@ -30,7 +31,6 @@ from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.bench.polish import polish
 from scenarios.flight import Flight
 
 LAG = 0.05

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg
+from polish import polish
 from support import paper_problem, random_problem
 
 from mpc.exact.axes import axes
@@ -19,7 +20,6 @@ from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged
 from quadsim.errors import ParameterError
 from quadsim.state import Array
-from scenarios.bench.polish import polish
 
 
 def terminated(problem: Problem) -> Problem:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
+
 from mpc.ocp import Problem
 from quadsim.state import Array
-from scenarios.bench.queries import recorded
 from scenarios.build import build_problem
+from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 
@@ -39,13 +41,14 @@ def record() -> tuple[Problem, tuple[Query, ...]]:
     flight = fly_scenario(load_scenario(SCENARIO))
     log = flight.log.control
     problem = build_problem(flight.scenario, flight.vehicle)
-    queried = recorded(flight.scenario, log, problem.horizon)
-    desired = problem.objective.desired(queried.reference)
+    reference = build_reference(flight.scenario, log.t.size + problem.horizon)
+    desired = problem.objective.desired(reference)
+    before = np.vstack([log.speeds_before, log.speeds[:-1]])
     queries = tuple(
         Query(
-            state=queried.state[k],
+            state=log.state[k],
             desired=desired[k + 1 : k + 1 + problem.horizon],
-            u_before=queried.speeds_before[k],
+            u_before=before[k],
             status=log.status[k],
             speeds=log.speeds[k],
         )

@@ -141,7 +141,6 @@ ONE_OF_EACH = {  # of every command; the first writes the run that others read
     "tune": ["tune", "tuning.toml", "--out", "tuning", "--workers", "1", "--no-report"],
     "reproduce": ["reproduce", "quadrotor-uav"],
     "export": ["export", "paper-unconstrained", *BRIEF, "--out", "exported"],
-    "bench": ["bench", "flight", "--repeats", "1", *BRIEF],
     "doctor": ["doctor"],
 }
 

@@ -1,0 +1,68 @@
+"""What a film costs: the start of the renderer, and each frame."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from timing import Record, Stopwatch, options, run
+
+from quadsim.report.film.video import render_video, rendering_backend, worker_count
+from scenarios.api import load
+from scenarios.flight import Outputs
+from scenarios.run import run_scenario
+
+FPS = 30
+
+
+def measure(name: str, quick: bool, workers: int | None) -> list[Record]:
+    """One record: seconds until the first frame is there, and from then on per frame [ms].
+
+    Raises:
+        RenderingUnavailableError: this machine cannot render.
+    """
+    backend = rendering_backend()
+    width, height, seconds = (320, 180, 0.5) if quick else (1280, 720, 4.0)
+    reports: list[tuple[int, int, float]] = []  # frames done, of how many, after how long [s]
+    with tempfile.TemporaryDirectory() as scratch:
+        directory = Path(scratch) / "run"
+        plain = Outputs(video=False, recording=False, figures=False)
+        run_scenario(load(name).replace({"duration": seconds, "constraints": []}), directory, plain)
+        watch = Stopwatch()
+        render_video(
+            directory,
+            directory / "film.mp4",
+            workers=workers,
+            width=width,
+            height=height,
+            fps=FPS,
+            progress=lambda done, total: reports.append((done, total, watch.elapsed)),
+        )
+        wall = watch.elapsed
+    frames, start = reports[0][1], reports[0][2]
+    return [
+        {
+            "back_end": backend,
+            "size": f"{width}x{height}",
+            "workers": worker_count(frames, workers),
+            "frames": frames,
+            "start_s": start,
+            "frame_ms": 1e3 * (wall - start) / frames,
+            "whole_s": wall,
+            "s_per_minute_of_film": start + 60.0 * FPS * (wall - start) / frames,
+        }
+    ]
+
+
+def main() -> None:
+    """Film, print and write."""
+    chosen = options(
+        __doc__,
+        scenario={"default": "paper-constrained", "help": "default: %(default)s"},
+        workers={"type": int, "metavar": "N", "help": "processes (default: one per core)"},
+    )
+    run(lambda: measure(chosen.scenario, chosen.quick, chosen.workers), f"A film of {chosen.scenario}", chosen.json)
+
+
+if __name__ == "__main__":
+    main()

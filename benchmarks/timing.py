@@ -1,0 +1,152 @@
+"""What the benchmarks share: options, tables, JSON, and times taken in turns on undisturbed cores."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import json
+import sys
+import time as clock
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from threadpoolctl import threadpool_limits
+
+from quadsim.errors import QuadsimError
+from quadsim.flight.metrics import percentiles
+from quadsim.state import Array
+from scenarios.machine import machine, versions
+
+Record = dict[str, Any]
+
+
+def options(about: str | None, **extra: Mapping[str, Any]) -> argparse.Namespace:
+    """The command line of a benchmark: `--json`, `--quick`, and options of its own."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all numbers there; a figure goes beside it")
+    parser.add_argument("--quick", action="store_true", help="a small part of it, in seconds")
+    for name, keywords in extra.items():
+        parser.add_argument(f"--{name}", **keywords)
+    return parser.parse_args()
+
+
+def run(measure: Callable[[], list[Record]], title: str, file: Path | None) -> list[Record]:
+    """Measure, print the records as a table and, where there is a file, write them with machine and versions.
+
+    Wrong input ends the script with exit status 2 and one message.
+    """
+    try:
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        records = measure()
+        if file is not None:
+            data = {"records": records, "machine": machine(), "versions": versions()}
+            file.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
+    except (QuadsimError, OSError) as error:
+        print(f"{Path(sys.argv[0]).name}: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    show(records, title)
+    return records
+
+
+def show(records: Sequence[Record], title: str) -> None:
+    """Print records as a table, their keys as its head."""
+    table = Table(title=title, title_justify="left")
+    for key in dict.fromkeys(key for record in records for key in record):
+        table.add_column(key.replace("_", " "), overflow="fold")
+    for record in records:
+        table.add_row(*(_cell(record.get(column)) for column in dict.fromkeys(k for r in records for k in r)))
+    Console(width=None if sys.stdout.isatty() else 200).print(table)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "-" if value is None else str(value)
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Linear algebra on one thread, and no garbage collection."""
+    gc.collect()
+    gc.disable()
+    try:
+        with threadpool_limits(limits=1):
+            yield
+    finally:
+        gc.enable()
+
+
+class Stopwatch:
+    """Seconds since it was made, and those that watched calls took."""
+
+    def __init__(self) -> None:
+        self._started = clock.perf_counter()
+        self.laps: dict[str, list[float]] = {}  # [s] of each call, by its name
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since it was made."""
+        return clock.perf_counter() - self._started
+
+    def watch(self, owner: object, method: str, name: str) -> None:
+        """Have each call of a method leave its seconds in `laps[name]`."""
+        function, laps = getattr(owner, method), self.laps.setdefault(name, [])
+
+        def timed(*arguments: Any, **named: Any) -> Any:
+            started = clock.perf_counter()
+            try:
+                return function(*arguments, **named)
+            finally:
+                laps.append(clock.perf_counter() - started)
+
+        setattr(owner, method, timed)
+
+
+def step_quantiles(ms: Array) -> Record:
+    """Median, 99th percentile and maximum of step times (K,) [ms]."""
+    found = percentiles(ms)
+    return {f"{name}_ms": float(found[name]) for name in ("p50", "p99", "max")}
+
+
+def time_in_turns(
+    candidates: Mapping[str, tuple[Callable[[int], None], Callable[[], object]]],
+    segments: Sequence[range],
+    *,
+    between: Callable[[], object],
+    repeats: int,
+    rng: np.random.Generator,
+) -> dict[str, Array]:
+    """Put the same questions to all candidates, in turns, so that other load on the machine affects all of them.
+
+    Args:
+        candidates: what prepares for a period, not timed, and what answers it.
+        segments: consecutive periods that a candidate answers before it is the next one's turn.
+        between: what a flight does between two answers, which leaves in the caches what it leaves there in a flight.
+        repeats: passes over all questions.
+        rng: decides the order within each segment.
+
+    Returns:
+        Each candidate's times of its questions in order, the median of the repeats [ms].
+    """
+    laps: dict[str, list[list[float]]] = {name: [[] for _ in range(repeats)] for name in candidates}
+    with undisturbed():
+        for i in range(repeats):
+            for segment in segments:
+                gc.collect()
+                for name in rng.permutation(list(candidates)).tolist():
+                    prepare, answer = candidates[name]
+                    prepare(max(segment.start - 1, 0))
+                    answer()  # from a cold start; not counted
+                    for period in segment:
+                        prepare(period)
+                        between()
+                        started = clock.perf_counter()
+                        answer()
+                        laps[name][i].append(1e3 * (clock.perf_counter() - started))
+    return {name: np.asarray(np.median(passes, axis=0)) for name, passes in laps.items()}

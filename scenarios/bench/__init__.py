@@ -1,1 +1,0 @@
-"""`quadsim bench`: QP solvers, flights and films measured on this machine."""

@@ -1,1 +1,0 @@
-"""The model-mismatch benchmark, `quadsim bench ladder`: what each controller survives, condition by condition."""

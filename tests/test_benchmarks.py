@@ -1,0 +1,92 @@
+"""Each benchmark from end to end with `--quick`: a table, and records with the numbers that the documents show."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from quadsim.errors import RenderingUnavailableError
+from quadsim.report.film.video import rendering_backend
+
+ROOT = Path(__file__).parent.parent
+
+
+def quick(name: str, tmp_path: Path) -> list[dict[str, Any]]:
+    """The records of a benchmark, whose table has to show each."""
+    file = tmp_path / f"{name}.json"
+    command = [sys.executable, f"benchmarks/{name}.py", "--quick", "--json", str(file)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    written = json.loads(file.read_text())
+    assert written["machine"]
+    records: list[dict[str, Any]] = written["records"]
+    for record in records:
+        assert next(iter(record.values())) in done.stdout
+    return records
+
+
+def test_solvers_agree_on_the_optimum(tmp_path: Path) -> None:
+    records = {record["solver"]: record for record in quick("solvers", tmp_path)}
+    assert {"as flown", "piqp-dense", "daqp"} <= set(records)
+    for name in ("as flown", "piqp-dense", "daqp"):
+        assert not records[name]["failures"]
+        assert records[name]["largest_difference_rad_s"] < 1e-3
+        assert 0.0 < records[name]["p50_ms"] <= records[name]["p99_ms"] <= records[name]["max_ms"]
+
+
+def test_the_parts_of_a_flight_make_up_its_time(tmp_path: Path) -> None:
+    *parts, _ = quick("flight", tmp_path)
+    assert sum(part["share_%"] for part in parts) == pytest.approx(100.0)
+    assert all(part["seconds"] > 0.0 for part in parts)
+
+
+def test_a_film_has_its_frames(tmp_path: Path) -> None:
+    try:
+        rendering_backend()
+    except RenderingUnavailableError as error:
+        pytest.skip(str(error))
+    (record,) = quick("film", tmp_path)
+    assert record["frames"] == 15
+    assert 0.0 < record["start_s"] <= record["whole_s"]
+
+
+def test_campaigns_by_one_worker_and_two(tmp_path: Path) -> None:
+    records = quick("campaign", tmp_path)
+    assert [(record["flights"], record["workers"]) for record in records] == [(2, 1), (4, 2), (4, 2)]
+    assert all(record["flight_s"] > 0.0 and 0.0 <= record["not_flying_%"] < 100.0 for record in records)
+
+
+def test_the_heavier_vehicle_ends_farther_away(tmp_path: Path) -> None:
+    flights = {(record["controller"], record["condition"]): record for record in quick("mismatch", tmp_path)}
+    assert {condition for _, condition in flights} == {"nominal", "mass +30 %"}
+    for controller in ("paper", "PID"):
+        assert flights[controller, "mass +30 %"]["end_error"] > 2.0 * flights[controller, "nominal"]["end_error"]
+    assert (tmp_path / "mismatch.png").is_file()
+
+
+def test_nonlinear_mpc_follows_where_lqr_does_not(tmp_path: Path) -> None:
+    errors = {record["controller"]: record["error"] for record in quick("speed", tmp_path)}
+    assert errors["nonlinear"] < 0.2 * errors["LQR"]
+    assert (tmp_path / "speed.png").is_file()
+
+
+def test_wrong_input_is_one_message(tmp_path: Path) -> None:
+    command = [sys.executable, "benchmarks/solvers.py", "--scenario", "hover-pid", "--json", str(tmp_path / "out.json")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "out.json").exists()
+
+
+def test_the_example_of_what_constraints_cost_runs(tmp_path: Path) -> None:
+    picture = tmp_path / "cost.png"
+    command = [sys.executable, "examples/constraint_cost.py", str(picture), "2.0"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "inf" in done.stdout
+    assert picture.is_file()
