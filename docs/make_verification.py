@@ -22,7 +22,6 @@ from peers.rotorpy_plant import INTEGRATOR
 from support import paper_problem
 from threadpoolctl import threadpool_limits
 
-from mpc.solvers import SOLVERS
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 
@@ -133,7 +132,7 @@ def agreement_section(measured: Sequence[Verdict]) -> str:
     return f"""\
 ## The solvers against one another
 
-Every solver of `mpc.solvers` on the same recorded QPs, through the back ends that `controller.solver` names. A solver's
+Our solvers, four of qpsolvers and qpOASES, the paper's own, on the same recorded QPs. A solver's
 own word is not taken: of each solution that it calls solved, the residuals of the Karush-Kuhn-Tucker conditions are
 computed here, from the QP and the multipliers (`mpc.qp.kkt_residuals`), and the first input is compared with qpmpc's.
 What it does not call solved is a failure. {slow} take long and give up on some QPs; they get every
@@ -177,7 +176,7 @@ def main() -> None:
         problem, queries = recorded.record()
         qp = constrained_qp.measure(problem, queries)
         nonlinear = [nonlinear_optimum.measure(case) for case in (PAPER, LAGGED)]
-        verdicts = [agreement.measure(name, problem, queries, qp.speeds) for name in SOLVERS]
+        verdicts = [agreement.measure(name, problem, queries, qp.speeds) for name in agreement.PACKAGES]
     checks: list[Check] = [
         *plant.checks,
         *flight.checks,

@@ -8,7 +8,7 @@ import time as clock
 
 import numpy as np
 
-from mpc.solvers import SOLVERS
+from mpc.solvers import solver_entries
 from quadsim.controller import SOLVED, Moment
 from quadsim.errors import QuadsimError
 from quadsim.report.film.video import rendering_backend
@@ -45,7 +45,9 @@ def doctor() -> dict[str, dict[str, str]]:
         "packages": versions(),
         "rendering": {"video": _rendering()},
         "viewer": {"native": viewer_problem() or "can be opened", "browser": "quadsim view RUN --web"},
-        "solvers": {name: _try_solver(name) if entry.installed else entry.line for name, entry in SOLVERS.items()},
+        "solvers": {
+            name: _try_solver(name) if entry.installed else entry.line for name, entry in solver_entries().items()
+        },
     }
 
 

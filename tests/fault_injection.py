@@ -6,7 +6,7 @@ import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from typing import Any, Final
 from unittest import mock
 
@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from mpc.answer import Answer
 from mpc.exact.shortcut import Shortcut
 from mpc.fallback.contract import Guarded
-from mpc.qp import Point
+from mpc.ocp import Query
 from mpc.solvers import piqp_backends
 from quadsim.controller import SOLVED, Command, Controller, Moment
 from quadsim.flight.log import FlightLog
@@ -284,25 +284,25 @@ class _FailingSolver:
 
     status: str = SOLVED
 
-    def solve(self, real: Any, solver: Any, vectors: Any, **matrices: Any) -> Any:
-        answer = real(solver, vectors, **matrices)
+    def solve(self, real: Any, backend: Any, qp: Any) -> Any:
+        found = real(backend, qp)
         if self.status == SOLVED:
-            return answer
-        nowhere = Point(*(np.full_like(part, np.nan) for part in answer.point))
-        return answer._replace(made=nowhere, status=self.status)
+            return found
+        nowhere = {name: getattr(found, name) * np.nan for name in ("x", "y", "z", "z_box")}
+        return found._replace(**nowhere, status=self.status)
 
 
 @contextlib.contextmanager
 def _failing_solver() -> Iterator[_FailingSolver]:
     failing = _FailingSolver()
-    shortest = Shortcut.solve
+    shortest, real = Shortcut.solve, piqp_backends._Piqp.solve
 
-    def solve(shortcut: Shortcut, *query: Any) -> Answer:
+    def solve(shortcut: Shortcut, query: Query) -> Answer:
         """The whole QP where it is to fail: there is nothing to fail in a shortcut."""
-        return shortest(shortcut, *query) if failing.status == SOLVED else shortcut._whole.solve(*query)
+        return shortest(shortcut, query) if failing.status == SOLVED else shortcut._whole.solve(query)
 
     with (
-        mock.patch.object(piqp_backends, "solve", partial(failing.solve, piqp_backends.solve)),
+        mock.patch.object(piqp_backends._Piqp, "solve", lambda backend, qp: failing.solve(real, backend, qp)),
         mock.patch.object(Shortcut, "solve", solve),
     ):
         yield failing

@@ -11,9 +11,9 @@ import numpy as np
 
 from mpc.constrained import ConstrainedMPC
 from mpc.exact.shortcut import with_shortcut
-from mpc.ocp import Problem, Rest
-from mpc.paper.condensed import condensed
-from mpc.qp import Backend, Formulation, Vectors, kkt_residuals
+from mpc.ocp import Problem, Query
+from mpc.paper.condensed import Condensed
+from mpc.qp import Backend, Formulation, kkt_residuals
 from mpc.solvers import SOLVERS, Answer, QPSolver, Solver, make_backend
 from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged, usual_steps
@@ -27,7 +27,6 @@ from scenarios.progress import Progress
 
 WITH_SHORTCUT: Final = ("daqp",)  # solvers that are shown both with and without shortcuts, besides the default
 REFERENCE_SOLVER: Final = "piqp-dense"  # where the search for the optimum in closed form starts
-Query = Callable[[int], tuple[Array, Array, Array]]
 STEPS_TRIED: Final = (1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 20, 25)
 
 
@@ -59,8 +58,8 @@ class _Witnessed:
         self._solve = solver.solve
         self.last: Answer | None = None
 
-    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
-        self.last = self._solve(state, desired, u_before, rest)
+    def solve(self, query: Query) -> Answer:
+        self.last = self._solve(query)
         return self.last
 
 
@@ -112,13 +111,12 @@ class Reference(NamedTuple):
 
 def reference_optima(problem: Problem, queries: Queries, periods: Sequence[int]) -> Reference:
     """Solve the periods' QPs in closed form; see `scenarios.bench.polish`."""
-    formulation, backend = condensed(problem), make_backend(REFERENCE_SOLVER)
+    formulation, backend = Condensed(problem), make_backend(REFERENCE_SOLVER)
     backend.setup(formulation.qp)
     inputs, worst = {}, 0.0
     for period in periods:
-        vectors = formulation.vectors(*queries.of_qp(problem, period))
-        qp = formulation.qp.with_vectors(vectors)
-        optimum = polish(qp, backend.solve(vectors))
+        qp = formulation.pose(queries.of_qp(problem, period)).qp
+        optimum = polish(qp, backend.solve(qp))
         worst = float(np.maximum(worst, kkt_residuals(qp, optimum).worst))  # NaN stays NaN
         inputs[period] = formulation.inputs(optimum.x)[0]
     return Reference(inputs=inputs, kkt=worst)
@@ -130,19 +128,18 @@ def judge(candidate: StepCandidate, queries: Queries, periods: Sequence[int], re
     Fields of `scenarios.bench.bench_results.CandidateResult`: `statuses`, `ways`, `failures`, `input_error` and `kkt`.
     """
     candidate.keep()
-    problem, form = candidate.problem, candidate.formulation
     statuses: Counter[str] = Counter()
     errors, residuals = [], []
     for period in periods:
         command, answer = candidate.answers[period]
         if command is None or command.status not in ACCEPTED:
             # a point that is called solved is rejected where it breaks the hard input bounds
-            statuses["rejected" if answer.solution.status in ACCEPTED else answer.solution.status] += 1
+            statuses["rejected" if answer.status in ACCEPTED else answer.status] += 1
             continue
         statuses[command.status] += 1
         errors.append(np.abs(command.speeds - reference.inputs[period]).max())
-        qp = form.qp.with_vectors(form.vectors(*queries.of_qp(problem, period)))
-        residuals.append(kkt_residuals(qp, answer.solution).worst)
+        assert answer.certificate is not None
+        residuals.append(kkt_residuals(*answer.certificate()).worst)
     return {
         "statuses": dict(sorted(statuses.items())),
         "ways": dict(Counter(map(str, candidate.ways(periods)))),
@@ -161,7 +158,7 @@ def time_stages(
 ) -> tuple[StageLength, ...]:
     """The QP condensed and cut into stages of M steps, on the periods in which constraints are active."""
     default, query = usual_steps(problem.model.nu), partial(queries.of_qp, problem)
-    candidates = {"condensed": _QPEntrant(condensed(problem), PiqpDense(), query)}
+    candidates = {"condensed": _QPEntrant(Condensed(problem), PiqpDense(), query)}
     for length in sorted({*STEPS_TRIED, default}):
         candidates[str(length)] = _QPEntrant(Staged(problem, steps_per_stage=length), PiqpMultistage(), query)
     laps = race(candidates, timed, progress=partial(progress, "stages"))
@@ -186,14 +183,14 @@ def time_stages(
 class _QPEntrant:
     """A form of the QP with its back end, without a controller around it."""
 
-    def __init__(self, formulation: Formulation, backend: Backend, query: Query) -> None:
+    def __init__(self, formulation: Formulation, backend: Backend, query: Callable[[int], Query]) -> None:
         self.formulation, self._backend, self._query = formulation, backend, query
         self.active: dict[int, int] = {}  # constraints active in the answer, by period
         backend.setup(formulation.qp)
 
     def prepare(self, period: int) -> None:
         self._period = period
-        self._vectors: Vectors = self.formulation.vectors(*self._query(period))
+        self._qp = self.formulation.pose(self._query(period)).qp
 
     def answer(self) -> None:
-        self.active[self._period] = self._backend.solve(self._vectors).active
+        self.active[self._period] = self._backend.solve(self._qp).active

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpc.ocp import Problem
+from mpc.ocp import Problem, Query
 from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import FlightError
 from quadsim.flight.log import ControlLog
@@ -28,10 +28,10 @@ class Queries:
     reference: Array  # (K + N, 4) filtered x, y, z [m], yaw [rad], row k at t_k
     speeds_before: Array  # (K, 4) u(k-1) [rad/s]
 
-    def of_qp(self, problem: Problem, period: int) -> tuple[Array, Array, Array]:
+    def of_qp(self, problem: Problem, period: int) -> Query:
         """xi(k), y_d and u(k-1)."""
         reference = self.reference[period + 1 : period + 1 + problem.horizon]
-        return self.state[period], problem.objective.desired(reference), self.speeds_before[period]
+        return Query(self.state[period], problem.objective.desired(reference), self.speeds_before[period])
 
 
 def recorded(scenario: Scenario, log: ControlLog, horizon: int) -> Queries:

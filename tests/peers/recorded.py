@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from mpc import ocp
 from mpc.ocp import Problem
 from quadsim.state import Array
 from scenarios.bench.queries import recorded
@@ -32,6 +33,11 @@ class Query:
     u_before: Array
     status: str
     speeds: Array
+
+    @property
+    def posed(self) -> ocp.Query:
+        """What is to be solved."""
+        return ocp.Query(self.state, self.desired, self.u_before)
 
 
 def record() -> tuple[Problem, tuple[Query, ...]]:

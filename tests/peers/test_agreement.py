@@ -12,10 +12,9 @@ from peers.constrained_qp import ConstrainedQP
 from peers.recorded import Query
 
 from mpc.ocp import Problem
-from mpc.solvers import SOLVERS
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", agreement.PACKAGES)
 def test_what_a_solver_calls_solved_is_optimal(
     name: str,
     problem: Problem,
@@ -42,4 +41,6 @@ def test_a_wrong_reference_is_seen(problem: Problem, queries: tuple[Query, ...],
 
 
 def test_the_page_names_every_solver(page: str) -> None:
-    assert [name for name, entry in SOLVERS.items() if f"| `{name}` | {versioned(entry.package)} |" not in page] == []
+    assert [
+        name for name, package in agreement.PACKAGES.items() if f"| `{name}` | {versioned(package)} |" not in page
+    ] == []

@@ -124,14 +124,6 @@ VARIANTS: Final = {
         "and output bounds tightened for disturbances and for the motion between samples",
         _robust(offset_free=OBSERVER, tightening=TighteningSettings()),
     ),
-    "+ LTV": ControllerVariant(
-        "as + offset-free, linearised at the present state in each period",
-        _robust(offset_free=OBSERVER, linearisation="state"),
-    ),
-    "+ iteration": ControllerVariant(
-        "as + offset-free, linearised along its last plan: the real-time iteration",
-        _robust(offset_free=OBSERVER, linearisation="trajectory"),
-    ),
     "LQR": ControllerVariant(
         "infinite horizon, weights by Bryson's rule, in the heading frame; as the next two, it has no bounds but those "
         f"on speeds, and commands no more than {BASELINE_TILT:g} deg of tilt",

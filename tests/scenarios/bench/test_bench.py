@@ -209,9 +209,9 @@ def test_wrong_answers_and_failures_are_seen(constrained_flight: Flight) -> None
     command, answer = candidate.answers[1]
     assert command is not None
     assert answer is not None
-    point = answer.solution.point
+    point = answer.certificate()[1]
     candidate.answers[1] = (replace(command, speeds=command.speeds + 1.0), answer)
-    off = answer._replace(solution=answer.solution._replace(made=point._replace(x=point.x + 1.0)))
+    off = answer._replace(solution=answer.solution._replace(x=point.x + 1.0))
     candidate.answers[2] = (candidate.answers[2][0], off)
     candidate.answers[3] = (None, answer._replace(solution=answer.solution._replace(status="numerics")))
     verdict = judge(candidate, queries, periods, reference)
