@@ -130,17 +130,15 @@ def test_parts_are_switched_on_one_after_another() -> None:
         assert spec.fallback.enabled
         return spec
 
-    def parts(name: str) -> tuple[float | str, float, bool, bool, bool, str]:
+    def parts(name: str) -> tuple[float | str, float, bool, bool, bool]:
         spec = robust(name)
         learns, tightened = spec.offset_free is not None, spec.tightening is not None
-        return spec.rotor_lag, spec.delay, spec.heading, learns, tightened, spec.linearisation
+        return spec.rotor_lag, spec.delay, spec.heading, learns, tightened
 
-    assert parts("soft") == (0.0, 0.0, False, False, False, "hover")
-    assert parts("+ model") == (0.025, 0.01, True, False, False, "hover")
-    assert parts("+ offset-free") == (0.025, 0.01, True, True, False, "hover")
-    assert parts("+ tightening") == (0.025, 0.01, True, True, True, "hover")
-    assert parts("+ LTV") == (0.025, 0.01, True, True, False, "state")
-    assert parts("+ iteration") == (0.025, 0.01, True, True, False, "trajectory")
+    assert parts("soft") == (0.0, 0.0, False, False, False)
+    assert parts("+ model") == (0.025, 0.01, True, False, False)
+    assert parts("+ offset-free") == (0.025, 0.01, True, True, False)
+    assert parts("+ tightening") == (0.025, 0.01, True, True, True)
     assert equip(scenario, "paper", CONDITIONS["nominal"]) == scenario
 
 
