@@ -32,7 +32,7 @@ Is it right? Here quadsim is compared with software that others wrote, by figure
 `make peers` installs the peers at the versions of `constraints.txt` and holds every check below;
 `make verification` measures them again and writes this page. The code is in `tests/peers`, one file per
 comparison. A page whose versions or digits are not today's fails `make peers`; figures that rounding decides may differ
-tenfold, or be below 1e-7, and the rows of the solvers that fail now and then, osqp and highs, may be another day's.
+tenfold, or be below 1e-7, and the rows of the solvers that fail now and then, osqp and proxqp, may be another day's.
 """
 
 
