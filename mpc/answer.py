@@ -12,7 +12,7 @@ from mpc.constraints import Bounds
 from mpc.ocp import Problem, Query, predicted
 from mpc.paper.condensed import row_maps
 from mpc.paper.prediction import prediction
-from mpc.qp import QP, kkt_residuals
+from mpc.qp import kkt_residuals
 from mpc.solvers import Answer
 from quadsim.controller import ACCEPTED, FALLBACK, Command
 from quadsim.errors import ParameterError
@@ -155,14 +155,13 @@ class AnswerCheck:
         `refused` is the reason found so far, which stays.
         """
         due, self._periods = self._periods % self._every == 0, self._periods + 1
-        if answer.qp is None:
+        if answer.certificate is None:
             return answer, refused
         violation = self._infeasibility(problem, query, answer)
         if refused is None and not violation <= INFEASIBLE:
             refused = INFEASIBLE_ANSWER
         if due or refused is not None:
-            qp = answer.qp if isinstance(answer.qp, QP) else answer.qp()
-            return answer._replace(infeasibility=violation, kkt=kkt_residuals(qp, answer.solution)), refused
+            return answer._replace(infeasibility=violation, kkt=kkt_residuals(*answer.certificate())), refused
         return answer._replace(infeasibility=violation), refused
 
     def _infeasibility(self, problem: Problem, query: Query, answer: Answer) -> float:
@@ -200,28 +199,28 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
 
 def free_command(answer: Answer) -> Command:
     """The command of an optimum without constraints, which is within every bound or it would not be one."""
-    return command_of(answer.plan[0], answer.plan, answer.solution.status, answer)
+    return command_of(answer.plan[0], answer.plan, answer.status, answer)
 
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
     """Speeds (4,) and a plan (N, 4) as a command under a status, with what is known of the answer."""
-    solution, accepted, kkt = answer.solution, status in ACCEPTED, answer.kkt
+    accepted, kkt = status in ACCEPTED, answer.kkt
     return Command(
         speeds=speeds.copy(),
         plan=plan,
         status=status,
         answered_by=answer.answered_by if accepted else FALLBACK,
-        iterations=solution.iterations,
-        active=solution.active if accepted else 0,
+        iterations=answer.iterations,
+        active=answer.active if accepted else 0,
         fallback=fallback,
         slack=max(float(answer.slacks.max()), 0.0) if accepted and answer.slacks.size else 0.0,
-        reported_primal=solution.reported_primal,
-        reported_dual=solution.reported_dual,
+        reported_primal=answer.reported_primal,
+        reported_dual=answer.reported_dual,
         infeasibility=answer.infeasibility,
         kkt_stationarity=math.nan if kkt is None else kkt.stationarity,
         kkt_complementarity=math.nan if kkt is None else kkt.complementarity,
         kkt_dual=math.nan if kkt is None else kkt.dual,
-        solve_s=solution.solve_s,
+        solve_s=answer.solve_s,
     )
 
 

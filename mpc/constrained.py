@@ -51,9 +51,7 @@ class ConstrainedMPC:
     ) -> None:
         self.problem, self.horizon, self.solver = problem, problem.horizon, solver.name
         self._solver = with_shortcut(problem, solver) if shortcut else solver
-        self._clearing = (
-            None if space is None else Clearing(problem, lambda query: self._solver.solve(*query[:4]), space)
-        )
+        self._clearing = None if space is None else Clearing(problem, self._solver, space)
         self._bounds, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
         self._before, self._plan, self._held = problem.model.u_bar, None, 0
         self.unanswered: Unanswered | None = None
@@ -88,12 +86,12 @@ class ConstrainedMPC:
         query = Query(state, self.problem.objective.desired(reference), self._before)
         problem = self.problem
         if self._clearing is None:
-            answer = self._solver.solve(query.state, query.desired, query.u_before)
+            answer = self._solver.solve(query)
         else:
-            answer, problem, _ = self._clearing.solve(now.time, query)
+            answer, problem = self._clearing.solve(now.time, query)
         refused = None
         if answer.method is not Method.FREE:
-            refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._bounds, self._before)
+            refused = rejection(answer.status, answer.plan[0], answer.plan, self._bounds, self._before)
         answer, refused = self._check(problem, query, answer, refused)
         self.answer = answer
         if answer.method is not Method.FREE or refused is not None:
@@ -122,5 +120,5 @@ class ConstrainedMPC:
             self._held += 1
         self._before = self._bounds.clip(self._plan[self._held], self._before)
         if refused is None:
-            return command_of(self._before, self._plan, answer.solution.status, answer)
+            return command_of(self._before, self._plan, answer.status, answer)
         return command_of(self._before, shifted(self._plan, self._held), refused, answer, fallback=1)

@@ -26,8 +26,7 @@ from scipy import sparse
 
 from mpc.constraints import Constraint, Penalty
 from mpc.ocp import Problem, Query, Unanswered
-from mpc.qp import Point
-from mpc.relinearised import Relinearised
+from mpc.qp import Solution
 from mpc.solvers import QPSolver
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
@@ -149,18 +148,8 @@ def recovery(unanswered: Unanswered, plan: Array) -> int | None:
 
 def _set_up(problem: Problem, query: Query) -> Callable[[Query], bool]:
     """Whether queries of this one's kind are solved."""
-    if query.steps is None:
-        fixed = QPSolver(SOLVER, problem)
-        return lambda query: fixed.solve(*query[:4]).solution.status == SOLVED
-    changing = Relinearised(problem)
-
-    def is_solved(query: Query) -> bool:
-        assert query.steps is not None
-        rest = query.rest or problem.rest
-        answer = changing.solve(*query.steps, query.state, query.desired, query.u_before, rest)
-        return answer.solution.status == SOLVED
-
-    return is_solved
+    solver = QPSolver(SOLVER, problem, changing=query.steps is not None)
+    return lambda query: solver.solve(query).status == SOLVED
 
 
 class _Relaxed(NamedTuple):
@@ -258,10 +247,7 @@ def _relaxed(
     slack = Penalty(l1=np.ones(1), l2=np.zeros(1))
     rows = tuple(replace(one, penalty=slack if side in elastic else None) for side, one in sides.items())
     form = Staged(replace(problem, bounds=None, constraints=rows), changing=True)
-    A, B, c = _steps(problem, query)
-    matrices = form.prepare(A, B)
-    vectors = form.changed_vectors(matrices, c, *query[:3], query.rest or problem.rest)
-    qp = form.changed(matrices, vectors)
+    qp = form.pose(query._replace(steps=_steps(problem, query))).qp
     named, columns = (
         [side for side in sides if side in elastic],
         form.slacks(np.arange(qp.c.size, dtype=float)).astype(int),
@@ -293,7 +279,7 @@ def _relaxed(
     z[above] -= found.ineqlin.marginals[: np.count_nonzero(above)]
     z[below] += found.ineqlin.marginals[np.count_nonzero(above) :]
     z_box = -found.upper.marginals - found.lower.marginals
-    multipliers = form.multipliers(Point(x=found.x, y=np.zeros(0), z=z, z_box=z_box))
+    multipliers = form.multipliers(Solution(x=found.x, y=np.zeros(0), z=z, z_box=z_box))
     return _Relaxed(
         total=float(found.fun),
         slacks=slacks,

@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Final, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from scipy.sparse import csc_matrix
 
-from mpc.ocp import Problem, Rest
+from mpc.ocp import Problem, Query
+from quadsim.controller import SOLVED
 from quadsim.state import Array, Indices
 
 Matrix: TypeAlias = Array | csc_matrix
 
 KKT_EVERY: Final = 20
 """Periods from one whose KKT residuals are computed in flight to the next."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Vectors:
-    """The part of a QP that changes from one control period to the next."""
-
-    c: Array
-    b: Array
-    h_l: Array
-    h_u: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,15 +41,6 @@ class QP:
     x_l: Array
     x_u: Array
     later: Indices | None = None
-
-    @property
-    def vectors(self) -> Vectors:
-        """The vectors that it is written with."""
-        return Vectors(c=self.c, b=self.b, h_l=self.h_l, h_u=self.h_u)
-
-    def with_vectors(self, vectors: Vectors) -> QP:
-        """The same matrices and box with other vectors."""
-        return replace(self, **vars(vectors))
 
 
 class QPRows:
@@ -123,47 +106,38 @@ class QPRows:
         return z.ravel(), np.dot(multipliers, self._of_box).ravel()
 
 
-class Point(NamedTuple):
-    """A primal point and the multipliers there."""
+class Solution(NamedTuple):
+    """A primal point of a QP with its multipliers, and how it was found; arrays are no solver's own."""
 
     x: Array
     y: Array  # multipliers of A x = b
     z: Array  # multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower
     z_box: Array  # multipliers of x_l <= x <= x_u, signed likewise
+    status: str = SOLVED  # `solved`, or the solver's name for what went wrong
+    iterations: int = 0
+    active: int = 0  # inequality rows and box entries active at the point
+    reported_primal: float = math.nan  # residual as the solver reports it; NaN where none is reported
+    reported_dual: float = math.nan  # likewise
+    solve_s: float = 0.0  # wall time inside the solver, updates included [s]
 
 
-class Solution(NamedTuple):
-    """What a back end answers, or a shortcut; arrays are no back end's own, and not to be written to."""
+class Posed(NamedTuple):
+    """The QP of one period."""
 
-    made: Point | Callable[[], Point]  # the point, or what makes it: a shortcut's is not wanted in flight
-    status: str  # `solved`, or the back end's name for what went wrong; of a shortcut, see `mpc.exact.shortcut`
-    iterations: int  # of whoever answered
-    active: int  # inequality rows and box entries active at the point
-    reported_primal: float  # residual as the QP solver reports it, before any polish; NaN where none is reported
-    reported_dual: float  # likewise
-    solve_s: float  # wall time inside the back end, updates included, and what shortcuts took before it [s]
-
-    @property
-    def point(self) -> Point:
-        """Where it is."""
-        return self.made if isinstance(self.made, Point) else self.made()
-
-    @property
-    def x(self) -> Array:
-        """The primal point."""
-        return self.point.x
+    qp: QP
+    states: Callable[[Array], Array]  # takes a primal point to the predicted states (N, n)
 
 
 class Formulation(Protocol):
-    """One way to write an MPC's optimisation as a QP whose matrices never change."""
+    """One way to write an MPC's optimisation as a QP."""
 
     @property
     def qp(self) -> QP:
-        """The matrices, with vectors for a zero state."""
+        """The QP of the problem's own model for a zero state."""
         ...
 
-    def vectors(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Vectors:
-        """The QP's vectors for xi(k) (n,), y_d (N, n_r) and u(k-1) (nu,), at the problem's rest state or another."""
+    def pose(self, query: Query) -> Posed:
+        """The QP of a period; without `Query.steps`, its matrices are the very ones of `qp`."""
         ...
 
     def inputs(self, x: Array) -> Array:
@@ -174,52 +148,20 @@ class Formulation(Protocol):
         """(N, m_s) the slacks in a primal point."""
         ...
 
-    def multipliers(self, point: Point) -> Array:
-        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Point`."""
-        ...
-
-
-class ChangingFormulation(Protocol):
-    """One way to write it where matrices change from period to period."""
-
-    @property
-    def qp(self) -> QP:
-        """The QP of the problem's own model, with vectors for a zero state."""
-        ...
-
-    def posed(
-        self, A: Array, B: Array, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
-    ) -> tuple[QP, Callable[[Array], Array]]:
-        """The QP of A (N, n, n), B (N, n, nu), c (N, n), and what takes a primal point to the states (N, n)."""
-        ...
-
-    def inputs(self, x: Array) -> Array:
-        """See `Formulation.inputs`."""
-        ...
-
-    def slacks(self, x: Array) -> Array:
-        """See `Formulation.slacks`."""
+    def multipliers(self, solution: Solution) -> Array:
+        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
         ...
 
 
 class Backend(Protocol):
-    """A QP solver set up once and called with new vectors each period."""
+    """A QP solver."""
 
     def setup(self, qp: QP) -> None:
-        """Take over the matrices and the box."""
+        """Prepare for QPs of these matrices, or at least of their pattern."""
         ...
 
-    def solve(self, vectors: Vectors) -> Solution:
-        """Solve with new vectors; whatever happens is in the solution's status."""
-        ...
-
-
-@runtime_checkable
-class RoughBackend(Backend, Protocol):
-    """One that can save time where the active set is all that is wanted."""
-
-    def solve_roughly(self, vectors: Vectors) -> Solution:
-        """The same to a looser tolerance."""
+    def solve(self, qp: QP) -> Solution:
+        """Solve; whatever happens is in the solution's status."""
         ...
 
 
@@ -240,7 +182,7 @@ class KKTResiduals:
 
 def kkt_residuals(qp: QP, solution: Solution) -> KKTResiduals:
     """The KKT residuals of a solution, computed from the QP alone and believing no solver."""
-    x, y, z, z_box = solution.point
+    x, y, z, z_box = solution[:4]
     gradient = qp.P @ x + qp.c + qp.A.T @ y + qp.G.T @ z + z_box
     values = np.concatenate([qp.G @ x, x])
     multipliers = np.concatenate([z, z_box])

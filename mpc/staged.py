@@ -18,7 +18,7 @@ The pattern of the matrices is fixed when a `Staged` is built; where they change
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from mpc.ocp import Problem, Rest
+from mpc.ocp import Problem, Query, Rest
 from mpc.paper.prediction import condense_stages
-from mpc.qp import QP, Point, QPRows, Vectors
+from mpc.qp import QP, Posed, QPRows, Solution
 from quadsim.errors import ParameterError
 from quadsim.state import Array, Indices
 
@@ -270,7 +270,7 @@ class Staged:
 
     Attributes:
         fixed: the matrices of the problem's model.
-        qp: these, with vectors for xi(k) and y_d zero and u(k-1) = u_bar.
+        qp: of these, for xi(k) and y_d zero and u(k-1) = u_bar.
 
     Raises:
         ValueError: the problem has no constraints; it needs no QP.
@@ -289,40 +289,29 @@ class Staged:
         self._linear[at.slacks] = problem.rows.l1[soft]
         A, B = np.broadcast_to(model.A, (N, *model.A.shape)), np.broadcast_to(model.B, (N, *model.B.shape))
         self.fixed = self._builder.build(A, B)
-        x_l, x_u = np.full(at.size, -math.inf), np.full(at.size, math.inf)
-        x_l[at.inputs], x_u[at.inputs], x_l[at.slacks] = self._rows.u_min, self._rows.u_max, 0.0
+        self._x_l, self._x_u = np.full(at.size, -math.inf), np.full(at.size, math.inf)
+        self._x_l[at.inputs], self._x_u[at.inputs] = self._rows.u_min, self._rows.u_max
+        self._x_l[at.slacks] = 0.0
         nothing = np.zeros((N, len(problem.objective.C_r)))
-        start = self.vectors(np.zeros(model.n), nothing, model.u_bar)
-        held = self.fixed
-        self.qp = QP(
-            P=held.P, c=start.c, A=held.dynamics, b=start.b, G=held.rows, h_l=start.h_l, h_u=start.h_u, x_l=x_l, x_u=x_u
-        )
+        self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp
 
-    def prepare(self, A: Array, B: Array) -> Matrices:
-        """The QP's matrices for a model A (N, n, n), B (N, n, nu) that changes."""
-        return self._builder.build(A, B)
+    def pose(self, query: Query, problem: Problem | None = None) -> Posed:
+        """See `mpc.qp.Formulation.pose`; `problem` differs in numbers of its constraints' rows alone."""
+        rest = query.rest or self._problem.rest
+        if query.steps is None:
+            A, B = self._problem.model.A, self._problem.model.B
+            offset = rest.x - A @ rest.x - B @ rest.u
+            matrices, c = self.fixed, np.broadcast_to(offset, (self._at.N, offset.size))
+        else:
+            A, B, c = query.steps
+            matrices = self._builder.build(A, B)
+        if problem is not None:
+            matrices = self._builder.renew(matrices, QPRows(problem))
+        return self._pose(matrices, c, query, rest)
 
-    def vectors(
-        self,
-        state: Array,
-        desired: Array,
-        u_before: Array,
-        rest: Rest | None = None,
-        matrices: Matrices | None = None,
-    ) -> Vectors:
-        """See `mpc.qp.Formulation.vectors`; with `matrices` that were `renewed`."""
-        model, (x_s, u_s) = self._problem.model, self._problem.rest if rest is None else rest
-        c = x_s - model.A @ x_s - model.B @ u_s
-        every = np.broadcast_to(c, (self._at.N, c.size))
-        return self.changed_vectors(matrices or self.fixed, every, state, desired, u_before, Rest(x_s, u_s))
-
-    def changed_vectors(
-        self, matrices: Matrices, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
-    ) -> Vectors:
-        """The QP's vectors for a model that changes, of c_i (N, n), x(k) (n,), y_d (N, n_r) and u(k-1) (nu,) [rad/s].
-
-        At `rest` is what the cost pulls inputs to, and where the terminal weight is about.
-        """
+    def _pose(self, matrices: Matrices, c: Array, query: Query, rest: Rest) -> Posed:
+        """The QP for c_i (N, n); at `rest` is what the cost pulls inputs to, and where the terminal weight is about."""
+        state, desired, u_before = query[:3]
         at, rows, objective = self._at, matrices.own, self._problem.objective
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))
         (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
@@ -345,28 +334,18 @@ class Staged:
             values = (rows.C @ known[:, :, None])[..., 0] * ~rows.of_states
             values[:-1] += (rows.C[:-1] @ known[1:, :, None])[..., 0] * rows.of_states
         values[0] -= rows.E @ u_before
-        return Vectors(
+        qp = QP(
+            P=matrices.P,
             c=gradient,
+            A=matrices.dynamics,
             b=np.concatenate([head[:, -1], tail[:, -1]]).ravel(),
+            G=matrices.rows,
             h_l=(rows.lower - values).ravel(),
             h_u=(rows.upper - values).ravel(),
+            x_l=self._x_l,
+            x_u=self._x_u,
         )
-
-    def renewed(self, problem: Problem, matrices: Matrices | None = None) -> Matrices:
-        """The fixed or other matrices for a problem that differs in numbers of its constraints' rows alone."""
-        return self._builder.renew(matrices or self.fixed, QPRows(problem))
-
-    def changed(self, matrices: Matrices, vectors: Vectors) -> QP:
-        """The QP with other matrices and vectors."""
-        return replace(self.qp.with_vectors(vectors), P=matrices.P, A=matrices.dynamics, G=matrices.rows)
-
-    def posed(
-        self, A: Array, B: Array, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
-    ) -> tuple[QP, Callable[[Array], Array]]:
-        """See `mpc.qp.ChangingFormulation.posed`."""
-        matrices = self.prepare(A, B)
-        qp = self.changed(matrices, self.changed_vectors(matrices, c, state, desired, u_before, rest))
-        return qp, partial(self.states, matrices, c, state)
+        return Posed(qp, partial(self._states, matrices, c, state))
 
     def inputs(self, x: Array) -> Array:
         """See `mpc.qp.Formulation.inputs`."""
@@ -376,17 +355,17 @@ class Staged:
         """See `mpc.qp.Formulation.slacks`."""
         return x[self._at.slacks]
 
-    def states(self, matrices: Matrices, c: Array, state: Array, x: Array) -> Array:
-        """(N, n) the predicted states in a primal point; other arguments as for `changed_vectors`."""
+    def _states(self, matrices: Matrices, c: Array, state: Array, x: Array) -> Array:
+        """(N, n) the predicted states in a primal point."""
         at = self._at
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))
         first = (matrices.head @ x[at.head] + head)[0, 1:-1]
         later = (matrices.tail[:, :-1] @ x[at.tail][:, None, :, None])[..., 0] + tail[:, :-1]
         return np.concatenate([first, later.reshape(-1, at.n), x[at.starts[-1:]]])
 
-    def multipliers(self, point: Point) -> Array:
+    def multipliers(self, solution: Solution) -> Array:
         """See `mpc.qp.Formulation.multipliers`."""
-        return self._rows.multipliers(point.z, point.z_box[self._at.inputs].ravel())
+        return self._rows.multipliers(solution.z, solution.z_box[self._at.inputs].ravel())
 
     def _offsets(self, matrices: Matrices, c: Array, state: Array) -> tuple[Array, Array]:
         """(1, L + 1, n, 1) and (J - 1, M + 1, n, 1): the states of all stages where v_j and s_1 .. s_J are zero."""

@@ -29,7 +29,7 @@ LAW: Final = "law"  # a law without a solver
 FALLBACK: Final = "fallback"  # an earlier plan or command, or the fallback contract
 STOPPED: Final = "stopped"  # nobody: rotors are off
 NO_SOLVER: Final = frozenset({GAIN, ACTIVE_SET, LAW, FALLBACK, STOPPED})
-"""Who may answer besides QP solvers, which go by their names in `mpc.solvers.SOLVERS`."""
+"""Who may answer besides QP solvers, which go by their names (`mpc.solvers.find_solver`)."""
 LAW_NAMES: Final = {
     "unconstrained": "unconstrained MPC",
     "constrained": "constrained MPC",

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from mpc.solvers import SOLVERS
+from mpc.solvers import solver_entries
 from quadsim.assets import read_toml, vehicle_names, vehicle_path
 from quadsim.vehicle import load_vehicle
 from scenarios.shipped import (
@@ -125,5 +125,5 @@ def catalogue() -> Catalogue:
         vehicles={name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
         controllers=CONTROLLERS,
         papers={name: read_toml(paper_path(name))["title"] for name in paper_names()},
-        solvers={name: entry.line for name, entry in SOLVERS.items()},
+        solvers={name: entry.line for name, entry in solver_entries().items()},
     )

@@ -8,9 +8,9 @@ import time as clock
 
 import numpy as np
 
-from mpc.solvers import SOLVERS
+from mpc.solvers import solver_entries
 from quadsim.controller import SOLVED, Moment
-from quadsim.errors import QuadsimError
+from quadsim.errors import FlightError, QuadsimError
 from quadsim.report.film.video import rendering_backend
 from quadsim.report.recording import viewer_problem
 from quadsim.vehicle import N_ROTORS
@@ -45,7 +45,9 @@ def doctor() -> dict[str, dict[str, str]]:
         "packages": versions(),
         "rendering": {"video": _rendering()},
         "viewer": {"native": viewer_problem() or "can be opened", "browser": "quadsim view RUN --web"},
-        "solvers": {name: _try_solver(name) if entry.installed else entry.line for name, entry in SOLVERS.items()},
+        "solvers": {
+            name: _try_solver(name) if entry.installed else entry.line for name, entry in solver_entries().items()
+        },
     }
 
 
@@ -65,7 +67,10 @@ def _try_solver(name: str) -> str:
     built = clock.perf_counter()
     controller.reset(np.full(N_ROTORS, vehicle.hover_speed))
     reference = build_reference(scenario, controller.horizon + 1)[1:]
-    command = controller.step(Moment(), build_initial_state(scenario), reference)
+    try:
+        command = controller.step(Moment(), build_initial_state(scenario), reference)
+    except FlightError as error:
+        return f"fails: {error}"
     verdict = "works" if command.status == SOLVED else f"answers {command.status}"
     setup_ms, step_ms = 1e3 * (built - started), 1e3 * (clock.perf_counter() - built)
     return f"{verdict}: set up in {setup_ms:.0f} ms, first step in {step_ms:.1f} ms"

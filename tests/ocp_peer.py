@@ -16,7 +16,7 @@ from polish import polish
 from scipy.optimize import linprog
 
 from mpc.constraints import Constraint
-from mpc.ocp import Problem, Rest
+from mpc.ocp import Problem, Query, Rest
 from mpc.qp import QP, Solution, kkt_residuals
 from mpc.solvers.daqp_dense import DaqpDense
 from quadsim.state import Array
@@ -43,6 +43,11 @@ class Period:
     desired: Array
     u_before: Array
     rest: Rest
+
+    @property
+    def query(self) -> Query:
+        """The same for a solver whose model changes."""
+        return Query(self.state, self.desired, self.u_before, self.rest, (self.A, self.B, self.c))
 
 
 def period(problem: Problem, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Period:
@@ -233,7 +238,7 @@ def optimum(problem: Problem, given: Period) -> Optimum:
     qp = dense_qp(problem, given)
     backend = DaqpDense()
     backend.setup(qp)
-    solution = backend.solve(qp.vectors)
+    solution = backend.solve(qp)
     exact = polish(qp, solution) if np.isfinite(solution.x).all() else solution
     if kkt_residuals(qp, exact).worst < kkt_residuals(qp, solution).worst:
         solution = exact

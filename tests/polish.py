@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 from scipy import sparse
 
-from mpc.qp import QP, Matrix, Point, Solution
+from mpc.qp import QP, Matrix, Solution
 from quadsim.state import Array
 
 FEASIBLE: Final = 1e-9
@@ -51,7 +51,7 @@ def polish(qp: QP, solution: Solution) -> Solution:
     lower, upper = np.concatenate([qp.x_l, qp.h_l, qp.b]), np.concatenate([qp.x_u, qp.h_u, qp.b])
     equal = np.flatnonzero(lower == upper)
     values = block @ solution.x
-    multipliers = np.concatenate([solution.point.z_box, solution.point.z, solution.point.y])
+    multipliers = np.concatenate([solution.z_box, solution.z, solution.y])
     side = (multipliers > upper - values).astype(np.int8) - (-multipliers > values - lower)
     side[equal] = 1
     start = side
@@ -75,8 +75,7 @@ def polish(qp: QP, solution: Solution) -> Solution:
     multipliers = np.zeros_like(lower)
     multipliers[active] = held
     z_box, z, y = np.split(multipliers, [n, n + rows])
-    point = Point(x=x, y=y, z=z, z_box=z_box)
-    return solution._replace(made=point, active=int(np.count_nonzero(active < n + rows)))
+    return solution._replace(x=x, y=y, z=z, z_box=z_box, active=int(np.count_nonzero(active < n + rows)))
 
 
 def _worst(against: Array, among: Any) -> Any:

@@ -13,7 +13,8 @@ from scipy.linalg import block_diag
 
 from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.model import LinearModel
-from mpc.ocp import Objective, Problem, Rest
+from mpc.nonlinear.model import NonlinearModel, advance
+from mpc.ocp import Objective, Problem, Query, Rest
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS
@@ -174,13 +175,25 @@ def changing_period(rng: np.random.Generator, problem: Problem) -> Period:
     )
 
 
-def flight_queries(flight: Flight, problem: Problem, stride: int) -> list[tuple[Array, Array, Array]]:
-    """(xi(k), y_d, u(k-1)) of every `stride`-th period of a flight."""
+def linearised(model: NonlinearModel, x: Array, u: Array) -> tuple[Array, Array, Array]:
+    """A, B, c of x(k+1) ~ A x(k) + B u(k) + c about a state x (n,) and inputs u (4,), by central differences."""
+    joint, h = np.concatenate([x, u]), 1e-4
+
+    def after(joint: Array) -> Array:
+        return advance(model, joint[: model.n], joint[model.n :])
+
+    slopes = np.array([after(joint + step) - after(joint - step) for step in h * np.eye(joint.size)]).T / (2.0 * h)
+    A, B = slopes[:, : model.n], slopes[:, model.n :]
+    return A, B, after(joint) - A @ x - B @ u
+
+
+def flight_queries(flight: Flight, problem: Problem, stride: int) -> list[Query]:
+    """xi(k), y_d, u(k-1) of every `stride`-th period of a flight."""
     log, N = flight.log.control, problem.horizon
     reference = paper_reference(log.t.size + N)
     before = np.vstack([log.speeds_before, log.speeds[:-1]])
     return [
-        (log.state[k], problem.objective.desired(reference[k + 1 : k + 1 + N]), before[k])
+        Query(log.state[k], problem.objective.desired(reference[k + 1 : k + 1 + N]), before[k])
         for k in range(0, log.t.size, stride)
     ]
 

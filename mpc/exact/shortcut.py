@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time as clock
 from functools import partial
 from typing import Final, NamedTuple
@@ -15,15 +14,14 @@ from mpc.constraints import Rows
 from mpc.exact.activeset import FEASIBLE, Active, ActiveSet, Side
 from mpc.exact.axes import Axis, axes
 from mpc.exact.free import FreeOptimum
-from mpc.ocp import Problem, Rest
+from mpc.ocp import Problem, Query
 from mpc.paper.condensed import Condensed, row_maps
 from mpc.qp import QP, Solution
-from mpc.solvers import Answer, Method, QPSolver, Solver
+from mpc.solvers import Answer, Method, Solver
 from quadsim.controller import ACTIVE_SET, GAIN, SOLVED, UNCONSTRAINED
 from quadsim.state import Array, Indices, all_true, read_only
 
 Flags = NDArray[np.bool_]
-_Query = tuple[Array, Array, Array, Rest | None]
 
 LARGEST_MAP: Final = 2**20
 """Entries beyond which there is no shortcut: 8 MiB, as much as a core's caches hold.  50 steps of the paper's problem
@@ -39,9 +37,7 @@ class Shortcut:
     1. no constraint at all: Eq. (22), a product for each axis of `mpc.exact.axes`; the status is then `unconstrained`;
     2. rows of states alone, axis by axis, by their multipliers (`mpc.exact.activeset`), from the last period's;
     3. all rows, likewise;
-    4. the whole QP by its solver, whose active set then leads to the exact optimum.  The first such QP after `reset`,
-       a flight's first period, is solved roughly where the solver can, and then again only where that does not lead
-       there.  Later ones are those that no active set near the last one answers; theirs seldom do.
+    4. the whole QP by its solver, whose active set then leads to the exact optimum.
 
     Along the plan active rows alternate, so that the last period's set, moved one step earlier, is nearly this one's;
     where margins grow along the horizon, it is nearly so unmoved.  Both are tried as a start.
@@ -95,7 +91,6 @@ class Shortcut:
                 if (N * max(own.size, axis.T.shape[1])) ** 2 <= LARGEST_MAP
             ]
         self._all = _Group(self.formulation, rows, grid.ravel(), np.eye(nu)) if grid.size**2 <= LARGEST_MAP else None
-        self._first = True  # the next QP for the solver is the first one since `reset`
 
     @property
     def name(self) -> str:
@@ -104,12 +99,12 @@ class Shortcut:
 
     def reset(self) -> None:
         """See `mpc.solvers.Solver.reset`."""
-        self._side, self._first = self._none_active, True
+        self._side = self._none_active
         self._whole.reset()
 
-    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
+    def solve(self, query: Query) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
-        started, query = clock.perf_counter(), (state, desired, u_before, rest)
+        started, (state, desired, u_before, rest, _) = clock.perf_counter(), query
         x_s, u_s = self._rest if rest is None else rest
         dx, dy = (state, desired) if rest is None else (state - x_s, desired - self._C_r @ x_s)
         found = self._free.at(dx, dy, u_before - u_s).T
@@ -127,10 +122,16 @@ class Shortcut:
         within = (self._lower <= free) & (free <= self._upper)
         if all_true(within):
             self._side = self._none_active
-            made = partial(self.formulation.point, plan, self._no_slacks, self._no_multipliers)
-            spent_s = clock.perf_counter() - started
-            solution = Solution(made, UNCONSTRAINED, 0, 0, math.nan, math.nan, spent_s)
-            return Answer(plan, self._no_slacks, solution, GAIN, Method.FREE, partial(self._qp, query))
+            return Answer(
+                plan,
+                self._no_slacks,
+                UNCONSTRAINED,
+                GAIN,
+                method=Method.FREE,
+                exact=True,
+                certificate=partial(self._certificate, query, plan, self._no_slacks, self._no_multipliers),
+                solve_s=clock.perf_counter() - started,
+            )
         free = free.copy()  # the values' room is used again
         if all_true(np.isfinite(free)):
             starts = self._starts()
@@ -143,9 +144,9 @@ class Shortcut:
                 return self._answer(optimum, method, query, started)
         return self._by_solver(plan, free, query, started)
 
-    def _qp(self, query: _Query) -> QP:
-        """The condensed QP of a query."""
-        return self.formulation.qp.with_vectors(self.formulation.vectors(*query))
+    def _certificate(self, query: Query, plan: Array, slacks: Array, multipliers: Array) -> tuple[QP, Solution]:
+        """The condensed QP of a query, and its solution of a plan (N, nu)."""
+        return self.formulation.pose(query).qp, self.formulation.solution(plan, slacks, multipliers)
 
     def _values_of(self, plan: Array, u_before: Array) -> Array:
         """(N, m) values of the rows, of those of states at the free optimum; the next call's too."""
@@ -187,57 +188,50 @@ class Shortcut:
             return None, True
         return _Found(plan, Active(z=z, values=values, side=side, steps=steps)), True
 
-    def _answer(self, found: _Found, method: Method, query: _Query, started: float) -> Answer:
-        slacks = self._no_slacks
-        if slacks.size and np.count_nonzero(violated := np.abs(found.active.side) == 2):
-            values, shape = found.active.values, self._rows.lower.shape
+    def _answer(self, found: _Found, method: Method, query: Query, started: float) -> Answer:
+        slacks, active = self._no_slacks, found.active
+        if slacks.size and np.count_nonzero(violated := np.abs(active.side) == 2):
+            values, shape = active.values, self._rows.lower.shape
             beyond = np.maximum(np.maximum(values - self._upper, self._lower - values), 0.0)
             slacks = (violated * beyond).reshape(shape)[:, self._rows.soft]
-        active = found.active
-        solution = Solution(
-            made=partial(self.formulation.point, found.plan, slacks, active.z.reshape(self._rows.lower.shape)),
-            status=SOLVED,
+        multipliers = active.z.reshape(self._rows.lower.shape)
+        return Answer(
+            found.plan,
+            slacks,
+            SOLVED,
+            ACTIVE_SET,
             iterations=active.steps,
             active=int(np.count_nonzero(active.side)),
-            reported_primal=math.nan,
-            reported_dual=math.nan,
+            method=method,
+            exact=True,
+            certificate=partial(self._certificate, query, found.plan, slacks, multipliers),
             solve_s=clock.perf_counter() - started,
         )
-        return Answer(found.plan, slacks, solution, ACTIVE_SET, method, partial(self._qp, query))
 
-    def _by_solver(self, plan: Array, free: Array, query: _Query, started: float) -> Answer:
+    def _by_solver(self, plan: Array, free: Array, query: Query, started: float) -> Answer:
         """The solver's answer to the whole QP, made exact where its active set leads to the optimum."""
-        spent_s, iterations = clock.perf_counter() - started, 0
-        whole = self._whole
-        solves = [whole.solve]
-        if self._first and self._all is not None and isinstance(whole, QPSolver) and whole.can_solve_roughly:
-            solves.insert(0, whole.solve_roughly)
-        self._side, self._first = self._none_active, False
-        for solve in solves:
-            answer = solve(*query)
-            started, given = clock.perf_counter(), answer.solution
-            iterations += given.iterations
-            if given.status == SOLVED:
-                multipliers = whole.formulation.multipliers(given.point)
-                found = None
-                if self._all is not None:
-                    self._side = self._all.near(multipliers.ravel(), free)
-                    found = self._all.solve(plan, free, [self._side])
-                if found is not None:
-                    self._side = found.active.side
-                    answer = self._answer(found, Method.WHOLE, query, started)
-                    spent_s += given.solve_s + answer.solution.solve_s
-                    break
-                point = self.formulation.point(answer.plan, answer.slacks, multipliers)
-                answer = answer._replace(solution=given._replace(made=point), qp=partial(self._qp, query))
-            spent_s += given.solve_s + clock.perf_counter() - started
-        solution = answer.solution._replace(
-            iterations=iterations,
-            solve_s=spent_s,
+        whole, spent_s = self._whole, clock.perf_counter() - started
+        answer = given = whole.solve(query)
+        started, self._side = clock.perf_counter(), self._none_active
+        if given.status == SOLVED:
+            assert given.certificate is not None
+            multipliers, found = whole.formulation.multipliers(given.certificate()[1]), None
+            if self._all is not None:
+                self._side = self._all.near(multipliers.ravel(), free)
+                found = self._all.solve(plan, free, [self._side])
+            if found is not None:
+                self._side = found.active.side
+                answer = self._answer(found, Method.WHOLE, query, started)
+            else:
+                certificate = partial(self._certificate, query, given.plan, given.slacks, multipliers)
+                answer = given._replace(certificate=certificate)
+        return answer._replace(
+            answered_by=whole.name,
+            iterations=given.iterations,
+            solve_s=spent_s + given.solve_s + clock.perf_counter() - started,
             reported_primal=given.reported_primal,
             reported_dual=given.reported_dual,
         )
-        return answer._replace(solution=solution, answered_by=whole.name)
 
 
 class _Found(NamedTuple):

@@ -47,8 +47,7 @@ from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
 from mpc.observer import DisturbanceObserver
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
-from mpc.relinearised import Relinearised
-from mpc.solvers import INVALID_DATA, Answer
+from mpc.solvers import INVALID_DATA, Answer, QPSolver
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
 from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, SQP, Command, Moment, Phase, stopped
@@ -158,8 +157,8 @@ class NonlinearMPC:
         self._check = AnswerCheck(self.problem, kkt_every)
         small = self.problem.horizon * (N_ROTORS + self.problem.rows.slacks.size) <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
-        self._qp = Relinearised(self.problem, self.solver, shortcut=True)
-        self._clearing = None if space is None else Clearing(self.problem, self._solve, space, changing=True)
+        self._qp = QPSolver(self.solver, self.problem, changing=True, shortcut=True)
+        self._clearing = None if space is None else Clearing(self.problem, self._qp, space, changing=True)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self._ramp = None if settings.ramp is None else self._make_ramp(settings.ramp)
         self._shift = settings.stride == 1 if settings.shift is None else settings.shift
@@ -355,7 +354,7 @@ class NonlinearMPC:
             self._plan = None
             return self._refuse(status, answer)
         assert sqp is not None
-        status = answer.solution.status
+        status = answer.status
         if sqp.defect > CONVERGED:
             status = NOT_CONVERGED
             if self.unanswered is None:
@@ -491,11 +490,6 @@ class NonlinearMPC:
             return nodes_of_motion(now.motion, self._nodes, stride)
         return nodes_of_preview(reference, self._nodes, stride, self._period, self._hover)
 
-    def _solve(self, query: Query) -> Answer:
-        assert query.steps is not None
-        assert query.rest is not None
-        return self._qp.solve(*query.steps, *query[:3], query.rest)
-
     def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem, SQP | None]:
         """Steps of sequential quadratic programming from the stored plan; the last problem is that of the answer."""
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
@@ -523,13 +517,12 @@ class NonlinearMPC:
             x, u = self._plan
             query = Query(s0, desired, before, rest, self._steps(x, u, frames))
             if self._clearing is None:
-                answer, problem = self._solve(query), self.problem
+                answer, problem = self._qp.solve(query), self.problem
             else:
-                answer, problem, states = self._clearing.solve(time, query, along=x[1:, P])
-                self._qp.last = (states, answer.plan) if answer.solution.status in ACCEPTED else None
-            if self._qp.last is None:
-                break
-            states, plan = self._qp.last[0][:, :n], self._qp.last[1]
+                answer, problem = self._clearing.solve(time, query, along=x[1:, P])
+            if answer.states is None or answer.status not in ACCEPTED:
+                return query, answer, problem, None
+            states, plan = answer.states[:, :n], answer.plan
             found = np.concatenate([measured[None], states])
             found[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
             self._plan = found, plan
@@ -549,8 +542,6 @@ class NonlinearMPC:
                 share = min(max(share / max(undone, SHORTEST), SHORTEST), largest)
                 last = step
                 self._plan = x + share * (found - x), u + share * (plan - u)
-        if self._qp.last is None:
-            return query, answer, problem, None
         defect = np.abs(defects(self._model, found, plan)).max()
         return query, answer, problem, SQP(float(defect), float(moved))
 
@@ -574,7 +565,7 @@ class NonlinearMPC:
         return wide, inputs, np.concatenate([c, (rows @ c[:, Q, None])[:, :, 0] + known], axis=1)
 
     def _rejection(self, answer: Answer) -> str | None:
-        status, plan = answer.solution.status, answer.plan
+        status, plan = answer.status, answer.plan
         if status not in ACCEPTED:
             return status
         beyond = np.abs(plan - self._clip(plan)).max()

@@ -94,34 +94,32 @@ def nonlinear_model(
 
 
 def derivative(model: NonlinearModel, x: Array, u: Array) -> Array:
-    """dx/dt (..., n) of states x (..., n) under inputs u (..., 4) [rad/s], of the same leading dimensions."""
-    speeds = u if model.rotor_lag is None else x[..., N_STATES:]
-    columns = np.moveaxis(x, -1, 0)
-    drive = np.moveaxis(np.square(speeds) @ model.effectiveness.T, -1, 0)
-    slope = np.empty_like(x)
-    slope[..., 0:N_STATES:2] = x[..., 1:N_STATES:2]
-    slope[..., 1:N_STATES:2] = np.moveaxis(accelerations(model, columns[6:12:2], columns[7:12:2], drive), 0, -1)
+    """dx/dt (..., n) of states x (..., n) under inputs u (..., 4) [rad/s]."""
+    speeds, columns = u if model.rotor_lag is None else x[..., N_STATES:], np.moveaxis(x, -1, 0)
+    euler, drive = columns[ANGLES], np.moveaxis(np.square(speeds) @ model.effectiveness.T, -1, 0)
+    constants = model.gyration, model.gravity, model.acceleration, model.angular_acceleration
+    slope = np.empty_like(columns)
+    slope[0:N_STATES:2] = columns[1:N_STATES:2]
+    slope[1:N_STATES:2] = _accelerations(np.sin(euler), np.cos(euler), columns[ANGLE_RATES], drive, *constants)
     if model.rotor_lag is not None:
-        slope[..., N_STATES:] = (u - speeds) / model.rotor_lag
-    return slope
+        slope[N_STATES:] = np.moveaxis((u - speeds) / model.rotor_lag, -1, 0)
+    return np.moveaxis(slope, 0, -1)
 
 
 def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
-    """The states (..., n) one period after states x (..., n) under inputs u (..., 4) [rad/s]."""
-    if x.ndim == 1:
-        return advance_disturbed(model, x, u, model.period, model.effectiveness, model.acceleration.tolist())
-    return integrate(model, x, u).end
+    """The state (n,) one period after a state x (n,) under inputs u (4,) [rad/s]."""
+    return advance_disturbed(model, x, u, model.period, model.effectiveness, model.acceleration.tolist())
 
 
 def advance_disturbed(
     model: NonlinearModel, x: Array, u: Array, period: float, effectiveness: Array, acceleration: Sequence[float]
 ) -> Array:
-    """`advance` for one state (n,), by a model with these numbers instead of its own.
+    """`advance` by a model with these numbers instead of its own.
 
-    It is `integrate`'s end in plain numbers: arrays of three take several times as long.
+    In plain numbers: arrays of three take several times as long.
     """
     step = period / model.substeps
-    speeds, _ = _rotor_speeds(model, step, x[N_STATES:], u)
+    speeds = _rotor_speeds(model, step, x[N_STATES:], u)
     drive = np.dot(np.square(speeds), effectiveness.T).tolist()
     constants = model.gyration.tolist(), model.gravity, acceleration, model.angular_acceleration.tolist()
     half, sixth = 0.5 * step, step / 6.0
@@ -167,72 +165,21 @@ def _weighted(first: Triple, second: Triple, third: Triple, fourth: Triple) -> T
     return a + 2.0 * (d + p) + x, b + 2.0 * (e + q) + y, c + 2.0 * (f + r) + z
 
 
-@dataclass(frozen=True, kw_only=True)
-class Passage:
-    """One period's integration, with the K = 4 `substeps` instants in it at which the model was evaluated."""
-
-    end: Array  # (..., n) states at the end
-    euler: Array  # (K, 3, ...) Euler angles at those instants [rad]
-    euler_rate: Array  # (K, 3, ...) their rates [rad/s]
-    drive: Array  # (K, 4, ...) U / m [m/s^2] and I^-1 tau [rad/s^2]
-    speeds: Array  # (K, 4, ...) rotor speeds [rad/s]
-    decay: Array  # (K,) share of the first rotor speeds still in these, 0 without lag
-
-
-def integrate(model: NonlinearModel, x: Array, u: Array) -> Passage:
-    """Integrate one period; arguments as for `advance`."""
-    columns = np.moveaxis(x, -1, 0)
-    step = model.period / model.substeps
-    speeds, decay = _rotor_speeds(model, step, columns[N_STATES:], np.moveaxis(u, -1, 0))
-    drive = np.einsum("ij,kj...->ki...", model.effectiveness, np.square(speeds))
-    q, s = columns[0:N_STATES:2], columns[1:N_STATES:2]  # positions and angles, and their rates
-    at_q, at_s = np.empty((2, decay.size, *q.shape), q.dtype)
-    slopes = np.empty_like(at_q)
-
-    def visit(k: int, q: Array, s: Array) -> Array:
-        at_q[k], at_s[k] = q, s
-        slopes[k] = accelerations(model, q[3:], s[3:], drive[k])
-        return slopes[k]
-
-    for k in range(0, decay.size, 4):
-        half = 0.5 * step
-        visit(k, q, s)
-        visit(k + 1, q + half * at_s[k], s + half * slopes[k])
-        visit(k + 2, q + half * at_s[k + 1], s + half * slopes[k + 1])
-        visit(k + 3, q + step * at_s[k + 2], s + step * slopes[k + 2])
-        q = q + step / 6.0 * (at_s[k] + 2.0 * (at_s[k + 1] + at_s[k + 2]) + at_s[k + 3])
-        s = s + step / 6.0 * (slopes[k] + 2.0 * (slopes[k + 1] + slopes[k + 2]) + slopes[k + 3])
-    end = np.empty_like(columns)
-    end[0:N_STATES:2], end[1:N_STATES:2] = q, s
-    if model.rotor_lag is not None:
-        end[N_STATES:] = speeds[-1]
-    return Passage(
-        end=np.moveaxis(end, 0, -1), euler=at_q[:, 3:], euler_rate=at_s[:, 3:], drive=drive, speeds=speeds, decay=decay
-    )
-
-
-def _rotor_speeds(model: NonlinearModel, step: float, rotors: Array, inputs: Array) -> tuple[Array, Array]:
-    """(K, 4, ...) speeds of rotors (4, ...) under inputs (4, ...) at the instants of a `Passage`, and its `decay`.
+def _rotor_speeds(model: NonlinearModel, step: float, rotors: Array, inputs: Array) -> Array:
+    """(K, 4) speeds of rotors (4,) under inputs (4,) at the instants of `_instants`.
 
     `step` is that of the Runge-Kutta method [s].
     """
     instants = _instants(model.substeps)
     if model.rotor_lag is None:
-        return np.broadcast_to(inputs, (instants.size, *inputs.shape)), np.zeros(instants.size)
-    decay = np.exp(-instants * step / model.rotor_lag)
-    return inputs + decay.reshape(-1, *[1] * inputs.ndim) * (rotors - inputs), decay
+        return np.broadcast_to(inputs, (instants.size, *inputs.shape))
+    return inputs + np.exp(-instants * step / model.rotor_lag)[:, None] * (rotors - inputs)
 
 
 @cache
 def _instants(substeps: int) -> Array:
     """(4 substeps,) instants at which Runge-Kutta's method evaluates slopes, in steps."""
     return read_only((np.arange(substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel())
-
-
-def accelerations(model: NonlinearModel, euler: Array, euler_rate: Array, drive: Array) -> Array:
-    """(6, ...) d2(p)/dt2 [m/s^2] and d2(eta)/dt2 [rad/s^2], of eta, its rate (3, ...) and of U/m, I^-1 tau (4, ...)."""
-    constants = model.gyration, model.gravity, model.acceleration, model.angular_acceleration
-    return np.stack(_accelerations(np.sin(euler), np.cos(euler), euler_rate, drive, *constants))
 
 
 def _accelerations(
@@ -245,7 +192,7 @@ def _accelerations(
     acceleration: Iterable[Any],
     angular_acceleration: Iterable[Any],
 ) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """See `accelerations`; entries are arrays or plain numbers.
+    """d2(p)/dt2 [m/s^2] and d2(eta)/dt2 [rad/s^2], of eta, its rate and of U/m, I^-1 tau, as plain numbers.
 
     With a, b, c the rates of roll, pitch and yaw, E^-1 dE/dt d(eta)/dt is (-b c cos - sin(pitch) l / cos, a c cos,
     -l / cos), where l = b (a + c sin(pitch)) and cos is that of pitch.

@@ -206,11 +206,7 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
 
 def defects(model: RigidBody, x: Array, u: Array) -> Array:
     """(N, n) how far a plan's states x (N + 1, n) are from where its inputs u (N, 4) take each one before, signed."""
-    Y, travelled = _integrate(model, _drives(model, x[:-1], u)[..., -1:], x[:-1, 3:N_BODY, None])
-    end = [x[:-1, P] + travelled[:, :, 0], Y[:, :, 0]]
-    if model.rotor_lag is not None:
-        end.append(_rotors_after(model, x[:-1], u))
-    return x[1:] - np.concatenate(end, axis=1)
+    return x[1:] - advance_nodes(model, x[:-1], u)
 
 
 def _integrate(model: RigidBody, drives: Array, Y: Array) -> tuple[Array, Array]:
@@ -358,32 +354,9 @@ def product(left: Array, right: Array) -> Array:
 
 def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
     """The states (..., n) one step after states x (..., n) under inputs u (..., 4), without derivatives."""
-    h, lag = model.step / model.substeps, model.rotor_lag
-    body = x[..., :N_BODY]
-    for s in range(model.substeps):
-        slopes: list[Array] = []
-        for fraction, weight in ((0.0, 0.0), (0.5, 0.5), (0.5, 0.5), (1.0, 1.0)):
-            at = body if not slopes else body + weight * h * slopes[-1]
-            now = u if lag is None else u + math.exp(-(s + fraction) * h / lag) * (x[..., N_BODY:] - u)
-            slopes.append(_derivative(model, at, now))
-        body = body + h / 6.0 * (slopes[0] + 2.0 * (slopes[1] + slopes[2]) + slopes[3])
-    if lag is None:
-        return np.asarray(body)
-    return np.concatenate([body, u + math.exp(-model.step / lag) * (x[..., N_BODY:] - u)], axis=-1)
-
-
-def _derivative(model: RigidBody, body: Array, rotors: Array) -> Array:
-    """d(p, q, v, omega)/dt (..., 13) with rotors at such shares (..., 4)."""
-    q, v, rates = body[..., Q], body[..., V], body[..., W]
-    drive = model.thrusts(rotors) @ model.effectiveness.T
-    w, x, y, z = (q[..., i] for i in range(4))
-    a, b, c = (rates[..., i] for i in range(3))
-    turn = 0.5 * np.stack(
-        [-x * a - y * b - z * c, w * a + y * c - z * b, w * b - x * c + z * a, w * c + x * b - y * a], axis=-1
-    )
-    push = drive[..., :1] * thrust_axis(q) - model.gravity * _UP + model.acceleration
-    if model.drags:
-        push = push + drag_acceleration(model, q, v)
-    momentum = model.inertia * rates
-    spin = drive[..., 1:] - np.cross(rates, momentum) / model.inertia + model.angular_acceleration
-    return np.concatenate([v, turn, push, spin], axis=-1)
+    shape, x, u = x.shape, x.reshape(-1, model.n), u.reshape(-1, N_ROTORS)
+    Y, travelled = _integrate(model, _drives(model, x, u)[..., -1:], x[:, 3:N_BODY, None])
+    end = [x[:, P] + travelled[:, :, 0], Y[:, :, 0]]
+    if model.rotor_lag is not None:
+        end.append(_rotors_after(model, x, u))
+    return np.concatenate(end, axis=1).reshape(shape)

@@ -80,7 +80,7 @@ class NonlinearSettings:
         soft: (l1, l2) of exceeding these by 1 rad or 1 rad/s; None for hard bounds.
         observer: tuning of the disturbance observer; None for no offset-free tracking.
         ramp: tuning of the one that follows changing forces, and fits drag to them; None for none.
-        solver: QP solver, in `mpc.solvers.SOLVERS`; None for the one that is the fastest for the size.
+        solver: QP solver (`mpc.solvers.find_solver`); None for the one that is the fastest for the size.
     """
 
     horizon: int = 10

@@ -6,18 +6,17 @@ of the cost add to them, other constraints add rows, and soft rows add slacks af
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import scipy.linalg
 
 from mpc.constraints import Rows
-from mpc.ocp import Problem, Rest
+from mpc.ocp import Problem, Query, predicted
 from mpc.paper.cost import cost
 from mpc.paper.prediction import Prediction, prediction
-from mpc.qp import QP, Point, QPRows, Vectors
+from mpc.qp import QP, Posed, QPRows, Solution
 from quadsim.state import Array, Indices
 
 
@@ -84,7 +83,7 @@ class Condensed:
     Attributes:
         maps: how states follow from the inputs.
         cost: of the inputs alone.
-        qp: H, the rows time by time, and the box; vectors for xi(k) and y_d zero and u(k-1) = u_bar.
+        qp: H, the rows time by time, and the box, for xi(k) and y_d zero and u(k-1) = u_bar.
 
     Raises:
         ValueError: the problem has no constraints; it needs no QP.
@@ -120,7 +119,7 @@ class Condensed:
             later=_one_step_later([nu, m_s, len(rows.C)], N),
         )
         nothing = np.zeros((N, problem.objective.C_r.shape[0]))
-        self.qp = self._blank.with_vectors(self.vectors(np.zeros(model.n), nothing, model.u_bar))
+        self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp
 
     @cached_property
     def _changing(self) -> _Changing:
@@ -139,22 +138,27 @@ class Condensed:
             S=_inputs_of_steps(self._problem),
         )
 
-    def vectors(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Vectors:
-        """See `mpc.qp.Formulation.vectors`."""
+    def pose(self, query: Query) -> Posed:
+        """See `mpc.qp.Formulation.pose`."""
+        if query.steps is not None:
+            return self._pose_changed(query)
         terms, values, rows = self.cost, self._values, self._rows
-        x_s, u_s = self._problem.rest if rest is None else rest
+        state, desired, u_before = query[:3]
+        x_s, u_s = query.rest or self._problem.rest
         dx, dy, du = state - x_s, desired - self._problem.objective.C_r @ x_s, u_before - u_s
         c = self._linear.copy()
         c[: self._inputs] += terms.F_x @ dx + terms.F_y @ dy.ravel() + terms.F_d @ du - self._pull @ u_s
         # Rows are of absolute inputs u = u_s + v and states x_s + dx(v).
         shift = rows.C @ x_s + rows.D @ u_s + values.of_state @ dx - self._of_rest @ u_s
         shift[0] += rows.E @ (u_s - u_before)
-        return Vectors(c=c, b=self._blank.b, h_l=(rows.lower - shift).ravel(), h_u=(rows.upper - shift).ravel())
+        qp = replace(self._blank, c=c, h_l=(rows.lower - shift).ravel(), h_u=(rows.upper - shift).ravel())
+        return Posed(qp, lambda x: predicted(self._problem, query, self.inputs(x)))
 
-    def posed(
-        self, A: Array, B: Array, c: Array, state: Array, desired: Array, u_before: Array, rest: Rest
-    ) -> tuple[QP, Callable[[Array], Array]]:
-        """See `mpc.qp.ChangingFormulation.posed`: in absolute states and inputs, with a model that changes."""
+    def _pose_changed(self, query: Query) -> Posed:
+        """The same in absolute states and inputs, with a model that changes."""
+        assert query.steps is not None
+        (A, B, c), (state, desired, u_before) = query.steps, query[:3]
+        rest = query.rest or self._problem.rest
         objective, rows, m = self._problem.objective, self._rows, self._inputs
         N, n, nu = B.shape
         fixed, count = self._changing, len(rows.C)
@@ -188,19 +192,8 @@ class Condensed:
             filled, known = fixed.G.copy(), values[:, :, m]
             filled.reshape(N, count, -1)[:, :, :m] = values[:, :, :m]
             G, h_l, h_u = np.asfortranarray(filled), (rows.lower - known).ravel(), (rows.upper - known).ravel()
-        qp = QP(
-            P=P,
-            c=gradient,
-            A=blank.A,
-            b=blank.b,
-            G=G,
-            h_l=h_l,
-            h_u=h_u,
-            x_l=blank.x_l,
-            x_u=blank.x_u,
-            later=blank.later,
-        )
-        return qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m]
+        qp = replace(blank, P=P, c=gradient, G=G, h_l=h_l, h_u=h_u)
+        return Posed(qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m])
 
     def inputs(self, x: Array) -> Array:
         """See `mpc.qp.Formulation.inputs`."""
@@ -210,12 +203,12 @@ class Condensed:
         """See `mpc.qp.Formulation.slacks`."""
         return x[self._inputs :].reshape(self._problem.horizon, -1)
 
-    def multipliers(self, point: Point) -> Array:
+    def multipliers(self, solution: Solution) -> Array:
         """See `mpc.qp.Formulation.multipliers`."""
-        return self._rows.multipliers(point.z, point.z_box[: self._inputs])
+        return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
 
-    def point(self, plan: Array, slacks: Array, multipliers: Array) -> Point:
-        """This QP's point of a plan (N, nu), slacks (N, m_s) and rows' multipliers (N, m).
+    def solution(self, plan: Array, slacks: Array, multipliers: Array) -> Solution:
+        """This QP's solution of a plan (N, nu), slacks (N, m_s) and rows' multipliers (N, m).
 
         Multipliers are positive at upper bounds and negative at lower ones.
         """
@@ -225,7 +218,7 @@ class Condensed:
             # Stationarity of a slack: l1 + 2 l2 e - |z| + z_box = 0.
             z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
             x, z_box = np.concatenate((x, slacks.ravel())), np.concatenate((z_box, z_slacks.ravel()))
-        return Point(x, self._blank.b, z, z_box)
+        return Solution(x, self._blank.b, z, z_box)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,8 +278,3 @@ def _one_step_later(sizes: list[int], N: int) -> Indices:
         found.append(np.concatenate([own[size:], own[-size:] if size else own]))
         start += own.size
     return np.concatenate(found)
-
-
-def condensed(problem: Problem) -> Condensed:
-    """Condense a constrained problem."""
-    return Condensed(problem)

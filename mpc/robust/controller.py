@@ -18,35 +18,25 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, AnswerCheck, command_of, free_command, refused, rejection, shifted
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, free_command, refused, rejection
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
 from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE, CompletedMoment
-from mpc.handover import observed, resized, within
-from mpc.heading import (
-    anchored,
-    predict_in_heading_frame,
-    seen_from,
-    slope,
-    turn_horizontally,
-    with_nearest_yaw,
-)
+from mpc.handover import observed, within
+from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, with_nearest_yaw
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
-from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
 from mpc.observer import DisturbanceObserver, thrust_axis
 from mpc.observer import ObserverSettings as ObserverSettings
 from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
-from mpc.relinearised import Relinearised
 from mpc.robust.settings import LONGEST_SPAN
-from mpc.robust.settings import Linearisation as Linearisation
 from mpc.robust.settings import RobustSettings as RobustSettings
 from mpc.solvers import INVALID_DATA, Answer, Method, QPSolver
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
-from quadsim.controller import ACCEPTED, GROUNDED, Command, Moment, Phase, stopped
+from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -140,13 +130,9 @@ class RobustMPC:
             constraints=constraints,
         )
         self._actuators, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
-        if settings.linearisation is Linearisation.HOVER:
-            whole = QPSolver(SOLVER, problem)
-            self._solver = with_shortcut(problem, whole) if shortcut else whole
-        else:
-            self._relinearised = Relinearised(problem)
-        changing = settings.linearisation is not Linearisation.HOVER
-        self._clearing = None if space is None else Clearing(problem, self._solve, space, changing=changing)
+        whole = QPSolver(SOLVER, problem)
+        self._solver = with_shortcut(problem, whole) if shortcut else whole
+        self._clearing = None if space is None else Clearing(problem, self._solver, space)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
 
@@ -159,23 +145,19 @@ class RobustMPC:
         self._called_at = self._measured = -math.inf
         self.unanswered: Unanswered | None = None
         self._check.reset()
-        if self.settings.linearisation is Linearisation.HOVER:
-            self._solver.reset()
-        else:
-            self._relinearised.last = None
+        self._solver.reset()
         if self._clearing is not None:
             self._clearing.reset()
         self._forget()
 
     def adopt(self, previous: object) -> None:
-        """Go on from what the law before knew: rotor speeds, disturbance, plan."""
+        """Go on from what the law before knew: rotor speeds and disturbance."""
         law = within(previous, RobustMPC)
         if law is not None:
             self._rotors = law._rotors.copy()
             self._called_at, self._measured = law._called_at, law._measured
             if self.settings.delay == law.settings.delay:
                 self._ahead = law._ahead
-            self._adopt_plan(law)
         own = None if law is None else law._observer
         estimate = observed(previous) if own is None else own.estimate
         if self._observer is not None and estimate is not None:
@@ -191,7 +173,7 @@ class RobustMPC:
         answer, problem = self._answer(now.time, query)
         refused, free = None, answer.method is Method.FREE
         if not free:
-            refused = rejection(answer.solution.status, answer.plan[0], answer.plan, self._actuators, self._acting)
+            refused = rejection(answer.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         answer, refused = self._check(problem, query, answer, refused)
         self.answer = answer
         if free and refused is None:
@@ -205,7 +187,7 @@ class RobustMPC:
             return self._refuse(refused, answer)
         plan = answer.plan.copy()
         self._acting = plan[0] = self._actuators.clip(plan[0], self._acting)
-        return command_of(plan[0], plan, answer.solution.status, answer)
+        return command_of(plan[0], plan, answer.status, answer)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
     def pose(self, now: Moment, state: Array, reference: Array) -> Query | Command:
@@ -246,26 +228,15 @@ class RobustMPC:
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`.
 
-        It is always the hover model that predicts, turned by each yaw, with the disturbance estimated last: a plan
-        flown without feedback may take the nonlinear one past a pitch of 90 deg, where its Euler angles end.
+        The hover model turned by each yaw predicts, with the disturbance estimated last.
         """
-        if self.settings.linearisation is Linearisation.HOVER:
-            return predict_in_heading_frame(self._nominal, states, plans, replace(self.trim, speeds=self._balanced()))
-        return predict_in_heading_frame(anchored(self._nominal, self.trim), states, plans, self.trim)
+        return predict_in_heading_frame(self._nominal, states, plans, replace(self.trim, speeds=self._balanced()))
 
     @property
     def disturbance(self) -> Array:
         """(6,) estimated acceleration at rest, world [m/s^2], and angular acceleration, body [rad/s^2]."""
         thrust = self._model.effectiveness[0] @ np.square(self.trim.speeds)
         return np.concatenate([self._resting, thrust * self.trim.twist])
-
-    def _adopt_plan(self, law: RobustMPC) -> None:
-        """Linearise along the plan of the law before."""
-        if Linearisation.HOVER in (self.settings.linearisation, law.settings.linearisation):
-            return
-        if law._relinearised.last is not None and law._model.n == self._model.n:
-            states, plan = law._relinearised.last
-            self._relinearised.last = resized(states, self.horizon), resized(plan, self.horizon)
 
     def _forget(self) -> None:
         """Assume no disturbance."""
@@ -326,25 +297,11 @@ class RobustMPC:
     def _answer(self, time: float, query: Query) -> tuple[Answer, Problem]:
         """The optimum, and the problem that it is of."""
         if self._clearing is None:
-            return self._solve(query), self.problem
-        turned = self.settings.heading and query.steps is None
-        answer, problem, states = self._clearing.solve(time + self.settings.delay, query, self._yaw if turned else 0.0)
-        if query.steps is not None and self._relinearised.last is not None:
-            self._relinearised.last = (states, answer.plan) if answer.solution.status in ACCEPTED else None
-        return answer, problem
-
-    def _solve(self, query: Query) -> Answer:
-        if query.steps is None:
-            return self._solver.solve(query.state, query.desired, query.u_before, query.rest)
-        assert query.rest is not None
-        return self._relinearised.solve(*query.steps, query.state, query.desired, query.u_before, query.rest)
+            return self._solver.solve(query), self.problem
+        return self._clearing.solve(time + self.settings.delay, query, self._yaw if self.settings.heading else 0.0)
 
     def _query(self, x0: Array, reference: Array) -> Query:
         yaw = float(x0[_YAW])
-        if self.settings.linearisation is not Linearisation.HOVER:
-            desired = self._objective.desired(with_nearest_yaw(reference, yaw, self.settings.largest_turn))
-            rest = Rest(np.zeros_like(x0), self.trim.speeds)
-            return Query(x0, desired, self._acting, rest, self._along_plan(x0))
         if not self.settings.heading:
             yaw = 0.0
         else:
@@ -361,21 +318,6 @@ class RobustMPC:
         thrust = self._model.effectiveness[0]
         excess = np.dot(thrust, np.square(self._rotors) - np.square(self.trim.speeds))
         return np.asarray(self.trim.speeds - np.dot(self._of_twist, excess * self.trim.twist))
-
-    def _along_plan(self, x0: Array) -> tuple[Array, Array, Array]:
-        """A (N, n, n), B (N, n, 4), c (N, n) of the predicted steps."""
-        acceleration = np.array(self._acceleration(thrust_axis(x0.tolist())))
-        model = replace(self._model, effectiveness=self._effectiveness, acceleration=acceleration)
-        last = self._relinearised.last
-        if self.settings.linearisation is Linearisation.STATE or last is None:
-            A, B, c = linearise(model, x0[None], self._acting[None])
-            return np.repeat(A, self.horizon, 0), np.repeat(B, self.horizon, 0), np.repeat(c, self.horizon, 0)
-        states, plan = last
-        # A period later, what was predicted for the end of the first step is now; the last input is held for one more.
-        along = states.copy()
-        along[:, _YAW] += math.tau * round((x0[_YAW] - along[0, _YAW]) / math.tau)
-        along[0] = x0
-        return linearise(model, along, shifted(plan, 1))
 
 
 def _widened(matrix: Array, n: int) -> Array:

@@ -28,13 +28,11 @@ from mpc.constraints import Constraint, Penalty
 from mpc.equilibrium import Trim
 from mpc.ocp import Objective, Problem, Query
 from mpc.robust.controller import RobustMPC
-from mpc.robust.settings import Linearisation
 from mpc.robust.tightening import observed
 from mpc.solvers import Answer
 from mpc.solvers.piqp_backends import PiqpMultistage
 from mpc.staged import Staged
 from quadsim.controller import ACCEPTED, UNCONSTRAINED, Command, Moment
-from quadsim.errors import ParameterError
 from quadsim.state import Array
 
 LATER: Final = 1e-6
@@ -64,18 +62,12 @@ class SafetyFilter:
     Attributes:
         problem: the constraints, all hard.
         wanted: (4,) the command to let pass in the next period [rad/s].
-
-    Raises:
-        ParameterError: the model is not that of hover.
     """
 
     name: Final = "safety-filter"
     solver: Final = "piqp-multistage"
 
     def __init__(self, mpc: RobustMPC) -> None:
-        if mpc.settings.linearisation is not Linearisation.HOVER:
-            rule = '"hover" for a safety filter'
-            raise ParameterError("controller", "linearisation", str(mpc.settings.linearisation), rule)
         self._mpc, self.horizon = mpc, mpc.horizon
         standing = _standing(mpc.problem)
         self.problem = _feasibility(mpc.problem, standing)
@@ -102,9 +94,9 @@ class SafetyFilter:
         if isinstance(query, Command):
             return query
         answer = self._nearest.solve(query, self.wanted)
-        if answer.solution.status not in ACCEPTED:
+        if answer.status not in ACCEPTED:
             answer = self._softened.solve(query, self.wanted)
-        plan, status = answer.plan, answer.solution.status
+        plan, status = answer.plan, answer.status
         problem = rejection(status, plan[0], plan, self._actuators, query.u_before)
         if problem is not None:
             return refused(query.u_before, self.horizon, problem, answer)
@@ -125,23 +117,23 @@ class _Nearest:
         self._form = form = Staged(problem)
         self._horizon, self._at_rest = problem.horizon, standing
         self._first = form.inputs(np.arange(form.qp.c.size, dtype=np.float64))[0].astype(np.intp)
-        P = form.qp.P.copy()
-        P[self._first, self._first] += 2.0
+        self._P = form.qp.P.copy()
+        self._P[self._first, self._first] += 2.0
         self._backend = PiqpMultistage()
-        self._backend.setup(replace(form.qp, P=P))
+        self._backend.setup(replace(form.qp, P=self._P))
         earlier, last = (form.qp.h_u.reshape(self._horizon, -1)[i] for i in (0, -1))
         self._ends = (earlier == LOOSE) & (last < LOOSE)  # rows that hold at the last state alone
 
     def solve(self, query: Query, wanted: Array) -> Answer:
         """The plan whose first input is nearest to `wanted` (4,) [rad/s]."""
-        vectors = self._form.vectors(query.state, query.desired, query.u_before, query.rest)
-        vectors.c[self._first] -= 2.0 * wanted
+        qp = replace(self._form.pose(query).qp, P=self._P)
+        qp.c[self._first] -= 2.0 * wanted
         if query.rest is not None:
-            for side in (vectors.h_l, vectors.h_u):
+            for side in (qp.h_l, qp.h_u):
                 side.reshape(self._horizon, -1)[-1, self._ends] += self._at_rest @ query.rest.x
-        solution = self._backend.solve(vectors)
+        solution = self._backend.solve(qp)
         plan, slacks = self._form.inputs(solution.x), self._form.slacks(solution.x)
-        return Answer(plan.copy(), slacks, solution, SafetyFilter.solver)
+        return Answer.of(qp, solution, plan.copy(), slacks, SafetyFilter.solver)
 
 
 def _feasibility(problem: Problem, standing: Array) -> Problem:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 from mpc.constraints import Penalty
@@ -14,17 +13,6 @@ from quadsim.state import Array
 
 LONGEST_SPAN: Final = 0.25
 """Longest time between two measured states [s] for their difference to show a disturbance; a sensor of 4 Hz."""
-
-
-class Linearisation(StrEnum):
-    """Where the prediction is linearised."""
-
-    HOVER = "hover"
-    """At hover, once: the paper's model, turned by the yaw where the heading frame is on."""
-    STATE = "state"
-    """At the present state, each period: successive linearisation."""
-    TRAJECTORY = "trajectory"
-    """Along the last plan, each period: one step of sequential quadratic programming, the real-time iteration."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +29,8 @@ class RobustSettings:
         largest_turn: how far the prediction may turn at once [rad], from the present yaw or from one period to
             the next; it goes on from there.  Of no effect on the hover model without `heading`.
         move_weight: Q_d (4, 4), of a command's change from one period to the next; None for none.
-        linearisation: where the prediction is linearised.
         margins: (N, n_c) by which the output bounds are tightened; None for none.
-        terminal: whether the last state has the weight of the hover model's LQR (`mpc.ocp.lqr_terminal_weight`); with
-            the hover model only.
+        terminal: whether the last state has the weight of the hover model's LQR (`mpc.ocp.lqr_terminal_weight`).
     """
 
     penalty: Penalty | None = None
@@ -54,7 +40,6 @@ class RobustSettings:
     heading: bool = False
     largest_turn: float = 0.5
     move_weight: Array | None = None
-    linearisation: Linearisation = Linearisation.HOVER
     margins: Array | None = None
     terminal: bool = False
 
@@ -64,6 +49,3 @@ class RobustSettings:
                 raise ParameterError("controller", name, getattr(self, name), "at least 0 s and finite")
         if not 0.0 < self.largest_turn < math.inf:
             raise ParameterError("controller", "largest_turn", self.largest_turn, "positive and finite")
-        if self.terminal and self.linearisation is not Linearisation.HOVER:
-            rule = 'left out, or linearisation = "hover": its Riccati equation is of that model'
-            raise ParameterError("controller", "terminal", "lqr", rule)

@@ -15,9 +15,9 @@ from typing import Final
 import daqp
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csc_matrix
 
-from mpc.qp import QP, Solution, Vectors
-from mpc.solvers import _common
+from mpc.qp import QP, Matrix, Solution
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 
@@ -47,32 +47,39 @@ _EQUALITY: Final = 5
 class DaqpDense:
     """Back end for dense QPs; see `mpc.qp.Backend`."""
 
-    def __init__(self) -> None:
-        self._model = daqp.Model()
-        self._model.settings = SETTINGS
-
     def setup(self, qp: QP) -> None:
         """See `mpc.qp.Backend.setup`."""
         self._qp = qp
         self._sense: Sense | None = None
+        self._model = daqp.Model()
+        self._model.settings = SETTINGS
         sense = np.zeros(qp.c.size + qp.h_l.size + qp.b.size, dtype=np.intc)
         sense[qp.c.size + qp.h_l.size :] = _EQUALITY
-        hessian, rows = _common.dense(qp.P), _common.dense(_common.rows(qp))
-        self._model.setup(
-            hessian, qp.c.copy(), rows, _common.upper(qp, qp.vectors), _common.lower(qp, qp.vectors), sense
-        )
+        rows = np.concatenate([_dense(qp.G), _dense(qp.A)])
+        self._model.setup(_dense(qp.P), qp.c.copy(), rows, *_bounds(qp), sense)
 
-    def solve(self, vectors: Vectors) -> Solution:
+    def solve(self, qp: QP) -> Solution:
         """See `mpc.qp.Backend.solve`."""
-        qp = self._qp
         started = clock.perf_counter()
-        upper, lower = _common.upper(qp, vectors), _common.lower(qp, vectors)
-        self._model.update(f=vectors.c, bupper=upper, blower=lower, sense=self._sense)
+        if qp.P is not self._qp.P or qp.G is not self._qp.G:
+            self.setup(qp)
+        else:
+            upper, lower = _bounds(qp)
+            self._model.update(f=qp.c, bupper=upper, blower=lower, sense=self._sense)
         x, _, flag, info = self._model.solve()
         self._sense = self._moved(info["lam"]) if flag == 1 else None
         elapsed = clock.perf_counter() - started
-        status = STATUS.get(flag, f"daqp_{flag}")
-        return _common.solution(qp, x, info["lam"], status=status, iterations=info["iterations"], solve_s=elapsed)
+        z_box, z, y = np.split(info["lam"], [qp.c.size, qp.c.size + qp.h_l.size])
+        return Solution(
+            x=x,
+            y=y,
+            z=z,
+            z_box=z_box,
+            status=STATUS.get(flag, f"daqp_{flag}"),
+            iterations=info["iterations"],
+            active=int(np.count_nonzero(z) + np.count_nonzero(z_box)),
+            solve_s=elapsed,
+        )
 
     def _moved(self, multipliers: Array) -> Sense | None:
         """The active set moved one step earlier, with nothing active at the last step; None to start as it was."""
@@ -83,3 +90,13 @@ class DaqpDense:
         sense = np.full(multipliers.size, _EQUALITY, dtype=np.intc)
         sense[: later.size] = np.where(later == np.arange(later.size), 0, found[later])
         return sense
+
+
+def _dense(matrix: Matrix) -> Array:
+    """A C-contiguous copy of a matrix."""
+    return np.array(matrix.toarray() if isinstance(matrix, csc_matrix) else matrix, order="C")
+
+
+def _bounds(qp: QP) -> tuple[Array, Array]:
+    """The upper and lower sides of [x; G x; A x]."""
+    return np.concatenate([qp.x_u, qp.h_u, qp.b]), np.concatenate([qp.x_l, qp.h_l, qp.b])

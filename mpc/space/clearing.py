@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from mpc.ocp import Problem, Query, predicted
-from mpc.solvers import Answer
-from mpc.solvers.piqp_backends import PiqpChanging
+from mpc.solvers import Answer, Solver
+from mpc.solvers.piqp_backends import PiqpMultistage
 from mpc.space.halfspaces import LOOSE, Space
 from mpc.staged import Staged
 from quadsim.controller import ACCEPTED
@@ -27,11 +26,10 @@ SETTLED: Final = 1e-2
 
 
 class Cleared(NamedTuple):
-    """An optimum among obstacles, the problem it is of, and the states (N, n) that it predicts."""
+    """An optimum among obstacles, with its `Answer.states`, and the problem it is of."""
 
     answer: Answer
     problem: Problem
-    states: Array
 
 
 class Clearing:
@@ -43,21 +41,19 @@ class Clearing:
 
     Args:
         problem: without half-spaces.
-        solve: solves it.
+        solver: solves it.
         space: what makes the half-spaces.
         changing: whether queries have steps of their own.
     """
 
-    def __init__(
-        self, problem: Problem, solve: Callable[[Query], Answer], space: Space, *, changing: bool = False
-    ) -> None:
-        self.problem, self._solve, self._space = problem, solve, space
+    def __init__(self, problem: Problem, solver: Solver, space: Space, *, changing: bool = False) -> None:
+        self.problem, self._solver, self._space = problem, solver, space
         self._changing = changing
         self.reset()
 
     def reset(self) -> None:
         """Forget the last plan."""
-        self._forms: dict[int, tuple[Staged, PiqpChanging]] = {}
+        self._forms: dict[int, tuple[Staged, PiqpMultistage]] = {}
         self._last: Array | None = None
 
     def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> Cleared:
@@ -77,11 +73,10 @@ class Clearing:
         # Where the last plan touched half-spaces, this one is all but sure to: it is sought among them at once.
         among = self._changing and along is not None and self._touched(t, along)
         if along is None or not among:
-            answer = self._solve(query)
-            if answer.solution.status not in ACCEPTED:
-                return Cleared(answer, problem, np.empty(0))
-            states = predicted(problem, query, answer.plan)
-            planned = states[:, self._space.positions] @ turn
+            answer = self._solver.solve(query)
+            if answer.status not in ACCEPTED:
+                return Cleared(answer, problem)
+            answer, planned = self._predicted(query, answer, turn)
             if along is None:
                 along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
         else:
@@ -91,17 +86,21 @@ class Clearing:
             room = _room(normals, bounds, planned)
             if (room >= -ROUNDING).all() and not (among and i == 0):
                 break
-            answer, problem, states = self._whole(query, normals, bounds, room, turn)
-            if answer.solution.status not in ACCEPTED:
+            answer, problem, planned = self._whole(query, normals, bounds, room, turn)
+            if answer.status not in ACCEPTED:
                 named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
                 constraints = (*self.problem.constraints, *named)
-                return Cleared(answer, replace(problem, constraints=constraints), states)
-            planned = states[:, self._space.positions] @ turn
+                return Cleared(answer, replace(problem, constraints=constraints))
             if np.abs(planned - along).max() < SETTLED:
                 break
             along = planned
         self._last = planned
-        return Cleared(answer, problem, states)
+        return Cleared(answer, problem)
+
+    def _predicted(self, query: Query, answer: Answer, turn: Array) -> tuple[Answer, Array]:
+        """The answer with its states, and their positions in the world (N, 3)."""
+        states = predicted(self.problem, query, answer.plan)
+        return answer._replace(states=states), states[:, self._space.positions] @ turn
 
     def _touched(self, t: Array, along: Array) -> bool:
         return bool((_room(*self._space.half_spaces(t, along), along) < NEAR).any())
@@ -111,21 +110,23 @@ class Clearing:
         added = self._space.constraint(normals, bounds, self.problem.model.n)
         return replace(self.problem, constraints=(*self.problem.constraints, added))
 
-    def _whole(self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array) -> Cleared:
-        """The optimum with half-spaces of the world; `room` (S, N) gives the tightest."""
+    def _whole(
+        self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array
+    ) -> tuple[Answer, Problem, Array]:
+        """The optimum with half-spaces of the world, and its positions; `room` (S, N) gives the tightest."""
         count = self._space.settings.rows
         while True:
             at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
             problem = self._posed(normals[at] @ turn.T, bounds[at])
             answer = self._solved(query, problem, len(at[0]))
-            if answer.solution.status not in ACCEPTED:
-                return Cleared(answer, problem, np.empty(0))
-            states = predicted(self.problem, query, answer.plan)
-            room = _room(normals, bounds, states[:, self._space.positions] @ turn)
+            if answer.status not in ACCEPTED:
+                return answer, problem, np.empty(0)
+            answer, planned = self._predicted(query, answer, turn)
+            room = _room(normals, bounds, planned)
             violated = room < -ROUNDING
             violated[at] = False
             if not violated.any():
-                return Cleared(answer, problem, states)
+                return answer, problem, planned
             room[at] = -LOOSE  # what was there stays
             count *= 2
 
@@ -133,23 +134,14 @@ class Clearing:
         """The QP's answer with so many half-spaces at each instant."""
         if count not in self._forms:
             normals = np.full((count, problem.horizon, 3), 3.0**-0.5)  # in general position
-            form, backend = (
-                Staged(self._posed(normals, np.zeros(normals.shape[:2])), changing=self._changing),
-                PiqpChanging(),
-            )
+            form = Staged(self._posed(normals, np.zeros(normals.shape[:2])), changing=self._changing)
+            backend = PiqpMultistage(changing=True)
             backend.setup(form.qp)
             self._forms[count] = form, backend
-        (form, backend), rest = self._forms[count], query.rest or self.problem.rest
-        if query.steps is None:
-            matrices = form.renewed(problem)
-            vectors = form.vectors(*query[:3], rest, matrices)
-        else:
-            A, B, c = query.steps
-            matrices = form.renewed(problem, form.prepare(A, B))
-            vectors = form.changed_vectors(matrices, c, *query[:3], rest)
-        qp = form.changed(matrices, vectors)
-        solution = backend.solve_changed(qp)
-        return Answer(form.inputs(solution.x), form.slacks(solution.x), solution, SOLVER, qp=qp)
+        form, backend = self._forms[count]
+        qp = form.pose(query, problem).qp
+        solution = backend.solve(qp)
+        return Answer.of(qp, solution, form.inputs(solution.x), form.slacks(solution.x), SOLVER)
 
 
 def _room(normals: Array, bounds: Array, positions: Array) -> Array:

@@ -15,7 +15,6 @@ from mpc.exact.free import FreeOptimum
 from mpc.export.tables import with_constraints
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.contract import Guarded
-from mpc.qp import Point
 from mpc.robust.controller import RobustMPC
 from mpc.solvers import Method
 from mpc.unconstrained import UnconstrainedMPC
@@ -121,7 +120,7 @@ def _answers(
             if command.status in ACCEPTED:
                 assert law.answer is not None
                 answer = WAYS[law.answer.method], command.speeds
-                if isinstance(law.answer.solution.made, Point):  # the solver's own, which nothing made exact
+                if not law.answer.exact:
                     break
         found.append(answer)
     status, commands = zip(*found, strict=True)

@@ -191,8 +191,6 @@ def exportable(spec: ControllerSpec, vehicle: Vehicle, period: float, shapes: Se
 
     if not isinstance(spec, UnconstrainedSpec | ConstrainedSpec | RobustSpec):
         raise ExportError(f"it is {spec.type!r}; exported are unconstrained, constrained and robust")
-    if isinstance(spec, RobustSpec) and spec.linearisation != "hover":
-        raise ExportError(f"its model is another in each period: linearisation = {spec.linearisation!r}, not 'hover'")
     if isinstance(spec, BoundedSpec) and spec.avoidance is not None and shapes:
         raise ExportError("its half-spaces around obstacles are others in each period: leave out controller.avoidance")
     if not isinstance(spec, RobustSpec):
@@ -335,7 +333,7 @@ def _unconstrained(problem: Problem) -> Controller:
 
 
 def _robust_settings(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustSettings:
-    from mpc.robust.settings import Linearisation, RobustSettings
+    from mpc.robust.settings import RobustSettings
 
     return RobustSettings(
         penalty=None if spec.soft is None else make_penalty(spec.soft, len(spec.output_bounds)),
@@ -345,7 +343,6 @@ def _robust_settings(spec: RobustSpec, vehicle: Vehicle, period: float) -> Robus
         heading=spec.heading,
         largest_turn=math.radians(spec.largest_turn),
         move_weight=None if spec.move_weight is None else spec.move_weight * np.eye(N_ROTORS),
-        linearisation=Linearisation(spec.linearisation),
         terminal=spec.terminal == "lqr",
         margins=tightening_margins(spec, vehicle, period),
     )

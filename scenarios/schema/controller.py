@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError
 from pydantic_core import PydanticCustomError
 
 from mpc.fallback.settings import FallbackSettings
-from mpc.solvers import SOLVERS
+from mpc.solvers import SOLVERS, find_solver
 from quadsim.errors import UnknownNameError
 from scenarios.schema.base import Spec
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
@@ -36,7 +36,7 @@ class ConstrainedSpec(BoundedSpec):
     solver: str = Field(
         default="piqp-multistage",
         description="QP solver, by its name in `quadsim list`",
-        json_schema_extra={"enum": [*SOLVERS]},
+        json_schema_extra={"examples": [*SOLVERS]},
     )
     fallback: FallbackSettings | None = Field(
         default=None, description="absent: the last plan is held, shifted, and then the flight is given up"
@@ -55,7 +55,7 @@ class NonlinearSpec(NonlinearPartsSpec):
     solver: str | None = Field(
         default=None,
         description="QP solver, by its name in `quadsim list`; absent: the fastest for the size",
-        json_schema_extra={"enum": [*SOLVERS, None]},
+        json_schema_extra={"examples": [*SOLVERS]},
     )
 
     @model_validator(mode="after")
@@ -69,8 +69,10 @@ COMPILED: Final = ("unconstrained", "constrained", "robust")
 
 
 def _require_solver(name: str) -> None:
-    if name not in SOLVERS:
-        raise ValueError(f"solver: {UnknownNameError('solver', name, SOLVERS)}")
+    try:
+        find_solver(name)
+    except UnknownNameError as error:
+        raise ValueError(f"solver: {error}") from error
 
 
 def shared_tilt_bound(spec: ConstrainedSpec) -> float | None:

@@ -39,11 +39,6 @@ class RobustSpec(BoundedSpec):
     move_weight: Weight | None = Field(
         default=None, description="[1/(rad/s)^2] diagonal of Q_d, of a command's change from one period to the next"
     )
-    linearisation: Literal["hover", "state", "trajectory"] = Field(
-        default="hover",
-        description="where the model is linearised: at hover, once; at the present state; or along the last plan, one "
-        "step of sequential quadratic programming each period",
-    )
     fallback: FallbackSettings = FallbackSettings()
 
     @model_validator(mode="after")
@@ -52,15 +47,13 @@ class RobustSpec(BoundedSpec):
             raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {self.rotor_lag:g}")
         if self.tightening is not None and not self.output_bounds:
             raise ValueError("tightening must be absent where there are no output_bounds to tighten")
-        if self.terminal is not None and self.linearisation != "hover":
-            raise ValueError(f'terminal must be absent where linearisation is not "hover"; got {self.terminal!r}')
-        if self.heading and self.linearisation == "hover":
+        if self.heading:
             bounded = {"output_bounds": [*self.output_bounds], **{each.name: each.of for each in self.polytopes}}
             for name, states in bounded.items():
                 turned = [state for state in states if state in TURNED]
                 if turned:
                     raise ValueError(
-                        f"{name} must not be of {', '.join(turned)} where heading turns the hover model: "
-                        'heading = false, or linearisation = "trajectory"'
+                        f"{name} must not be of {', '.join(turned)} where heading turns the model: "
+                        'heading = false, or type = "nonlinear"'
                     )
         return self

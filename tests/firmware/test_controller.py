@@ -125,9 +125,9 @@ def peers() -> list[tuple[Array | None, Array | None]]:
     found: list[tuple[Array | None, Array | None]] = []
     for state, reference, acting in drawn():
         query = Query(state, problem.objective.desired(reference), acting)
-        answer = daqp.solve(query.state, query.desired, query.u_before)
-        first = answer.plan[0] if answer.solution.status == SOLVED else None
-        qp = form.qp.with_vectors(form.vectors(query.state, query.desired, query.u_before))
+        answer = daqp.solve(Query(query.state, query.desired, query.u_before))
+        first = answer.plan[0] if answer.status == SOLVED else None
+        qp = form.pose(Query(query.state, query.desired, query.u_before)).qp
         rows = np.vstack([np.eye(qp.c.size), qp.G])
         lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
         try:

@@ -7,11 +7,10 @@ import pytest
 from support import paper_problem, paper_reference
 
 from mpc.constrained import ConstrainedMPC
-from mpc.ocp import Rest
+from mpc.ocp import Query
 from mpc.solvers import Answer, QPSolver
 from quadsim.controller import Command, Moment
 from quadsim.errors import PlanExhaustedError
-from quadsim.state import Array
 
 STATE = np.zeros(12)
 STATE[10] = np.pi / 6
@@ -25,8 +24,8 @@ class FaultySolver(QPSolver):
         super().__init__("piqp-multistage", self.problem)
         self.faults, self.calls = faults, 0
 
-    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
-        answer = super().solve(state, desired, u_before, rest)
+    def solve(self, query: Query) -> Answer:
+        answer = super().solve(query)
         fault = self.faults.get(self.calls)
         self.calls += 1
         if fault == "not_finite":
@@ -34,7 +33,7 @@ class FaultySolver(QPSolver):
         if fault == "out_of_bounds":
             return answer._replace(plan=answer.plan + 100.0)
         if fault is not None:
-            return answer._replace(solution=answer.solution._replace(status=fault), plan=answer.plan * 0.0)
+            return answer._replace(status=fault, plan=answer.plan * 0.0)
         return answer
 
 

@@ -14,10 +14,8 @@ from scenarios.loading import load_scenario
 from scenarios.run import start
 
 DISTURBED = ["effects.disturbance={force=[0.4, -0.3, 0.0], torque=[0.0, 0.0, 0.01]}", "effects.load.mass_factor=1.1"]
-ALONG_PLAN = ["controller.linearisation=trajectory", "controller.heading=false"]
 LAWS: dict[str, tuple[str, list[str], dict[str, Any]]] = {
     "robust": ("robust", DISTURBED, {"horizon": 50}),
-    "robust, relinearised": ("robust", [*DISTURBED, *ALONG_PLAN], {"horizon": 50}),
     "robust, another weight": ("robust", DISTURBED, {"output_weights.yaw": 100.001}),
     "constrained": ("paper-constrained", [], {"horizon": 50}),
     "nonlinear": ("nonlinear", [], {"iterations": 1}),

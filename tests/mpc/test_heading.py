@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support import linearised
 
 from mpc.equilibrium import equilibrium, twisted
 from mpc.heading import advance, anchored, predict_in_heading_frame, turn, turn_horizontally
 from mpc.model import hover_model
-from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import nonlinear_model
 from mpc.paper.prediction import rollout
 from quadsim.state import INDEX
@@ -70,8 +70,8 @@ def test_the_anchored_model_is_the_nonlinear_ones_linearisation_at_rest(vehicle:
     disturbed = replace(plain, effectiveness=twisted(plain.effectiveness, twist))
     trim = equilibrium(plain, twist=twist)
     assert np.ptp(trim.speeds) > 20.0
-    A, B, _ = linearise(disturbed, trim.state()[None], trim.speeds[None])
+    A, B, _ = linearised(disturbed, trim.state(), trim.speeds)
     model = anchored(hover_model(vehicle, 0.05), trim)
-    np.testing.assert_allclose(model.A, A[0], atol=1e-7)
-    np.testing.assert_allclose(model.B, B[0], atol=1e-7)
+    np.testing.assert_allclose(model.A, A, atol=1e-7)
+    np.testing.assert_allclose(model.B, B, atol=1e-7)
     np.testing.assert_array_equal(model.u_bar, trim.speeds)

@@ -20,19 +20,17 @@ from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Constraint, Penalty, tightened
 from mpc.exact.shortcut import Shortcut
 from mpc.model import LinearModel, continuous_model, discretise
-from mpc.nonlinear.linearise import linearise
-from mpc.nonlinear.model import nonlinear_model
-from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
-from mpc.relinearised import Relinearised
-from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
-from mpc.solvers import SOLVERS, Method, QPSolver
+from mpc.ocp import Objective, Problem, Query, Rest, lqr_terminal_weight
+from mpc.robust.controller import RobustMPC, RobustSettings
+from mpc.solvers import SOLVERS, Method, QPSolver, find_solver, solver_entries
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 
-INSTALLED = [name for name in SOLVERS if SOLVERS[name].installed]
-MAY_FAIL = {"osqp", "highs"}
-"""Which say so, see docs; all others have to solve."""
+OTHERS = ("clarabel", "osqp", "proxqp", "quadprog")
+INSTALLED = [name for name in (*SOLVERS, *OTHERS) if name in solver_entries() and find_solver(name).installed]
+MAY_FAIL = {"osqp", "proxqp"}
+"""Which say so; all others have to solve."""
 N = 15
 PERIOD = 0.05
 
@@ -121,10 +119,10 @@ def test_the_peers_optimum_is_held_by_these_rows(soft: bool) -> None:
 @pytest.mark.parametrize("which", CASES)
 def test_every_solver_holds_it(which: str | int, soft: bool, name: str) -> None:
     problem, given, row, peer = case(which, soft=soft)
-    answer = QPSolver(name, problem).solve(given.state, given.desired, given.u_before)
-    if name in MAY_FAIL and answer.solution.status != SOLVED:
+    answer = QPSolver(name, problem).solve(Query(given.state, given.desired, given.u_before))
+    if name in MAY_FAIL and answer.status != SOLVED:
         return
-    assert (answer.solution.status == SOLVED) == (peer.solution.status == SOLVED)
+    assert (answer.status == SOLVED) == (peer.solution.status == SOLVED)
     if peer.solution.status != SOLVED:
         return
     np.testing.assert_allclose(answer.plan[0], peer.plan[0], rtol=0.0, atol=2e-3)
@@ -141,8 +139,8 @@ def test_the_shortcut_holds_it(which: str | int, soft: bool) -> None:
     problem, given, row, peer = case(which, soft=soft)
     solver = Shortcut(problem, QPSolver("piqp-multistage", problem))
     for _ in range(2):
-        answer = solver.solve(given.state, given.desired, given.u_before)
-        assert (answer.solution.status in ACCEPTED) == (peer.solution.status == SOLVED)
+        answer = solver.solve(Query(given.state, given.desired, given.u_before))
+        assert (answer.status in ACCEPTED) == (peer.solution.status == SOLVED)
         if peer.solution.status != SOLVED:
             return
         np.testing.assert_allclose(answer.plan, peer.plan, rtol=0.0, atol=1e-6)
@@ -157,15 +155,15 @@ def test_the_free_optimum_is_taken_where_and_only_where_it_keeps_it(row: int, si
     """A bound just beyond the free optimum's extreme value is inactive; just before it, active."""
     problem, given, wide, _ = paper(soft=soft)
     query = 0.01 * given.state, 0.01 * given.desired, given.u_before
-    near = ocp_peer.period(problem, *query)
+    near = ocp_peer.period(problem, *query[:4])
     wide = replace(wide, lower=np.full(3, -1e6), upper=np.full(3, 1e6))
 
     def answered(constraint: Constraint) -> Any:
         one = replace(problem, constraints=(constraint,))
-        return Shortcut(one, QPSolver("piqp-multistage", one)).solve(*query)
+        return Shortcut(one, QPSolver("piqp-multistage", one)).solve(Query(*query))
 
     free = answered(wide)
-    assert (free.method, free.solution.status) == (Method.FREE, UNCONSTRAINED)
+    assert (free.method, free.status) == (Method.FREE, UNCONSTRAINED)
     reached = ocp_peer.values(wide, near, free.plan)[:, row]
     extreme, outwards = (reached.min(), -1.0) if side == "lower" else (reached.max(), 1.0)
     for distance, method in ((1e-7, Method.FREE), (-1e-4, Method.WHOLE)):
@@ -199,7 +197,7 @@ def test_rows_of_states_alone_are_held_axis_by_axis(soft: bool) -> None:
     peer = ocp_peer.optimum(problem, given)
     without = ocp_peer.optimum(replace(problem, constraints=()), given)
     assert (ocp_peer.violation(row, given, without.plan).max(axis=0) > 1e-2).all()
-    answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(np.zeros(12), desired, problem.model.u_bar)
+    answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(given.query._replace(steps=None))
     assert answer.method is Method.AXES
     np.testing.assert_allclose(answer.plan, peer.plan, rtol=0.0, atol=1e-5)
     beyond = ocp_peer.violation(row, given, answer.plan)
@@ -262,15 +260,13 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "margins": np.linspace(0.0, 0.02, N)[:, None] * np.ones(2),
     },
     "terminal": {"terminal": True},
-    "state": {"linearisation": Linearisation.STATE},
-    "state with lag": {"linearisation": Linearisation.STATE, "rotor_lag": 0.03, "move_weight": 0.5 * np.eye(4)},
 }
 
 
 @pytest.mark.parametrize("parts", SETTINGS)
 @pytest.mark.parametrize("kind", ["hard", "soft", "tightened"])
 def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str) -> None:
-    """From hover with a little tilt and speed; models of `state` are linearised there."""
+    """From hover with a little tilt and speed."""
     settings = RobustSettings(**SETTINGS[parts])
     base = modelled(vehicle, settings, ())
     hover, reference = np.full(4, vehicle.hover_speed), np.tile([3.0, -2.0, 2.0, 0.3], (N, 1))
@@ -280,10 +276,6 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
     rest = Rest(np.zeros(base.model.n), hover)
     rest.x[12:] = hover[: base.model.n - 12]
     given = ocp_peer.period(base, x0, base.objective.desired(reference), hover, rest)
-    if settings.linearisation is Linearisation.STATE:
-        model = nonlinear_model(vehicle, PERIOD, rotor_lag=settings.rotor_lag or None)
-        A, B, c = (np.repeat(part, N, 0) for part in linearise(model, x0[None], hover[None]))
-        given = replace(given, A=A, B=B, c=c)
     row = coupled(base, given, soft=kind == "soft", share=0.7)
     row = replace(row, C=None if row.C is None else row.C[:, :12])
     if kind == "tightened":
@@ -306,12 +298,10 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
     controller.reset(hover)
     command = controller.step(Moment(acting=hover), state, reference)
     assert command.status == SOLVED
-    exact = settings.linearisation is Linearisation.HOVER
-    np.testing.assert_allclose(command.plan[0], peer.plan[0], rtol=0.0, atol=1e-5 if exact else 1e-3)
-    np.testing.assert_allclose(command.plan, peer.plan, rtol=0.0, atol=1e-5 if exact else 2e-2)
+    np.testing.assert_allclose(command.plan, peer.plan, rtol=0.0, atol=1e-5)
     held = problem.constraints[0]
     beyond = ocp_peer.violation(held, given, command.plan)
-    assert command.slack == pytest.approx(peer.slacks.max(initial=0.0), abs=1e-6 if exact else 1e-4)
+    assert command.slack == pytest.approx(peer.slacks.max(initial=0.0), abs=1e-6)
     assert (beyond.max() > 1e-3) == (kind == "soft")
     if kind != "soft":
         assert beyond.max() < 1e-6
@@ -330,10 +320,8 @@ def test_models_that_change_from_step_to_step_hold_it(soft: bool, solver: str) -
         problem = replace(problem, constraints=(row,))
         given = changing_period(rng, problem)
         peer = ocp_peer.optimum(problem, given)
-        answer = Relinearised(problem, solver, shortcut=True).solve(
-            given.A, given.B, given.c, given.state, given.desired, given.u_before, given.rest
-        )
-        assert (answer.solution.status in ACCEPTED) == (peer.solution.status == SOLVED)
+        answer = QPSolver(solver, problem, changing=True, shortcut=True).solve(given.query)
+        assert (answer.status in ACCEPTED) == (peer.solution.status == SOLVED)
         if peer.solution.status != SOLVED:
             continue
         solved += 1

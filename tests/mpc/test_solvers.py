@@ -7,15 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import qpsolvers
 from support import flight_queries, paper_problem, paper_reference, random_problem
 
 from mpc.constrained import ConstrainedMPC
-from mpc.paper.condensed import condensed
-from mpc.qp import Solution, kkt_residuals
-from mpc.solvers import SOLVERS, QPSolver, make_backend
+from mpc.constraints import Penalty
+from mpc.ocp import Query
+from mpc.paper.condensed import Condensed
+from mpc.qp import kkt_residuals
+from mpc.solvers import SOLVERS, Answer, QPSolver, find_solver, make_backend, solver_entries
 from mpc.solvers.daqp_dense import DaqpDense
-from mpc.solvers.osqp_sparse import OsqpSparse
-from mpc.solvers.piqp_backends import PiqpDense
+from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged
 from quadsim.controller import SOLVED, Moment
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
@@ -23,34 +25,34 @@ from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 
-ALWAYS = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "osqp")
+ALWAYS = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "clarabel")
 """What `make setup` installs."""
 
 
-def infeasible(name: str) -> Solution:
+def infeasible(name: str) -> Answer:
     """A tilt and a turn that no bounded input undoes within the first period."""
     problem = paper_problem()
     tilted = np.zeros(12)
     tilted[6], tilted[7] = np.radians(30.0), 5.0
     desired = problem.objective.desired(np.zeros((50, 4)))
-    return QPSolver(name, problem).solve(tilted, desired, problem.model.u_bar).solution
+    return QPSolver(name, problem).solve(Query(tilted, desired, problem.model.u_bar))
 
 
 @pytest.mark.parametrize("name", ALWAYS)
 def test_an_infeasible_problem_is_not_called_solved(name: str) -> None:
-    assert infeasible(name).status in {"primal_infeasible", "max_iterations", "numerics"}
+    assert infeasible(name).status in {"primal_infeasible", "max_iterations", "numerics", "unsolved"}
 
 
-@pytest.mark.parametrize("name", ["daqp", "osqp"])
+@pytest.mark.parametrize("name", ["daqp", "clarabel"])
 def test_a_failure_leaves_the_next_solve_alone(name: str) -> None:
     problem = paper_problem()
     solver = QPSolver(name, problem)
     desired = problem.objective.desired(np.zeros((50, 4)))
     tilted = np.zeros(12)
     tilted[6], tilted[7] = np.radians(30.0), 5.0
-    assert solver.solve(tilted, desired, problem.model.u_bar).solution.status == "primal_infeasible"
-    hover = solver.solve(np.zeros(12), desired, problem.model.u_bar)
-    assert hover.solution.status == SOLVED
+    assert solver.solve(Query(tilted, desired, problem.model.u_bar)).status in {"primal_infeasible", "unsolved"}
+    hover = solver.solve(Query(np.zeros(12), desired, problem.model.u_bar))
+    assert hover.status == SOLVED
     np.testing.assert_allclose(hover.plan, np.tile(problem.model.u_bar, (50, 1)), atol=1e-3)
 
 
@@ -60,8 +62,8 @@ def test_data_that_is_not_finite_reaches_no_back_end(place: int, corrupted: floa
     query = [np.zeros(12), problem.objective.desired(np.zeros((50, 4))), problem.model.u_bar.copy()]
     query[place].flat[0] = corrupted
     solver = QPSolver("piqp-multistage", problem)
-    answer = solver.solve(*query)
-    assert answer.solution.status == "invalid_data"
+    answer = solver.solve(Query(*query))
+    assert answer.status == "invalid_data"
     assert np.isnan(answer.plan).all()
     controller = ConstrainedMPC(problem, solver, shortcut=False)
     controller.reset(problem.model.u_bar)
@@ -69,26 +71,25 @@ def test_data_that_is_not_finite_reaches_no_back_end(place: int, corrupted: floa
         controller.step(Moment(), np.full(12, np.nan), paper_reference(51)[1:])
 
 
-@pytest.mark.parametrize("kind", [DaqpDense, OsqpSparse])
-def test_equality_rows_and_multipliers(kind: type[DaqpDense | OsqpSparse]) -> None:
+def test_equality_rows_and_multipliers() -> None:
     """On the stages' QP, which has equalities and free variables, and on the condensed one: KKT, and one optimum."""
     rng = np.random.default_rng(5)
     for _ in range(5):
         problem = random_problem(rng, horizon=6, n=3, nu=2, n_c=1)
         query = (0.1 * rng.normal(size=3), rng.normal(size=(6, 3)), problem.model.u_bar)
         plans = []
-        for formulation in (Staged(problem, steps_per_stage=2), condensed(problem)):
-            backend, peer = kind(), PiqpDense()
-            vectors = formulation.vectors(*query)
+        for formulation in (Staged(problem, steps_per_stage=2), Condensed(problem)):
+            backend, peer = DaqpDense(), PiqpDense()
+            qp = formulation.pose(Query(*query)).qp
             backend.setup(formulation.qp)
-            peer.setup(condensed(problem).qp)
-            expected = peer.solve(condensed(problem).vectors(*query))
-            solution = backend.solve(vectors)
+            peer.setup(Condensed(problem).qp)
+            expected = peer.solve(Condensed(problem).pose(Query(*query)).qp)
+            solution = backend.solve(qp)
             assert solution.status == expected.status
             if solution.status != SOLVED:
                 continue
-            residuals = kkt_residuals(formulation.qp.with_vectors(vectors), solution)
-            assert residuals.worst < 1e-3 * max(1.0, float(np.abs(solution.point.z).max(initial=0.0)))
+            residuals = kkt_residuals(qp, solution)
+            assert residuals.worst < 1e-3 * max(1.0, float(np.abs(solution.z).max(initial=0.0)))
             plans.append(formulation.inputs(solution.x))
         if plans:
             np.testing.assert_allclose(plans[0], plans[1], atol=1e-3)
@@ -105,7 +106,7 @@ def test_a_flight_by_daqp_holds_its_audit_and_is_the_same(constrained_flight: Fl
 def test_daqp_starts_from_the_active_set_one_step_earlier(constrained_flight: Flight) -> None:
     """Over whole QPs of the paper's flight: a third of the changes, the same optima."""
     problem = paper_problem()
-    form = condensed(problem)
+    form = Condensed(problem)
     later = form.qp.later
     assert later is not None
     rows = np.asarray(form.qp.G).reshape(50, -1, 200)
@@ -119,7 +120,7 @@ def test_daqp_starts_from_the_active_set_one_step_earlier(constrained_flight: Fl
         backend = DaqpDense()
         backend.setup(qp)
         queries = flight_queries(constrained_flight, problem, stride=1)[800:900]
-        solutions = [backend.solve(form.vectors(*query)) for query in queries]
+        solutions = [backend.solve(form.pose(Query(*query)).qp) for query in queries]
         assert {solution.status for solution in solutions} == {SOLVED}
         changes[name] = sum(solution.iterations for solution in solutions)
         found[name] = np.array([solution.x for solution in solutions])
@@ -130,25 +131,52 @@ def test_daqp_starts_from_the_active_set_one_step_earlier(constrained_flight: Fl
 def test_unknown_solver_lists_those_there_are() -> None:
     with pytest.raises(UnknownNameError, match=r"no solver named 'piqp-dens'; did you mean 'piqp-dense'"):
         QPSolver("piqp-dens", paper_problem())
+    assert {"clarabel", "quadprog"} & {*solver_entries()} <= {*qpsolvers.available_solvers}
 
 
-@pytest.mark.parametrize(
-    ("name", "package", "extra"),
-    [("daqp", "daqp", "daqp"), ("qpoases", "casadi", "solvers"), ("proxqp", "proxsuite", "solvers")],
-)
-def test_a_solver_that_is_not_installed_names_its_package(
-    name: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_qpsolvers_its_names_say_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda module: None)
-    with pytest.raises(MissingPackageError, match=rf"the solver '{name}' needs the package '{package}': pip install"):
-        make_backend(name)
-    assert SOLVERS[name].line == f"not installed: pip install 'quadsim[{extra}]'"
-    assert not SOLVERS[name].installed
+    with pytest.raises(
+        UnknownNameError, match=r"no solver named 'clarabel'.*pip install 'quadsim\[solvers\]' adds those"
+    ):
+        find_solver("clarabel")
+
+
+def test_piqp_is_the_staged_one_and_no_other_packages() -> None:
+    assert find_solver("piqp") is SOLVERS["piqp-multistage"]
+    assert "piqp" not in solver_entries()
+    assert isinstance(make_backend("piqp"), PiqpMultistage)
+
+
+def test_a_solver_of_qpsolvers_keeps_nothing_and_meets_the_kkt_conditions(constrained_flight: Flight) -> None:
+    """Multipliers included, of box, rows and slacks: from either side, and none at infinity."""
+    problem = paper_problem("paper-constrained", "controller.horizon=15")
+    assert problem.bounds is not None
+    soft = Penalty(l1=np.full(2, 1e4), l2=np.full(2, 1e4))
+    problem = replace(problem, bounds=replace(problem.bounds, penalty=soft, u_max=np.full(4, np.inf)))
+    active = 0
+    for query in flight_queries(constrained_flight, problem, stride=120):
+        answers = [QPSolver(name, problem).solve(query) for name in ("clarabel", "piqp-dense")]
+        assert [answer.status for answer in answers] == [SOLVED, SOLVED]
+        np.testing.assert_allclose(answers[0].plan[0], answers[1].plan[0], atol=1e-3)
+        assert answers[0].certificate is not None
+        qp, solution = answers[0].certificate()
+        assert kkt_residuals(qp, solution).worst < 1e-3 * max(1.0, float(np.abs(solution.z).max()))
+        active += answers[0].active
+    assert active > 10
+
+
+def test_a_solver_that_is_not_installed_names_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda module: None)
+    with pytest.raises(MissingPackageError, match="the solver 'daqp' needs the package 'daqp': pip install"):
+        make_backend("daqp")
+    assert SOLVERS["daqp"].line == "not installed: pip install 'quadsim[daqp]'"
+    assert not SOLVERS["daqp"].installed
 
 
 def test_entries_describe_themselves() -> None:
     for name in ALWAYS:
-        entry = SOLVERS[name]
+        entry = find_solver(name)
         assert entry.installed
         assert entry.line == entry.description
         assert entry.version[0].isdigit()

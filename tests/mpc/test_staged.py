@@ -14,18 +14,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ocp_peer import Period
 from polish import polish
-from support import changing_period, flight_queries, paper_problem, paper_reference, random_problem, with_terms
+from support import (
+    changing_period,
+    flight_queries,
+    linearised,
+    paper_problem,
+    paper_reference,
+    random_problem,
+    with_terms,
+)
 
 from mpc.constraints import Penalty
-from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import nonlinear_model
-from mpc.ocp import Problem, Rest
-from mpc.paper.condensed import Condensed, condensed
+from mpc.ocp import Problem, Query, Rest
+from mpc.paper.condensed import Condensed
 from mpc.qp import QP, Formulation, Solution, kkt_residuals
-from mpc.relinearised import Relinearised
 from mpc.solvers import QPSolver
 from mpc.solvers.daqp_dense import DaqpDense
-from mpc.solvers.piqp_backends import PiqpChanging, PiqpDense, PiqpMultistage
+from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
@@ -41,15 +47,13 @@ class Changing:
     """A problem whose model changes, staged and solved again each time, in any number of steps per stage."""
 
     form: Staged
-    backend: PiqpChanging
+    backend: PiqpMultistage
 
     def qp(self, now: Period) -> QP:
-        matrices = self.form.prepare(now.A, now.B)
-        vectors = self.form.changed_vectors(matrices, now.c, now.state, now.desired, now.u_before, now.rest)
-        return self.form.changed(matrices, vectors)
+        return self.form.pose(now.query).qp
 
     def solve(self, now: Period) -> Solution:
-        return self.backend.solve_changed(self.qp(now))
+        return self.backend.solve(self.qp(now))
 
     def plan(self, solution: Solution) -> Array:
         return self.form.inputs(solution.x)
@@ -58,11 +62,11 @@ class Changing:
         return self.form.slacks(solution.x)
 
     def states(self, now: Period, solution: Solution) -> Array:
-        return self.form.states(self.form.prepare(now.A, now.B), now.c, now.state, solution.x)
+        return self.form.pose(now.query).states(solution.x)
 
 
 def changing(problem: Problem, steps: int) -> Changing:
-    form, backend = Staged(problem, steps_per_stage=steps, changing=True), PiqpChanging()
+    form, backend = Staged(problem, steps_per_stage=steps, changing=True), PiqpMultistage(changing=True)
     backend.setup(form.qp)
     return Changing(form, backend)
 
@@ -77,11 +81,11 @@ def exact(form: Formulation, query: tuple[Array, Array, Array, Rest]) -> tuple[A
     """Plan and slacks at a form's optimum, with its KKT residual over the size of its multipliers."""
     backend = PiqpMultistage() if isinstance(form, Staged) else PiqpDense()
     backend.setup(form.qp)
-    vectors = form.vectors(*query)
-    qp, solution = form.qp.with_vectors(vectors), backend.solve(vectors)
+    qp = form.pose(Query(*query)).qp
+    solution = backend.solve(qp)
     assert solution.status == SOLVED
     optimum = polish(qp, solution)
-    size = max(1.0, float(np.abs(np.concatenate([optimum.point.z, optimum.point.z_box])).max()))
+    size = max(1.0, float(np.abs(np.concatenate([optimum.z, optimum.z_box])).max()))
     return form.inputs(optimum.x), form.slacks(optimum.x), kkt_residuals(qp, optimum).worst / size
 
 
@@ -108,9 +112,9 @@ def test_it_has_the_condensed_optimum(
     staged = Staged(problem, steps_per_stage=steps)
     solver = PiqpMultistage()
     solver.setup(staged.qp)
-    peer = ocp_peer.optimum(problem, ocp_peer.period(problem, *query))
+    peer = ocp_peer.optimum(problem, ocp_peer.period(problem, *query[:4]))
     if peer.solution.status != SOLVED:
-        assert solver.solve(staged.vectors(*query)).status != SOLVED
+        assert solver.solve(staged.pose(Query(*query)).qp).status != SOLVED
         return
     plan, slacks, residual = exact(staged, query)
     other, others, residual_of_condensed = exact(Condensed(problem), query)
@@ -126,10 +130,10 @@ def test_stages_cover_the_horizon(steps: int) -> None:
     """Whatever M, and whatever is left for the first stage and the last, the QP is the same."""
     problem = paper_problem()
     query = np.zeros(12), problem.objective.desired(paper_reference(51)[1:]), problem.model.u_bar
-    expected = QPSolver("piqp-dense", problem).solve(*query).plan
+    expected = QPSolver("piqp-dense", problem).solve(Query(*query)).plan
     formulation, backend = Staged(problem, steps_per_stage=steps), PiqpMultistage()
     backend.setup(formulation.qp)
-    solution = backend.solve(formulation.vectors(*query))
+    solution = backend.solve(formulation.pose(Query(*query)).qp)
     np.testing.assert_allclose(formulation.inputs(solution.x)[0], expected[0], atol=1e-3)
     np.testing.assert_allclose(formulation.inputs(solution.x), expected, atol=0.05)
 
@@ -142,7 +146,7 @@ def test_every_stage_length_gives_the_condensed_optimum(steps: int) -> None:
     state[10] = np.pi / 6
     query = state, problem.objective.desired(paper_reference(18)[1:]), problem.model.u_bar, problem.rest
     plan, _, residual = exact(Staged(problem, steps_per_stage=steps), query)
-    other, _, _ = exact(condensed(problem), query)
+    other, _, _ = exact(Condensed(problem), query)
     assert residual < 1e-8
     np.testing.assert_allclose(plan, other, atol=1e-6)
 
@@ -173,8 +177,8 @@ def test_constant_matrices_make_the_papers_plan(constrained_flight: Flight, step
     backend.setup(formulation.qp)
     pressing = 0
     for query in flight_queries(constrained_flight, problem, stride=100):
-        solution = solver.solve(ocp_peer.period(problem, *query))
-        optimum = backend.solve(formulation.vectors(*query))
+        solution = solver.solve(ocp_peer.period(problem, *query[:4]))
+        optimum = backend.solve(formulation.pose(Query(*query)).qp)
         assert solution.status == optimum.status == SOLVED
         plan, expected = solver.plan(solution), formulation.inputs(optimum.x)
         np.testing.assert_allclose(plan[:10], expected[:10], atol=1e-3)
@@ -212,12 +216,12 @@ def test_systems_that_change_agree_with_a_peer(horizon: int, soft: bool | str, t
             np.testing.assert_allclose(solver.slacks(solution), peer.slacks, atol=2e-4)
             states = ocp_peer.trajectory(now, solver.plan(solution))[1:]
             np.testing.assert_allclose(solver.states(now, solution), states, atol=1e-6)
-            size = max(1.0, float(np.abs(solution.point.z).max()))
+            size = max(1.0, float(np.abs(solution.z).max()))
             assert kkt_residuals(solver.qp(now), solution).worst < 1e-5 * size
         if peer.solution.status != SOLVED:
             continue
         solved += 1
-        whole = Relinearised(problem, "piqp-dense").solve(*vars(now).values())
+        whole = QPSolver("piqp-dense", problem, changing=True).solve(now.query)
         np.testing.assert_allclose(whole.plan, peer.plan, atol=2e-4)
         np.testing.assert_allclose(whole.slacks, peer.slacks, atol=2e-4)
         if solved == 3:
@@ -247,12 +251,12 @@ def lagging(problem: Problem, vehicle: Vehicle) -> Problem:
     """The paper's weights and bounds, for states that end with the rotor speeds."""
     assert problem.bounds is not None
     C_r, C_c = (np.pad(C, ((0, 0), (0, 4))) for C in (problem.objective.C_r, problem.bounds.C_c))
-    hover = np.full((1, 4), vehicle.hover_speed)
+    hover = np.full(4, vehicle.hover_speed)
     model = nonlinear_model(vehicle, 0.05, rotor_lag=LAG)
-    A, B, _ = linearise(model, np.hstack([np.zeros((1, 12)), hover]), hover)
+    A, B, _ = linearised(model, np.concatenate([np.zeros(12), hover]), hover)
     return replace(
         problem,
-        model=replace(problem.model, A=A[0], B=B[0]),
+        model=replace(problem.model, A=A, B=B),
         objective=replace(problem.objective, C_r=C_r),
         bounds=replace(problem.bounds, C_c=C_c),
     )
@@ -262,9 +266,9 @@ def along_flight(flight: Flight, vehicle: Vehicle, problem: Problem, stride: int
     """Periods of the nonlinear model with lag, each linearised at the state where it begins."""
     model = nonlinear_model(vehicle, 0.05, rotor_lag=LAG)
     hover = np.full(4, vehicle.hover_speed)
-    for state, desired, before in flight_queries(flight, problem, stride):
+    for state, desired, before, *_ in flight_queries(flight, problem, stride):
         x0 = np.concatenate([state, before])
-        A, B, c = linearise(model, np.tile(x0, (50, 1)), np.tile(hover, (50, 1)))
+        A, B, c = (np.repeat(part[None], 50, axis=0) for part in linearised(model, x0, hover))
         rest = Rest(np.zeros(16), hover)
         yield Period(A=A, B=B, c=c, state=x0, desired=desired, u_before=before, rest=rest)
 
@@ -288,25 +292,6 @@ def test_updated_values_solve_as_a_fresh_setup(constrained_flight: Flight, vehic
     assert len(nnz) == 1
 
 
-def test_matrices_made_once_serve_many_periods(constrained_flight: Flight, vehicle: Vehicle) -> None:
-    """Used again, and in turn with others, they make the same QP as matrices rebuilt."""
-    problem = softened(lagging(paper_problem(), vehicle), [2e5, 2e5], [1e4, 1e4])
-    problem = replace(problem, objective=replace(problem.objective, Q_d=5.0 * np.eye(4)))
-    form = Staged(problem, steps_per_stage=4, changing=True)
-    periods = [*along_flight(constrained_flight, vehicle, problem, stride=240)]
-    made = [form.prepare(now.A, now.B) for now in periods[:2]]
-    for which, now in [(0, periods[0]), (0, periods[1]), (1, periods[2]), (1, periods[3]), (0, periods[4])]:
-        given = now.c, now.state, now.desired, now.u_before, now.rest
-        again = form.prepare(periods[which].A, periods[which].B)
-        updated, fresh = (
-            form.changed(matrices, form.changed_vectors(matrices, *given)) for matrices in (made[which], again)
-        )
-        for name in ("P", "A", "G"):
-            assert (getattr(updated, name) != getattr(fresh, name)).nnz == 0
-        for name in ("c", "b", "h_l", "h_u"):
-            np.testing.assert_array_equal(getattr(updated, name), getattr(fresh, name))
-
-
 # Soft bounds
 
 
@@ -318,7 +303,7 @@ def test_slack_is_zero_where_hard_bounds_cost_less_than_its_price(constrained_fl
     for now in along_flight(constrained_flight, vehicle, problem, stride=40):
         strict, lenient = hard.solve(now), soft.solve(now)
         assert lenient.status == SOLVED
-        multiplier = np.abs(hard.form.multipliers(strict.point)[:, :2]).max()  # of the output bounds
+        multiplier = np.abs(hard.form.multipliers(strict)[:, :2]).max()  # of the output bounds
         if strict.status == SOLVED and multiplier < price:
             pressing += int(multiplier > 1.0)
             assert soft.slacks(lenient).max() < 1e-7

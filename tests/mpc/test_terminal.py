@@ -12,7 +12,7 @@ from support import paper_problem, random_problem
 
 from mpc.exact.axes import axes
 from mpc.exact.shortcut import Shortcut
-from mpc.ocp import Objective, Problem, Rest, lqr_terminal_weight
+from mpc.ocp import Objective, Problem, Query, Rest, lqr_terminal_weight
 from mpc.paper.condensed import Condensed
 from mpc.qp import Formulation
 from mpc.solvers import Method, QPSolver
@@ -51,15 +51,15 @@ def gain(problem: Problem) -> Array:
 
 def first_inputs(problem: Problem, query: tuple[Array, Array, Array, Rest]) -> dict[str, Array]:
     """By the free optimum, the condensed QP and the staged one."""
-    answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(*query)
+    answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(Query(*query))
     assert answer.method is Method.FREE
     found = {"free": answer.plan[0]}
     forms: tuple[Formulation, ...] = (Condensed(problem), Staged(problem, steps_per_stage=3))
     for form in forms:
         backend = PiqpDense() if isinstance(form, Condensed) else PiqpMultistage()
         backend.setup(form.qp)
-        vectors = form.vectors(*query)
-        found[type(form).__name__] = form.inputs(polish(form.qp.with_vectors(vectors), backend.solve(vectors)).x)[0]
+        qp = form.pose(Query(*query)).qp
+        found[type(form).__name__] = form.inputs(polish(qp, backend.solve(qp)).x)[0]
     return found
 
 
@@ -99,7 +99,8 @@ def test_without_it_a_short_horizon_is_not_infinite() -> None:
     """What the tests above rest on."""
     problem = without_bounds(paper_problem("paper-constrained", "controller.horizon=7"))
     state = 0.01 * np.random.default_rng(0).normal(size=12)
-    answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(state, np.zeros((7, 4)), problem.model.u_bar)
+    solver = Shortcut(problem, QPSolver("piqp-multistage", problem))
+    answer = solver.solve(Query(state, np.zeros((7, 4)), problem.model.u_bar))
     assert np.abs(answer.plan[0] - problem.model.u_bar + gain(problem) @ state).max() > 0.1
 
 

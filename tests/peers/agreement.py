@@ -8,17 +8,28 @@ from typing import Final
 
 import numpy as np
 from peers.checks import Check
+from peers.qpoases import Qpoases
 from peers.recorded import Query
 
 from mpc.ocp import Problem
+from mpc.paper.condensed import Condensed
 from mpc.qp import KKTResiduals, kkt_residuals
-from mpc.solvers import SOLVERS, QPSolver
+from mpc.solvers import SOLVERS, find_solver, make_backend
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 
-SLOW: Final = {"osqp": 10, "highs": 10}
-"""Solvers that are called every so many periods only; they take 0.1 s and more for each."""
-MAY_FAIL: Final = frozenset(SLOW)
+QPOASES: Final = "qpoases"
+PACKAGES: Final = {name: entry.package for name, entry in SOLVERS.items()} | {
+    "clarabel": "clarabel",
+    "osqp": "osqp",
+    "proxqp": "proxsuite",
+    "quadprog": "quadprog",
+    QPOASES: "casadi",
+}
+"""Of every solver that takes part: ours, some of qpsolvers, and the paper's own."""
+SLOW: Final = dict.fromkeys(("osqp", "proxqp", "clarabel", "quadprog"), 10)
+"""Solvers that are called every so many periods only: qpsolvers sets them up anew each time."""
+MAY_FAIL: Final = frozenset(("osqp", "proxqp"))
 """Solvers that give up on some of the QPs, and report it."""
 ALLOWED_DIFFERENCE, ALLOWED_RESIDUAL = 1e-3, 1e-2
 """Of what a solver calls solved: its first input from the reference [rad/s], and its worst KKT residual."""
@@ -29,7 +40,7 @@ class Verdict:
     """One solver on the recorded QPs; difference and residuals are the worst over those it calls solved.
 
     Attributes:
-        solver: its name in `SOLVERS`.
+        solver: its name in `PACKAGES`.
         queried: number of QPs.
         failures: how many it did not call solved.
         difference: its first inputs from the reference, the largest over rotors and QPs [rad/s].
@@ -45,7 +56,7 @@ class Verdict:
     @property
     def checks(self) -> tuple[Check, ...]:
         """Its first inputs and its residuals, and its failures unless they are its habit."""
-        name, peer = f"`{self.solver}`, {self.queried} QPs", SOLVERS[self.solver].package
+        name, peer = f"`{self.solver}`, {self.queried} QPs", PACKAGES[self.solver]
         checks = (
             Check(
                 what=f"{name}: first input",
@@ -67,21 +78,23 @@ def measure(name: str, problem: Problem, queries: Sequence[Query], reference: Ar
     """Call one solver, every period or, of `SLOW` ones, every so many.
 
     Args:
-        name: in `SOLVERS`.
+        name: in `PACKAGES`.
         problem: the optimisation.
         queries: K of them, in the order of the flight, which solvers that start warm make use of.
         reference: (K, 4) first inputs to compare with [rad/s].
     """
-    solver, every = QPSolver(name, problem), SLOW.get(name, 1)
+    form = Condensed(problem) if name == QPOASES else find_solver(name).formulate(problem)
+    backend, every = Qpoases() if name == QPOASES else make_backend(name), SLOW.get(name, 1)
+    backend.setup(form.qp)
     queried, expected_inputs = queries[::every], reference[::every]
     differences, residuals = [], []
     for query, expected in zip(queried, expected_inputs, strict=True):
-        answer = solver.solve(query.state, query.desired, query.u_before)
-        if answer.solution.status != SOLVED:
+        qp = form.pose(query.posed).qp
+        solution = backend.solve(qp)
+        if solution.status != SOLVED:
             continue
-        vectors = solver.formulation.vectors(query.state, query.desired, query.u_before)
-        residuals.append(kkt_residuals(solver.formulation.qp.with_vectors(vectors), answer.solution))
-        differences.append(np.abs(answer.plan[0] - expected).max())
+        residuals.append(kkt_residuals(qp, solution))
+        differences.append(np.abs(form.inputs(solution.x)[0] - expected).max())
     return Verdict(
         solver=name,
         queried=len(queried),

@@ -131,7 +131,7 @@ def measure(problem: Problem, queries: Sequence[Query]) -> ConstrainedQP:
     peer, ours = QpmpcController(problem), QPSolver(OURS, problem)
     plans = [peer.solve(query) for query in queries]
     speeds = np.array([peer.speeds(plan) for plan in plans])
-    answers = np.array([ours.solve(query.state, query.desired, query.u_before).plan[0] for query in queries])
+    answers = np.array([ours.solve(query.posed).plan[0] for query in queries])
     return ConstrainedQP(
         speeds=speeds,
         differences=np.abs(speeds - answers).max(axis=1),

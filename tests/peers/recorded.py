@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from mpc import ocp
 from mpc.ocp import Problem
 from quadsim.state import Array
 from scenarios.build import build_problem
@@ -34,6 +35,11 @@ class Query:
     u_before: Array
     status: str
     speeds: Array
+
+    @property
+    def posed(self) -> ocp.Query:
+        """What is to be solved."""
+        return ocp.Query(self.state, self.desired, self.u_before)
 
 
 def record() -> tuple[Problem, tuple[Query, ...]]:

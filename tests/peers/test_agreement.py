@@ -12,10 +12,9 @@ from peers.constrained_qp import ConstrainedQP
 from peers.recorded import Query
 
 from mpc.ocp import Problem
-from mpc.solvers import SOLVERS
 
 
-@pytest.mark.parametrize("name", SOLVERS)
+@pytest.mark.parametrize("name", agreement.PACKAGES)
 def test_what_a_solver_calls_solved_is_optimal(
     name: str,
     problem: Problem,

@@ -166,7 +166,6 @@ ROBUST = some(
         "rotor_lag": number(0.01, 0.2) | st.just("vehicle"),
         "delay": number(0.0, 0.02),
         "move_weight": number(0.01, 20.0),
-        "linearisation": st.sampled_from(["hover", "state", "trajectory"]),
         "fallback": st.sampled_from([{}, {"enabled": False}]),
     }
 )

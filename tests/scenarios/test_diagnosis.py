@@ -121,13 +121,6 @@ CASES = {
     "the last command outside the bounds": Case(
         acting=290.0, violated=("speed upper",), blocking=("slew lower",), field="input_bounds.slew"
     ),
-    "linearised along the trajectory": Case(
-        settings=("controller.type=robust", 'controller.linearisation="trajectory"'),
-        state=TILTED,
-        violated=("roll upper",),
-        blocking=("slew lower", "slew upper"),
-        field="output_bounds.roll",
-    ),
     "rotors that lag, and a delay": Case(
         settings=("controller.type=robust", "controller.rotor_lag=0.05", "controller.delay=0.02"),
         state=TILTED,

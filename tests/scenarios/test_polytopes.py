@@ -108,7 +108,7 @@ def test_every_term_has_both_rates() -> None:
 
 def test_a_turned_model_has_no_rows_of_world_axes() -> None:
     """The model of `heading` moves in axes turned by the yaw, where a row of x would be another one each period."""
-    with pytest.raises(ScenarioError, match="fence must not be of x where heading turns the hover model"):
+    with pytest.raises(ScenarioError, match="fence must not be of x where heading turns the model"):
         load_scenario("robust", ['controller.polytopes=[{name="fence", of=["x"], rows=[[1.0]], upper=[3.0]}]'])
 
 
@@ -134,8 +134,3 @@ def test_a_terminal_weight_needs_a_riccati_equation_with_a_solution() -> None:
     small["controller"] |= {"terminal": "lqr", "output_weights": {"z": 1.0}}
     with pytest.raises(Exception, match=r"terminal must be left out, or weights on all of x, y, z and yaw"):
         problem_of(small)
-
-
-def test_a_terminal_weight_is_of_the_hover_model() -> None:
-    with pytest.raises(ScenarioError, match='terminal must be absent where linearisation is not "hover"'):
-        load_scenario("robust", ['controller.terminal="lqr"', 'controller.linearisation="trajectory"'])

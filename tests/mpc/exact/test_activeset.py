@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -16,9 +15,9 @@ from support import paper_problem, random_axes
 from mpc.exact import activeset as module
 from mpc.exact.activeset import ActiveSet, Side
 from mpc.exact.shortcut import Shortcut
-from mpc.ocp import Problem
-from mpc.paper.condensed import condensed
-from mpc.qp import QP, Point, Solution, Vectors, kkt_residuals
+from mpc.ocp import Problem, Query
+from mpc.paper.condensed import Condensed
+from mpc.qp import QP, Solution, kkt_residuals
 from mpc.solvers import Method, QPSolver
 from mpc.solvers.piqp_backends import PiqpDense
 from quadsim.controller import ACCEPTED, SOLVED
@@ -50,18 +49,12 @@ class Rows:
         e[np.abs(found.side[soft]) != 2] = 0.0
         z_e = np.minimum(np.abs(z[soft]) - self.l1[soft] - 2.0 * self.l2[soft] * e, 0.0)
         return Solution(
-            made=Point(
-                x=np.concatenate([v, e]),
-                y=np.zeros(0),
-                z=np.concatenate([z[~soft], np.maximum(z[soft], 0.0), np.minimum(z[soft], 0.0)]),
-                z_box=np.concatenate([np.zeros(v.size), z_e]),
-            ),
-            status=SOLVED,
+            x=np.concatenate([v, e]),
+            y=np.zeros(0),
+            z=np.concatenate([z[~soft], np.maximum(z[soft], 0.0), np.minimum(z[soft], 0.0)]),
+            z_box=np.concatenate([np.zeros(v.size), z_e]),
             iterations=found.steps,
             active=int(np.count_nonzero(z)),
-            reported_primal=math.nan,
-            reported_dual=math.nan,
-            solve_s=0.0,
         )
 
     @property
@@ -87,7 +80,7 @@ class Rows:
 
     def residual(self, solution: Solution) -> float:
         """Its largest KKT residual over the size of its multipliers."""
-        return kkt_residuals(self.whole, solution).worst / max(1.0, np.abs(solution.point.z).max(initial=0.0))
+        return kkt_residuals(self.whole, solution).worst / max(1.0, np.abs(solution.z).max(initial=0.0))
 
 
 def random_rows(rng: np.random.Generator, *, n: int, rows: int, soft: float, least: float = 0.0) -> Rows:
@@ -173,8 +166,8 @@ def test_approximate_multipliers_give_the_active_set(off: float) -> None:
         hard = int(np.isinf(problem.l1).sum())
         m = 8 - hard
         z = np.zeros(8)
-        z[np.isinf(problem.l1)] = exact.point.z[:hard]
-        z[np.isfinite(problem.l1)] = exact.point.z[hard : hard + m] + exact.point.z[hard + m :]
+        z[np.isinf(problem.l1)] = exact.z[:hard]
+        z[np.isfinite(problem.l1)] = exact.z[hard : hard + m] + exact.z[hard + m :]
         near = problem.set.near(z + off * rng.normal(size=8), problem.G @ problem.free, problem.lower, problem.upper)
         found = problem.solve(near)
         assert found is not None
@@ -192,7 +185,7 @@ def test_it_agrees_with_an_interior_point_method(seed: int, soft: float, share: 
     found = problem.solve(random_start(np.random.default_rng(seed), problem, share))
     backend, qp = PiqpDense(), problem.whole
     backend.setup(qp)
-    whole = backend.solve(Vectors(c=qp.c, b=qp.b, h_l=qp.h_l, h_u=qp.h_u))
+    whole = backend.solve(qp)
     if found is None:
         return
     assert whole.status == SOLVED
@@ -230,7 +223,7 @@ def test_the_start_with_the_fewest_wrong_rows_is_taken(monkeypatch: pytest.Monke
     problem = random_rows(np.random.default_rng(3), n=8, rows=8, soft=0.0)
     cold = problem.solve(nothing(problem))
     assert cold is not None
-    right = np.sign(cold.point.z).astype(np.int8)
+    right = np.sign(cold.z).astype(np.int8)
     wrong = np.where(np.isfinite(problem.upper), 1, -1).astype(np.int8) * (right == 0).astype(np.int8)
     assert np.count_nonzero(right) > 2
     for starts in ((right, wrong), (wrong, right), (nothing(problem), wrong, right)):
@@ -302,7 +295,7 @@ def test_steps_are_counted_and_given_up() -> None:
     found = problem.solve(nothing(problem))
     assert found is not None
     assert found.iterations > 1
-    np.testing.assert_allclose(found.point.z, [1.0, 0.0])
+    np.testing.assert_allclose(found.z, [1.0, 0.0])
 
 
 # Whole QPs of controllers
@@ -315,16 +308,14 @@ def by_active_set(qp: QP, near: Solution) -> Solution | None:
     (bounded,) = np.nonzero(np.isfinite(lower) | np.isfinite(upper))
     hard, P = np.full(bounded.size, np.inf), np.asarray(qp.P)
     problem = Rows(P, qp.c, rows[bounded], lower[bounded], upper[bounded], hard, np.zeros(bounded.size))
-    z = np.concatenate([near.point.z_box, near.point.z])[bounded]
+    z = np.concatenate([near.z_box, near.z])[bounded]
     start = problem.set.near(z, problem.G @ problem.free, problem.lower, problem.upper)
     found = problem.set.solve(problem.G @ problem.free, problem.lower, problem.upper, [start])
     if found is None:
         return None
     multipliers = np.zeros(len(rows))
     multipliers[bounded] = found.z
-    return near._replace(
-        made=near.point._replace(x=problem.free - problem.R @ found.z, z_box=multipliers[:n], z=multipliers[n:])
-    )
+    return near._replace(x=problem.free - problem.R @ found.z, z_box=multipliers[:n], z=multipliers[n:])
 
 
 def certified(qp: QP, solution: Solution) -> Array | None:
@@ -336,7 +327,7 @@ def certified(qp: QP, solution: Solution) -> Array | None:
     n, wide = qp.c.size, np.longdouble
     rows = np.vstack([np.eye(n), np.asarray(qp.G)])
     lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
-    side = np.sign(np.concatenate([solution.point.z_box, solution.point.z]))
+    side = np.sign(np.concatenate([solution.z_box, solution.z]))
     active = np.flatnonzero(side)
     if active.size:
         _, size, order = scipy.linalg.qr(rows[active].T, mode="economic", pivoting=True)
@@ -374,9 +365,9 @@ def test_the_certificate_is_of_the_optimum_alone() -> None:
             h_l=np.array([1.0, -1.0]), h_u=far, x_l=-far, x_u=far)  # fmt: skip
     backend = PiqpDense()
     backend.setup(qp)
-    solution = backend.solve(Vectors(c=qp.c, b=qp.b, h_l=qp.h_l, h_u=qp.h_u))
+    solution = backend.solve(qp)
     for z, exact in (([-2.0, 0.0], True), ([0.0, 0.0], False), ([-2.0, -1.0], False)):
-        x = certified(qp, solution._replace(made=solution.point._replace(z=np.array(z), z_box=np.zeros(2))))
+        x = certified(qp, solution._replace(z=np.array(z), z_box=np.zeros(2)))
         assert (x is not None) is exact
         if x is not None:
             np.testing.assert_array_equal(x, [1.0, 0.0])
@@ -397,14 +388,13 @@ def test_whole_qps_are_brought_to_the_optimum(ratio: float, room: float, off: fl
         rng = np.random.default_rng(seed)
         problem = spread(random_axes(rng, horizon=6, room=room), rng, ratio)
         query = 2.0 * rng.normal(size=7), 2.0 * rng.normal(size=(6, 7)), problem.model.u_bar
-        formulation, backend = condensed(problem), PiqpDense()
+        formulation, backend = Condensed(problem), PiqpDense()
         backend.setup(formulation.qp)
-        vectors = formulation.vectors(*query)
-        near = backend.solve(vectors)
+        qp = formulation.pose(Query(*query)).qp
+        near = backend.solve(qp)
         if near.status != SOLVED or not near.active:
             continue
         constrained += 1
-        qp = formulation.qp.with_vectors(vectors)
         polished = by_active_set(qp, near)
         if polished is None:
             continue
@@ -429,11 +419,11 @@ def test_active_constraints_that_depend_on_each_other() -> None:
     state[4] = 100.0
     query = state, desired, problem.model.u_bar
     whole = QPSolver("piqp-multistage", problem)
-    answer, given = Shortcut(problem, whole).solve(*query), whole.solve(*query)
-    assert answer.solution.status == given.solution.status == SOLVED
-    form = condensed(problem)
-    scale = np.abs(answer.solution.point.z).max()
-    assert kkt_residuals(form.qp.with_vectors(form.vectors(*query)), answer.solution).worst < 1e-6 * scale
+    answer, given = Shortcut(problem, whole).solve(Query(*query)), whole.solve(Query(*query))
+    assert answer.status == given.status == SOLVED
+    form = Condensed(problem)
+    scale = np.abs(answer.certificate()[1].z).max()
+    assert kkt_residuals(form.pose(Query(*query)).qp, answer.certificate()[1]).worst < 1e-6 * scale
     np.testing.assert_allclose(answer.plan, given.plan, atol=1e-2)
 
 
@@ -447,11 +437,11 @@ def test_every_way_ends_at_the_optimum(ratio: float, exact: float) -> None:
         problem = spread(random_axes(rng, horizon=6, room=float(rng.choice([1.0, 10.0, 1000.0]))), rng, ratio)
         size = float(rng.choice([0.05, 2.0]))
         query = size * rng.normal(size=7), size * rng.normal(size=(6, 7)), problem.model.u_bar
-        answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(*query)
-        if answer.solution.status not in ACCEPTED:
+        answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(Query(*query))
+        if answer.status not in ACCEPTED:
             continue
-        formulation = condensed(problem)
-        x = certified(formulation.qp.with_vectors(formulation.vectors(*query)), answer.solution)
+        formulation = Condensed(problem)
+        x = certified(formulation.pose(Query(*query)).qp, answer.certificate()[1])
         queries += 1
         if x is not None:
             errors[answer.method].append(np.abs(answer.plan.ravel() - x).max())

@@ -15,13 +15,11 @@ from support import random_axes
 from mpc.exact.axes import axes
 from mpc.exact.free import FreeOptimum
 from mpc.exact.shortcut import Shortcut
-from mpc.ocp import Problem, Rest, lqr_terminal_weight
+from mpc.ocp import Problem, Query, Rest, lqr_terminal_weight
 from mpc.solvers import Method, QPSolver
 from quadsim.controller import ACCEPTED, SOLVED
-from quadsim.state import Array
 
 TERMS = ("Q_d", "P", "rest")
-Query = tuple[Array, Array, Array, Rest]
 
 
 def drawn(rng: np.random.Generator, terms: Collection[str], *, size: float, room: float) -> tuple[Problem, Query]:
@@ -36,7 +34,7 @@ def drawn(rng: np.random.Generator, terms: Collection[str], *, size: float, room
     if "rest" in terms:
         rest = Rest(0.1 * rng.normal(size=7), model.u_bar + 0.1 * room * rng.normal(size=4))
     before = model.u_bar + 0.01 * rng.normal(size=4)
-    query = size * rng.normal(size=7), size * rng.normal(size=(5, 7)), before, rest
+    query = Query(size * rng.normal(size=7), size * rng.normal(size=(5, 7)), before, rest)
     return replace(problem, objective=objective), query
 
 
@@ -48,9 +46,9 @@ def drawn(rng: np.random.Generator, terms: Collection[str], *, size: float, room
 )
 def test_every_way_ends_at_the_peers_optimum(seed: int, terms: set[str], size: float, room: float) -> None:
     problem, query = drawn(np.random.default_rng(seed), terms, size=size, room=room)
-    answer = Shortcut(problem, QPSolver("piqp-dense", problem)).solve(*query)
-    peer = ocp_peer.optimum(problem, ocp_peer.period(problem, *query))
-    assert (answer.solution.status in ACCEPTED) == (peer.solution.status == SOLVED)
+    answer = Shortcut(problem, QPSolver("piqp-dense", problem)).solve(Query(*query))
+    peer = ocp_peer.optimum(problem, ocp_peer.period(problem, *query[:4]))
+    assert (answer.status in ACCEPTED) == (peer.solution.status == SOLVED)
     if peer.solution.status == SOLVED:
         scale = max(1.0, float(np.abs(peer.plan).max()))
         np.testing.assert_allclose(answer.plan, peer.plan, rtol=0.0, atol=1e-7 * scale)
@@ -65,7 +63,7 @@ def test_every_way_is_taken(terms: tuple[str, ...]) -> None:
         size, room = float(rng.choice([0.05, 2.0])), float(rng.choice([1.0, 1000.0]))
         problem, query = drawn(rng, terms, size=size, room=room)
         assert len(axes(problem)) == 3
-        methods.append(Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(*query).method)
+        methods.append(Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(Query(*query)).method)
     assert min(methods.count(method) for method in Method) >= 2
 
 
@@ -75,14 +73,14 @@ def test_moves_that_tie_the_axes_leave_one_piece() -> None:
     tied = replace(problem, objective=replace(problem.objective, Q_d=np.diag([1.0, 0.0, 0.0, 0.0])))
     (whole,) = axes(tied)
     np.testing.assert_array_equal(whole.T, np.eye(4))
-    answer = Shortcut(tied, QPSolver("piqp-dense", tied)).solve(*query)
-    peer = ocp_peer.optimum(tied, ocp_peer.period(tied, *query))
+    answer = Shortcut(tied, QPSolver("piqp-dense", tied)).solve(Query(*query))
+    peer = ocp_peer.optimum(tied, ocp_peer.period(tied, *query[:4]))
     np.testing.assert_allclose(answer.plan, peer.plan, atol=1e-8)
 
 
 def test_values_of_rows_are_those_of_the_plan() -> None:
     """C x along the free optimum, rolled out; it receives only deviations from rest."""
-    problem, (state, desired, before, rest) = drawn(np.random.default_rng(2), TERMS, size=0.5, room=1.0)
+    problem, (state, desired, before, rest, _) = drawn(np.random.default_rng(2), TERMS, size=0.5, room=1.0)
     parts = axes(problem)
     free = FreeOptimum(problem, parts)
     answer = free.at(state - rest.x, desired - problem.objective.C_r @ rest.x, before - rest.u)

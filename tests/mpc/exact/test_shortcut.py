@@ -15,8 +15,8 @@ from support import paper_problem, paper_reference, random_axes, random_problem
 from mpc.constrained import ConstrainedMPC
 from mpc.exact import shortcut as shortcut_module
 from mpc.exact.shortcut import Shortcut, with_shortcut
-from mpc.ocp import Problem
-from mpc.paper.condensed import condensed
+from mpc.ocp import Problem, Query
+from mpc.paper.condensed import Condensed
 from mpc.paper.constraints import inequalities
 from mpc.paper.prediction import prediction
 from mpc.qp import kkt_residuals
@@ -33,15 +33,15 @@ def shortcut(problem: Problem, solver: str = "piqp-multistage") -> Shortcut:
 
 def free_plan(problem: Problem, state: Array, desired: Array, u_before: Array) -> Array | None:
     """The plan, where no QP was needed."""
-    answer = shortcut(problem).solve(state, desired, u_before)
-    assert (answer.method is Method.FREE) == (answer.solution.status == UNCONSTRAINED)
+    answer = shortcut(problem).solve(Query(state, desired, u_before))
+    assert (answer.method is Method.FREE) == (answer.status == UNCONSTRAINED)
     return answer.plan if answer.method is Method.FREE else None
 
 
 def largest_residual(problem: Problem, answer: Answer, *query: Array) -> float:
     """Of a shortcut's answer, as a solution of the paper's condensed QP."""
-    form = condensed(problem)
-    return kkt_residuals(form.qp.with_vectors(form.vectors(*query)), answer.solution).worst
+    form = Condensed(problem)
+    return kkt_residuals(form.pose(Query(*query)).qp, answer.certificate()[1]).worst
 
 
 def unconstrained_optimum(problem: Problem, state: Array, desired: Array) -> Array:
@@ -88,19 +88,19 @@ def test_axis_by_axis_is_the_whole_where_and_only_where_inputs_stay_in_bounds(
     problem = random_axes(rng, horizon=horizon, room=room)
     n, nu = problem.model.n, problem.model.nu
     query = (size * rng.normal(size=n), size * rng.normal(size=(horizon, n)), problem.model.u_bar)
-    found, whole = shortcut(problem).solve(*query), QPSolver("piqp-dense", problem).solve(*query)
+    found, whole = shortcut(problem).solve(Query(*query)), QPSolver("piqp-dense", problem).solve(Query(*query))
     if found.method is Method.WHOLE:
         bounds = problem.bounds
         assert bounds is not None
         far = np.full(nu, 1e9)
         wide = replace(bounds, u_min=bounds.u_min - far, u_max=bounds.u_max + far, delta_min=-far, delta_max=far)
-        without = shortcut(replace(problem, bounds=wide)).solve(*query)
-        if without.solution.status == SOLVED and without.method is not Method.WHOLE:
+        without = shortcut(replace(problem, bounds=wide)).solve(Query(*query))
+        if without.status == SOLVED and without.method is not Method.WHOLE:
             steps = np.diff(without.plan, axis=0, prepend=query[2][None])
             inside = (bounds.u_min <= without.plan) & (without.plan <= bounds.u_max)
             assert not (inside & (bounds.delta_min <= steps) & (steps <= bounds.delta_max)).all()
     else:
-        assert whole.solution.status == SOLVED
+        assert whole.status == SOLVED
         size = max(1.0, np.abs(whole.plan).max())
         np.testing.assert_allclose(found.plan, whole.plan, atol=1e-3 * size)
         assert largest_residual(problem, found, *query) < 1e-7 * size**2
@@ -113,7 +113,8 @@ def test_every_way_is_taken_by_random_problems() -> None:
         rng = np.random.default_rng(seed)
         problem = random_axes(rng, horizon=6, room=float(rng.choice([1.0, 1000.0])))
         size, n = rng.choice([0.1, 2.0]), problem.model.n
-        methods.append(shortcut(problem).solve(size * rng.normal(size=n), np.zeros((6, n)), problem.model.u_bar).method)
+        query = Query(size * rng.normal(size=n), np.zeros((6, n)), problem.model.u_bar)
+        methods.append(shortcut(problem).solve(query).method)
     assert min(methods.count(method) for method in Method) >= 3
 
 
@@ -153,13 +154,13 @@ def test_its_answer_is_the_solution_of_the_whole_qp(constrained_flight: Flight, 
     methods = []
     for k in range(0, log.t.size, 8):
         query = log.state[k], problem.objective.desired(reference[k + 1 : k + 51]), before[k]
-        answer, expected = quick.solve(*query), whole.solve(*query)
-        assert expected.solution.status == SOLVED
+        answer, expected = quick.solve(Query(*query)), whole.solve(Query(*query))
+        assert expected.status == SOLVED
         assert largest_residual(problem, answer, *query) < 1e-7
         np.testing.assert_allclose(answer.plan, expected.plan, atol=1e-6)
         if answer.method is Method.AXES:
-            assert answer.solution.status == SOLVED
-            assert min(answer.solution.active, answer.solution.iterations) > 0
+            assert answer.status == SOLVED
+            assert min(answer.active, answer.iterations) > 0
         methods.append(answer.method)
     assert methods.count(Method.FREE) == sum(status == UNCONSTRAINED for status in log.status[::8])
     assert methods.count(Method.AXES) == pytest.approx(70, abs=4)
@@ -187,15 +188,15 @@ def test_a_measured_nan_is_never_feasible() -> None:
     problem = paper_problem()
     quick, hover = shortcut(problem), problem.model.u_bar
     desired = np.zeros((50, 4))
-    assert quick.solve(np.zeros(12), desired, hover).method is Method.FREE
+    assert quick.solve(Query(np.zeros(12), desired, hover)).method is Method.FREE
     for query in (
         (np.full(12, np.nan), desired, hover),
         (np.zeros(12), desired * np.nan, hover),
         (np.zeros(12), desired, hover * np.nan),
     ):
-        answer = quick.solve(*query)
+        answer = quick.solve(Query(*query))
         assert answer.method is Method.WHOLE
-        assert answer.solution.status == "invalid_data"
+        assert answer.status == "invalid_data"
 
 
 def test_what_no_axis_can_hold_is_reported_by_the_whole_qp() -> None:
@@ -203,9 +204,9 @@ def test_what_no_axis_can_hold_is_reported_by_the_whole_qp() -> None:
     problem = paper_problem()
     tilted = np.zeros(12)
     tilted[6] = 0.5
-    answer = shortcut(problem).solve(tilted, np.zeros((50, 4)), problem.model.u_bar)
+    answer = shortcut(problem).solve(Query(tilted, np.zeros((50, 4)), problem.model.u_bar))
     assert answer.method is Method.WHOLE
-    assert answer.solution.status == "primal_infeasible"
+    assert answer.status == "primal_infeasible"
 
 
 def test_a_bound_that_no_axis_has_is_left_to_the_whole_qp() -> None:
@@ -217,9 +218,9 @@ def test_a_bound_that_no_axis_has_is_left_to_the_whole_qp() -> None:
     desired = np.zeros((50, 4))
     desired[:, 0] = 3.0 * np.linspace(0.0, 1.0, 50) ** 4
     query = np.zeros(12), desired, problem.model.u_bar
-    assert shortcut(problem).solve(*query).method is Method.AXES
-    impossible = shortcut(replace(problem, bounds=bounds)).solve(*query)
-    assert (impossible.method, impossible.solution.status) == (Method.WHOLE, "primal_infeasible")
+    assert shortcut(problem).solve(Query(*query)).method is Method.AXES
+    impossible = shortcut(replace(problem, bounds=bounds)).solve(Query(*query))
+    assert (impossible.method, impossible.status) == (Method.WHOLE, "primal_infeasible")
 
 
 @pytest.mark.parametrize("solver", ["piqp-multistage", "piqp-dense"])
@@ -234,14 +235,14 @@ def test_steps_may_be_bounded_for_some_inputs_alone(solver: str) -> None:
     plans = []
     for upper in (some, wide):
         one = replace(problem, bounds=replace(problem.bounds, delta_max=upper, delta_min=-upper))
-        answer = shortcut(one, solver).solve(np.zeros(12), desired, problem.model.u_bar)
-        assert (answer.method, answer.solution.status) == (Method.WHOLE, SOLVED)
+        answer = shortcut(one, solver).solve(Query(np.zeros(12), desired, problem.model.u_bar))
+        assert (answer.method, answer.status) == (Method.WHOLE, SOLVED)
         plans.append(answer.plan)
     np.testing.assert_allclose(*plans, atol=1e-3)
     assert np.abs(np.diff(plans[0], axis=0)).max(axis=0)[[1, 2]].max() <= 5.0 + 1e-6
 
 
-def test_failed_attempts_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_attempts_count() -> None:
     """Ten metres to the side at once: pitch can be held within 5 deg, at steps of the rotors beyond their bounds.
 
     The time that it took is added to the solver's, whose iterations are the ones that count.
@@ -251,48 +252,14 @@ def test_failed_attempts_count(monkeypatch: pytest.MonkeyPatch) -> None:
     desired[:, 0] = 10.0
     query = np.zeros(12), desired, problem.model.u_bar
     whole = QPSolver("piqp-multistage", problem)
-    given = whole.solve(*query)
-    monkeypatch.setattr(whole, "solve_roughly", lambda *_: given)
-    answer = Shortcut(problem, whole).solve(*query)
+    given = whole.solve(Query(*query))
+    answer = Shortcut(problem, whole).solve(Query(*query))
     assert answer.method is Method.WHOLE
     np.testing.assert_allclose(answer.plan, given.plan, atol=1e-3)
-    assert answer.solution.solve_s > given.solution.solve_s
-    assert answer.solution.iterations == given.solution.iterations
-    assert answer.solution.reported_primal == given.solution.reported_primal
+    assert answer.solve_s > given.solve_s
+    assert answer.iterations == given.iterations
+    assert answer.reported_primal == given.reported_primal
     assert (answer.answered_by, given.answered_by) == ("piqp-multistage", "piqp-multistage")
-
-
-def test_the_first_whole_qp_is_solved_roughly_and_finished_exactly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A tight answer follows where a rough one does not lead to the optimum; later periods have that alone."""
-    problem = paper_problem()
-    desired = np.zeros((50, 4))
-    desired[:, 0] = 10.0
-    query = np.zeros(12), desired, problem.model.u_bar
-    whole = QPSolver("piqp-multistage", problem)
-    rough, tight = whole.solve_roughly(*query), whole.solve(*query)
-    assert rough.solution.iterations < tight.solution.iterations
-    quick = Shortcut(problem, whole)
-    finished = quick.solve(*query)
-    assert finished.solution.iterations == rough.solution.iterations
-    assert largest_residual(problem, finished, *query) < 1e-9
-    assert np.abs(finished.plan - tight.plan).max() < np.abs(rough.plan - tight.plan).max()
-    assert quick._all is not None
-    monkeypatch.setattr(quick._all, "solve", lambda *_: None)
-    both = rough.solution.iterations + tight.solution.iterations
-    for reset, iterations in ((True, both), (False, tight.solution.iterations)):
-        if reset:
-            quick.reset()
-        answer = quick.solve(*query)
-        assert answer.solution.iterations == iterations
-        np.testing.assert_array_equal(answer.plan, tight.plan)
-
-
-def test_back_ends_without_a_rough_answer_are_marked() -> None:
-    pytest.importorskip("daqp")
-    solver = QPSolver("daqp", paper_problem())
-    assert not solver.can_solve_roughly
-    with pytest.raises(TypeError, match="daqp has no rough answer"):
-        solver.solve_roughly(np.zeros(12), np.zeros((50, 4)), np.zeros(4))
 
 
 def test_answers_to_a_whole_qp_too_large_to_polish_stand(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -301,10 +268,10 @@ def test_answers_to_a_whole_qp_too_large_to_polish_stand(monkeypatch: pytest.Mon
     desired = np.zeros((50, 4))
     desired[:, 0] = 10.0
     query = np.zeros(12), desired, problem.model.u_bar
-    whole = QPSolver("piqp-multistage", problem).solve(*query).plan
+    whole = QPSolver("piqp-multistage", problem).solve(Query(*query)).plan
     for largest, polished in ((500**2, True), (500**2 - 1, False)):
         monkeypatch.setattr(shortcut_module, "LARGEST_MAP", largest)
-        answer = shortcut(problem).solve(*query)
+        answer = shortcut(problem).solve(Query(*query))
         assert answer.method is Method.WHOLE
         assert (largest_residual(problem, answer, *query) < 1e-9) is polished
         assert np.array_equal(answer.plan, whole) is not polished
@@ -338,7 +305,7 @@ def test_steps_leak_no_memory_and_allocate_nothing_large(sideways: float, height
     controller.reset(problem.model.u_bar)
     reference = np.tile([0.0, 0.0, height, 0.0], (50, 1))
     reference[:, 0] = sideways * np.linspace(0.0, 1.0, 50) ** 4
-    assert shortcut(problem).solve(np.zeros(12), reference, problem.model.u_bar).method is method
+    assert shortcut(problem).solve(Query(np.zeros(12), reference, problem.model.u_bar)).method is method
     state = np.zeros(12)
 
     def take_25_steps() -> str:
@@ -372,9 +339,9 @@ def test_steps_leak_no_memory_and_allocate_nothing_large(sideways: float, height
 def test_without_output_bounds_the_inputs_decide() -> None:
     problem = paper_problem("paper-constrained", "controller.output_bounds={}")
     quick, far = shortcut(problem), np.zeros(12)
-    assert quick.solve(far, np.zeros((50, 4)), problem.model.u_bar).method is Method.FREE
+    assert quick.solve(Query(far, np.zeros((50, 4)), problem.model.u_bar)).method is Method.FREE
     far[4] = -100.0
-    assert quick.solve(far, np.zeros((50, 4)), problem.model.u_bar).method is Method.WHOLE
+    assert quick.solve(Query(far, np.zeros((50, 4)), problem.model.u_bar)).method is Method.WHOLE
 
 
 @pytest.mark.parametrize("horizon", [50, 100, 200])
@@ -388,7 +355,7 @@ def test_it_is_exact_over_long_horizons(horizon: int) -> None:
     state = np.zeros(12)
     state[[0, 2, 4, 6, 8]] = [0.02, -0.03, -0.05, 0.002, -0.003]
     plan = free_plan(problem, state, desired, problem.model.u_bar)
-    answer = QPSolver("piqp-multistage", problem).solve(state, desired, problem.model.u_bar)
+    answer = QPSolver("piqp-multistage", problem).solve(Query(state, desired, problem.model.u_bar))
     assert plan is not None
     np.testing.assert_allclose(plan[0], answer.plan[0], atol=1e-4)
 

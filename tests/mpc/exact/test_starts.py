@@ -10,12 +10,11 @@ from support import flight_queries, paper_problem
 
 from mpc.constraints import Constraint, Penalty
 from mpc.exact.shortcut import Shortcut
-from mpc.ocp import Problem, Rest
+from mpc.ocp import Problem, Query, Rest
 from mpc.qp import Formulation
 from mpc.robust.controller import RobustMPC
 from mpc.solvers import Answer, Method, QPSolver, Solver
 from quadsim.controller import ACCEPTED
-from quadsim.state import Array
 from scenarios.build import build_controller, build_plant
 from scenarios.courses.make import build_reference
 from scenarios.flight import Flight
@@ -23,8 +22,6 @@ from scenarios.loading import load_scenario
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_once
-
-Query = tuple[Array, Array, Array, Rest]
 
 
 class Recording:
@@ -45,10 +42,11 @@ class Recording:
     def reset(self) -> None:
         self._solver.reset()
 
-    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
-        assert rest is not None
-        self.queries.append((state.copy(), desired.copy(), u_before.copy(), Rest(rest.x.copy(), rest.u.copy())))
-        return self._solver.solve(state, desired, u_before, rest)
+    def solve(self, query: Query) -> Answer:
+        assert query.rest is not None
+        rest = Rest(*(part.copy() for part in query.rest))
+        self.queries.append(Query(*(part.copy() for part in query[:3]), rest))
+        return self._solver.solve(query)
 
 
 @pytest.fixture(scope="module")
@@ -81,15 +79,15 @@ def agreed(problem: Problem, queries: list[Query], stride: int) -> dict[Method, 
     empty = fresh._side.copy()
     methods = dict.fromkeys(Method, 0)
     for k, query in enumerate(queries):
-        answer = warm.solve(*query)
+        answer = warm.solve(query)
         methods[answer.method] += 1
-        assert answer.solution.status in ACCEPTED
+        assert answer.status in ACCEPTED
         if k % stride:
             continue
         reset.reset()
         fresh._side = empty.copy()
         for cold in (reset, fresh):
-            other = cold.solve(*query)
+            other = cold.solve(query)
             assert (other.method is Method.FREE) == (answer.method is Method.FREE)
             np.testing.assert_allclose(other.plan[0], answer.plan[0], rtol=1e-9, atol=0.0)
             np.testing.assert_allclose(other.plan, answer.plan, rtol=1e-7, atol=0.0)
@@ -115,11 +113,11 @@ def test_bounds_that_only_some_steps_have(constrained_flight: Flight) -> None:
     quick, whole = (Shortcut(problem, QPSolver("daqp", problem)) for _ in range(2))
     active = 0
     for query in flight_queries(constrained_flight, problem, stride=1)[20:80]:
-        answer = quick.solve(*query)
+        answer = quick.solve(query)
         whole.reset()
-        expected = whole._whole.solve(*query)
-        assert answer.solution.status in ACCEPTED
-        assert expected.solution.status in ACCEPTED
+        expected = whole._whole.solve(query)
+        assert answer.status in ACCEPTED
+        assert expected.status in ACCEPTED
         np.testing.assert_allclose(answer.plan, expected.plan, atol=1e-5)
         active += bool(quick._side.reshape(50, -1)[20, -1])
         moved = quick._starts()[0]
@@ -130,7 +128,7 @@ def test_bounds_that_only_some_steps_have(constrained_flight: Flight) -> None:
 
 def test_over_the_papers_flight(constrained_flight: Flight) -> None:
     problem = paper_problem()
-    queries = [(*query, problem.rest) for query in flight_queries(constrained_flight, problem, stride=1)]
+    queries = [query._replace(rest=problem.rest) for query in flight_queries(constrained_flight, problem, stride=1)]
     methods = agreed(problem, queries, stride=12)
     assert min(methods.values()) > 10
     assert methods[Method.AXES] > 300

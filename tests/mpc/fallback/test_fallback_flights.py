@@ -18,7 +18,7 @@ from support import paper_reference
 from mpc.constrained import ConstrainedMPC
 from mpc.fallback.contract import Guarded
 from mpc.fallback.settings import FallbackSettings
-from mpc.ocp import Rest
+from mpc.ocp import Query
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers.piqp_backends import STATUS
 from quadsim.controller import ACCEPTED
@@ -50,15 +50,15 @@ class FaultySolver(QPSolver):
         super().__init__("piqp-multistage", problem())
         self.faults, self.calls = faults, -1
 
-    def solve(self, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Answer:
+    def solve(self, query: Query) -> Answer:
         self.calls += 1
         fault = self.faults.get(self.calls)
         if isinstance(fault, Exception):
             raise fault
-        answer = super().solve(state, desired, u_before, rest)
+        answer = super().solve(query)
         if fault is None:
             return answer
-        return answer._replace(solution=answer.solution._replace(status=fault), plan=answer.plan * np.nan)
+        return answer._replace(status=fault, plan=answer.plan * np.nan)
 
 
 def fly_paper(

@@ -10,7 +10,7 @@ import pytest
 from support import paper_problem
 
 from mpc.constraints import Bounds
-from mpc.ocp import Objective
+from mpc.ocp import Objective, Query
 from mpc.paper.condensed import Condensed
 from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.robust.filter import STANDING, SafetyFilter
@@ -89,11 +89,12 @@ def test_an_unsafe_one_becomes_the_nearest_whose_plan_keeps_the_bounds(wanted: l
     P[:4, :4] += 2.0 * np.eye(4)
     level = state.copy()
     level[INDEX["yaw"]] = 0.0
-    vectors = form.vectors(level, np.zeros((HORIZON, 4)), HOVER)
-    vectors.c[:4] -= 2.0 * (HOVER + wanted)
+    qp = form.pose(Query(level, np.zeros((HORIZON, 4)), HOVER)).qp
+    qp.c[:4] -= 2.0 * (HOVER + wanted)
     backend = make_backend("piqp-dense")
-    backend.setup(replace(form.qp.with_vectors(vectors), P=np.asfortranarray(P)))
-    other = form.inputs(backend.solve(vectors).x)[0]
+    qp = replace(qp, P=np.asfortranarray(P))
+    backend.setup(qp)
+    other = form.inputs(backend.solve(qp).x)[0]
     assert command.speeds == pytest.approx(other, abs=1e-3)
     # No command that is nearer is safe: moving on towards what was wanted breaks a bound of the prediction.
     assert np.linalg.norm(command.speeds - HOVER - wanted) > 0.1

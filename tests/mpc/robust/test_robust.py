@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import paper_problem, paper_reference
+from support import linearised, paper_problem, paper_reference
 
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Penalty
@@ -17,10 +17,9 @@ from mpc.equilibrium import equilibrium
 from mpc.fallback.completion import CompletedMoment
 from mpc.heading import turn_horizontally
 from mpc.model import continuous_model, discretise, hover_model
-from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
 from mpc.observer import ObserverSettings
-from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
+from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.solvers import QPSolver
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment, Phase
 from quadsim.errors import ParameterError
@@ -117,13 +116,13 @@ def test_the_hover_matrices_are_the_papers_without_lag_and_the_nonlinear_models_
     rest = equilibrium(lagging)
     x, u = rest.state(n=16), rest.speeds
     hover = discretise(*continuous_model(vehicle, 0.03), PERIOD)
-    for ours, exact in zip(hover, linearise(lagging, x[None], u[None])[:2], strict=True):
-        np.testing.assert_allclose(ours, exact[0], atol=1e-7)
+    for ours, exact in zip(hover, linearised(lagging, x, u)[:2], strict=True):
+        np.testing.assert_allclose(ours, exact, atol=1e-7)
 
 
 @pytest.mark.parametrize("parts", [{}, {"penalty": SOFT}, EVERYTHING])
 def test_a_period_without_an_active_constraint_has_its_status(vehicle: Vehicle, parts: dict[str, Any]) -> None:
-    """And one with some is solved; models that change have no such shortcut."""
+    """And one with some is solved."""
     now, shifted = Moment(acting=np.full(4, vehicle.hover_speed)), np.tile([5.0, 0.0, 0.0, 0.0], (50, 1))
     controller = robust(vehicle, **parts)
     for reference, status in ((HOLD, UNCONSTRAINED), (shifted, SOLVED), (HOLD, UNCONSTRAINED)):
@@ -131,8 +130,6 @@ def test_a_period_without_an_active_constraint_has_its_status(vehicle: Vehicle, 
         command = controller.step(now, np.zeros(12), reference)
         assert command.status == status
         assert (command.active > 0) == (status == SOLVED)
-    changing = robust(vehicle, **{**parts, "linearisation": Linearisation.STATE})
-    assert changing.step(now, np.zeros(12), HOLD).status == SOLVED
 
 
 # Soft bounds
@@ -185,31 +182,13 @@ def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle) -> None:
     assert np.abs(speeds - before).max() > 0.1
 
 
-def test_along_the_last_plan_the_prediction_is_the_nonlinear_models(vehicle: Vehicle) -> None:
-    """But for what one iteration leaves: little from the third period on, and nothing once the vehicle has settled."""
-    plant = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
-    known = robust(vehicle, rotor_lag=0.03, penalty=SOFT, linearisation=Linearisation.TRAJECTORY)
-    start = make_state(position=(0.3, -0.2, 0.1), euler=(0.0, 0.0, 0.4))
-    errors = []
-    for state, _ in flown(known, plant, start, np.zeros((90, 4)), 24):
-        assert known._relinearised.last is not None
-        states, plan = known._relinearised.last
-        x = np.concatenate([state, known._rotors])
-        x = [x := advance(plant, x, inputs) for inputs in plan[:11]]
-        errors.append(np.abs(np.array(x) - states[:11])[:, :12].max(axis=1))
-    assert np.max(errors[2:]) < 8e-4
-    assert np.max(np.array(errors)[2:, 0]) < 1e-5
-    assert np.max(errors[18:]) < 1e-5
-
-
 # Offset-free tracking
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
-@pytest.mark.parametrize("linearisation", list(Linearisation))
-def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float, linearisation: Linearisation) -> None:
+def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float) -> None:
     """Also of the controller: at rest at its set-point, it commands what holds it there."""
-    controller = robust(vehicle, rotor_lag=0.03, heading=True, observer=ObserverSettings(), linearisation=linearisation)
+    controller = robust(vehicle, rotor_lag=0.03, heading=True, observer=ObserverSettings())
     believing(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
     force, torque = np.split(controller.disturbance, 2)
     model = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
@@ -223,11 +202,10 @@ def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float
     np.testing.assert_allclose(controller.step(Moment(acting=u), world[:12], reference).speeds, u, atol=1e-4)
 
 
-@pytest.mark.parametrize("linearisation", [Linearisation.HOVER, Linearisation.TRAJECTORY])
-def test_constant_forces_torques_and_mass_leave_no_steady_error(vehicle: Vehicle, linearisation: Linearisation) -> None:
+def test_constant_forces_torques_and_mass_leave_no_steady_error(vehicle: Vehicle) -> None:
     force, torque = np.array([0.3, -0.2, 0.25]), np.array([0.5, -0.3, 0.1])
     reference = np.tile([0.0, 0.0, 0.0, 0.5], (240, 1))
-    settings: dict[str, Any] = {**EVERYTHING, "rotor_lag": 0.0, "delay": 0.0, "linearisation": linearisation}
+    settings: dict[str, Any] = {**EVERYTHING, "rotor_lag": 0.0, "delay": 0.0}
     disturbed = replace(nonlinear_model(vehicle, PERIOD), acceleration=force, angular_acceleration=torque)
     heavy = nonlinear_model(replace(vehicle, mass=1.1 * vehicle.mass), PERIOD)
     start = make_state(euler=(0.0, 0.0, 0.5))
@@ -270,14 +248,13 @@ def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> N
     assert controller.disturbance[2] == pytest.approx(vehicle.gravity * (1.0 - factor), abs=0.05)
 
 
-@pytest.mark.parametrize("linearisation", [Linearisation.HOVER, Linearisation.TRAJECTORY])
-def test_what_a_worn_rotor_does_is_known_at_any_thrust(vehicle: Vehicle, linearisation: Linearisation) -> None:
+def test_what_a_worn_rotor_does_is_known_at_any_thrust(vehicle: Vehicle) -> None:
     """Climbing with more thrust, it turns the vehicle more, by as much: nothing is left to learn."""
     worn = nonlinear_model(vehicle, PERIOD)
     worn = replace(worn, effectiveness=worn.effectiveness * [1.0, 0.8, 1.0, 1.0])
     reference = np.zeros((260, 4))
     reference[180:, 2] = 10.0
-    settings: dict[str, Any] = {"penalty": SOFT, "observer": ObserverSettings(), "linearisation": linearisation}
+    settings: dict[str, Any] = {"penalty": SOFT, "observer": ObserverSettings()}
     controller = robust(vehicle, weight=0.1, heading=True, **settings)
     torques, thrusts = [], []
     for k, (_, speeds) in enumerate(flown(controller, worn, make_state(), reference, 200)):
@@ -364,8 +341,7 @@ def test_predictions_and_trim_are_of_what_is_believed(vehicle: Vehicle) -> None:
 # Heading
 
 
-@pytest.mark.parametrize("linearisation", list(Linearisation))
-def test_a_flight_turned_by_any_yaw_is_the_same_flight(vehicle: Vehicle, linearisation: Linearisation) -> None:
+def test_a_flight_turned_by_any_yaw_is_the_same_flight(vehicle: Vehicle) -> None:
     """With a side force and a torque to learn, lag, delay and a turn on the way."""
     turn = 2.5
     plant = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
@@ -383,14 +359,13 @@ def test_a_flight_turned_by_any_yaw_is_the_same_flight(vehicle: Vehicle, lineari
     turned_force = turn_horizontally(force, np.array(turn))
     flights = []
     for x, reference, push in ((start, course, force), (turned_start, turned_course, turned_force)):
-        controller = robust(vehicle, **{**EVERYTHING, "linearisation": linearisation})
+        controller = robust(vehicle, **EVERYTHING)
         pushed = replace(plant, acceleration=push[[0, 2, 4]])
         flights.append([np.array(part) for part in zip(*flown(controller, pushed, x, reference, 30), strict=True)])
     (states, commands), (turned_states, turned_commands) = flights
     back = turn_horizontally(turned_states, np.full(30, -turn))
     back[:, INDEX["yaw"]] -= turn
-    # Where it is relinearised, the QP itself is turned: then it is solved to its tolerance only.
-    np.testing.assert_allclose(back, states, atol=1e-6 if linearisation is Linearisation.HOVER else 1e-4)
+    np.testing.assert_allclose(back, states, atol=1e-6)
     np.testing.assert_allclose(turned_commands, commands, atol=1e-2)
 
 
@@ -440,13 +415,10 @@ def test_a_delay_is_answered_from_where_the_vehicle_will_be(vehicle: Vehicle, de
 # Statuses
 
 
-@pytest.mark.parametrize("linearisation", list(Linearisation))
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1e6, 1e200])
-def test_numbers_out_of_hand_are_refused_and_forgotten(
-    vehicle: Vehicle, linearisation: Linearisation, value: float
-) -> None:
+def test_numbers_out_of_hand_are_refused_and_forgotten(vehicle: Vehicle, value: float) -> None:
     acting = np.full(4, vehicle.hover_speed)
-    controller = robust(vehicle, **{**EVERYTHING, "linearisation": linearisation})
+    controller = robust(vehicle, **EVERYTHING)
     for channel in (1, 4, 7, 8, 11):
         controller.reset(acting)
         controller.step(Moment(acting=acting), np.zeros(12), HOLD)
@@ -464,13 +436,10 @@ def test_numbers_out_of_hand_are_refused_and_forgotten(
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.02])
-@pytest.mark.parametrize("linearisation", list(Linearisation))
-def test_numbers_that_get_out_of_hand_on_the_way_spoil_nothing(
-    vehicle: Vehicle, linearisation: Linearisation, delay: float
-) -> None:
+def test_numbers_that_get_out_of_hand_on_the_way_spoil_nothing(vehicle: Vehicle, delay: float) -> None:
     """Rates that no vehicle has, though a sensor might say so, overflow within a period of integration."""
     acting = np.full(4, vehicle.hover_speed)
-    controller = robust(vehicle, **{**EVERYTHING, "linearisation": linearisation, "delay": delay})
+    controller = robust(vehicle, **{**EVERYTHING, "delay": delay})
     for channel in (7, 9, 11):
         spun = np.zeros(12)
         spun[[channel, 8]] = 1e3, 1.5
@@ -515,7 +484,7 @@ def test_its_own_last_command_acts_where_none_is_given(vehicle: Vehicle) -> None
 
 
 def test_reset_restarts(vehicle: Vehicle) -> None:
-    controller = robust(vehicle, **{**EVERYTHING, "linearisation": Linearisation.TRAJECTORY})
+    controller = robust(vehicle, **EVERYTHING)
     plant = replace(nonlinear_model(vehicle, PERIOD), acceleration=np.array([0.3, 0.0, 0.2]))
     start, reference = make_state(position=(0.2, 0.0, 0.0)), np.zeros((60, 4))
     first, again = (np.array([u for _, u in flown(controller, plant, start, reference, 6)]) for _ in range(2))
@@ -536,20 +505,3 @@ def test_reset_restarts(vehicle: Vehicle) -> None:
 def test_impossible_settings_are_refused(vehicle: Vehicle, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ParameterError, match=message):
         robust(vehicle, **settings)
-
-
-# Successive linearisation
-
-
-def test_a_yaw_counted_from_another_turn_changes_nothing(vehicle: Vehicle) -> None:
-    """Between two periods an estimator may count 2 pi more; the plan is then linearised about along with it."""
-    plain, counted = (robust(vehicle, penalty=SOFT, linearisation=Linearisation.TRAJECTORY) for _ in range(2))
-    state = make_state(position=(0.3, -0.2, 0.1), euler=(0.05, -0.04, 0.4))
-    for _ in range(3):
-        first = [controller.step(Moment(), state, HOLD).speeds for controller in (plain, counted)]
-        np.testing.assert_array_equal(first[0], first[1])
-    turned, reference = state.copy(), HOLD.copy()
-    turned[INDEX["yaw"]] += math.tau
-    reference[:, 3] += math.tau
-    expected = plain.step(Moment(), state, HOLD).speeds
-    np.testing.assert_allclose(counted.step(Moment(), turned, reference).speeds, expected, atol=1e-4)

@@ -56,26 +56,27 @@ def query(problem: Problem, *, goal: float = 2.0, speed: float = 0.8) -> Query:
 
 def clearing(problem: Problem, among: Space, calls: list[Answer] | None = None, *, changing: bool = False) -> Clearing:
     solver = with_shortcut(problem, QPSolver("piqp-multistage", problem))
+    find = solver.solve
 
     def solve(posed: Query) -> Answer:
-        answer = solver.solve(*posed[:4])
+        answer = find(posed._replace(steps=None))
         if calls is not None:
             calls.append(answer)
         return answer
 
-    return Clearing(problem, solve, among, changing=changing)
+    solver.solve = solve  # type: ignore[method-assign]
+    return Clearing(problem, solver, among, changing=changing)
 
 
 def by_dense_qp(problem: Problem, posed: Query, normals: Array, bounds: Array) -> Array:
     """The plan (N, nu) of the condensed QP with hard half-spaces (S, N, 3), (S, N) as rows of its own."""
     form, maps = Condensed(problem), prediction(problem.model, N)
-    vectors = form.vectors(*posed[:3])
+    qp = form.pose(Query(*posed[:3])).qp
     chosen = np.zeros((len(bounds), N, N * 12))
     for i in range(N):
         chosen[:, i, 12 * i + np.array(POSITION)] = normals[:, i]
     rows = chosen.reshape(-1, N * 12)
     free = maps.Phi @ posed.state - maps.Psi @ np.tile(problem.model.u_bar, N)
-    qp = form.qp.with_vectors(vectors)
     qp = replace(
         qp,
         G=np.vstack([qp.G, rows @ maps.Psi]),
@@ -85,7 +86,7 @@ def by_dense_qp(problem: Problem, posed: Query, normals: Array, bounds: Array) -
     )
     backend = PiqpDense()
     backend.setup(qp)
-    solution = backend.solve(qp.vectors)
+    solution = backend.solve(qp)
     assert solution.status == SOLVED
     assert kkt_residuals(qp, solution).worst < 1e-3
     return form.inputs(solution.x)
@@ -126,12 +127,12 @@ def test_regions_are_exact_and_hold_in_their_window() -> None:
 def test_the_optimum_is_that_of_a_dense_qp(problem: Problem) -> None:
     among, posed = space(PILLAR, FENCE, rows=7), query(problem)
     found = clearing(problem, among).solve(0.0, posed)
-    assert found.answer.solution.status == SOLVED
+    assert found.answer.status == SOLVED
     free = clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0))).solve(0.0, posed)
     assert np.abs(found.answer.plan - free.answer.plan).max() > 1.0
-    normals, bounds = among.half_spaces(PERIOD * np.arange(1, N + 1), free.states[:, list(POSITION)])
+    normals, bounds = among.half_spaces(PERIOD * np.arange(1, N + 1), free.answer.states[:, list(POSITION)])
     np.testing.assert_allclose(found.answer.plan, by_dense_qp(problem, posed, normals, bounds), atol=2e-3)
-    room = (normals * found.states[:, list(POSITION)]).sum(axis=2) - bounds
+    room = (normals * found.answer.states[:, list(POSITION)]).sum(axis=2) - bounds
     assert room.min() > -1e-5
     assert room.min() < 1e-3  # active
 
@@ -144,16 +145,16 @@ def test_rows_are_added_until_all_half_spaces_are_satisfied(problem: Problem) ->
         PERIOD * np.arange(1, N + 1),
         clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0)))
         .solve(0.0, posed)
-        .states[:, list(POSITION)],
+        .answer.states[:, list(POSITION)],
     )
-    assert ((normals * ours.states[:, list(POSITION)]).sum(axis=2) - bounds).min() > -1e-4
+    assert ((normals * ours.answer.states[:, list(POSITION)]).sum(axis=2) - bounds).min() > -1e-4
 
 
 def test_where_the_way_is_clear_the_answer_is_the_solver_s(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Clearing, "_solved", None)  # no QP of its own
     calls: list[Answer] = []
     beside = replace(PILLAR, position=(0.9, 3.0, 0.0))
-    assert clearing(problem, space(beside, FENCE), calls).solve(0.0, query(problem)).answer is calls[0]
+    assert clearing(problem, space(beside, FENCE), calls).solve(0.0, query(problem)).answer.plan is calls[0].plan
 
 
 def test_a_moving_obstacle_counts_where_it_will_be(problem: Problem) -> None:
@@ -161,16 +162,16 @@ def test_a_moving_obstacle_counts_where_it_will_be(problem: Problem) -> None:
     calls: list[Answer] = []
     gone = Sphere(name="gone", position=(1.0, 0.0, 0.0), radius=0.2, velocity=(0.0, 8.0, 0.0))
     found = clearing(problem, space(gone), calls).solve(0.0, query(problem))
-    assert found.answer is calls[0]
+    assert found.answer.plan is calls[0].plan
     meeting = 22
-    x = float(found.states[meeting - 1, INDEX["x"]])
+    x = float(found.answer.states[meeting - 1, INDEX["x"]])
     start = (x, 3.0 * meeting * PERIOD + 0.4, 0.0)
     comes = Sphere(name="comes", position=start, radius=0.2, velocity=(0.0, -3.0, 0.0))
     found = clearing(problem, space(replace(comes, velocity=(0.0, 0.0, 0.0))), calls).solve(0.0, query(problem))
-    assert found.answer is calls[1]
+    assert found.answer.plan is calls[1].plan
     found = clearing(problem, space(comes, soft=True, iterations=20), calls).solve(0.0, query(problem))
-    assert found.answer is not calls[2]
-    t, positions = PERIOD * np.arange(1, N + 1), found.states[:, list(POSITION)]
+    assert found.answer.plan is not calls[2].plan
+    t, positions = PERIOD * np.arange(1, N + 1), found.answer.states[:, list(POSITION)]
     assert comes.clearance(t, positions).min() > RADIUS - 1e-3
 
 
@@ -188,16 +189,16 @@ def test_steps_of_their_own_make_no_difference_where_they_are_the_model_s(proble
     steps = (np.tile(model.A, (N, 1, 1)), np.tile(model.B, (N, 1, 1)), np.tile(-model.B @ model.u_bar, (N, 1)))
     changing = clearing(problem, space(PILLAR), changing=True).solve(0.0, posed._replace(steps=steps))
     np.testing.assert_allclose(changing.answer.plan, plain.answer.plan, atol=1e-3)
-    np.testing.assert_allclose(changing.states, plain.states, atol=1e-5)
+    np.testing.assert_allclose(changing.answer.states, plain.answer.states, atol=1e-5)
 
 
 def test_soft_half_spaces_give_way_and_hard_ones_are_named(problem: Problem) -> None:
     around = Sphere(name="around", position=(0.0, 0.0, 0.0), radius=3.0)
     soft = clearing(problem, space(around, soft=True)).solve(0.0, query(problem))
-    assert soft.answer.solution.status == SOLVED
+    assert soft.answer.status == SOLVED
     assert soft.answer.slacks.max() > 1.0
     hard = clearing(problem, space(around, FENCE)).solve(0.0, query(problem))
-    assert hard.answer.solution.status != SOLVED
+    assert hard.answer.status != SOLVED
     assert [part.name for part in hard.problem.constraints] == ["obstacle around", "keep_in"]
     assert hard.problem.constraints[0].C is not None
     assert hard.problem.constraints[0].C.shape == (N, 1, 12)

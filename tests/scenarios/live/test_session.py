@@ -204,7 +204,6 @@ def test_knobs_have_units_and_limits() -> None:
     assert found["horizon"].minimum == 1
     assert found["output_bounds.roll"].value == (-5.0, 5.0)
     assert "[m/s]" in found["offset_free.velocity_noise"].about
-    assert set(found["linearisation"].choices) == {"hover", "state", "trajectory"}
     assert "type" not in found
 
 

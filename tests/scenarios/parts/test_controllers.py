@@ -24,7 +24,7 @@ from mpc.nonlinear.controller import NonlinearMPC
 from mpc.nonlinear.settings import Weights
 from mpc.observer import ObserverSettings
 from mpc.ocp import Objective
-from mpc.robust.controller import Linearisation, RobustMPC, RobustSettings
+from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.robust.tightening import TighteningSettings, margins
 from mpc.solvers import QPSolver
 from mpc.unconstrained import UnconstrainedMPC
@@ -151,7 +151,6 @@ PARTS: dict[str, tuple[Any, dict[str, Any]]] = {
     "heading": (True, {"heading": True}),
     "largest_turn": (90.0, {"largest_turn": math.radians(90.0)}),
     "move_weight": (2.0, {"move_weight": 2.0 * np.eye(4)}),
-    "linearisation": ("trajectory", {"linearisation": Linearisation.TRAJECTORY}),
 }
 
 
@@ -381,7 +380,7 @@ def test_nodes_that_do_not_fit_are_refused(fields: dict[str, Any], message: str)
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"solver": "piqp"}, "controller.solver: no solver named 'piqp'"),
+        ({"solver": "piqb"}, "controller.solver: no solver named 'piqb'"),
         ({"rotor_lag": 1e-9}, "controller.rotor_lag must be 0, or at least 0.0001 s; got 1e-09"),
         ({"tilt": 90.0}, "controller.tilt must be < 90.0; got 90.0"),
         (
@@ -462,8 +461,6 @@ WRONG = {
     "controller.heading=1": "controller.heading must be true or false; got 1",
     "controller.largest_turn=0": "controller.largest_turn must be > 0.0; got 0",
     "controller.move_weight=0": "controller.move_weight must be > 0.0; got 0",
-    "controller.linearisation=none": "controller.linearisation must be one of 'hover', 'state' or 'trajectory'; "
-    "got 'none'",
     "controller.tightening.turning=-1": "controller.tightening.turning must be >= 0.0; got -1",
     "controller.output_bounds={}": "controller.tightening must be absent where there are no output_bounds to tighten",
     "controller.fallback=false": "controller.fallback must be a table; got False",
@@ -525,7 +522,6 @@ EVERYTHING = {
     "tightening": {},
     "heading": True,
     "move_weight": 5.0,
-    "linearisation": "state",
     "fallback": {"tilt": 3.0},
 }
 TABLES = ["pid", EVERYTHING, {**ROBUST, "type": "constrained", "fallback": {}}, {"type": "lqr"}, "a.b:C"]

@@ -87,10 +87,15 @@ def test_a_vehicle_file_beside_the_scenario_is_found_and_stored_by_its_whole_pat
 
 def test_a_description_says_what_was_changed() -> None:
     text = load_scenario("hover").description
-    changed = load_scenario("hover", ["controller.horizon=30", "controller.solver=osqp", "seed=7", "name=mine"])
-    assert changed.description == f'{text} (changed: controller.horizon = 30; controller.solver = "osqp")'
+    changed = load_scenario("hover", ["controller.horizon=30", "controller.solver=piqp-dense", "seed=7", "name=mine"])
+    assert changed.description == f'{text} (changed: controller.horizon = 30; controller.solver = "piqp-dense")'
     more = changed.replace({"controller.horizon": 40, "vehicle.mass": 4.123456789, "effects.air": None})
-    parts = ['controller.solver = "osqp"', "controller.horizon = 40", "vehicle.mass = 4.12346", "effects.air = absent"]
+    parts = [
+        'controller.solver = "piqp-dense"',
+        "controller.horizon = 40",
+        "vehicle.mass = 4.12346",
+        "effects.air = absent",
+    ]
     assert more.description == f"{text} (changed: {'; '.join(parts)})"
     assert parse_scenario(tomllib.loads(more.to_toml())).description == more.description
 
@@ -170,7 +175,7 @@ WRONG = {
     "controller.input_weights.speed=big": "controller.input_weights.speed must be a number; got 'big'",
     "controller.input_weights.speed=[1, 2]": "controller.input_weights.speed must be a list of 4 numbers; got [1, 2]",
     "controller.input_weights.speed=[1, 2, 0, 1]": "controller.input_weights.speed.2 must be > 0.0; got 0",
-    "controller.solver=gurobi": "controller.solver: no solver named 'gurobi' (there are: clarabel, daqp, ...",
+    "controller.solver=gurobi": "controller.solver: no solver named 'gurobi' (there are: ...",
     "controller.output_bounds.rol=[0, 1]": "controller.output_bounds.rol is not a state; did you mean 'roll'? ...",
     "controller.output_bounds.roll=[-5]": "controller.output_bounds.roll must be a list of 2 numbers; got [-5]",
     "constraints=3": "constraints must be a list; got 3",

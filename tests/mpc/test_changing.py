@@ -1,4 +1,4 @@
-"""The QP of a model that changes, as the controller solves it: refusals, failures, and what it remembers."""
+"""The QP of a model that changes, as the controller solves it: refusals, failures, and the states that it predicts."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from support import changing_period, paper_problem, random_problem
 
 from mpc.constraints import Penalty
 from mpc.ocp import Problem
-from mpc.relinearised import LARGEST, Relinearised
-from mpc.solvers import Answer
+from mpc.solvers import LARGEST, Answer, QPSolver
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED
 
 
@@ -24,8 +23,12 @@ def soft_problem() -> Problem:
     return replace(problem, bounds=replace(problem.bounds, penalty=Penalty(l1=np.ones(1), l2=np.ones(1))))
 
 
-def solved(solver: Relinearised, now: Period) -> Answer:
-    return solver.solve(now.A, now.B, now.c, now.state, now.desired, now.u_before, now.rest)
+def changing(problem: Problem, name: str = "piqp-multistage", *, shortcut: bool = False) -> QPSolver:
+    return QPSolver(name, problem, changing=True, shortcut=shortcut)
+
+
+def solved(solver: QPSolver, now: Period) -> Answer:
+    return solver.solve(now.query)
 
 
 PARTS = ("A", "B", "c", "state", "desired", "u_before", "u_rest")
@@ -47,44 +50,41 @@ def corrupted(now: Period, part: str, number: float) -> Period:
 def test_data_that_is_not_finite_or_of_no_vehicle_is_refused(part: str, number: float) -> None:
     """With answers of the usual shapes, and without harm to what is solved next."""
     problem = soft_problem()
-    now, solver = changing_period(np.random.default_rng(2), problem), Relinearised(problem)
+    now, solver = changing_period(np.random.default_rng(2), problem), changing(problem)
     before = solved(solver, now)
     answer = solved(solver, corrupted(now, part, number))
-    assert answer.solution.status == "invalid_data"
-    assert solver.last is None
+    assert answer.status == "invalid_data"
+    assert answer.states is None
     for ours, usual in ((answer.plan, before.plan), (answer.slacks, before.slacks)):
         assert ours.shape == usual.shape
         assert np.isnan(ours).all()
-    assert np.isnan(answer.solution.x).all()
+    assert answer.certificate is None
     np.testing.assert_allclose(solved(solver, now).plan, before.plan, atol=1e-9)
 
 
-def test_it_remembers_the_states_of_its_plan() -> None:
+def test_an_answer_has_the_states_of_its_plan() -> None:
     problem = soft_problem()
-    solver = Relinearised(problem)
-    assert solver.last is None
+    solver = changing(problem)
     for seed in range(5):
         now = changing_period(np.random.default_rng(seed), problem)
         answer = solved(solver, now)
-        assert answer.solution.status == SOLVED
-        assert solver.last is not None
-        states, plan = solver.last
-        np.testing.assert_array_equal(plan, answer.plan)
-        np.testing.assert_allclose(states, ocp_peer.trajectory(now, plan)[1:], atol=1e-6)
+        assert answer.status == SOLVED
+        assert answer.states is not None
+        np.testing.assert_allclose(answer.states, ocp_peer.trajectory(now, answer.plan)[1:], atol=1e-6)
 
 
-def test_a_failure_leaves_the_next_solve_alone_and_nothing_to_remember() -> None:
+def test_a_failure_leaves_the_next_solve_alone_and_has_no_states() -> None:
     problem = paper_problem()
-    solver = Relinearised(problem)
+    solver = changing(problem)
     desired, u_bar = problem.objective.desired(np.zeros((50, 4))), problem.model.u_bar
     tilted = np.zeros(12)
     tilted[6], tilted[7] = np.radians(30.0), 5.0
     failed = solved(solver, ocp_peer.period(problem, tilted, desired, u_bar))
-    assert failed.solution.status in {"primal_infeasible", "max_iterations", "numerics"}
-    assert failed.solution.status not in ACCEPTED
-    assert solver.last is None
+    assert failed.status in {"primal_infeasible", "max_iterations", "numerics"}
+    assert failed.status not in ACCEPTED
+    assert failed.states is None
     hover = solved(solver, ocp_peer.period(problem, np.zeros(12), desired, u_bar))
-    assert hover.solution.status == SOLVED
+    assert hover.status == SOLVED
     np.testing.assert_allclose(hover.plan, np.tile(u_bar, (50, 1)), atol=1e-3)
 
 
@@ -97,19 +97,19 @@ def test_condensed_and_staged_forms_have_one_optimum(solver: str, terminal: floa
     Q_d = 0.3 * np.eye(problem.model.nu)
     objective = replace(problem.objective, Q_d=Q_d, P=terminal * problem.objective.weights[0])
     problem = replace(problem, objective=objective)
-    ways = Relinearised(problem), Relinearised(problem, solver), Relinearised(problem, solver, shortcut=True)
+    ways = changing(problem), changing(problem, solver), changing(problem, solver, shortcut=True)
     for _ in range(8):
         now = changing_period(rng, problem)
         u = now.rest.u + 0.2 * rng.normal(size=(problem.horizon, problem.model.nu))
         now = replace(now, rest=now.rest._replace(u=u))
         staged, condensed, shortcut = (solved(way, now) for way in ways)
         for other in (condensed, shortcut):
-            assert {staged.solution.status, other.solution.status} <= ACCEPTED
+            assert {staged.status, other.status} <= ACCEPTED
             np.testing.assert_allclose(other.plan, staged.plan, atol=1e-4)
             np.testing.assert_allclose(other.slacks, staged.slacks, atol=1e-4)
-        assert ways[0].last is not None
-        assert ways[1].last is not None
-        np.testing.assert_allclose(ways[1].last[0], ways[0].last[0], atol=1e-4)
+        assert condensed.states is not None
+        assert staged.states is not None
+        np.testing.assert_allclose(condensed.states, staged.states, atol=1e-4)
 
 
 def test_the_unconstrained_optimum_is_answered_where_it_violates_nothing() -> None:
@@ -123,7 +123,7 @@ def test_the_unconstrained_optimum_is_answered_where_it_violates_nothing() -> No
     wide = replace(wide, u_min=centre - 1e4, u_max=centre + 1e4)
     problem = replace(problem, bounds=wide)
     now = changing_period(np.random.default_rng(3), problem)
-    way = Relinearised(problem, "piqp-dense", shortcut=True)
+    way = changing(problem, "piqp-dense", shortcut=True)
     answer = solved(way, now)
-    assert answer.solution.status == UNCONSTRAINED
-    np.testing.assert_allclose(answer.plan, solved(Relinearised(problem), now).plan, atol=1e-5)
+    assert answer.status == UNCONSTRAINED
+    np.testing.assert_allclose(answer.plan, solved(changing(problem), now).plan, atol=1e-5)

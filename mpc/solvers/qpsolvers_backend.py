@@ -1,0 +1,78 @@
+"""Any solver of qpsolvers, by its name there, on the condensed QP; it is set up anew in each period.
+
+Caron et al., qpsolvers: Quadratic Programming Solvers in Python, https://github.com/qpsolvers/qpsolvers.
+"""
+
+from __future__ import annotations
+
+import time as clock
+import warnings
+from typing import Any, Final
+
+import numpy as np
+import qpsolvers
+from scipy.sparse import csc_matrix
+
+from mpc.qp import QP, Solution
+from quadsim.controller import SOLVED
+
+ACTIVE_MULTIPLIER: Final = 1e-5
+"""Size of a multiplier from which its constraint counts as active; at the paper's optima they reach 1e3."""
+UNSOLVED: Final = "unsolved"
+"""Status of a QP without a solution; qpsolvers does not say why."""
+
+SETTINGS: Final[dict[str, dict[str, Any]]] = {
+    "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-9},  # its own leave 5e-3 rad/s
+    "osqp": {"eps_abs": 1e-5, "eps_rel": 0.0, "max_iter": 10_000},  # at 1e-4 the first input is off by 1e-2 rad/s
+    "proxqp": {"eps_abs": 1e-7, "eps_rel": 0.0, "max_iter": 1000},
+}
+"""Where a solver's own tolerances are too loose for commands."""
+
+
+class AnyOfQpsolvers:
+    """A back end; see `mpc.qp.Backend`.
+
+    Args:
+        name: in `qpsolvers.available_solvers`.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._matrix = np.asarray if name in qpsolvers.dense_solvers else csc_matrix
+
+    def setup(self, qp: QP) -> None:
+        """Nothing is kept from one QP to the next."""
+
+    def solve(self, qp: QP) -> Solution:
+        """See `mpc.qp.Backend.solve`; each two-sided row or entry of the box becomes two, a side at infinity none."""
+        started = clock.perf_counter()
+        rows = np.concatenate([np.eye(qp.c.size), qp.G])
+        lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
+        above, below = np.isfinite(upper), np.isfinite(lower)
+        one_sided = np.concatenate([rows[above], -rows[below]])
+        problem = qpsolvers.Problem(
+            self._matrix(qp.P), qp.c, self._matrix(one_sided), np.concatenate([upper[above], -lower[below]])
+        )
+        try:
+            with warnings.catch_warnings(action="ignore"):  # of what is converted, or not solved, which the status says
+                found = qpsolvers.solve_problem(problem, solver=self._name, **SETTINGS.get(self._name, {}))
+        except qpsolvers.QPError:
+            found = qpsolvers.Solution(problem)
+        elapsed = clock.perf_counter() - started
+        multipliers = np.zeros(upper.size)
+        if found.found and found.x is not None and found.z is not None:
+            x, (of_upper, of_lower) = found.x, np.split(found.z, [np.count_nonzero(above)])
+            multipliers[above] += of_upper
+            multipliers[below] -= of_lower
+        else:
+            x, multipliers = np.full_like(qp.c, np.nan), multipliers * np.nan
+        z_box, z = np.split(multipliers, [qp.c.size])
+        return Solution(
+            x=x,
+            y=np.empty(0),
+            z=z,
+            z_box=z_box,
+            status=UNSOLVED if np.isnan(x).any() else SOLVED,
+            active=int(np.count_nonzero(np.abs(multipliers) > ACTIVE_MULTIPLIER)),
+            solve_s=elapsed,
+        )
