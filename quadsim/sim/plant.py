@@ -17,6 +17,7 @@ from mujoco.rollout import Rollout
 
 from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError, RaisedError
+from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
 from quadsim.sim.effects import (
     LOADING,
@@ -37,18 +38,7 @@ from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator, Segment, physics_to_state
 from quadsim.sim.rigid_body import RigidBody, check_free
 from quadsim.space import Obstacle
-from quadsim.state import (
-    ANGLE_RATES,
-    ANGLES,
-    EULER,
-    N_STATES,
-    POSITIONS,
-    VELOCITIES,
-    Array,
-    YawTurns,
-    euler_to_body_rates,
-    euler_to_quaternion,
-)
+from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 _FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)

@@ -12,8 +12,9 @@ import mujoco
 import numpy as np
 
 from quadsim.report.film.camera import Camera
+from quadsim.rotation import euler_to_quaternion
 from quadsim.sim.airframe import compile_model
-from quadsim.state import EULER, POSITION, Array, euler_to_quaternion
+from quadsim.state import EULER, POSITION, Array
 from quadsim.vehicle import Vehicle
 from scenarios.schema.scenario import Scenario
 
