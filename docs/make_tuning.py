@@ -14,7 +14,7 @@ from typing import Any
 from make_numbers import copy_figure, write_page
 
 import quadsim
-from quadsim.flight.form import read_json
+from quadsim.flight.summary import read_json
 from quadsim.report.table import Grid, format_number, line, section
 from scenarios.shipped import tuning_names
 from scenarios.tuning.objective import parse_expression

@@ -15,7 +15,7 @@ import pyarrow as pa
 import tomlkit
 
 from quadsim.errors import InputError, OutputError
-from quadsim.flight.form import Optional, read_json
+from quadsim.flight.summary import read_json
 from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.outputs import Growing, growing, to_json
 from scenarios.campaign import manifest as records
@@ -42,7 +42,7 @@ SCENARIO_FILE: Final = "scenario.toml"
 ANSWER_FILE: Final = "best.toml"
 REPORT_FILES: Final = ("index.html", "tuning.png", "tuning.svg")
 START_DIR, ANSWER_DIR, COMPARISON_DIR = "start", "candidate-{}", "comparison"
-_FORM: Final = {"format": str, "status": str, "sessions": [dict], "optuna": Optional(str)}
+_FORM: Final = {"format": str, "status": str, "sessions": list}
 _MAY_GROW: Final = ("trials", "fresh", "description")
 
 
