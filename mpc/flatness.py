@@ -18,6 +18,7 @@ import numpy as np
 
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
+from quadsim.rotation import multiply
 from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
 
@@ -73,7 +74,7 @@ def attitudes(acceleration: Array, *, period: float, gravity: float, yaw: Array 
         turn = yaw - period * np.concatenate([[0.0], np.cumsum(least_rates[1:, 2])])
     else:
         turn = _turn_to(least, yaw)
-    attitude = _multiply(least, _about_z(turn))
+    attitude = multiply(least, _about_z(turn))
     rates = _body_rates(attitude, period)
     cos, sin, (wx, wy, wz) = np.cos(turn[0]), np.sin(turn[0]), least_rates[0]
     rates[0] = cos * wx + sin * wy, cos * wy - sin * wx, wz  # without the turn, which has no step before it
@@ -88,7 +89,7 @@ def _carried(b: Array, yaw: float) -> Array:
     attitude = np.empty((len(b), 4))
     now = _about_z(np.array([yaw]))
     for k in range(len(b)):
-        now = _multiply(turn[k : k + 1], now)
+        now = multiply(turn[k : k + 1], now)
         attitude[k] = now[0]
     return attitude
 
@@ -96,7 +97,7 @@ def _carried(b: Array, yaw: float) -> Array:
 def _body_rates(attitude: Array, period: float) -> Array:
     """(K, 3) body rates 2 vec(q* Dq) [rad/s] along quaternions (K, 4), a period [s] apart."""
     conjugate = attitude * np.array([1.0, -1.0, -1.0, -1.0])
-    rates: Array = 2.0 * _multiply(conjugate, np.gradient(attitude, period, axis=0))[:, 1:]
+    rates: Array = 2.0 * multiply(conjugate, np.gradient(attitude, period, axis=0))[:, 1:]
     return rates
 
 
@@ -119,16 +120,3 @@ def _about_z(angle: Array) -> Array:
     """(K, 4) quaternions of turns about z by angles (K,) [rad]."""
     half, zero = 0.5 * angle, np.zeros_like(angle)
     return np.column_stack([np.cos(half), zero, zero, np.sin(half)])
-
-
-def _multiply(p: Array, q: Array) -> Array:
-    """(K, 4) Hamilton products of quaternions wxyz."""
-    (pw, px, py, pz), (qw, qx, qy, qz) = p.T, q.T
-    return np.column_stack(
-        [
-            pw * qw - px * qx - py * qy - pz * qz,
-            pw * qx + px * qw + py * qz - pz * qy,
-            pw * qy - px * qz + py * qw + pz * qx,
-            pw * qz + px * qy - py * qx + pz * qw,
-        ]
-    )

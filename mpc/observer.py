@@ -25,7 +25,8 @@ from annotated_types import doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Positive
-from quadsim.state import ANGLES, VELOCITIES, Array, body_rates_of
+from quadsim.rotation import body_rates_of
+from quadsim.state import ANGLES, VELOCITIES, Array
 
 UPRIGHT: Final = 0.1
 """Smallest vertical part of the thrust axis from which on a change of vertical speed is attributed to thrust."""

@@ -1,15 +1,14 @@
-"""The 12-state of the paper: order, names, units, and attitude kinematics.
+"""The 12-state of the paper: order, names and units.
 
 The state vector is xi = [x vx y vy z vz roll roll_rate pitch pitch_rate yaw yaw_rate] (Sec. 2.3), positions and
 velocities in the world frame (z up), attitude as Z-Y-X Euler angles (body_to_world = Rz(yaw) Ry(pitch) Rx(roll)),
-and **Euler-angle rates**, not body rates. All functions take arrays with any leading dimensions.
+and **Euler-angle rates**, not body rates; `quadsim.rotation` converts between them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,90 +45,6 @@ REFERENCE_STATES: Final = tuple(INDEX[name] for name in REFERENCE_NAMES)
 def shown_unit(unit: str) -> tuple[str, float]:
     """The unit in which people read an SI quantity, and the factor to it: angles are shown in degrees."""
     return _SHOWN.get(unit, (unit, 1.0))
-
-
-def quaternion_to_euler(quaternion: Array) -> Array:
-    """Roll, pitch, yaw [rad] of unit quaternions.
-
-    Args:
-        quaternion: (..., 4), scalar first (w, x, y, z), body to world.
-
-    Returns:
-        (..., 3): roll and yaw in [-pi, pi], pitch in [-pi/2, pi/2].
-    """
-    w, x, y, z = _entries(quaternion)
-    euler = np.empty((*x.shape, 3))
-    euler[..., 0] = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    euler[..., 1] = np.arcsin(np.minimum(np.maximum(2.0 * (w * y - z * x), -1.0), 1.0))
-    euler[..., 2] = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return euler
-
-
-def euler_to_quaternion(euler: Array) -> Array:
-    """Unit quaternions (..., 4), scalar first, body to world, of roll, pitch, yaw (..., 3) [rad]."""
-    half = 0.5 * np.asarray(euler, float)
-    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(half), -1, 0), np.moveaxis(np.sin(half), -1, 0)
-    return np.stack(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ],
-        axis=-1,
-    )
-
-
-def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:
-    """Euler-angle rates [rad/s] from body rates (p, q, r).
-
-    d(roll)/dt = p + (q sin(roll) + r cos(roll)) tan(pitch), and so on; singular at pitch = +-90 deg, where the
-    result grows without bound.  The paper (Sec. 2.2) takes the two sets of rates as equal, which holds at small
-    angles only.
-    """
-    roll, pitch, _ = _entries(euler)
-    p, q, r = _entries(body_rates)
-    sin_roll, cos_roll = np.sin(roll), np.cos(roll)
-    lateral = q * sin_roll + r * cos_roll
-    rates = np.empty((*lateral.shape, 3))
-    rates[..., 0] = p + lateral * np.tan(pitch)
-    rates[..., 1] = q * cos_roll - r * sin_roll
-    rates[..., 2] = lateral / np.cos(pitch)
-    return rates
-
-
-def euler_to_body_rates(euler: Array, euler_rates: Array) -> Array:
-    """Body rates (p, q, r) [rad/s] from Euler-angle rates; the inverse of `body_to_euler_rates`."""
-    roll, pitch = euler[..., 0], euler[..., 1]
-    rates = np.moveaxis(np.asarray(euler_rates, float), -1, 0)
-    return np.stack(_body_rates(np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch), rates), axis=-1)
-
-
-def body_rates_of(state: Sequence[float]) -> tuple[float, float, float]:
-    """The same of one state (12,), finite, in plain numbers: sooner done than by arrays of three."""
-    roll, pitch, _ = state[ANGLES]
-    return _body_rates(math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch), state[ANGLE_RATES])
-
-
-def _body_rates(sin_roll: Any, cos_roll: Any, sin_pitch: Any, cos_pitch: Any, euler_rates: Any) -> tuple[Any, Any, Any]:
-    """Body rates (p, q, r) from Euler-angle rates, arrays or plain numbers."""
-    roll_rate, pitch_rate, yaw_rate = euler_rates
-    return (
-        roll_rate - yaw_rate * sin_pitch,
-        pitch_rate * cos_roll + yaw_rate * cos_pitch * sin_roll,
-        -pitch_rate * sin_roll + yaw_rate * cos_pitch * cos_roll,
-    )
-
-
-def body_to_world(euler: Array) -> Array:
-    """Rotation matrices (..., 3, 3) from body to world for roll, pitch, yaw (..., 3) [rad]."""
-    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(euler), -1, 0), np.moveaxis(np.sin(euler), -1, 0)
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def tilt(states: Array) -> Array:
@@ -170,12 +85,6 @@ def make_state(
     state[list(POSITION)] = position
     state[list(EULER)] = euler
     return state
-
-
-def _entries(vectors: Array) -> tuple[Array, ...]:
-    """The entries of vectors (..., m), each of shape (...)."""
-    array = np.asarray(vectors, float)
-    return tuple([array[..., i] for i in range(array.shape[-1])])
 
 
 def all_true(flags: NDArray[np.bool_]) -> bool:

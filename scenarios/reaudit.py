@@ -22,6 +22,7 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
+from quadsim.flight.summary import constraint_verdict
 from quadsim.report.comparison import verdict
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
@@ -209,12 +210,14 @@ def _differences(
             yield f"{key} is recorded as {summary[key]!r:.80}, and the run's files give {value!r:.80}"
     if summary["status"] == "completed" and not whole:
         yield f"status is recorded as 'completed', and {log.control.t.size} of {scenario.periods} periods were flown"
+    if (summary["status"] == "completed") != (summary["reason"] is None):
+        yield f"status is recorded as {summary['status']!r:.40}, and reason as {summary['reason']!r:.80}"
     deadline_ms = 1e3 * scenario.control_period
     numbers = metrics.flight_numbers(log, deadline_ms=deadline_ms, course=build_course_steps(scenario))
     recorded = dict(_leaves({key: summary[key] for key in numbers}))
     for key, value in _leaves(numbers):
         before = recorded.get(key, value)
-        alike = _is_close(before, value, ROUNDING) if isinstance(value, float) else before == value
+        alike = before == value or (isinstance(before, int | float) and _is_close(before, value, ROUNDING))
         if not alike:
             yield f"{key} is recorded as {before!r:.80}, and the tables give {value!r:.80}"
     entries = summary["constraints"]
@@ -224,6 +227,10 @@ def _differences(
         return
     for entry, finding in zip(entries, findings, strict=True):
         yield from (f"{finding.limit.name}: {what}" for what in _constraint_differences(entry, finding, scenario, log))
+    for entry in entries:
+        found = constraint_verdict(entry)
+        if entry["satisfied"] != (found == "satisfied") or entry.get("verdict", found) != found:
+            yield f"{entry['name']}: satisfied is {entry['satisfied']}, and its worst margins say {found}"
     required = all(entry["satisfied"] for entry in entries if entry["required"])
     unrecovered = metrics.unrecovered(log.control)
     satisfied = summary["reason"] is None and not log.control.crashed and not unrecovered and required

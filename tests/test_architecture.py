@@ -19,7 +19,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("quadsim", "mpc", "scenarios")
 MPC_MAY_IMPORT = {
-    f"quadsim.{name}" for name in ("vehicle", "state", "errors", "fields", "controller", "motion", "space")
+    f"quadsim.{name}" for name in ("vehicle", "state", "rotation", "errors", "fields", "controller", "motion", "space")
 }  # fmt: skip
 RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it alone may import at its top what is heavy."""

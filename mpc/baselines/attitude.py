@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 
 from mpc.nonlinear.rigidbody import rotation
-from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, body_to_world, euler_to_body_rates
+from quadsim.rotation import body_to_world, euler_to_body_rates
+from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array
 
 LEAST_LIFT: Final = 0.2
 """Share of the weight below which thrust is not reduced, so that torques keep their authority.  Ours."""

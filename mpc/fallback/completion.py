@@ -27,6 +27,7 @@ from mpc.fallback.hover import by_group, require_quadrotor
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
 from quadsim.controller import Moment
+from quadsim.rotation import body_rates_of
 from quadsim.state import (
     ANGLE_RATES,
     ANGLES,
@@ -39,7 +40,6 @@ from quadsim.state import (
     VELOCITY,
     Array,
     all_true,
-    body_rates_of,
     read_only,
 )
 

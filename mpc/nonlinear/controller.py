@@ -38,7 +38,6 @@ from mpc.nonlinear.rigidbody import (
     defects,
     drag_acceleration,
     linearise_nodes,
-    product,
     rigid_body,
     rotation,
     thrust_axis,
@@ -52,20 +51,14 @@ from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
 from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, SQP, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
-from quadsim.state import (
-    ANGLE_RATES,
-    ANGLES,
-    EULER,
-    EULER_RATE,
-    N_STATES,
-    POSITIONS,
-    VELOCITIES,
-    Array,
+from quadsim.rotation import (
     body_to_euler_rates,
     euler_to_body_rates,
     euler_to_quaternion,
+    multiply,
     quaternion_to_euler,
 )
+from quadsim.state import ANGLE_RATES, ANGLES, EULER, EULER_RATE, N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 LARGEST_CONDENSED: Final = 80
@@ -468,7 +461,7 @@ class NonlinearMPC:
         length = np.linalg.norm(turn, axis=1)
         turn[length < 1e-6] = (1.0, 0.0, 0.0, 0.0)
         turn /= np.linalg.norm(turn, axis=1, keepdims=True)
-        states[:, Q] = product(turn, q)
+        states[:, Q] = multiply(turn, q)
         effort = np.empty((len(total), 4))
         effort[:, 0], effort[:, 1:] = size[:-1] - total, -model.angular_acceleration
         return Nodes(states, thrusts + effort @ self._inverse.T)

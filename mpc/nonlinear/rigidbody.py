@@ -341,17 +341,6 @@ def drag_acceleration(model: RigidBody, q: Array, v: Array) -> Array:
     return np.asarray((R @ pull[..., None])[..., 0])
 
 
-def product(left: Array, right: Array) -> Array:
-    """Quaternion products (..., 4)."""
-    a, b, c, d = (left[..., i] for i in range(4))
-    w, x, y, z = (right[..., i] for i in range(4))
-    return np.stack(
-        [a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y, a * y - b * z + c * w + d * x,
-         a * z + b * y - c * x + d * w],
-        axis=-1,
-    )  # fmt: skip
-
-
 def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
     """The states (..., n) one step after states x (..., n) under inputs u (..., 4), without derivatives."""
     shape, x, u = x.shape, x.reshape(-1, model.n), u.reshape(-1, N_ROTORS)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
+from quadsim.rotation import euler_to_body_rates
 from quadsim.space import Constraining
 from quadsim.state import (
     EULER,
@@ -31,7 +32,6 @@ from quadsim.state import (
     STATE_NAMES,
     STATE_UNITS,
     Array,
-    euler_to_body_rates,
     shown_unit,
     tilt,
 )

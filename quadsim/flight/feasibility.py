@@ -20,19 +20,8 @@ from typing import Final
 import numpy as np
 
 from quadsim.flight.audit import Mask
-from quadsim.state import (
-    EULER,
-    EULER_RATE,
-    INDEX,
-    N_STATES,
-    POSITION,
-    STATE_UNITS,
-    VELOCITY,
-    Array,
-    euler_to_body_rates,
-    shown_unit,
-    tilt,
-)
+from quadsim.rotation import euler_to_body_rates
+from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, STATE_UNITS, VELOCITY, Array, shown_unit, tilt
 from quadsim.vehicle import Vehicle
 
 STENCIL: Final = 2  # samples on either side that a torque depends on

@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.state import EULER, INDEX, Array, body_to_world, tilt
+from quadsim.rotation import body_to_world
+from quadsim.state import EULER, INDEX, Array, tilt
 
 AIRBORNE: Final = 0.05  # clearance of the feet [m] above which a vehicle flies: no landing gear springs back that far
 TOUCH: Final = 2e-3  # clearance [m] from which on a part touches: contacts are soft, and points stand for rounded parts

@@ -11,7 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.controller import Phase
-from quadsim.state import ANGLE_RATES, ANGLES, Array, euler_to_body_rates, euler_to_quaternion
+from quadsim.rotation import conjugate, euler_to_body_rates, euler_to_quaternion, multiply
+from quadsim.state import ANGLE_RATES, ANGLES, Array
 
 RESIDUALS: Final = (
     *("reported_primal", "reported_dual", "infeasibility"),
@@ -75,12 +76,8 @@ class ControlLog:
         error = self.state - self.truth
         if self.attitude is not None and self.body_rates is not None:
             angles, rates = self.truth[:, ANGLES], self.truth[:, ANGLE_RATES]
-            w, x, y, z = euler_to_quaternion(angles).T
-            a, b, c, d = self.attitude.T
-            half = np.column_stack(
-                [w * b - x * a - y * d + z * c, w * c - y * a + x * d - z * b, w * d - z * a - x * c + y * b]
-            )
-            error[:, ANGLES] = 2.0 * np.copysign(1.0, w * a + x * b + y * c + z * d)[:, None] * half
+            turn = multiply(conjugate(euler_to_quaternion(angles)), self.attitude)
+            error[:, ANGLES] = 2.0 * np.copysign(1.0, turn[:, :1]) * turn[:, 1:]
             error[:, ANGLE_RATES] = self.body_rates - euler_to_body_rates(angles, rates)
         return error
 

@@ -91,7 +91,7 @@ def load_run(directory: Path) -> Run:
     try:
         vehicle = Vehicle(**summary.get("actual", summary["vehicle"]))
         limits = tuple(limit_from_json(entry) for entry in summary["constraints"])
-    except (ArithmeticError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise FileError(directory / SUMMARY_FILE, f"is damaged ({error})") from error
     raised = tuple(summary.get("traceback", ()))
     interrupted = summary.get("verdict") == "aborted" and not raised

@@ -1,163 +1,93 @@
-"""`summary.json` of a run: its form, and whether it agrees with itself."""
+"""`summary.json` of a run, read back."""
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
+from types import NoneType
 from typing import Any, Final
 
 from quadsim.errors import FileError, printable
-from quadsim.flight.audit import CLEARANCE, SIGNALS, SUM, TERMS, Held, sum_signal
-from quadsim.flight.form import MAYBE_NUMBER, MAYBE_TEXT, NUMBER, Each, Optional, misfits, read_json
+from quadsim.flight.audit import Held
 from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
-from quadsim.state import REFERENCE_NAMES, STATE_NAMES
 
-_WHAT: Final = "a run's summary"
-_COURSE: Final = {
-    **dict.fromkeys(
-        ("tilt", "velocity", "acceleration", "yaw", "yaw_rate", "rotor_min", "rotor_max", "thrust_to_weight"), NUMBER
-    ),
-    "thrust_min": Optional(NUMBER),
+NUMBER: Final = (int, float)
+MAYBE_NUMBER: Final = (int, float, NoneType)
+LARGEST_FILE: Final = 64_000_000  # size [bytes] of the largest file that is read
+_FORM: Final = {
+    **dict.fromkeys(("scenario", "status"), str),
+    "reason": (str, NoneType),
+    "satisfied": bool,
+    "duration": NUMBER,
+    "constraints": list,
+    **dict.fromkeys(("tracking", "control", "controller", "vehicle", "wall_s", "files"), dict),
 }
-_CHANNELS: Final = dict.fromkeys(REFERENCE_NAMES, NUMBER)
-_STATES: Final = dict.fromkeys(STATE_NAMES, NUMBER)
-_SPREAD: Final = dict.fromkeys(("p50", "p95", "p99", "max"), NUMBER)
-_LAW: Final = {"name": str, "solver": str, "horizon": Optional(int)}
-_FLOWN: Final = {
-    "tracking": {
-        "unit": dict.fromkeys(REFERENCE_NAMES, str),
-        **dict.fromkeys(("rmse", "max_error", "final_error", "overshoot"), _CHANNELS),
-        "position_error": Optional(dict.fromkeys(("mean", "rms", "max"), NUMBER)),
-        "settling": Optional([{"channel": str, "time": NUMBER, "settled": MAYBE_NUMBER}]),
-    },
-    "control": {
-        **dict.fromkeys(("speed_min", "speed_max", "slew_min", "slew_max"), NUMBER),
-        "total_variation": Optional(NUMBER),
-    },
-    "controller": {
-        **_LAW,
-        "statuses": Each(int),
-        "fallbacks": Each(int),
-        "answered_by": Each(int),
-        "iterations": ({"mean": NUMBER, "max": int}, type(None)),
-        "iterations_by": Each({"mean": NUMBER, "max": int}),
-        **dict.fromkeys(("active_max", "active_periods", "unrecovered"), Optional(int)),
-        "residuals": Each({"max": MAYBE_NUMBER, "periods": int}),
-        "solve_ms": _SPREAD,
-        "step_ms": _SPREAD,
-        "deadline_ms": NUMBER,
-        "deadline_misses": int,
-    },
-}
-"""Of a flight that came to its first period; of another these tables are empty, but for the controller's own."""
 _CONSTRAINT: Final = {
     **dict.fromkeys(("name", "signal", "unit"), str),
     **dict.fromkeys(("tolerance", "tolerance_sampled", "start", "time_violated"), NUMBER),
     **dict.fromkeys(("required", "satisfied"), bool),
-    "verdict": Optional(str),
-    "terms": Optional(Each(NUMBER)),
-    "shape": Optional(dict),
-    "radius": Optional(NUMBER),
     **dict.fromkeys(
         ("lower", "upper", "stop", "peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time"),
         MAYBE_NUMBER,
     ),
 }
-_VEHICLE: Final = {
-    "name": str,
-    "description": Optional(str),
-    **dict.fromkeys(
-        ("mass", "gravity", "arm_length", "thrust_coefficient", "drag_to_thrust", "speed_min", "speed_max"), NUMBER
-    ),
-    "inertia": [NUMBER],
-    "rotor_azimuths": [NUMBER],
-    "rotor_spins": [int],
-    **dict.fromkeys(
-        ("rotor_rise", "rotor_fall", "rotor_inertia", "rotor_radius", "rotor_drag", "extent"), Optional(MAYBE_NUMBER)
-    ),
-    "body_drag": Optional(([NUMBER], type(None))),
-}
-_DIAGNOSIS: Final = {
-    "time": NUMBER,
-    "feasible": (bool, type(None)),
-    **dict.fromkeys(("status", "sentence", "advice"), str),
-    "conflict": [
-        {
-            **dict.fromkeys(("name", "side", "unit", "field"), str),
-            "rotors": [int],
-            "by": NUMBER,
-            **dict.fromkeys(("start", "stop"), MAYBE_NUMBER),
-        }
-    ],
-    "suggestions": [{"settings": dict, "after": MAYBE_NUMBER}],
-}
-_TOUCHDOWN: Final = dict.fromkeys(("time", "speed", "horizontal_speed", "tilt"), NUMBER)
-FORM: Final = {
-    **dict.fromkeys(("scenario", "status"), str),
-    "reason": MAYBE_TEXT,
-    "traceback": Optional([str]),
-    "satisfied": bool,
-    "duration": NUMBER,
-    **dict.fromkeys(("description", "group", "expected", "verdict"), Optional(str)),
-    "as_expected": Optional(bool),
-    "seed": Optional(int),
-    "course": Optional({**_COURSE, "jumps": [NUMBER], "problems": [str], "sentence": str}),
-    "events": Optional([{"time": NUMBER, "text": str}]),
-    "tracking": dict,
-    "constraints": [_CONSTRAINT],
-    "audit_notes": Optional([str]),
-    "control": dict,
-    "controller": _LAW,
-    "diagnosis": Optional((_DIAGNOSIS, type(None))),
-    "computation": Optional({"delay_ms": _SPREAD, "missed": int}),
-    "estimation": Optional(
-        {
-            "rmse": _STATES,
-            "max_error": _STATES,
-            "not_finite": int,
-            "samples": Each({"accepted": int, "rejected": int}),
-        }
-    ),
-    "ground": Optional(
-        {
-            "started": str,
-            "takeoff_time": MAYBE_NUMBER,
-            "touchdown": (_TOUCHDOWN, type(None)),
-            "phase": MAYBE_TEXT,
-            "crashed": bool,
-        }
-    ),
-    "vehicle": _VEHICLE,
-    "actual": Optional(_VEHICLE),
-    "wall_s": {"simulate": NUMBER, "total": NUMBER},
-    "versions": Optional(Each(str)),
-    "machine": Optional({"system": str, "processor": str, "cores": (int, type(None))}),
-    "products": Optional(Each(str)),
-    "files": Each(str),
-}
-FLOWN_FORM: Final = FORM | _FLOWN  # of a flight that came to its first period
-_TOGETHER: Final = {"worst_margin": ("worst_time",), "worst_margin_sampled": ("peak_sampled",)}
-"""Of a constraint: present wherever a margin is."""
+"""What verdicts and pages rest on; the rest is trusted."""
+
+
+def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
+    """A JSON object from a file of quadsim's.
+
+    Args:
+        path: of the file.
+        form: the type of each entry that has to be there.
+        what: the file, for messages.
+
+    Raises:
+        FileError: it cannot be read, is no JSON, or an entry is missing or of another type.
+    """
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise FileError(path, f"is not {what}: it must be of {LARGEST_FILE} or fewer bytes")
+        found = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+    except (OSError, RecursionError, ValueError) as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(path, f"is not {what} ({printable(str(error))[:200]})") from error
+    if wrong := _misfits(found, form):
+        raise FileError(path, f"is not {what}: it lacks or misstates {', '.join(wrong)}")
+    return dict(found)
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number of JSON")
+
+
+def _misfits(table: object, form: Mapping[str, Any]) -> list[str]:
+    """Entries of a table that are missing or of another type; true and false are no numbers."""
+    held = table if isinstance(table, dict) else {}
+    return [
+        name
+        for name, kind in form.items()
+        if name not in held or not isinstance(held[name], kind) or (isinstance(held[name], bool) and kind is not bool)
+    ]
 
 
 def read_summary(directory: Path) -> dict[str, Any]:
-    """`summary.json` of a run directory, with all of its form.
+    """`summary.json` of a run directory.
 
     Raises:
-        FileError: there is none, quadsim did not write it, it contradicts itself, or a link leads out of the directory.
+        FileError: there is none, quadsim did not write it, or a link leads out of the directory.
     """
     require_inside(directory)
     path = directory / SUMMARY_FILE
     if not path.is_file():
         raise FileError(directory, f"is not a run directory: it has no {SUMMARY_FILE}")
-    summary = read_json(path, FORM, _WHAT)
-    flown = {key: summary[key] for key in _FLOWN}
-    wrong = list(misfits(flown, _FLOWN)) if summary["tracking"] or summary["control"] else []
-    if wrong:
-        raise FileError(path, f"is not {_WHAT}: it lacks or misstates {', '.join(map(printable, wrong[:10]))}")
-    if problem := next(contradictions(summary), None):
-        raise FileError(path, f"contradicts itself: {printable(problem)}")
+    summary = read_json(path, _FORM, "a run's summary")
+    for i, entry in enumerate(summary["constraints"]):
+        if wrong := _misfits(entry, _CONSTRAINT):
+            raise FileError(path, f"is not a run's summary: constraints.{i} lacks or misstates {', '.join(wrong)}")
     return summary
 
 
@@ -172,39 +102,6 @@ def require_inside(directory: Path) -> None:
         for path in (Path(folder, name) for name in sorted((*folders, *files))):
             if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(home):
                 raise FileError(path, f"is a link that leads out of {directory}; nothing is read through it")
-
-
-def contradictions(summary: Mapping[str, Any]) -> Iterator[str]:
-    """What a summary states that is inconsistent."""
-    if (summary["status"] == "completed") != (summary["reason"] is None):
-        yield f"status is {summary['status']!r:.40}, and reason is {summary['reason']!r:.80}"
-    names = [entry["name"] for entry in summary["constraints"]]
-    if len(set(names)) < len(names):
-        yield "two constraints have one name"
-    for entry in summary["constraints"]:
-        name = f"{entry['name']:.80}"
-        if _unit(entry) != entry["unit"]:
-            yield f"{name}: signal {entry['signal']!r:.40} in {entry['unit']!r:.40}"
-        for key, others in _TOGETHER.items():
-            if entry[key] is not None and any(entry[other] is None for other in others):
-                yield f"{name}: {key} is there without {' and '.join(others)}"
-        if entry["worst_margin"] is None and entry["worst_margin_sampled"] is not None:
-            yield f"{name}: worst_margin_sampled is there without worst_margin"
-        found = constraint_verdict(entry)
-        if entry["satisfied"] != (found == "satisfied") or entry.get("verdict", found) != found:
-            stated = f"satisfied is {str(entry['satisfied']).lower()}, its verdict {entry.get('verdict', '-'):.40}"
-            yield f"{name}: {stated}, and its worst margins say {found}"
-
-
-def _unit(entry: Mapping[str, Any]) -> str | None:
-    """The unit of a constraint's signal; None where there is no such signal."""
-    if entry["signal"] in SIGNALS:
-        return SIGNALS[entry["signal"]].unit
-    if entry["signal"] == CLEARANCE:
-        return "m" if "shape" in entry and "radius" in entry else None
-    terms = tuple(entry.get("terms", {}).items())
-    known = entry["signal"] == SUM and terms and all(name in TERMS for name, _ in terms)
-    return sum_signal(terms).unit if known else None
 
 
 def constraint_verdict(entry: Mapping[str, Any]) -> Held:

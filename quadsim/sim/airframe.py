@@ -10,9 +10,10 @@ import numpy as np
 
 from quadsim.assets import models_dir
 from quadsim.flight.ground import Outline
+from quadsim.rotation import euler_to_quaternion
 from quadsim.sim.effects.body_drag import semi_axes
 from quadsim.space import Obstacle
-from quadsim.state import Array, euler_to_quaternion
+from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 BODY: Final = "quadrotor"

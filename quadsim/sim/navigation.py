@@ -9,23 +9,13 @@ from operator import attrgetter
 import numpy as np
 
 from quadsim.errors import ParameterError
+from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
 from quadsim.sim.estimation.estimate import MEAN_QUATERNION, MEAN_RATES
 from quadsim.sim.estimation.filter import ErrorStateFilter, Tally
 from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.sensing.sampler import Sample, Sampler, truth
 from quadsim.sim.sensing.sensor import Sensor, SensorFault, SensorName
-from quadsim.state import (
-    ANGLE_RATES,
-    ANGLES,
-    N_STATES,
-    POSITIONS,
-    VELOCITIES,
-    Array,
-    YawTurns,
-    body_to_euler_rates,
-    euler_to_quaternion,
-    quaternion_to_euler,
-)
+from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
 from quadsim.vehicle import Vehicle
 
 

@@ -10,16 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from quadsim.errors import ParameterError
-from quadsim.state import (
-    ANGLE_RATES,
-    ANGLES,
-    N_STATES,
-    POSITIONS,
-    VELOCITIES,
-    Array,
-    body_to_euler_rates,
-    quaternion_to_euler,
-)
+from quadsim.rotation import body_to_euler_rates, quaternion_to_euler
+from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array
 
 Integrator = Literal["mujoco", "rk4"]  # who takes the physics steps: MuJoCo, or `quadsim.sim.rigid_body`
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from operator import add
-from struct import Struct
 from typing import Final
 
 import mujoco
@@ -17,6 +16,7 @@ from mujoco.rollout import Rollout
 
 from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError, RaisedError
+from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
 from quadsim.sim.effects import (
     LOADING,
@@ -37,25 +37,13 @@ from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator, Segment, physics_to_state
 from quadsim.sim.rigid_body import RigidBody, check_free
 from quadsim.space import Obstacle
-from quadsim.state import (
-    ANGLE_RATES,
-    ANGLES,
-    EULER,
-    N_STATES,
-    POSITIONS,
-    VELOCITIES,
-    Array,
-    YawTurns,
-    euler_to_body_rates,
-    euler_to_quaternion,
-)
+from quadsim.state import ANGLE_RATES, ANGLES, EULER, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 _FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _CONTROL: Final = int(mujoco.mjtState.mjSTATE_CTRL)
 _PLAUSIBLE: Final = 1e6
 """Largest magnitude of any time [s], position [m], speed [m/s] or rate [rad/s] taken for flight, not divergence."""
-_THREE, _FOUR, _SIX = Struct("3d"), Struct("4d"), Struct("6d")
 _NUMERICAL_WARNINGS: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -346,11 +334,7 @@ class Plant:
         moving_air = wind is not None and drags
         of_rotors = self._of_rotors(speeds, slopes)
         forces, step, velocity_before = self._forces.midway, mujoco.mj_step, self._velocity_before
-        # Through memory views, which take and give a few numbers in a third of an array's time.
-        qpos, qvel, fluid = data.qpos.data, data.qvel.data, data.qfrc_fluid
-        applied, control, air_of_model = (_bytes(array) for array in (data.qfrc_applied, data.ctrl, model.opt.wind))
-        states, wrenches = _bytes(trajectory).cast("d"), _bytes(wrench)
-        row = trajectory.shape[1]
+        qpos, qvel, applied, control = data.qpos, data.qvel, data.qfrc_applied, data.ctrl  # looked up once
         if self._moving:
             times = self.time + self.timestep * np.arange(steps, dtype=np.float64)
             positions = np.stack([obstacle.positions(times) for obstacle in self._moving], axis=1)
@@ -362,18 +346,16 @@ class Plant:
                 acting = list(map(add, acting, noises[i]))
             if self._own:
                 acting = list(map(add, acting, self._own_wrench(i * self.timestep, [*qpos, *qvel])))
-            _SIX.pack_into(applied, 0, *acting)
-            _SIX.pack_into(wrenches, i * _SIX.size, *acting)
-            _FOUR.pack_into(control, 0, *thrust)
+            applied[:] = wrench[i] = acting
+            control[:] = thrust
             if moving_air:
-                _THREE.pack_into(air_of_model, 0, *breeze)
+                model.opt.wind[:] = breeze
             if self._moving:
                 data.mocap_pos[self._mocaps] = positions[i]
             step(model, data)
-            first = row * i
-            states[first + 1 : first + 8], states[first + 8 : first + row] = qpos, qvel
+            trajectory[i, 1:8], trajectory[i, 8:] = qpos, qvel
             if drags:
-                wrench[i] += fluid
+                wrench[i] += data.qfrc_fluid
         self._velocity_before = velocity_before
         trajectory[:, 0] = self._clock(steps)
         return trajectory, wrench
@@ -436,11 +418,6 @@ class Plant:
         counts = self._data.warning.number
         if counts.any() and (raised := [kind.name for kind in _NUMERICAL_WARNINGS if counts[int(kind)]]):
             raise DivergenceError(f"the plant diverged: MuJoCo reports {', '.join(raised)}", time=self.time)
-
-
-def _bytes(array: Array) -> memoryview:
-    """The memory of an array."""
-    return array.data.cast("B")
 
 
 def _discard(message: str) -> None:

@@ -11,8 +11,7 @@ from typing import Any, Final
 
 from quadsim.assets import models_dir
 from quadsim.errors import FileError, InputError
-from quadsim.flight.form import MAYBE_TEXT, Each, Optional, read_json
-from quadsim.flight.summary import require_inside
+from quadsim.flight.summary import read_json, require_inside
 from quadsim.outputs import SUMMARY_FILE, Growing, digest_of, to_json
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
@@ -31,8 +30,7 @@ FORMAT: Final = "quadsim campaign"
 _FORM: Final = {
     **dict.fromkeys(("format", "name", "status"), str),
     **dict.fromkeys(("flights", "flown"), int),
-    "sessions": [dict],
-    **dict.fromkeys(("controller", "controller_code"), Optional(MAYBE_TEXT)),
+    "sessions": list,
 }
 _ROOT: Final = Path(__file__).resolve().parents[2]
 
@@ -217,7 +215,7 @@ def _listed(directory: Path) -> dict[str, str]:
         FileError: its summary is damaged.
     """
     path = directory / SUMMARY_FILE
-    summary = read_json(path, {"files": Optional(Each(str))}, "a campaign's summary") if path.exists() else {}
+    summary = read_json(path, {}, "a campaign's summary") if path.exists() else {}
     ours = (CAMPAIGN_FILE, SCENARIO_FILE, FLIGHTS_FILE, TIMES_FILE)
     return {name: digest for name, digest in summary.get("files", {}).items() if name in ours}
 

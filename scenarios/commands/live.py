@@ -15,8 +15,7 @@ from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.common import load, shown
 from scenarios.live.guard import LOOPBACK
 from scenarios.live.pacing import Pace
-from scenarios.live.script import play, read_script
-from scenarios.live.session import Session
+from scenarios.live.session import Session, read_script
 from scenarios.reaudit import reaudit, stored_scenario
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.scenario import Scenario
@@ -56,7 +55,7 @@ def live(options: Namespace) -> int:
                     while session.reason is None and session.k < scenario.periods:
                         session.advance()
                 if script is not None:
-                    for reason in play(session, script):
+                    for reason in session.play(script):
                         console.say(f"refused: {reason}")
                 else:
                     _serve(session, options, save)

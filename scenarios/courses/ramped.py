@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpc.flatness import attitudes
-from quadsim.state import Array, quaternion_to_euler
+from quadsim.rotation import quaternion_to_euler
+from quadsim.state import Array
 from scenarios.courses.course import Path
 
 

@@ -7,10 +7,10 @@ the address that is printed and is stored as a cookie.
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from typing import Any, Final
@@ -48,16 +48,18 @@ class Guard:
             return "this server goes by another name"
         if origin is not None and not self._is_ours(origin.partition("://")[2], port):
             return "a page of another site may not connect"
-        given = [*parse_qs(path.partition("?")[2]).get("token", []), *self._cookies(headers, port)]
+        given = parse_qs(path.partition("?")[2]).get("token", [])
+        with contextlib.suppress(CookieError, LookupError):
+            given.append(SimpleCookie(headers.get("Cookie", ""))[f"quadsim-{port}"].value)
         if not any(secrets.compare_digest(each.encode(), self.token.encode()) for each in given):
             return "open the address that quadsim live printed: it has a token"
         return None
 
     def cookie(self, port: int) -> str:
         """The header that keeps the token in the browser; cookies ignore ports, hence its name."""
-        return f"{self._name(port)}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+        return f"quadsim-{port}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
-    @contextmanager
+    @contextlib.contextmanager
     def installed(self) -> Iterator[None]:
         """Have the server that viser starts meanwhile check its requests."""
         from viser.infra import _infra
@@ -91,27 +93,8 @@ class Guard:
             host, given = parts.hostname or "", parts.port
         except ValueError:
             return False
-        if given != port:
-            return False
-        if host in LOOPBACK or host == self._host:
-            return True
-        return self._host not in LOOPBACK and _is_address(host)  # no site can be bound to the name of an address
-
-    def _cookies(self, headers: Any, port: int) -> list[str]:
-        try:
-            found = SimpleCookie(headers.get("Cookie", ""))
-        except (CookieError, LookupError):
-            return []
-        return [found[self._name(port)].value] if self._name(port) in found else []
-
-    @staticmethod
-    def _name(port: int) -> str:
-        return f"quadsim-{port}"
-
-
-def _is_address(host: str) -> bool:
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
+        if given != port or host in LOOPBACK or host == self._host:
+            return given == port
+        with contextlib.suppress(ValueError):  # no site can be bound to the name of an address
+            return self._host not in LOOPBACK and bool(ipaddress.ip_address(host))
         return False
-    return True

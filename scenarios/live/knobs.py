@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any
 
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.json_schema import scenario_schema
-
-LISTED: Final = 2  # longest list of numbers that is shown: pairs of bounds
 
 Value = float | int | bool | str | tuple[float, ...]
 
@@ -27,36 +25,35 @@ class Knob:
 
 
 def knobs(spec: ControllerSpec) -> tuple[Knob, ...]:
-    """Every field of a controller that has a value, but its type, lists of tables and what own code reads."""
+    """Every field of a controller that has a value, but its type, longer lists and what a user's controller reads."""
     root = scenario_schema()
-    schema = root["$defs"][type(spec).__name__]
-    values = spec.model_dump(mode="json", exclude_none=True)
-    return tuple(each for each in _walk("", values, schema, root) if each.path != "type")
+    values = spec.model_dump(mode="json", exclude_none=True, exclude={"type"})
+    return tuple(_walk("", values, root["$defs"][type(spec).__name__], "", root))
 
 
-def _walk(path: str, value: Any, schema: Mapping[str, Any], root: Mapping[str, Any]) -> Iterator[Knob]:
-    schema, about = _plain(schema, root, value)
+def _walk(path: str, value: Any, schema: Mapping[str, Any], about: str, root: Mapping[str, Any]) -> Iterator[Knob]:
+    schema, found = _plain(schema, root, value)
+    about = found or about
     if isinstance(value, Mapping):
         properties, others = schema.get("properties", {}), schema.get("additionalProperties", {})
         for name, entry in value.items():
             inner = properties.get(name, others)
             if isinstance(inner, Mapping):
-                for knob in _walk(f"{path}.{name}" if path else name, entry, inner, root):
-                    yield replace(knob, about=knob.about or about)
+                yield from _walk(f"{path}.{name}" if path else name, entry, inner, about, root)
         return
-    each = _plain(schema.get("items", {}), root, None)[0] if isinstance(value, list) else schema
-    common: dict[str, Any] = {
-        "path": path,
-        "about": about,
-        "minimum": each.get("minimum", each.get("exclusiveMinimum")),
-        "maximum": each.get("maximum", each.get("exclusiveMaximum")),
-    }
-    if isinstance(value, bool | int | float):
-        yield Knob(value=value, **common)
-    elif isinstance(value, str):
-        yield Knob(value=value, choices=tuple(each.get("enum", (value,))), **common)
-    elif len(value) == LISTED and all(isinstance(entry, int | float) for entry in value):
-        yield Knob(value=tuple(map(float, value)), **common)
+    entry = _plain(schema.get("items", {}), root, None)[0] if isinstance(value, list) else schema
+    if isinstance(value, list):
+        if len(value) != 2 or not all(isinstance(number, int | float) for number in value):
+            return
+        value = tuple(map(float, value))
+    yield Knob(
+        path=path,
+        value=value,
+        about=about,
+        minimum=entry.get("minimum", entry.get("exclusiveMinimum")),
+        maximum=entry.get("maximum", entry.get("exclusiveMaximum")),
+        choices=tuple(entry.get("enum", (value,))) if isinstance(value, str) else (),
+    )
 
 
 def _plain(schema: Mapping[str, Any], root: Mapping[str, Any], value: Any) -> tuple[Mapping[str, Any], str]:

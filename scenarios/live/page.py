@@ -10,12 +10,13 @@ import asyncio
 import contextlib
 import dataclasses
 import errno
+import inspect
 import io
 import math
 import socket
 import warnings
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from html import escape
 from importlib.util import find_spec
@@ -27,7 +28,7 @@ from quadsim.controller import OPTIMAL
 from quadsim.errors import InputError, MissingPackageError, OutputError, ParameterError
 from quadsim.flight.audit import Limit
 from quadsim.report.palette import BOUND, LINES
-from quadsim.state import quaternion_to_euler
+from quadsim.rotation import quaternion_to_euler
 from quadsim.vehicle import N_ROTORS
 from scenarios.live.guard import Guard
 from scenarios.live.knobs import Knob, Value, knobs
@@ -44,9 +45,13 @@ _STEER: Final = {"W": (1, 0, 0), "S": (-1, 0, 0), "A": (0, 1, 0), "D": (0, -1, 0
 """Keys, and the direction of the set-point's velocity that each adds to."""
 _STEER_STEP: Final = 0.5  # [m/s] by which a key changes it
 _STEER_MOST: Final = 5.0
-_NO_VELOCITY: Final = "0, 0, 0"
 _ACTIVE: Final = 0.1  # share of a bound's scale within which a margin counts as active
-_FAULTS: Final = ("dropout", "freeze", "nan")
+_PLOTS: Final = {
+    "Position error [m]": ("x", "y", "z"),
+    "Tilt and yaw error [deg]": ("tilt", "yaw"),
+    "Rotor speeds [rad/s]": ("1", "2", "3", "4"),
+    "Step [ms]": ("step",),
+}
 
 STYLE: Final = """<style>
 .q{font:12px/1.45 system-ui,sans-serif;padding:0 .6em}.q b{font-variant-numeric:tabular-nums}
@@ -124,9 +129,9 @@ class Page:
         from viser import _messages
 
         self._session, self._pace, self._save, self._others = session, pace, save, others
-        self._guard = Guard(host)
+        guard = Guard(host)
         silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
-        with silent, self._guard.installed():
+        with silent, guard.installed():
             self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
         found = self._server.get_port()
         if port not in (0, found):
@@ -134,7 +139,7 @@ class Page:
             raise ParameterError("", "--port", port, "a port that is free")
         for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel that any client may open
             self._server._websock_server.unregister_handler(message)
-        self.address = f"http://{_reachable(host)}:{found}/?token={self._guard.token}"
+        self.address = f"http://{_reachable(host)}:{found}/?token={guard.token}"
         self._driver: int | None = None
         self._takes: dict[int, Any] = {}  # the button of each client that takes the controls
         self._aims: dict[int, Any] = {}  # where each client looks, from the vehicle [m]
@@ -145,6 +150,7 @@ class Page:
         self._server.gui.set_panel_label(f"quadsim live: {session.scenario.name}")
         self.stage = Stage(self._server.scene, session)
         self._fields: dict[str, tuple[Knob, list[Any]]] = {}
+        self._rest: list[tuple[Any, Any]] = []  # widgets, and what they are at the start of a flight
         self._build()
         self._server.on_client_connect(self._connected)
         self._server.on_client_disconnect(self._left)
@@ -154,65 +160,60 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    # What the thread that flies calls
+    # What the thread that flies calls; see `scenarios.live.pacing.View`
 
     def show(self, frame: Frame, factor: float) -> None:
-        """See `scenarios.live.pacing.View`."""
+        """Show a period that has been flown."""
         self._frame = frame
         self._remember(frame)
-        for reason in frame.refused:
-            self._notify(f"refused: {reason}")
+        with _unless_gone():
+            for reason in frame.refused:
+                for client in self._server.get_clients().values():
+                    client.add_notification("quadsim", f"refused: {reason}")
         with self._server.atomic():
             self.stage.show(frame)
             if frame.k % _EVERY == 0 or self._pace.paused:
                 self._status.content = self._state(frame, factor)
-                self._margins.content = _bars(
-                    self._session.limits, frame, self._session.flights[-1].loop.controller.name
-                )
-            if frame.k % (2 * _EVERY) == 0 or self._pace.paused:
-                self._plot()
+                other = self._session.flights[-1].loop.controller.name
+                self._margins.content = _bars(self._session.limits, frame, other)
+            if (frame.k % (2 * _EVERY) == 0 or self._pace.paused) and len(self._history) > 1:
+                table = np.array(self._history)[::2].T  # plots are the most of what is sent
+                first = 1
+                for plot, names in zip(self._plots, _PLOTS.values(), strict=True):
+                    plot.data = (table[0], *table[first : first + len(names)])
+                    first += len(names)
 
     def pose(self, frame: Frame, share: float) -> None:
-        """See `scenarios.live.pacing.View`."""
+        """Draw the vehicles, and let cameras follow."""
         with _unless_gone(), self._server.atomic():
             at = self.stage.pose(frame, share)
-            if self._follow.value:
-                for client in self._server.get_clients().values():
-                    if client.client_id in self._aims:
-                        camera = client.camera
-                        away = np.asarray(camera.position) - camera.look_at
-                        look_at = at + self._aims[client.client_id]
-                        camera.position = look_at + away  # which moves where it looks
-                        camera.look_at = look_at
+            for client in self._server.get_clients().values() if self._follow.value else ():
+                if client.client_id in self._aims:
+                    _look(client.camera, at + self._aims[client.client_id])
         self._server.flush()
 
     def ended(self, reason: str | None) -> None:
-        """See `scenarios.live.pacing.View`."""
-        if reason is None:
-            self._history.clear()
-            self.stage.reset()
-            self._steer[:] = 0.0
-            for widget, value in self._rest:
-                widget.value = value
-            self._handle.position = np.array(self._place.value)
-            self._steered.value = _NO_VELOCITY
-            self._answer.content = ""
-            self._show_knobs(self._session.scenario.controller)
-        else:
-            self._status.content = (
-                f'{STYLE}<div class="q bad">{escape(reason)}. Reset begins anew; Save keeps it.</div>'
-            )
+        """The flight has ended, with its reason, or has begun anew (None)."""
+        if reason is not None:
+            self._status.content = _says(f"{reason}. Reset begins anew; Save keeps it.", "bad")
+            return
+        self._history.clear()
+        self.stage.reset()
+        for widget, value in self._rest:
+            widget.value = value
+        self._handle.position = np.array(self._place.value)
+        self._show_velocity(np.zeros(3))
+        self._answer.content = ""
+        self._show_knobs(self._session.scenario.controller)
 
     # What is on the page
 
     def _build(self) -> None:
         gui = self._server.gui
-        self._status = gui.add_html(f'{STYLE}<div class="q">starting</div>')
+        self._status = gui.add_html(_says("starting"))
         self._margins = gui.add_html("")
-        self._rest: list[tuple[Any, Any]] = []  # widgets, and what they are at the begin of a flight
         with gui.add_folder("Run"):
-            run = {"Pause": self._toggle, "Step": self._step, "Reset": self._reset}
-            self._group("Flight", run)
+            self._group("Flight", {"Pause": self._toggle, "Step": self._step, "Reset": self._reset})
             speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1", hint="simulated over real time")
             self._on(speed.on_update, lambda event: setattr(self._pace, "speed", float(event.target.value)))
             self._follow = gui.add_checkbox("Camera follows", True)
@@ -223,144 +224,105 @@ class Page:
         with tabs.add_tab("Target"):
             self._targets()
         with tabs.add_tab("Controller"):
-            self._controller_tab()
+            chosen = gui.add_dropdown("Controller", ["as started", *self._others])
+            self._answer = gui.add_html("")
+            self._button("Take this controller", lambda event: self._take(chosen.value))
+            self._knobs_folder = gui.add_folder("Fields")
+            self._show_knobs(self._session.scenario.controller)
         with tabs.add_tab("Plots"):
-            x, zero = np.array([0.0, 1.0]), np.zeros(2)
             self._plots = [
                 gui.add_uplot(
-                    (x, *([zero] * len(names))),
+                    (np.array([0.0, 1.0]), *([np.zeros(2)] * len(names))),
                     ({"label": "t [s]"}, *({"label": n, "stroke": c} for n, c in zip(names, LINES, strict=False))),
                     scales={"x": {"time": False}},
                     aspect=1.9,
                     title=title,
                 )
-                for title, names in (
-                    ("Position error [m]", ("x", "y", "z")),
-                    ("Tilt and yaw error [deg]", ("tilt", "yaw")),
-                    ("Rotor speeds [rad/s]", ("1", "2", "3", "4")),
-                    ("Step [ms]", ("step",)),
-                )
+                for title, names in _PLOTS.items()
             ]
 
     def _pushes(self) -> None:
-        gui, session = self._server.gui, self._session
+        gui = self._server.gui
         gui.add_markdown("Drag the vehicle with the mouse to pull it.")
 
-        async def pulled(event: Any) -> None:
-            if event.client is None or not self._drives(event.client):
-                return
+        def pulled(event: Any) -> None:
             to = None if event.phase == "end" else [float(each) for each in event.end_position]
-            session.submit({"type": "pull"} if to is None else {"type": "pull", "to": to}, subject="pull")
+            self._session.submit({"type": "pull", "to": to}, subject="pull")
 
-        self.stage.grab.on_drag("left")(pulled)
+        self._on(self.stage.grab.on_drag("left"), pulled)
         wind = gui.add_vector2("Wind x, y [m/s]", (0.0, 0.0), min=(-12.0, -12.0), max=(12.0, 12.0), step=0.5)
-        self._submits(wind, "wind", lambda value: {"type": "wind", "velocity": [*map(float, value), 0.0]})
+        self._submits(wind, lambda value: {"type": "wind", "velocity": [*map(float, value), 0.0]})
         gust = gui.add_vector2("Gust x, y [m/s]", (6.0, 0.0), min=(-15.0, -15.0), max=(15.0, 15.0), step=0.5)
-        self._button(
-            "Gust",
-            lambda event: session.submit(
-                {"type": "gust", "velocity": [*map(float, gust.value), 0.0], "duration": 1.0}, subject="gust"
-            ),
-        )
-        mass = session.flights[0].actual.mass
+        self._event("Gust", lambda: {"type": "gust", "velocity": [*map(float, gust.value), 0.0], "duration": 1.0})
+        mass = self._session.flights[0].actual.mass
         load = gui.add_number("Payload [kg]", round(0.1 * mass, 4), min=0.0, max=mass, step=round(0.01 * mass, 5))
-        self._button(
-            "Take payload", lambda event: session.submit({"type": "payload_pickup", "mass": float(load.value)})
-        )
-        self._button("Drop payload", lambda event: session.submit({"type": "payload_drop"}))
+        self._event("Take payload", lambda: {"type": "payload_pickup", "mass": float(load.value)})
+        self._event("Drop payload", lambda: {"type": "payload_drop"})
         factor = gui.add_slider("Mass factor", 0.7, 1.5, 0.01, 1.0)
-        self._submits(factor, "mass", lambda value: {"type": "mass", "factor": float(value)})
+        self._submits(factor, lambda value: {"type": "mass", "factor": float(value)})
         lag = gui.add_slider("Rotor lag [ms]", 0, 100, 5, 0)
-        self._submits(lag, "lag", lambda value: {"type": "rotor_lag", "rise": float(value) / 1e3})
+        self._submits(lag, lambda value: {"type": "rotor_lag", "rise": float(value) / 1e3})
         for rotor in range(1, N_ROTORS + 1):
             wear = gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0)
-            self._rest.append((wear, 0.0))
-            self._submits(wear, f"wear {rotor}", partial(_wear, rotor))
-        self._rest += [(wind, (0.0, 0.0)), (factor, 1.0), (lag, 0)]
+            self._submits(
+                wear, partial(lambda rotor, value: {"type": "wear", "rotor": rotor, "loss": float(value)}, rotor)
+            )
         sensor = gui.add_dropdown("Sensor", ("position", "velocity", "attitude", "rates"))
-        fault = gui.add_dropdown("Fault", _FAULTS)
-        self._button(
-            "Fail sensor for 1 s",
-            lambda event: session.submit(
-                {"type": "sensor_fault", "sensor": sensor.value, "fault": fault.value, "duration": 1.0}
-            ),
-        )
+        fault = gui.add_dropdown("Fault", ("dropout", "freeze", "nan"))
+        failed = {"type": "sensor_fault", "duration": 1.0}
+        self._event("Fail sensor for 1 s", lambda: {**failed, "sensor": sensor.value, "fault": fault.value})
         late = gui.add_number("Late commands [ms]", 200, min=10, max=5000, step=10)
-        self._button(
-            "Stall the computer", lambda event: session.submit({"type": "stall", "duration": float(late.value) / 1e3})
-        )
+        self._event("Stall the computer", lambda: {"type": "stall", "duration": float(late.value) / 1e3})
 
     def _targets(self) -> None:
-        gui, session = self._server.gui, self._session
-        unit = self.stage.unit
+        gui, scene = self._server.gui, self._server.scene
         gui.add_markdown(
             "Drag the arrows beside the vehicle's goal, shift-click on the ground, or type. Keys W, S, A, D, R, F fly "
             "the set-point along x, y and z; X stops it."
         )
-        here = np.asarray(session.flights[0].loop.course.row(0)[:3])
-        self._handle = self._server.scene.add_transform_controls(
-            "/target", scale=3.0 * unit, position=here, disable_rotations=True, disable_sliders=True
+        here = np.asarray(self._session.flights[0].loop.course.row(0)[:3])
+        self._handle = scene.add_transform_controls(
+            "/target", scale=3.0 * self.stage.unit, position=here, disable_rotations=True, disable_sliders=True
         )
-        place = self._place = gui.add_vector3("Set-point [m]", tuple(map(float, here)), step=0.1)
-
-        async def dragged(event: Any) -> None:
-            if event.client is not None and self._drives(event.client):
-                at = [round(float(each), 2) for each in event.target.position]
-                place.value = tuple(at)
-                self._set_point(at)
-
-        self._handle.on_update(dragged)
-
-        def typed(event: Any) -> None:
-            at = [float(each) for each in event.target.value]
-            self._handle.position = np.array(at)
-            self._set_point(at)
-
-        self._on(place.on_update, typed)
+        self._place = gui.add_vector3("Set-point [m]", tuple(map(float, here)), step=0.1)
+        self._rest.append((self._place, self._place.value))
 
         def clicked(event: Any) -> None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
             if origin[2] * direction[2] < 0.0:  # it meets the ground
                 meets = origin - origin[2] / direction[2] * direction
                 sample = None if self._frame is None else self._frame.samples[0]
-                height = place.value[2] if sample is None else sample.observation.reference[2]
-                at = [round(float(each), 2) for each in (*meets[:2], height)]
-                self._handle.position, place.value = np.array(at), tuple(at)
-                self._set_point(at)
+                height = self._place.value[2] if sample is None else sample.observation.reference[2]
+                self._set_point((*meets[:2], height))
 
-        self._on(self._server.scene.on_click(modifier="shift"), clicked)
+        self._on(self._handle.on_update, lambda event: self._set_point(event.target.position))
+        self._on(self._place.on_update, lambda event: self._set_point(event.target.value))
+        self._on(scene.on_click(modifier="shift"), clicked)
         yaw = gui.add_slider("Yaw [deg]", -180, 180, 5, 0)
-        self._submits(yaw, "yaw", lambda value: {"type": "setpoint", "yaw": float(value)})
-        self._rest += [(place, place.value), (yaw, 0)]
-        self._steered = gui.add_text("Set-point velocity [m/s]", _NO_VELOCITY, disabled=True)
+        self._submits(yaw, lambda value: {"type": "setpoint", "yaw": float(value)})
+        self._steered = gui.add_text("Set-point velocity [m/s]", "0, 0, 0", disabled=True)
         for key, direction in _STEER.items():
-            command = gui.add_command(
-                f"Fly {'+' if sum(direction) > 0 else '-'}{'xyz'[np.abs(direction).argmax()]}", hotkey=key
-            )
+            command = gui.add_command(f"Fly {'-+'[sum(direction) > 0]}{'xyz'[np.abs(direction).argmax()]}", hotkey=key)
             self._on(command.on_trigger, partial(self._fly_on, direction))
         self._on(gui.add_command("Stop the set-point", hotkey="X").on_trigger, lambda event: self._fly(np.zeros(3)))
         self._button("Stop set-point", lambda event: self._fly(np.zeros(3)))
 
-    def _set_point(self, at: list[float]) -> None:
+    def _set_point(self, at: Any) -> None:
         self._fly(np.zeros(3))
-        self._session.submit({"type": "setpoint", **dict(zip("xyz", at, strict=True))}, subject="setpoint")
+        x, y, z = (round(float(each), 2) for each in at)
+        self._handle.position, self._place.value = np.array([x, y, z]), (x, y, z)
+        self._session.submit({"type": "setpoint", "x": x, "y": y, "z": z}, subject="setpoint")
 
     def _fly_on(self, direction: tuple[int, int, int], event: Any) -> None:
         self._fly(self._steer + _STEER_STEP * np.array(direction))
 
     def _fly(self, velocity: Any) -> None:
-        self._steer = np.clip(velocity, -_STEER_MOST, _STEER_MOST)
-        self._steered.value = ", ".join(f"{each:g}" for each in self._steer)
+        self._show_velocity(np.clip(velocity, -_STEER_MOST, _STEER_MOST))
         self._session.submit({"type": "steer", "velocity": self._steer.tolist()}, subject="steer")
 
-    def _controller_tab(self) -> None:
-        gui = self._server.gui
-        names = ["as started", *self._others]
-        chosen = gui.add_dropdown("Controller", names)
-        self._answer = gui.add_html("")
-        self._button("Take this controller", lambda event: self._take(chosen.value))
-        self._knobs_folder = gui.add_folder("Fields")
-        self._show_knobs(self._session.scenario.controller)
+    def _show_velocity(self, velocity: Any) -> None:
+        self._steer = velocity
+        self._steered.value = ", ".join(f"{each:g}" for each in velocity)
 
     def _show_knobs(self, spec: ControllerSpec) -> None:
         for _, handles in self._fields.values():
@@ -372,7 +334,7 @@ class Page:
                 handles = self._inputs(knob)
                 self._fields[knob.path] = knob, handles
                 for handle in handles:
-                    self._on_later(handle.on_update, partial(self._turn, knob.path))
+                    self._on(handle.on_update, partial(self._turn, knob.path))
 
     def _inputs(self, knob: Knob) -> list[Any]:
         """The widgets of a field: two for a pair."""
@@ -381,12 +343,11 @@ class Page:
             return [gui.add_checkbox(knob.path, value, hint=knob.about)]
         if isinstance(value, str):
             return [gui.add_dropdown(knob.path, knob.choices, initial_value=value, hint=knob.about)]
+        look = {"min": knob.minimum, "max": knob.maximum, "hint": knob.about}
         if isinstance(value, tuple):
-            limits = {"min": knob.minimum, "max": knob.maximum, "hint": knob.about}
             names = (f"{knob.path} lower", f"{knob.path} upper")
-            return [gui.add_number(name, each, **limits) for name, each in zip(names, value, strict=True)]
-        step = 1 if isinstance(value, int) else None
-        return [gui.add_number(knob.path, value, min=knob.minimum, max=knob.maximum, step=step, hint=knob.about)]
+            return [gui.add_number(name, each, **look) for name, each in zip(names, value, strict=True)]
+        return [gui.add_number(knob.path, value, step=1 if isinstance(value, int) else None, **look)]
 
     async def _turn(self, path: str, event: Any) -> None:
         if path not in self._fields:  # of a controller that was replaced meanwhile
@@ -408,26 +369,22 @@ class Page:
 
     async def _replace(self, fields: Mapping[str, Any], what: str) -> bool:
         """Build a controller beside the flight and let it take over; where it cannot be built, report why."""
-        flight = self._session.flights[0]
         try:
-            successor = await asyncio.to_thread(flight.successor, fields)
+            successor = await asyncio.to_thread(self._session.flights[0].successor, fields)
         except InputError as error:
-            self._answer.content = (
-                f'{STYLE}<div class="q bad">refused, the controller before flies on: {escape(str(error))}</div>'
-            )
+            self._answer.content = _says(f"refused, the controller before flies on: {error}", "bad")
             return False
         self._session.submit({"type": "controller", "fields": dict(fields)}, successor=successor)
-        self._answer.content = f'{STYLE}<div class="q">flies from the next period on: {escape(what)}</div>'
+        self._answer.content = _says(f"flies from the next period on: {what}")
         return True
 
     # Buttons
 
     def _toggle(self, event: Any) -> None:
-        self._pace.pause(not self._pace.paused)
+        self._pace.paused = not self._pace.paused
 
     def _step(self, event: Any) -> None:
-        if not self._pace.paused:
-            self._toggle(event)
+        self._pace.paused = True
         self._pace.single()
 
     def _reset(self, event: Any) -> None:
@@ -438,44 +395,35 @@ class Page:
         self._pace.order(anew)
 
     def _save_now(self, event: Any) -> None:
-        client = event.client
-
         def keep(session: Session) -> None:
             try:
                 result = f"saved: {self._save(session)}"
             except (InputError, OutputError) as error:
                 result = f"not saved: {error}"
             with _unless_gone():
-                client.add_notification("Save", result)
+                event.client.add_notification("Save", result)
 
         self._pace.order(keep)
 
     def _download(self, event: Any) -> None:
-        client = event.client
-
         def send(session: Session) -> None:
             if session.k:
-                text = session.flight().scenario.to_toml()
-                client.send_file_download(f"{session.scenario.name}.toml", text.encode(), save_immediately=True)
+                _send(event.client, f"{session.scenario.name}.toml", session.flight().scenario.to_toml())
 
         self._pace.order(send)
 
     def _scene(self, event: Any) -> None:
-        html = self._server.scene.as_html()
-        event.client.send_file_download(f"{self._session.scenario.name}.html", html.encode(), save_immediately=True)
+        _send(event.client, f"{self._session.scenario.name}.html", self._server.scene.as_html())
 
     # Who drives
 
     async def _connected(self, client: Any) -> None:
         if self._driver is None:
             self._driver = client.client_id
-        unit, at = self.stage.unit, np.asarray(self.stage.frames[0].position)
-        away = unit * np.array([-4.0, -6.0, 3.0])
+        away = self.stage.unit * np.array([-4.0, -6.0, 3.0])
         upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
-        self._aims[client.client_id] = np.array([0.0, 0.0, -0.5 * np.linalg.norm(away)]) * upright
-        look_at = at + self._aims[client.client_id]
-        client.camera.position = look_at + away  # which moves where it looks
-        client.camera.look_at = look_at
+        aim = self._aims[client.client_id] = np.array([0.0, 0.0, -0.5 * np.linalg.norm(away)]) * upright
+        _look(client.camera, np.asarray(self.stage.frames[0].position) + aim, away)
         take = client.gui.add_button("Take the controls", visible=self._driver != client.client_id)
         self._takes[client.client_id] = take
 
@@ -498,50 +446,36 @@ class Page:
         for client, take in self._takes.items():
             take.visible = client != driver
 
-    def _drives(self, client: Any) -> bool:
-        if client.client_id == self._driver:
-            return True
-        client.add_notification("You watch", "Another page has the controls: Take the controls changes that.")
-        return False
+    def _on(self, register: Callable[[Any], Any], act: Callable[[Any], Any]) -> None:
+        """Call for what the driving client does; not for what Python sets, which has no client."""
 
-    def _button(self, label: str, act: Callable[[Any], Any]) -> Any:
-        button = self._server.gui.add_button(label)
-        self._on_later(button.on_click, act)
-        return button
+        async def called(event: Any) -> None:  # a plain function would run in one of many threads
+            if event.client is None:
+                return
+            if event.client.client_id != self._driver:
+                text = "Another page has the controls: Take the controls changes that."
+                event.client.add_notification("You watch", text)
+            elif inspect.isawaitable(found := act(event)):
+                await found
+
+        register(called)
+
+    def _button(self, label: str, act: Callable[[Any], Any]) -> None:
+        self._on(self._server.gui.add_button(label).on_click, act)
+
+    def _event(self, label: str, table: Callable[[], Mapping[str, Any]]) -> None:
+        """A button that submits an event."""
+        self._button(label, lambda event: self._session.submit(table()))
 
     def _group(self, label: str, acts: Mapping[str, Callable[[Any], Any]]) -> None:
         """Buttons in a row."""
         buttons = self._server.gui.add_button_group(label, tuple(acts))
-        self._on_later(buttons.on_click, lambda event: acts[event.target.value](event))
+        self._on(buttons.on_click, lambda event: acts[event.target.value](event))
 
-    def _on(self, register: Callable[[Any], Any], act: Callable[[Any], None]) -> None:
-        """Call for what the driving client does; not for what Python sets, which has no client."""
-
-        async def called(event: Any) -> None:
-            if event.client is not None and self._drives(event.client):
-                act(event)
-
-        register(called)
-
-    def _submits(self, widget: Any, subject: str, table: Callable[[Any], Mapping[str, Any]]) -> None:
+    def _submits(self, widget: Any, table: Callable[[Any], Mapping[str, Any]]) -> None:
         """Submit an input made of a widget's value whenever the driving client changes that."""
-        self._on(widget.on_update, lambda event: self._session.submit(table(event.target.value), subject=subject))
-
-    def _on_later(self, register: Callable[[Any], Any], act: Callable[[Any], Awaitable[Any] | None]) -> None:
-        """The same of what may take a while, and is awaited."""
-
-        async def called(event: Any) -> None:
-            if event.client is not None and self._drives(event.client):
-                found = act(event)
-                if found is not None and hasattr(found, "__await__"):
-                    await found
-
-        register(called)
-
-    def _notify(self, text: str) -> None:
-        with _unless_gone():
-            for client in self._server.get_clients().values():
-                client.add_notification("quadsim", text)
+        self._rest.append((widget, widget.value))
+        self._on(widget.on_update, lambda event: self._session.submit(table(event.target.value), subject=widget.label))
 
     # Numbers
 
@@ -556,15 +490,6 @@ class Page:
         tilt = math.degrees(math.acos(min(1.0, max(-1.0, up))))
         yaw = math.degrees(math.remainder(yaw, 2.0 * math.pi))
         self._history.append((frame.time, *error, tilt, yaw, *sample.speeds, 1e3 * sample.step_s))
-
-    def _plot(self) -> None:
-        if len(self._history) < 2:
-            return
-        table = np.array(self._history)[::2].T  # plots are the most of what is sent
-        first = 1
-        for plot, count in zip(self._plots, (3, 2, 4, 1), strict=True):
-            plot.data = (table[0], *table[first : first + count])
-            first += count
 
     def _state(self, frame: Frame, factor: float) -> str:
         sample = frame.samples[0]
@@ -590,7 +515,7 @@ class Page:
             f"tilt <b>{worst[4]:.1f}</b> deg, error <b>{np.linalg.norm(worst[1:4]):.2f}</b> m, pull "
             f"<b>{np.linalg.norm(frame.pull):.1f}</b> N",
         ]
-        return f'{STYLE}<div class="q">' + "<br>".join(rows) + "</div>"
+        return _html("<br>".join(rows))
 
 
 @contextlib.contextmanager
@@ -603,6 +528,25 @@ def _unless_gone() -> Iterator[None]:
 
 def _wear(rotor: int, loss: Any) -> dict[str, Any]:
     return {"type": "wear", "rotor": rotor, "loss": float(loss)}
+
+
+def _look(camera: Any, at: Any, away: Any = None) -> None:
+    """Turn a camera to a point [m], from as far away as it is."""
+    away = np.asarray(camera.position) - camera.look_at if away is None else away
+    camera.position = at + away  # which moves where it looks
+    camera.look_at = at
+
+
+def _send(client: Any, name: str, text: str) -> None:
+    client.send_file_download(name, text.encode(), save_immediately=True)
+
+
+def _html(content: str, mark: str = "") -> str:
+    return f'{STYLE}<div class="q {mark}">{content}</div>'
+
+
+def _says(text: str, mark: str = "") -> str:
+    return _html(escape(text), mark)
 
 
 def _bars(limits: tuple[Limit, ...], frame: Frame, other: str) -> str:

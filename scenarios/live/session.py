@@ -6,23 +6,26 @@ scenario and on the periods at which they act alone.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+from pydantic import Field
 
-from quadsim.errors import FlightError, InputError, ParameterError
+from quadsim.assets import read_toml
+from quadsim.errors import FlightError, InputError
+from quadsim.fields import Fraction
 from quadsim.flight.audit import Limit
 from quadsim.sim.loop import Sample
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
-from quadsim.vehicle import N_ROTORS
 from scenarios.flight import Flight
 from scenarios.limits import with_bounds_stated
-from scenarios.parts.live import Successor
+from scenarios.parts.live import Successor, validated
 from scenarios.run import StartedFlight, start
+from scenarios.schema.base import Spec, Triple
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.scenario import Scenario
 
@@ -31,50 +34,64 @@ STRONGEST: Final = 0.3  # largest pull in weights of the vehicle
 FORCE_STEP: Final = 1e-3  # to which pulls are rounded [N]
 
 
-_ENTRIES: Final = {"pull": {"type", "to"}, "wear": {"type", "rotor", "loss"}, "steer": {"type", "velocity"}}
-"""Of inputs that are no events of a scenario file."""
+class Pull(Spec):
+    """A spring from the vehicle to a point of the world, held until it is let go."""
+
+    type: Literal["pull"]
+    to: Triple | None = None  # [m] world; absent to let go
 
 
-class Pull(NamedTuple):
-    """A spring from a point of the body to a point of the world, held until it is let go."""
+class Wear(Spec):
+    """A rotor's loss of thrust, held."""
 
-    to: tuple[float, float, float]
+    type: Literal["wear"]
+    rotor: Annotated[int, Field(ge=1, le=4)]
+    loss: Fraction
 
 
-@dataclass(frozen=True, kw_only=True)
-class Input:
-    """Something that a person did."""
+class Steer(Spec):
+    """The set-point's velocity [m/s], held."""
 
-    table: Mapping[str, Any]
-    """An event of a scenario file without its time; or of type `pull` (`to` [m] world, absent to let go), `wear`
-    (`rotor` 1 to 4, `loss` 0 to 1, held), `steer` (`velocity` of the set-point [m/s], held)."""
-    subject: str | None = None  # an earlier input of the same subject that has not acted yet is dropped
-    successor: Successor | None = None  # of an event `controller`, the controller that was built for it
+    type: Literal["steer"]
+    velocity: Triple
+
+
+class _Held(Spec):
+    input: Annotated[Pull | Wear | Steer, Field(discriminator="type")]
+
+
+class _ScriptInput(Spec, extra="allow"):
+    at: Annotated[float, Field(ge=0.0)]
+
+
+class Script(Spec):
+    """A session without a browser: inputs as `Session.submit` takes them, and the times [s] at which they are given."""
+
+    duration: Annotated[float, Field(gt=0.0, le=36_000.0)]  # of the session [s]
+    inputs: list[_ScriptInput] = Field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """One control period as it was flown, for a view."""
+    """One control period as it was flown, for a view; of each flight, where it has not ended."""
 
     k: int  # which period
     time: float  # when it began [s]
-    samples: tuple[Sample | None, ...]  # of each flight; None where it has ended
-    margins: tuple[Mapping[str, float], ...]
-    """Of each constraint at its worst within the period; see `StartedFlight.margins`."""
-    horizons: tuple[Array | None, ...]
-    """(N + 1, 3) predicted positions [m] of each flight, from the present one on; None without a model."""
+    samples: tuple[Sample | None, ...]
+    margins: tuple[Mapping[str, float], ...]  # see `StartedFlight.margins`
+    horizons: tuple[Array | None, ...]  # (N + 1, 3) predicted positions [m], from the present one on
     pull: Array  # (3,) the force of the person's hand [N]; zero without one
     refused: tuple[str, ...]  # why inputs were refused
 
 
 @dataclass
-class _Held:
+class _Hand:
     """What goes on until it is changed."""
 
-    pull: Pull | None = None
+    pull: Array | None = None  # (3,) to where [m]
     wear: dict[int, float] = field(default_factory=dict)
     steer: Array = field(default_factory=lambda: np.zeros(3))
-    setpoint: Array | None = None
+    setpoint: Array | None = None  # (3,) where steering has come to [m]
 
 
 class Session:
@@ -95,7 +112,7 @@ class Session:
 
     def __init__(self, scenario: Scenario, against: ControllerSpec | None = None) -> None:
         self.scenario, self._against = scenario, against
-        self._queue: deque[Input] = deque()
+        self._queue: deque[tuple[Mapping[str, Any], str | None, Successor | None]] = deque()
         self.flights: tuple[StartedFlight, ...] = ()
         self.reset()
 
@@ -107,10 +124,8 @@ class Session:
         if self._against is not None:
             scenarios.append(with_bounds_stated(self.scenario).model_copy(update={"controller": self._against}))
         self.flights = tuple(start(each, live=True) for each in scenarios)
-        self._held = _Held()
+        self._held = _Hand()
         self.reason: str | None = None
-        weight = self.flights[0].actual.mass * self.flights[0].actual.gravity
-        self._stiffness, self._strongest = STIFFNESS * weight, STRONGEST * weight
 
     def close(self) -> None:
         """Give back what the flights hold; what was flown stays."""
@@ -135,8 +150,14 @@ class Session:
     def submit(
         self, table: Mapping[str, Any], *, subject: str | None = None, successor: Successor | None = None
     ) -> None:
-        """Let something happen from the next period on; from any thread."""
-        self._queue.append(Input(table=dict(table), subject=subject, successor=successor))
+        """Let something happen from the next period on; from any thread.
+
+        Args:
+            table: a `Pull`, `Wear` or `Steer`, or an event of a scenario file without its time.
+            subject: an earlier input of the same subject that has not acted yet is dropped.
+            successor: of an event `controller`, the controller that was built for it.
+        """
+        self._queue.append((dict(table), subject, successor))
 
     def advance(self) -> Frame:
         """Fly one control period.
@@ -146,36 +167,48 @@ class Session:
         """
         if self.reason is not None:
             raise InputError(f"the flight has ended: {self.reason}")
-        refused = [reason for each in self._taken() if (reason := self._apply(each)) is not None]
-        pull = self._hold(refused)
-        samples: list[Sample | None] = []
+        refused: list[str] = []
+        taken = [self._queue.popleft() for _ in range(len(self._queue))]
+        last = {subject: i for i, (_, subject, _) in enumerate(taken)}
+        for i, (table, subject, successor) in enumerate(taken):
+            if subject is None or last[subject] == i:
+                try:
+                    self._apply(table, successor)
+                except InputError as error:
+                    refused.append(str(error))
+        pull, shown = self._hold(refused), []
         for flight in self.flights:
-            if flight.loop.reason is not None:
-                samples.append(None)
-                continue
-            try:
-                samples.append(flight.step())
-            except FlightError as error:
-                samples.append(None)
-                if flight is self.flights[0]:
-                    self.reason = str(error)
-        margins = tuple(
-            {} if sample is None else flight.margins(sample)
-            for flight, sample in zip(self.flights, samples, strict=True)
-        )
-        horizons = tuple(
-            None if sample is None else _horizon(flight, sample)
-            for flight, sample in zip(self.flights, samples, strict=True)
-        )
+            sample, margins, horizon = None, {}, None
+            if flight.loop.reason is None:
+                try:
+                    sample = flight.step()
+                    margins, horizon = flight.margins(sample), _horizon(flight, sample)
+                except FlightError as error:
+                    self.reason = str(error) if flight is self.flights[0] else self.reason
+            shown.append((sample, margins, horizon))
+        samples, all_margins, horizons = zip(*shown, strict=True)
         return Frame(
             k=self.k - 1,
             time=round((self.k - 1) * self.period, 9),
-            samples=tuple(samples),
-            margins=margins,
+            samples=samples,
+            margins=all_margins,
             horizons=horizons,
             pull=pull,
             refused=tuple(refused),
         )
+
+    def play(self, script: Script) -> list[str]:
+        """Fly by a script, as fast as it goes; why inputs were refused.
+
+        An input is given when the first period begins that is not before its time.
+        """
+        refused: list[str] = []
+        waiting = deque(sorted(script.inputs, key=lambda each: each.at))
+        while self.reason is None and self.k * self.period < script.duration - 1e-9:
+            while waiting and waiting[0].at <= self.k * self.period + 1e-9:
+                self.submit(waiting.popleft().model_extra or {})
+            refused += self.advance().refused
+        return refused
 
     def flight(self, which: int = 0) -> Flight:
         """What has been flown so far, audited; its scenario flies to the same bits.
@@ -187,52 +220,25 @@ class Session:
             raise InputError("nothing has been flown yet")
         return self.flights[which].flight()
 
-    def _taken(self) -> list[Input]:
-        """The inputs up to now, of each subject the last one."""
-        taken: list[Input] = []
-        while self._queue:
-            taken.append(self._queue.popleft())
-        last = {each.subject: i for i, each in enumerate(taken)}
-        return [each for i, each in enumerate(taken) if each.subject is None or last[each.subject] == i]
-
-    def _apply(self, given: Input) -> str | None:
-        """Let an input act; why it is refused, or None."""
-        table = given.table
-        try:
-            kind = str(table.get("type"))
-            if unknown := sorted(set(table) - _ENTRIES.get(kind, set(table))):
-                raise InputError(f"{kind}: unknown: {', '.join(unknown)}; it has {', '.join(sorted(_ENTRIES[kind]))}")
-            if kind == "pull":
-                to = table.get("to")
-                self._held.pull = None if to is None else Pull(_vector(to, "pull", "to"))
-            elif kind == "wear":
-                self._wear(table)
-            elif kind == "steer":
-                self._held.steer = np.array(_vector(table.get("velocity"), "steer", "velocity"))
+    def _apply(self, table: Mapping[str, Any], successor: Successor | None) -> None:
+        """Let an input act; a controller's event on the first flight alone."""
+        if table.get("type") not in ("pull", "wear", "steer"):
+            if table.get("type") == "setpoint":
+                self._held.setpoint = None
+            if table.get("type") == "controller":
+                self.flights[0].apply(table, successor)
             else:
-                self._happen(table, given.successor)
-        except InputError as error:
-            return str(error)
-        return None
-
-    def _wear(self, table: Mapping[str, Any]) -> None:
-        rotor, loss = table.get("rotor"), table.get("loss")
-        if not isinstance(rotor, int) or isinstance(rotor, bool) or rotor not in range(1, N_ROTORS + 1):
-            raise ParameterError("wear", "rotor", rotor, f"1 to {N_ROTORS}")
-        if not isinstance(loss, int | float) or isinstance(loss, bool) or not 0.0 <= loss <= 1.0:
-            raise ParameterError("wear", "loss", loss, "from 0 to 1")
-        self._held.wear[rotor] = float(loss)
-
-    def _happen(self, event: Mapping[str, Any], successor: Successor | None = None) -> None:
-        """Apply an event to every flight, to none of them if one refuses.
-
-        A controller's event is the first flight's alone.
-        """
-        if event.get("type") == "controller":
-            self.flights[0].apply(event, successor)
+                self._happen(table)
             return
-        if event.get("type") == "setpoint":
-            self._held.setpoint = None
+        match validated(_Held, {"input": table}, "input").input:
+            case Pull(to=to):
+                self._held.pull = None if to is None else np.array(to)
+            case Wear(rotor=rotor, loss=loss):
+                self._held.wear[rotor] = loss
+            case Steer(velocity=velocity):
+                self._held.steer = np.array(velocity)
+
+    def _happen(self, event: Mapping[str, Any]) -> None:
         for flight in self.flights:
             if flight.loop.reason is None:
                 flight.apply(event)
@@ -242,17 +248,15 @@ class Session:
         held, force, last = self._held, np.zeros(3), self.flights[0].loop.last
         if last is None:  # where the vehicle is shows once a period has been flown
             return force
-        if held.pull is not None:
-            reach = np.array(held.pull.to) - last.segment.physics[-1, 1:4]
-            force = self._stiffness * reach
-            size = float(np.linalg.norm(force))
-            force *= min(1.0, self._strongest / size) if size > 0.0 else 0.0
-            force = np.round(force / FORCE_STEP) * FORCE_STEP
         events: list[dict[str, Any]] = []
-        if force.any():
-            events.append(
-                {"type": "push", "duration": self.period, "force": [round(each, 6) for each in force.tolist()]}
-            )
+        if held.pull is not None:
+            weight = self.flights[0].actual.mass * self.flights[0].actual.gravity
+            force = STIFFNESS * weight * (held.pull - last.segment.physics[-1, 1:4])
+            size = float(np.linalg.norm(force))
+            force *= min(1.0, STRONGEST * weight / size) if size > 0.0 else 0.0
+            force = np.round(force / FORCE_STEP) * FORCE_STEP
+            if force.any():
+                events.append({"type": "push", "duration": self.period, "force": np.round(force, 6).tolist()})
         for rotor, loss in sorted(held.wear.items()):
             if loss > 0.0:
                 events.append({"type": "rotor_loss", "rotor": rotor, "loss": loss, "duration": self.period})
@@ -260,28 +264,28 @@ class Session:
             at = last.observation.reference[:3] if held.setpoint is None else held.setpoint
             held.setpoint = np.round(at + self.period * held.steer, 6)
             events.append({"type": "setpoint", **dict(zip(REFERENCE_NAMES, held.setpoint.tolist(), strict=False))})
-        for event in events:
-            try:
-                for flight in self.flights:
-                    if flight.loop.reason is None:
-                        flight.apply(event)
-            except InputError as error:  # as where a scenario is full of events
-                refused.append(f"{error}; all is let go")
-                self._held = _Held()
-                return np.zeros(3)
+        try:
+            for event in events:
+                self._happen(event)
+        except InputError as error:  # as where a scenario is full of events
+            refused.append(f"{error}; all is let go")
+            self._held = _Hand()
+            return np.zeros(3)
         return force
 
 
-def _vector(value: object, name: str, entry: str) -> tuple[float, float, float]:
-    """Three finite numbers."""
-    if not isinstance(value, list | tuple) or len(value) != 3 or not all(map(_is_finite, value)):
-        raise ParameterError(name, entry, value, "three finite numbers")
-    x, y, z = map(float, value)
-    return x, y, z
+def read_script(path: str | Path) -> Script:
+    """Read a script.
 
-
-def _is_finite(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    Raises:
+        FileError: it cannot be read.
+        InputError: it is not a script.
+    """
+    script = validated(Script, read_toml(Path(path)), str(path))
+    for i, each in enumerate(script.inputs):
+        if each.at >= script.duration:
+            raise InputError(f"{path}: inputs.{i}.at must be below duration = {script.duration} s; got {each.at}")
+    return script
 
 
 def _horizon(flight: StartedFlight, sample: Sample) -> Array | None:

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 from quadsim.errors import InputError
-from quadsim.flight.form import Each, Optional
-from quadsim.flight.summary import FLOWN_FORM
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
-from scenarios.limits import build_limits
 from scenarios.papers.paper import NumberSpec, Paper, scenario_of
 from scenarios.progress import Progress, silent
 from scenarios.run import fly_scenario
-from scenarios.schema.settings import get_field
 
 HEAD: Final = ("number", "unit", "published", "ours", "difference", "tolerance", "reproduced")
 _RULE: Final = "measure must lead to a number of the flight's summary"
@@ -130,13 +125,10 @@ def reproduce_paper(
         chosen: which numbers.
 
     Raises:
-        InputError: a number cannot be flown, or the flight's summary has no such number; before anything is flown
-            where that can be known.
+        InputError: a number cannot be flown, or the flight's summary has no such number.
     """
     specs = [spec for spec in paper.numbers if chosen(spec)]
     scenarios = [scenario_of(paper, spec) for spec in specs]
-    for spec, scenario in zip(specs, scenarios, strict=True):
-        _require_number(spec, [limit.name for limit in build_limits(scenario)])
     flown: dict[str, dict[str, Any]] = {}
     found = []
     for done, (spec, scenario) in enumerate(zip(specs, scenarios, strict=True)):
@@ -149,31 +141,19 @@ def reproduce_paper(
     return Reproduction(paper=paper, numbers=tuple(found))
 
 
-def _require_number(spec: NumberSpec, constraints: Sequence[str]) -> None:
-    """Refuse a measure that cannot lead to a number of a flight's summary, by the summary's form."""
-    form: Any = FLOWN_FORM
-    path, allowed = "", dict[str, Any]()
-    for key in [*spec.measure.split("."), None]:
-        form = form.form if isinstance(form, Optional) else form
-        form = form[0] if isinstance(form, tuple) else form  # the other is None
-        if path == "constraints":
-            allowed = dict.fromkeys(constraints, form[0])
-        elif isinstance(form, Each) or (isinstance(form, list) and str(key).isdigit()):  # known after the flight
-            allowed = {str(key): form.form if isinstance(form, Each) else form[0]}
-        else:
-            allowed = form if isinstance(form, dict) else {}
-        if key not in allowed:
-            break
-        path, form = f"{path}.{key}".lstrip("."), allowed[key]
-    if path != spec.measure or form not in (int, float):
-        there = f" ({path or 'summary.json'} has: {', '.join(allowed)})" if allowed else ""
-        raise InputError(f"{spec.name}: {_RULE}; got {spec.measure!r}{there}")
-
-
 def _measured(spec: NumberSpec, summary: dict[str, Any]) -> Reproduced:
     if summary["status"] != "completed":
         return Reproduced(spec=spec, ours=None, reason=summary["reason"])
-    value = get_field(copy.deepcopy(summary), spec.measure)
+    value: Any = summary
+    path = ""
+    for key in spec.measure.split("."):
+        if isinstance(value, list | tuple):
+            value = {entry["name"] if path == "constraints" else str(i): entry for i, entry in enumerate(value)}
+        there = value if isinstance(value, Mapping) else {}
+        if key not in there:
+            has = f" ({path or 'summary.json'} has: {', '.join(there)})" if there else ""
+            raise InputError(f"{spec.name}: {_RULE}; got {spec.measure!r}{has}")
+        path, value = f"{path}.{key}".lstrip("."), there[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{spec.name}: {_RULE}; got {spec.measure!r}")
     return Reproduced(spec=spec, ours=float(value))

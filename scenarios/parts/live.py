@@ -9,7 +9,7 @@ from bisect import insort
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -60,6 +60,21 @@ class _Listed(Spec):
     """A table that has events, for messages to name them."""
 
     events: list[Event]
+
+
+T = TypeVar("T", bound=Spec)
+
+
+def validated(kind: type[T], data: Mapping[str, Any], name: str) -> T:
+    """A table of this kind.
+
+    Raises:
+        ScenarioError: it is none; the message starts with `name`.
+    """
+    try:
+        return kind.model_validate_json(json.dumps(data, default=lambda _: math.inf))
+    except ValidationError as error:
+        raise ScenarioError(name, describe_all(error, data, kind)) from error
 
 
 class FlightEvents:
@@ -159,11 +174,7 @@ class FlightEvents:
         step, first = self.scenario.plant.timestep, self._loop.k + self._loop.observed
         at = round(first * self.scenario.control_period, 9)
         if isinstance(event, Mapping):
-            data = {"events": [{**event, "at": at}]}
-            try:
-                event = _Listed.model_validate_json(json.dumps(data, default=lambda _: math.inf)).events[0]
-            except ValidationError as error:
-                raise ScenarioError("event", describe_all(error, data, _Listed)) from error
+            event = validated(_Listed, {"events": [{**event, "at": at}]}, "event").events[0]
         if isinstance(event, SensorFaultEvent):  # what is sensed at the period's begin has been sensed
             at = round(at + step, 9)
         if isinstance(event, Stall) and self._loop.answered >= at:  # a command that has come was not held up

@@ -9,7 +9,8 @@ import pytest
 
 from mpc.observer import DisturbanceObserver, ObserverSettings, observer_gain, thrust_axis
 from quadsim.errors import ParameterError
-from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, body_to_euler_rates, body_to_world, make_state
+from quadsim.rotation import body_to_euler_rates, body_to_world
+from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, make_state
 
 PERIOD = 0.05
 LEVEL = make_state()

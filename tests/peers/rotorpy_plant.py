@@ -17,8 +17,9 @@ from rotorpy.vehicles.multirotor import Multirotor
 from scipy.integrate import solve_ivp
 
 from quadsim.errors import ParameterError
+from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.sim.physics import Segment, physics_to_state
-from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, euler_to_body_rates, euler_to_quaternion
+from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 INTEGRATOR: Final = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13}

@@ -8,6 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from quadsim.rotation import (
+    body_rates_of,
+    body_to_euler_rates,
+    body_to_world,
+    euler_to_body_rates,
+    euler_to_quaternion,
+    quaternion_to_euler,
+)
 from quadsim.sim.physics import physics_to_state
 from quadsim.state import (
     EULER_RATE,
@@ -18,13 +26,7 @@ from quadsim.state import (
     STATE_NAMES,
     STATE_UNITS,
     Array,
-    body_rates_of,
-    body_to_euler_rates,
-    body_to_world,
-    euler_to_body_rates,
-    euler_to_quaternion,
     make_state,
-    quaternion_to_euler,
     read_only,
 )
 

@@ -14,19 +14,9 @@ from mpc.nonlinear.rigidbody import thrust_axis
 from quadsim.controller import Command, Controller, Moment
 from quadsim.flight.parquet import log_tables, read_log, write_log
 from quadsim.motion import Motion
+from quadsim.rotation import euler_to_body_rates, euler_to_quaternion, quaternion_to_euler
 from quadsim.sim.physics import physics_to_state
-from quadsim.state import (
-    ANGLE_RATES,
-    ANGLES,
-    INDEX,
-    N_STATES,
-    Array,
-    YawTurns,
-    euler_to_body_rates,
-    euler_to_quaternion,
-    quaternion_to_euler,
-    tilt,
-)
+from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, Array, YawTurns, tilt
 from scenarios.build import build_controller
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario

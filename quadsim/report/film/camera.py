@@ -12,8 +12,9 @@ import numpy as np
 
 from quadsim.errors import ParameterError, RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend, worker_process
+from quadsim.rotation import euler_to_quaternion
 from quadsim.space import Obstacle
-from quadsim.state import EULER, POSITION, Array, euler_to_quaternion
+from quadsim.state import EULER, POSITION, Array
 from quadsim.vehicle import Vehicle
 
 REQUEST: Final = Struct("15d")

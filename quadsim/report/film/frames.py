@@ -10,7 +10,8 @@ import numpy as np
 from quadsim.errors import FileError, ParameterError
 from quadsim.flight.audit import Limit, margins_at, margins_sampled
 from quadsim.flight.rundir import Run
-from quadsim.state import EULER, POSITION, Array, euler_to_quaternion, tilt
+from quadsim.rotation import euler_to_quaternion
+from quadsim.state import EULER, POSITION, Array, tilt
 
 _CAMERA_MEMORY: Final = 0.7  # time constant [s] of the camera's smoothing, forward and backward
 _LEASH: Final = 0.6  # how far the camera's aim may be from the vehicle, in arm lengths per axis

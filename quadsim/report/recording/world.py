@@ -12,7 +12,8 @@ from quadsim.flight.rundir import Run
 from quadsim.report.recording import style
 from quadsim.report.recording.style import Colour, time_column
 from quadsim.report.scene import obstacles_in, region_edges
-from quadsim.state import EULER, POSITION, Array, euler_to_quaternion
+from quadsim.rotation import euler_to_quaternion
+from quadsim.state import EULER, POSITION, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.sim.sensing.sphere import conjugate, exponential, logarithm, normalise, product
+from quadsim.rotation import conjugate, exponential, logarithm, multiply, normalise
 from quadsim.state import Array
 
 POSITION: Final = slice(0, 3)
@@ -41,7 +41,7 @@ def retract(mean: Array, error: Array) -> Array:
     moved[:6] = mean[:6] + error[:6]
     w, x, y, z = mean[MEAN_QUATERNION].tolist()
     a, b, c = error[ATTITUDE].tolist()
-    moved[MEAN_QUATERNION] = normalise(product((w, x, y, z), exponential((a, b, c))))
+    moved[MEAN_QUATERNION] = normalise(multiply((w, x, y, z), exponential((a, b, c))))
     moved[10:] = mean[10:] + error[9:]
     return moved
 
@@ -53,5 +53,5 @@ def difference(mean: Array, other: Array) -> Array:
     error[9:] = mean[10:] - other[10:]
     w, x, y, z = mean[MEAN_QUATERNION].tolist()
     a, b, c, d = other[MEAN_QUATERNION].tolist()
-    error[ATTITUDE] = logarithm(product(conjugate((a, b, c, d)), (w, x, y, z)))
+    error[ATTITUDE] = logarithm(multiply(conjugate((a, b, c, d)), (w, x, y, z)))
     return error

@@ -24,6 +24,7 @@ from typing import Final
 import numpy as np
 
 from quadsim.fields import Vector
+from quadsim.rotation import exponential, multiply, normalise
 from quadsim.sim.estimation.estimate import (
     ATTITUDE,
     GYRO_BIAS,
@@ -35,7 +36,6 @@ from quadsim.sim.estimation.estimate import (
     Estimate,
 )
 from quadsim.sim.estimation.settings import EstimatorSettings
-from quadsim.sim.sensing.sphere import exponential, normalise, product
 from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
 
@@ -115,7 +115,7 @@ def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: flo
     half = 0.5 * h
     p1, q1, r1 = p + half * (tx - kx * q * r), q + half * (ty - ky * p * r), r + half * (tz - kz * p * q)
     quarter = 0.25 * h  # the mean rate of the first half, times its length
-    w, x, y, z = product(attitude, exponential((quarter * (p + p1), quarter * (q + q1), quarter * (r + r1))))
+    w, x, y, z = multiply(attitude, exponential((quarter * (p + p1), quarter * (q + q1), quarter * (r + r1))))
     ax, ay, az = 2.0 * a * (x * z + w * y), 2.0 * a * (y * z - w * x), a * (1.0 - 2.0 * (x * x + y * y)) - model.gravity
     mean = np.array(
         [
@@ -125,7 +125,7 @@ def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: flo
             vx + h * ax,
             vy + h * ay,
             vz + h * az,
-            *normalise(product(attitude, exponential((h * p1, h * q1, h * r1)))),
+            *normalise(multiply(attitude, exponential((h * p1, h * q1, h * r1)))),
             p + h * (tx - kx * q1 * r1),
             q + h * (ty - ky * p1 * r1),
             r + h * (tz - kz * p1 * q1),

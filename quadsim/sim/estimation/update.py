@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from quadsim.rotation import conjugate, logarithm, multiply, of_euler
 from quadsim.sim.estimation.estimate import (
     ATTITUDE,
     GYRO_BIAS,
@@ -27,7 +28,6 @@ from quadsim.sim.estimation.estimate import (
     retract,
 )
 from quadsim.sim.sensing.sensor import SensorName
-from quadsim.sim.sensing.sphere import conjugate, logarithm, of_euler, product
 from quadsim.state import Array, read_only
 
 _BLOCKS: Final = {
@@ -61,7 +61,7 @@ def innovation(name: SensorName, mean: Array, value: Array) -> Array:
     if name is SensorName.ATTITUDE:
         w, x, y, z = mean[MEAN_QUATERNION].tolist()
         roll, pitch, yaw = value.tolist()
-        return np.array(logarithm(product(conjugate((w, x, y, z)), of_euler(roll, pitch, yaw))))
+        return np.array(logarithm(multiply(conjugate((w, x, y, z)), of_euler(roll, pitch, yaw))))
     if name is SensorName.RATES:
         return value - mean[MEAN_RATES] - mean[MEAN_GYRO_BIAS]
     return value - mean[_BLOCKS[name][0]]

@@ -10,9 +10,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from quadsim.rotation import exponential, multiply, quaternion_to_euler
 from quadsim.sim.sensing.sensor import FaultKind, Sensor, SensorFault, SensorName
-from quadsim.sim.sensing.sphere import exponential, product
-from quadsim.state import Array, quaternion_to_euler
+from quadsim.state import Array
 
 _COLUMNS = {
     SensorName.POSITION: slice(1, 4),
@@ -148,7 +148,7 @@ class Sampler:
         if name is not SensorName.ATTITUDE:
             return rows[:, _COLUMNS[name]] + errors
         turned = [
-            product((w, x, y, z), exponential((a, b, c)))
+            multiply((w, x, y, z), exponential((a, b, c)))
             for (w, x, y, z), (a, b, c) in zip(rows[:, _COLUMNS[name]].tolist(), errors.tolist(), strict=True)
         ]
         return quaternion_to_euler(np.array(turned))

@@ -12,7 +12,7 @@ from annotated_types import Ge, Le, doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Fraction
-from quadsim.sim.sensing.sphere import Vector
+from quadsim.rotation import Vector
 
 AXES: Final = (0, 1, 2)
 

@@ -15,20 +15,11 @@ from mpc.model import hover_model
 from mpc.nonlinear import model as module
 from mpc.nonlinear.model import NonlinearModel, derivative, nonlinear_model
 from quadsim.errors import ParameterError
+from quadsim.rotation import body_to_euler_rates, body_to_world, euler_to_body_rates
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.plant import Plant
-from quadsim.state import (
-    EULER,
-    EULER_RATE,
-    POSITION,
-    VELOCITY,
-    Array,
-    body_to_euler_rates,
-    body_to_world,
-    euler_to_body_rates,
-    make_state,
-)
+from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array, make_state
 from quadsim.vehicle import Vehicle
 
 PERIOD = 0.05

@@ -15,14 +15,15 @@ from mpc.constraints import Constraint
 from mpc.diagnosis import find_conflict
 from mpc.nonlinear.controller import CONVERGED, NonlinearMPC
 from mpc.nonlinear.reference import nodes_of_motion, nodes_of_preview
-from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, advance_nodes, product, rigid_body, thrust_axis
+from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, advance_nodes, rigid_body, thrust_axis
 from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
 from mpc.observer import ObserverSettings
 from quadsim.assets import vehicle_path
 from quadsim.controller import ACCEPTED, NOT_CONVERGED, OPTIMAL, Command, Moment, Phase
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
-from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array, quaternion_to_euler
+from quadsim.rotation import multiply, quaternion_to_euler
+from quadsim.state import INDEX, N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(vehicle_path("hummingbird"))
@@ -481,7 +482,7 @@ def test_turning_the_world_about_the_vertical_turns_the_answer_with_it() -> None
     turn = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     other = x.copy()
     other[P], other[V] = turn @ x[P], turn @ x[V]
-    other[Q] = product(np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]), x[Q])
+    other[Q] = multiply(np.array([math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]), x[Q])
     reference = np.zeros((20, 4))
     reference[:, 3] = yaw
     np.testing.assert_allclose(call(law(weights=even), other, reference=reference).speeds, plain.speeds, rtol=1e-9)

@@ -21,27 +21,20 @@ from mpc.nonlinear.rigidbody import (
     advance_nodes,
     defects,
     linearise_nodes,
-    product,
     rigid_body,
     rotation,
     thrust_axis,
 )
 from quadsim.assets import vehicle_path
 from quadsim.errors import ParameterError
-from quadsim.state import (
-    ANGLE_RATES,
-    ANGLES,
-    N_STATES,
-    POSITIONS,
-    VELOCITIES,
-    Array,
+from quadsim.rotation import (
     body_to_euler_rates,
     body_to_world,
     euler_to_body_rates,
     euler_to_quaternion,
     quaternion_to_euler,
-    tilt,
 )
+from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, tilt
 from quadsim.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(vehicle_path("lopes2011"))
@@ -141,12 +134,6 @@ def test_the_angle_of_the_thrust_axis_is_the_tilt_of_euler_angles_at_any_attitud
     states[:, ANGLES] = quaternion_to_euler(q)
     np.testing.assert_allclose(tilt(states), np.arccos(thrust_axis(q)[:, 2]), atol=1e-6)
     np.testing.assert_allclose(rotation(q), body_to_world(states[:, ANGLES]), atol=1e-7)
-
-
-def test_products_turn_one_after_the_other() -> None:
-    q = np.random.default_rng(5).normal(size=(2, 4))
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    np.testing.assert_allclose(rotation(product(q[0], q[1])), rotation(q[0]) @ rotation(q[1]), atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quadsim.flight.feasibility import STENCIL, Demand, assess, demand
-from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array, body_to_world, euler_to_body_rates, tilt
+from quadsim.rotation import body_to_world, euler_to_body_rates
+from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array, tilt
 from quadsim.vehicle import Vehicle
 
 PERIOD = 0.01

@@ -14,7 +14,8 @@ from scipy.integrate import cumulative_trapezoid
 from mpc.flatness import attitudes, motion_along
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
-from quadsim.state import Array, quaternion_to_euler
+from quadsim.rotation import quaternion_to_euler
+from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, build_motion, build_reference
 from scenarios.courses.ramped import ramped_phase

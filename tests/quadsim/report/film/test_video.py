@@ -30,7 +30,8 @@ from quadsim.report.film.captions import Overlay, margin_rows
 from quadsim.report.film.frames import Shot, make_footage, thin
 from quadsim.report.film.painter import CYAN, GREEN, RED, VIOLET, Colour
 from quadsim.report.film.video import render_gif, render_video, rendering_backend
-from quadsim.state import EULER, INDEX, POSITION, body_to_world
+from quadsim.rotation import body_to_world
+from quadsim.state import EULER, INDEX, POSITION
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,8 @@ from quadsim.flight.audit import HELD, SIGNALS, Limit, margins_sampled
 from quadsim.flight.rundir import Run
 from quadsim.report.recording import layout, open_viewer, texts, viewer_problem, world, write_recording
 from quadsim.report.recording.style import FRONT_PANELS, PANELS, TIMELINE, VERDICTS, panels
-from quadsim.state import EULER, INDEX, POSITION, body_to_world
+from quadsim.rotation import body_to_world
+from quadsim.state import EULER, INDEX, POSITION
 
 
 class Content:

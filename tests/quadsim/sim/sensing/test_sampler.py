@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from quadsim.rotation import euler_to_quaternion
 from quadsim.sim.sensing.sampler import Sample, Sampler, truth
 from quadsim.sim.sensing.sensor import FaultKind, Outliers, Sensor, SensorFault, SensorName
-from quadsim.state import Array, euler_to_quaternion
+from quadsim.state import Array
 
 TIMESTEP = 1e-3
 STEPS = 20_000

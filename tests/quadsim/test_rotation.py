@@ -10,8 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from quadsim.sim.sensing.sphere import Vector, conjugate, exponential, logarithm, normalise, of_euler, product
-from quadsim.state import euler_to_quaternion
+from quadsim.rotation import (
+    Vector,
+    conjugate,
+    euler_to_quaternion,
+    exponential,
+    logarithm,
+    multiply,
+    normalise,
+    of_euler,
+)
 
 vectors = st.tuples(*[st.floats(-1.8, 1.8)] * 3)
 """Rotation vectors no longer than pi."""
@@ -20,7 +28,7 @@ vectors = st.tuples(*[st.floats(-1.8, 1.8)] * 3)
 @given(a=vectors, b=vectors)
 def test_products_are_those_of_scipy(a: Vector, b: Vector) -> None:
     expected = (Rotation.from_rotvec(a) * Rotation.from_rotvec(b)).as_quat(scalar_first=True)
-    found = np.array(product(exponential(a), exponential(b)))
+    found = np.array(multiply(exponential(a), exponential(b)))
     assert abs(found @ expected) == pytest.approx(1.0, abs=1e-14)  # q and -q are one rotation
 
 
@@ -40,10 +48,17 @@ def test_small_angles_keep_their_digits(angle: float) -> None:
 @given(a=vectors)
 def test_a_rotation_and_its_conjugate_cancel(a: Vector) -> None:
     q = exponential(a)
-    assert product(q, conjugate(q)) == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-15)
+    assert multiply(q, conjugate(q)) == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-15)
     assert normalise((3.0 * q[0], 3.0 * q[1], 3.0 * q[2], 3.0 * q[3])) == pytest.approx(q, abs=1e-15)
 
 
 @given(euler=st.tuples(*[st.floats(-3.2, 3.2)] * 3))
 def test_euler_angles_are_those_of_the_state(euler: Vector) -> None:
     np.testing.assert_allclose(of_euler(*euler), euler_to_quaternion(np.array(euler)), atol=1e-15)
+
+
+@given(vectors=st.lists(st.tuples(vectors, vectors), min_size=1, max_size=4))
+def test_arrays_are_multiplied_as_each_of_their_rows_is(vectors: list[tuple[Vector, Vector]]) -> None:
+    pairs = [(exponential(a), conjugate(exponential(b))) for a, b in vectors]
+    a, b = (np.array(each) for each in zip(*pairs, strict=True))
+    np.testing.assert_array_equal(multiply(a, conjugate(conjugate(b))), [multiply(p, q) for p, q in pairs])

@@ -1,0 +1,180 @@
+"""Rotations: quaternions, Euler angles, and their rates.
+
+Quaternions are (w, x, y, z), body to world, Hamilton's product; Euler angles are Z-Y-X, body_to_world =
+Rz(yaw) Ry(pitch) Rx(roll); rotation vectors are angle times axis [rad].  A small error e of an attitude q
+turns the body: q * exp(e).
+Solà, "Quaternion kinematics for the error-state Kalman filter", 2017, arXiv:1711.02508: Eqs. (12), (101), (105).
+
+Functions of arrays take any leading dimensions; functions of tuples take plain numbers, which for one attitude are
+several times faster.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, overload
+
+import numpy as np
+
+from quadsim.state import ANGLE_RATES, ANGLES, Array
+
+Quaternion = tuple[float, float, float, float]
+Vector = tuple[float, float, float]
+
+
+@overload
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion: ...
+@overload
+def multiply(a: Array, b: Array) -> Array: ...
+def multiply(a: Any, b: Any) -> Any:
+    """Hamilton's product: the rotation b, then, in the frame that b leads to, a: body to world of both.
+
+    Args:
+        a: a tuple of plain numbers, or (..., 4).
+        b: the same.
+    """
+    if isinstance(a, tuple):
+        return _product(a, b)
+    return np.stack(_product(np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)), axis=-1)
+
+
+def _product(a: Iterable[Any], b: Iterable[Any]) -> tuple[Any, Any, Any, Any]:
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+@overload
+def conjugate(q: Quaternion) -> Quaternion: ...
+@overload
+def conjugate(q: Array) -> Array: ...
+def conjugate(q: Any) -> Any:
+    """The inverse rotation of a unit quaternion: a tuple of plain numbers, or (..., 4)."""
+    return (q[0], -q[1], -q[2], -q[3]) if isinstance(q, tuple) else q * [1.0, -1.0, -1.0, -1.0]
+
+
+def normalise(q: Quaternion) -> Quaternion:
+    """The unit quaternion in the same direction."""
+    scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale
+
+
+def exponential(vector: Vector) -> Quaternion:
+    """The unit quaternion of a rotation vector [rad]."""
+    x, y, z = vector
+    angle = math.sqrt(x * x + y * y + z * z)
+    # sin(a/2)/a by its series where the quotient loses its digits; the terms left out are below 1e-17 there.
+    scale = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
+    return math.cos(0.5 * angle), scale * x, scale * y, scale * z
+
+
+def logarithm(q: Quaternion) -> Vector:
+    """The shortest rotation vector [rad] of a unit quaternion, at most pi long; q and -q are one rotation."""
+    w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
+    sine = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 if sine < 1e-8 else 2.0 * math.atan2(sine, w) / sine
+    return scale * x, scale * y, scale * z
+
+
+def quaternion_to_euler(quaternion: Array) -> Array:
+    """Roll, pitch, yaw [rad] of unit quaternions.
+
+    Args:
+        quaternion: (..., 4), scalar first (w, x, y, z), body to world.
+
+    Returns:
+        (..., 3): roll and yaw in [-pi, pi], pitch in [-pi/2, pi/2].
+    """
+    w, x, y, z = _entries(quaternion)
+    euler = np.empty((*x.shape, 3))
+    euler[..., 0] = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    euler[..., 1] = np.arcsin(np.minimum(np.maximum(2.0 * (w * y - z * x), -1.0), 1.0))
+    euler[..., 2] = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return euler
+
+
+def euler_to_quaternion(euler: Array) -> Array:
+    """Unit quaternions (..., 4), scalar first, body to world, of roll, pitch, yaw (..., 3) [rad]."""
+    half = 0.5 * np.asarray(euler, float)
+    return np.stack(_quaternion(np.moveaxis(np.cos(half), -1, 0), np.moveaxis(np.sin(half), -1, 0)), axis=-1)
+
+
+def of_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """The same of one attitude, in plain numbers."""
+    halves = 0.5 * roll, 0.5 * pitch, 0.5 * yaw
+    return _quaternion(map(math.cos, halves), map(math.sin, halves))
+
+
+def _quaternion(cosines: Iterable[Any], sines: Iterable[Any]) -> tuple[Any, Any, Any, Any]:
+    """The unit quaternion of half the Euler angles' cosines and sines, arrays or plain numbers."""
+    (cr, cp, cy), (sr, sp, sy) = cosines, sines
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:
+    """Euler-angle rates [rad/s] from body rates (p, q, r).
+
+    d(roll)/dt = p + (q sin(roll) + r cos(roll)) tan(pitch), and so on; singular at pitch = +-90 deg, where the
+    result grows without bound.  The paper (Sec. 2.2) takes the two sets of rates as equal, which holds at small
+    angles only.
+    """
+    roll, pitch, _ = _entries(euler)
+    p, q, r = _entries(body_rates)
+    sin_roll, cos_roll = np.sin(roll), np.cos(roll)
+    lateral = q * sin_roll + r * cos_roll
+    rates = np.empty((*lateral.shape, 3))
+    rates[..., 0] = p + lateral * np.tan(pitch)
+    rates[..., 1] = q * cos_roll - r * sin_roll
+    rates[..., 2] = lateral / np.cos(pitch)
+    return rates
+
+
+def euler_to_body_rates(euler: Array, euler_rates: Array) -> Array:
+    """Body rates (p, q, r) [rad/s] from Euler-angle rates; the inverse of `body_to_euler_rates`."""
+    roll, pitch = euler[..., 0], euler[..., 1]
+    rates = np.moveaxis(np.asarray(euler_rates, float), -1, 0)
+    return np.stack(_body_rates(np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch), rates), axis=-1)
+
+
+def body_rates_of(state: Sequence[float]) -> tuple[float, float, float]:
+    """Body rates (p, q, r) [rad/s] of one finite state (12,), in plain numbers: faster than arrays of three."""
+    roll, pitch, _ = state[ANGLES]
+    return _body_rates(math.sin(roll), math.cos(roll), math.sin(pitch), math.cos(pitch), state[ANGLE_RATES])
+
+
+def _body_rates(sin_roll: Any, cos_roll: Any, sin_pitch: Any, cos_pitch: Any, euler_rates: Any) -> tuple[Any, Any, Any]:
+    """Body rates (p, q, r) from Euler-angle rates, arrays or plain numbers."""
+    roll_rate, pitch_rate, yaw_rate = euler_rates
+    return (
+        roll_rate - yaw_rate * sin_pitch,
+        pitch_rate * cos_roll + yaw_rate * cos_pitch * sin_roll,
+        -pitch_rate * sin_roll + yaw_rate * cos_pitch * cos_roll,
+    )
+
+
+def body_to_world(euler: Array) -> Array:
+    """Rotation matrices (..., 3, 3) from body to world for roll, pitch, yaw (..., 3) [rad]."""
+    (cr, cp, cy), (sr, sp, sy) = np.moveaxis(np.cos(euler), -1, 0), np.moveaxis(np.sin(euler), -1, 0)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _entries(vectors: Array) -> tuple[Array, ...]:
+    """The entries of vectors (..., m), each of shape (...)."""
+    array = np.asarray(vectors, float)
+    return tuple([array[..., i] for i in range(array.shape[-1])])
