@@ -12,7 +12,6 @@ import pytest
 
 import quadsim
 from quadsim.controller import Moment
-from quadsim.errors import InputError
 from quadsim.flight import rundir
 from quadsim.report.comparison import comparison_rows
 from quadsim.state import STATE_NAMES, Array
@@ -130,26 +129,6 @@ def test_what_the_effects_leave_to_the_vehicle_is_that_of_the_actual_one() -> No
     assert written.vehicle.rotor_rise == 0.0125
     again = parse_scenario(tomllib.loads(written.to_toml()))
     assert resolve(again, build_vehicle(again)).to_toml() == written.to_toml()
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (["actual.mas=4.4"], "actual.mas is not a field of the scenario file; did you mean 'mass'?"),
-        (["actual.file='hummingbird'"], "actual.file is not a field of the scenario file"),
-        (["actual.mass='heavy'"], "actual.mass must be a number; got 'heavy'"),
-        (["actual.mass=-1"], "actual.mass must be positive; got -1.0"),
-        (["actual.speed_max=150.0"], "actual.speed_max must be no lower than its hover speed"),
-        (
-            ["effects.rotors={rise=0.02, fall=0.02}", "actual.rotor_rise=0.05"],
-            r"actual.rotor_rise must be absent where effects.rotors.rise = 0.02 states it; got 0.05",
-        ),
-    ],
-)
-def test_messages(settings: list[str], message: str) -> None:
-    with pytest.raises(InputError) as caught:
-        load_scenario("hover", settings)
-    assert message in str(caught.value)
 
 
 def test_campaigns_draw_it_by_its_value_or_relative_to_the_model() -> None:
