@@ -68,10 +68,3 @@ def test_the_filter_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
     assert behind.startswith("gust: 180 steps, tilt up to 4.")
     assert "flown; stepped in" in behind
     assert alone.endswith("lost; no filter")
-
-
-def test_the_count_of_violations_that_samples_miss_is_todays() -> None:
-    import make_gym
-
-    table = make_gym.markdown(make_gym.between_samples()[0])
-    assert table in make_gym.PAGE.read_text(encoding="utf-8"), "docs/gym.md is out of date: make gym"

@@ -7,7 +7,6 @@ import pytest
 from make_numbers import mujoco_transition, transition_difference
 
 from mpc.model import continuous_model, discretise, hover_model
-from quadsim.errors import ParameterError
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -97,9 +96,3 @@ def test_hover_anywhere_is_an_equilibrium_of_deviations_only(vehicle: Vehicle) -
     np.testing.assert_allclose(model.A @ hover, hover, atol=1e-14)
     as_printed = model.A @ hover + model.B @ model.u_bar
     assert as_printed[5] == pytest.approx(2 * vehicle.gravity * PERIOD)  # climbing at twice g after one period
-
-
-@pytest.mark.parametrize("period", [0.0, -0.05, np.inf])
-def test_impossible_periods_are_refused(vehicle: Vehicle, period: float) -> None:
-    with pytest.raises(ParameterError, match=r"controller\.period must be positive and finite"):
-        hover_model(vehicle, period)

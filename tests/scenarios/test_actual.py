@@ -116,11 +116,6 @@ def test_both_vehicles_are_recorded_and_shown(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.command, flight.command)
 
 
-def test_a_flight_of_the_modelled_vehicle_records_one(constrained_flight: Flight) -> None:
-    assert "actual" not in constrained_flight.summary
-    assert constrained_flight.actual == constrained_flight.vehicle
-
-
 def test_what_the_effects_leave_to_the_vehicle_is_that_of_the_actual_one() -> None:
     scenario = load_scenario("hummingbird-real-rotors", ["actual.rotor_rise=0.05"])
     written = resolve(scenario, build_vehicle(scenario))
@@ -150,9 +145,3 @@ def test_campaigns_draw_it_by_its_value_or_relative_to_the_model() -> None:
     assert one.actual is not None
     assert one.actual.mass == drawn["draw.mass"]
     assert one.actual.inertia == pytest.approx([0.033 * drawn["draw.inertia"]] * 2 + [0.066])
-
-
-def test_sweeps_take_it(tmp_path: Path) -> None:
-    hover = quadsim.load("hover").replace({"duration": 1.0})
-    found = quadsim.sweep(hover, {"actual.mass": [4.0, 4.4]}, workers=1, progress=False)
-    assert found["rmse.z"][0] < 1e-6 < found["rmse.z"][1]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -86,13 +85,6 @@ def test_each_criterion_is_on_unless_it_is_switched_off(unstable: str, settings:
     assert flight.outcome == ("satisfied" if lost is None else "lost")
     if lost is None:
         assert flight.log.plant.state[-1, 4] < -500.0
-
-
-def test_the_criteria_are_written_out() -> None:
-    scenario = load_scenario("hover", ["lost.tilt=false", "lost.depth=3"])
-    assert load_scenario("hover").lost.limits == {"tilt": 120.0, "distance": 100.0, "depth": 50.0, "speed": 50.0}
-    assert scenario.lost.limits == {"distance": 100.0, "depth": 3.0, "speed": 50.0}
-    assert tomllib.loads(scenario.to_toml())["lost"] == {"tilt": False, "distance": 100.0, "depth": 3.0, "speed": 50.0}
 
 
 def test_what_capsizes_on_the_ground_has_crashed_and_is_not_lost(unstable: str) -> None:

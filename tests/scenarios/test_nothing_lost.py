@@ -83,17 +83,6 @@ def test_a_controller_that_exits_does_not_pass_a_check(tmp_path: Path) -> None:
     assert not (tmp_path / "w.xml").exists()
 
 
-def test_a_force_that_raises_ends_the_flight_likewise(tmp_path: Path) -> None:
-    def force(time: float, state: object) -> list[float]:
-        if time > 0.42:
-            raise KeyError("gone")
-        return [0.0] * 6
-
-    flown = quadsim.fly(quadsim.load("hover", {"duration": 1.0}), forces=[force], progress=False)
-    assert (flown.outcome, flown.time.size) == ("aborted", 8)
-    assert str(flown.log.reason).endswith("the force force raised KeyError: 'gone'")
-
-
 def test_a_prediction_that_raises_after_the_flight_loses_nothing_else() -> None:
     class Law:
         def __init__(self, vehicle: Vehicle, **settings: object) -> None:
@@ -203,14 +192,6 @@ def test_a_product_that_fails_is_named_and_decides_the_status_only_if_asked_for(
     assert quadsim_command("check", "runs/hover-2", here=tmp_path).returncode == 0
 
 
-def test_a_film_asked_for_later_that_fails_is_status_2_and_leaves_the_run(tmp_path: Path) -> None:
-    assert quadsim_command("run", "hover", "--set", "duration=0.5", *BARE, here=tmp_path).returncode == 0
-    before = summary_of(tmp_path / "runs" / "hover")
-    assert quadsim_command("video", "runs/hover", here=tmp_path, IMAGEIO_FFMPEG_EXE="/bin/false").returncode == 2
-    assert summary_of(tmp_path / "runs" / "hover") == before
-    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["hover"]
-
-
 @pytest.mark.parametrize("film", [True, False])
 def test_ctrl_c_keeps_what_was_flown(tmp_path: Path, film: bool) -> None:
     """In flight and while it is filmed: the file that appears first shows which."""
@@ -247,12 +228,3 @@ def test_python_keeps_a_flight_whose_film_was_asked_for_and_fails(
     with pytest.raises(OutputError, match="it is not empty"):
         flown.save(tmp_path / "run")
     flown.save(tmp_path / "run", overwrite=True, video=False, recording=False, figures=False)
-
-
-def test_check_says_what_a_campaign_is(tmp_path: Path) -> None:
-    scenario = quadsim.load("hover", {"duration": 0.5})
-    mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "uniform", "low": 4.0, "high": 4.4}
-    quadsim.campaign(scenario, vary=[mass], flights=2, workers=1, out=tmp_path / "c", report=False, progress=False)
-    done = quadsim_command("check", "c", here=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith("quadsim: c is a campaign, not a run: quadsim replay c --worst makes a run")

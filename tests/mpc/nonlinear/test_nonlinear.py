@@ -13,7 +13,6 @@ import pytest
 from mpc.model import hover_model
 from mpc.nonlinear.linearise import linearise
 from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
-from quadsim.errors import ParameterError
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.plant import Plant
@@ -228,22 +227,3 @@ def test_a_state_that_runs_away_is_no_number(vehicle: Vehicle) -> None:
         assert not np.isfinite(advance(model, x[None], u[None])).all()
         assert not np.isfinite(advance(model, x, u)).all()
         assert np.isnan(advance(model, 1e200 * x, u)).all()
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"period": 0.0}, r"controller\.period must be positive and finite; got 0\.0"),
-        ({"period": math.inf}, r"controller\.period must be positive and finite; got inf"),
-        ({"substeps": 0}, r"controller\.substeps must be a whole number >= 1; got 0"),
-        ({"rotor_lag": 0.0}, r"controller\.rotor_lag must be positive and finite, or None; got 0\.0"),
-        ({"acceleration": np.zeros(2)}, r"controller\.acceleration must be three finite numbers"),
-        (
-            {"angular_acceleration": np.full(3, np.nan)},
-            r"controller\.angular_acceleration must be three",
-        ),
-    ],
-)
-def test_impossible_numbers_are_refused(vehicle: Vehicle, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ParameterError, match=message):
-        replace(nonlinear_model(vehicle, PERIOD), **changes)

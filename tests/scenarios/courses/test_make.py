@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support import scenario_table
 
-from quadsim.errors import FileError, ParameterError
+from quadsim.errors import FileError
 from quadsim.state import Array
 from scenarios.courses.make import build_course, build_course_steps, build_reference
 from scenarios.courses.smoothing import smooth
@@ -192,17 +192,3 @@ def test_a_table_that_changed_after_the_scenario_was_resolved_is_refused(tmp_pat
         FileError, match=r"course\.csv: is not the file of the scenario: its SHA-256 is not [0-9a-f]{64}$"
     ):
         build_course(made)
-
-
-# --- what is wrong -------------------------------------------------------------------------------------------------
-
-
-def test_a_first_point_that_leaves_no_way_to_go_is_named() -> None:
-    with pytest.raises(ParameterError) as caught:
-        build_course(scenario("minimum_snap", points=[{"position": list(INITIAL)}, *POINTS]))
-    assert str(caught.value) == (
-        "reference.points.0.position must be 0.001 m or more from the initial position, where the course begins "
-        "(or give times instead of speed); got [1.0, -2.0, 3.0]"
-    )
-    stays = scenario("minimum_snap", points=[{"position": list(INITIAL)}], speed=None, times=[5.0])
-    np.testing.assert_allclose(build_course(stays).sample(np.linspace(0, 5, 9))[:, :3], np.tile(INITIAL, (9, 1)))

@@ -18,14 +18,12 @@ from quadsim.assets import vehicle_path
 from quadsim.errors import UnknownNameError
 from quadsim.flight.audit import SIGNALS
 from quadsim.state import STATE_NAMES
-from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS
-from scenarios.build import resolve
 from scenarios.limits import build_limits
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import LIBRARY, scenario_names
+from scenarios.shipped import LIBRARY
 
 
 def reread(scenario: Scenario) -> Scenario:
@@ -33,19 +31,6 @@ def reread(scenario: Scenario) -> Scenario:
 
 
 # --- what is right -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", scenario_names())
-def test_every_file_of_the_library_comes_back_from_its_resolved_text(name: str) -> None:
-    scenario = load_scenario(name)
-    resolved = resolve(scenario, build_vehicle(scenario))
-    assert scenario.name == name
-    assert reread(scenario) == scenario
-    assert reread(resolved) == resolved
-    assert build_vehicle(reread(resolved)) == build_vehicle(scenario)
-    numbers = resolved.vehicle.overrides()  # its file alone defines it
-    assert numbers.keys() >= VEHICLE_UNITS.keys() - set(OPTIONAL_PARAMETERS)
-    assert set(numbers) == {key for key in VEHICLE_UNITS if getattr(build_vehicle(scenario), key) is not None}
 
 
 def test_defaults_are_written_out() -> None:
@@ -91,19 +76,6 @@ def test_a_description_says_what_was_changed() -> None:
     parts = ['controller.solver = "osqp"', "controller.horizon = 40", "vehicle.mass = 4.12346", "effects.air = absent"]
     assert more.description == f"{text} (changed: {'; '.join(parts)})"
     assert parse_scenario(tomllib.loads(more.to_toml())).description == more.description
-
-
-def test_a_description_of_one_s_own_stays_as_it_is() -> None:
-    found = load_scenario("hover", ["controller.horizon=30", "description=mine"])
-    assert found.description == "mine"
-    assert load_scenario("hover").replace({"description": "mine"}).description == "mine"
-
-
-def test_a_long_value_is_cut_in_a_description() -> None:
-    events = [{"type": "push", "at": float(at), "duration": 0.1, "force": [0.1, 0.0, 0.0]} for at in range(9)]
-    found = load_scenario("hover").replace({"events": events})
-    assert found.description.endswith("...)")
-    assert len(found.description) < 160
 
 
 # --- what is wrong with the file, a name or a setting --------------------------------------------------------------
