@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights gym reproduce speed soak campaigns live tuning firmware export-numbers pins clean
+.PHONY: help setup demo test peers check docs format types build numbers verification nonlinear robustness first-flights gym reproduce speed campaigns live tuning firmware export-numbers pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -46,9 +46,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite
 	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning: export OMP_NUM_THREADS := 1
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning: export OPENBLAS_NUM_THREADS := 1
-test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed soak campaigns tuning: export MKL_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed campaigns tuning: export OMP_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed campaigns tuning: export OPENBLAS_NUM_THREADS := 1
+test peers firmware export-numbers verification nonlinear robustness first-flights reproduce speed campaigns tuning: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -113,9 +113,6 @@ speed: setup  ## fly every controller ever faster and remake docs/speed.md: some
 
 gym: setup  ## remake the numbers and the figure of docs/gym.md: some ten minutes; CRAZYFLOW=PYTHON times that beside it
 	@$(PY) docs/make_gym.py $(if $(CRAZYFLOW),--crazyflow $(CRAZYFLOW))
-
-soak: setup  ## one simulated hour on end: memory and step time have to stay as they were
-	@$(PY) tests/soak.py --minutes 60
 
 campaigns: setup  ## fly the campaigns that ship and remake docs/paper-robustness.md, some forty minutes; goes on with what is there
 	@$(PY) docs/make_campaigns.py

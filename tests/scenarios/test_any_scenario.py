@@ -241,7 +241,7 @@ def accepted(table: dict[str, Any]) -> Scenario | None:
     return scenario
 
 
-@settings(max_examples=40, derandomize=True, database=None)
+@settings(max_examples=25, derandomize=True, database=None)
 @given(table=tables())
 def test_any_valid_scenario_flies_and_its_resolved_file_flies_it_again(table: dict[str, Any]) -> None:
     scenario = accepted(table)

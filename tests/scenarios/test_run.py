@@ -8,10 +8,9 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from quadsim.assets import vehicle_path
@@ -196,13 +195,6 @@ def test_a_flight_lost_on_the_way_is_recorded_up_to_there(tmp_path: Path) -> Non
     assert flown.log.plant.state[-1, 4] < -1.0
 
 
-def test_a_flight_that_was_interrupted_is_not_what_any_scenario_expects(tmp_path: Path) -> None:
-    scenario = load_scenario("hover", [SHORT, "expect=lost"])
-    flight = run_scenario(scenario, tmp_path / "run", TABLES, interrupt_after(3))
-    assert flight.outcome == "aborted"
-    assert rundir.read_summary(tmp_path / "run")["as_expected"] is False
-
-
 def test_ctrl_c_in_flight_keeps_what_was_flown(tmp_path: Path) -> None:
     scenario = load_scenario("paper-constrained", ["duration=6.0"])
     flight = run_scenario(scenario, tmp_path / "run", TABLES, interrupt_after(33))
@@ -221,39 +213,6 @@ def test_what_was_flown_until_then_is_what_would_have_been(short_run: Run, tmp_p
 
 
 # --- nothing is ever half written ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("table", [FLIGHT_FILE, TIMING_FILE, PLANT_FILE, HORIZON_FILE])
-def test_a_disk_that_fills_up_while_a_table_is_written_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: str
-) -> None:
-    write_table = pq.write_table
-
-    def full(data: Any, file: BinaryIO, **options: Any) -> None:
-        write_table(data, file, **options)
-        if Path(file.name).name == table:
-            file.truncate(100)
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(pq, "write_table", full)
-    with pytest.raises(OutputError, match=r"run: No space left on device$"):
-        run(tmp_path / "new" / "run", SHORT)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_ctrl_c_while_tables_are_written_loses_no_flight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_table, stops = pq.write_table, [KeyboardInterrupt()]
-
-    def stopped(*arguments: Any, **options: Any) -> None:
-        write_table(*arguments, **options)
-        if stops:
-            raise stops.pop()
-
-    monkeypatch.setattr(pq, "write_table", stopped)
-    flown = run(tmp_path / "run", SHORT)
-    assert flown.summary["status"] == "completed"
-    assert rundir.damaged_files(flown.directory, flown.summary) == []
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
 
 
 @pytest.mark.parametrize(

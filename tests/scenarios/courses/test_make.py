@@ -13,7 +13,7 @@ from support import scenario_table
 
 from quadsim.errors import FileError
 from quadsim.state import Array
-from scenarios.courses.make import build_course, build_course_steps, build_reference
+from scenarios.courses.make import build_course, build_reference
 from scenarios.courses.smoothing import smooth
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.scenario import Scenario
@@ -144,11 +144,6 @@ def test_yaw_turns_are_in_degrees_and_leave_the_position() -> None:
     np.testing.assert_array_equal(poses[:, :3], np.tile(INITIAL, (3, 1)))
 
 
-def test_only_steps_have_steps_to_settle() -> None:
-    assert build_course_steps(scenario("steps"))
-    assert not any(build_course_steps(scenario(kind)) for kind in REFERENCES if kind != "steps")
-
-
 # --- tables --------------------------------------------------------------------------------------------------------
 
 
@@ -173,16 +168,6 @@ def test_a_table_is_found_beside_its_scenario_and_stored_by_its_whole_path_and_h
     poses = build_course(again).sample(np.array([0.0, 1.45, 1.5, 2.5, 3.5, 9.0]))
     np.testing.assert_allclose(poses[:, 0], [0.0, 0.0, 1.0, 3.0, 5.0, 5.0])  # row 1 is at 1 s, and start at 0.5 s
     np.testing.assert_allclose(poses[-1], [5.0, -2.0, 3.0, 0.5])  # yaw in radians
-
-
-def test_a_table_is_found_in_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = beside(tmp_path, file="tables/other.csv")
-    (tmp_path / "elsewhere" / "tables").mkdir(parents=True)
-    (tmp_path / "elsewhere" / "tables" / "other.csv").write_text(TABLE)
-    monkeypatch.chdir(tmp_path / "elsewhere")
-    reference = load_scenario(str(path)).reference
-    assert reference.type == "csv"
-    assert reference.file == str(tmp_path / "elsewhere" / "tables" / "other.csv")
 
 
 def test_a_table_that_changed_after_the_scenario_was_resolved_is_refused(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,14 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from quadsim.errors import FileError, OutputError, ParameterError, RenderingUnavailableError
+from quadsim.errors import FileError, OutputError, RenderingUnavailableError
 from quadsim.flight.audit import Limit, audit
 from quadsim.flight.parquet import write_log
 from quadsim.flight.rundir import Run, load_run
 from quadsim.outputs import amend
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
-from quadsim.report.film.frames import Shot, make_footage
+from quadsim.report.film.frames import make_footage
 from quadsim.report.film.painter import RED
 from quadsim.report.film.video import render_gif, render_video, rendering_backend
 from quadsim.state import EULER, INDEX, POSITION, body_to_world
@@ -155,25 +155,6 @@ def test_a_flight_without_a_single_period_is_refused(short_run: Run, tmp_path: P
     assert not (tmp_path / "film.mp4").exists()
 
 
-def test_the_users_backend_is_tried_first(monkeypatch: pytest.MonkeyPatch):
-    tried: list[str] = []
-
-    def run(_: object, *, env: dict[str, str], **__: object) -> None:
-        tried.append(env["MUJOCO_GL"])
-        assert env["PYOPENGL_PLATFORM"] == env["MUJOCO_GL"]
-        if env["MUJOCO_GL"] == "osmesa":
-            raise subprocess.CalledProcessError(1, "probe", stderr=b"Traceback\nImportError: no OSMesa here\n")
-
-    monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    monkeypatch.setattr(subprocess, "run", run)
-    video._probe.cache_clear()
-    assert rendering_backend() == "egl"
-    assert tried == ["osmesa", "egl"]
-    assert rendering_backend() == "egl"
-    assert tried == ["osmesa", "egl", "osmesa"], "one that renders is not tried again"
-    video._probe.cache_clear()
-
-
 @pytest.fixture
 def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
     """Workers that report one frame; the one that renders the first frames then waits, another fails."""
@@ -221,28 +202,6 @@ def test_ctrl_c_kills_the_workers(short_run: Run, tmp_path: Path, monkeypatch: p
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("options", "rule"),
-    [
-        ({"width": 641}, "even"),
-        ({"height": 90}, "at least 180"),
-        ({"fps": 0}, "at least 1"),
-        ({"workers": 0}, "at least 1"),
-        ({"speed": 0.0}, "positive"),
-        ({"start": 7.0}, "between 0 s"),
-    ],
-)
-def test_impossible_films_are_refused(short_run: Run, tmp_path: Path, options: dict[str, float], rule: str):
-    with pytest.raises(ParameterError, match=rule):
-        render_video(short_run.directory, tmp_path / "film.mp4", **options)
-
-
-def test_a_shot_gives_its_times():
-    shot = Shot(run="x", fps=10, start=2.0, speed=4.0, first=5, count=3)
-    assert shot.times == pytest.approx([4.0, 4.4, 4.8])
-    assert Shot(**asdict(shot)) == shot
-
-
 def test_footage_meets_the_plant_at_its_rows_and_halfway_between(short_run: Run):
     plant = short_run.log.plant
     rows = np.array([10, 200, 777])
@@ -270,12 +229,6 @@ def test_the_camera_is_smooth_and_never_far(short_run: Run):
     footage = make_footage(short_run, times)
     reach = np.abs(footage.aim - footage.position).max()
     assert 0.0 < reach <= 0.6 * short_run.vehicle.arm_length + 1e-12
-
-
-def test_captions_name_the_law(short_run: Run) -> None:
-    summary = {**short_run.summary, "controller": {**short_run.summary["controller"], "name": "pid", "solver": ""}}
-    run = replace(short_run, summary=summary)
-    assert Overlay(run, make_footage(run, np.array([1.0])), width=1280, height=720)._subtitle == "PID"
 
 
 def pixels(run: Run, colour: tuple[int, int, int], time: float = 1.0) -> int:
