@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from scenarios.loading import load_scenario
 from scenarios.papers.paper import NumberSpec, load_paper, scenario_of
 from scenarios.papers.reproduction import Reproduced, Reproduction, reproduce_paper
 from scenarios.run import fly_scenario
+from scenarios.schema.problems import ScenarioError
 from scenarios.shipped import paper_names, scenario_names
 
 HEAD = 'title = "A paper"\nauthors = "N. N."\nabout = "A hover"\n'
@@ -157,6 +159,29 @@ def test_a_scenario_beside_the_papers_file_is_found(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace('scenario = "hover"', 'scenario = "mine.toml"'))
     paper = load_paper(str(path))
     assert scenario_of(paper, paper.numbers[0]).name == "mine"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("absolute = 0.0", "", "time flown.absolute must be given, or relative, but not both"),
+        ("absolute = 0.0", "absolute = 0.0\nrelative = 0.1", "time flown.absolute must be given, or relative, but not"),
+        (
+            "published = 0.5",
+            "published = [0.6, 0.5]",
+            "published must be a lower and a higher number of relation equal",
+        ),
+        ("published = 0.5", "published = 'half'", "time flown.published must be"),
+        ("published = 0.5", "publisht = 0.5", "time flown.publisht is not a field of the paper file; did you mean"),
+        ('source = "here"', "", "time flown.source is missing"),
+        ('title = "A paper"', "", "title is missing"),
+    ],
+)
+def test_a_wrong_file_is_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
+    path = Path(written(tmp_path, ("0.5", "absolute = 0.0")))
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(ScenarioError, match=re.escape(message)):
+        load_paper(str(path))
 
 
 def test_what_cannot_be_flown_or_measured_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
