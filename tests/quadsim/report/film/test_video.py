@@ -139,12 +139,11 @@ def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path):
     assert (tmp_path / "film.gif").stat().st_size < 200_000
 
 
-@pytest.mark.parametrize(("rows", "states"), [(1, 1.0), (20, 1e5)], ids=["one-period", "lost-far-away"])
-def test_aborted_flights_can_be_filmed(backend: str, short_run: Run, tmp_path: Path, rows: int, states: float):
-    directory = rewrite(short_run, tmp_path / "aborted", rows, states=states)
+def test_a_flight_of_one_period_that_is_lost_far_away_can_be_filmed(backend: str, short_run: Run, tmp_path: Path):
+    directory = rewrite(short_run, tmp_path / "aborted", 1, states=1e5)
     render_video(directory, tmp_path / "film.mp4", width=320, height=180, fps=10, workers=1)
     frames = decode(tmp_path / "film.mp4")
-    assert frames.shape == (max(1, round(0.05 * rows * 10)), 180, 320, 3)
+    assert frames.shape == (1, 180, 320, 3)
     assert frames.mean() > 30.0
 
 
