@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import sys
 from collections.abc import Iterator
@@ -55,14 +54,6 @@ def test_an_installed_one_flies_by_the_name_of_its_entry_point(monkeypatch: pyte
     flight = fly_scenario(load_scenario("waypoints", ["controller=example"]))
     assert flight.controller == "MyController"
     np.testing.assert_array_equal(flight.log.plant.state, flown().log.plant.state)
-
-
-def test_it_is_of_thirty_lines() -> None:
-    """Of code, without documentation and imports."""
-    tree = ast.parse((EXAMPLES / "my_controller.py").read_text(encoding="utf-8"))
-    (law,) = (node for node in tree.body if isinstance(node, ast.ClassDef))
-    assert law.end_lineno is not None
-    assert law.end_lineno - law.lineno + 1 <= 30
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpc.equilibrium import LEAST_LIFT, Trim, equilibrium, twisted
+from mpc.equilibrium import LEAST_LIFT, equilibrium, twisted
 from mpc.heading import turn_horizontally
 from mpc.nonlinear.model import derivative, nonlinear_model
-from quadsim.errors import ParameterError
-from quadsim.state import INDEX, Array
+from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle
 
 
@@ -68,19 +67,3 @@ def test_what_thrust_twists_is_held_at_rest(vehicle: Vehicle) -> None:
     disturbed = replace(plain, effectiveness=twisted(plain.effectiveness, twist), acceleration=acceleration)
     np.testing.assert_allclose(derivative(disturbed, rest.state(), rest.speeds), 0.0, atol=1e-11)
     np.testing.assert_array_equal(rest.twist, twist)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"speeds": np.full(3, 190.0)}, r"trim\.speeds must be 4 finite numbers"),
-        ({"speeds": np.full(4, math.nan)}, r"trim\.speeds must be 4 finite numbers"),
-        ({"lift": np.zeros(2)}, r"trim\.lift must be three finite numbers, the last one positive"),
-        ({"lift": np.array([0.0, 0.0, math.inf])}, r"trim\.lift must be three finite numbers"),
-        ({"twist": np.full(3, math.nan)}, r"trim\.twist must be three finite numbers"),
-        ({"lift": np.array([0.0, 1.0, 0.0])}, r"trim\.lift must be .* the last one positive; got"),
-    ],
-)
-def test_an_impossible_trim_is_refused(change: dict[str, Array], message: str) -> None:
-    with pytest.raises(ParameterError, match=message):
-        Trim(**{"speeds": np.full(4, 190.0), "lift": np.array([0.0, 0.0, 1.0]), **change})

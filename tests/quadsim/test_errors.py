@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import pickle
-from pathlib import Path
 
 import pytest
 
@@ -79,20 +78,10 @@ def test_every_error_has_the_root_and_the_exit_status_of_its_family(kind: type[Q
     assert issubclass(kind, FlightError) == (kind in FLIGHT)
 
 
-def test_errors_are_also_what_python_calls_them() -> None:
-    for kind in (InputError, ParameterError, UnknownNameError, FileError):
-        assert issubclass(kind, ValueError)
-    assert issubclass(OutputError, OSError)
-
-
 def test_a_parameter_error_stores_its_values() -> None:
     error = ParameterError("vehicle", "mass", -1.0, "positive")
     assert str(error) == "vehicle.mass must be positive; got -1.0"
     assert (error.owner, error.name, error.value, error.rule) == ("vehicle", "mass", -1.0, "positive")
-
-
-def test_an_option_of_the_command_line_has_no_owner() -> None:
-    assert str(ParameterError("", "--workers", 0, "at least 1")) == "--workers must be at least 1; got 0"
 
 
 def test_an_unknown_name_is_answered_with_the_nearest_and_all_there_are() -> None:
@@ -106,28 +95,3 @@ def test_an_unknown_name_is_answered_with_the_nearest_and_all_there_are() -> Non
 
 def test_nothing_is_guessed_where_nothing_is_near() -> None:
     assert str(UnknownNameError("solver", "osqp", ["dense"])) == "no solver named 'osqp' (there are: dense)"
-
-
-def test_file_and_output_errors_name_the_path() -> None:
-    for error, message in (
-        (FileError("a/b.toml", "no such file"), "a/b.toml: no such file"),
-        (OutputError("a/b.toml", "the disk is full"), "cannot write a/b.toml: the disk is full"),
-    ):
-        assert str(error) == message
-        assert error.path == Path("a/b.toml")
-        assert message.endswith(error.problem)
-
-
-def test_no_rendering_reports_what_was_tried_and_what_to_install() -> None:
-    error = RenderingUnavailableError({"egl": "no libEGL", "osmesa": "no libOSMesa"})
-    assert error.tried == {"egl": "no libEGL", "osmesa": "no libOSMesa"}
-    for part in ("egl: no libEGL; osmesa: no libOSMesa", "apt-get install", "libegl1", "libosmesa6", "--no-video"):
-        assert part in str(error)
-    assert issubclass(ViewerUnavailableError, QuadsimError)
-
-
-def test_a_flight_error_gives_its_time() -> None:
-    error = DivergenceError("lost", time=1.25)
-    assert str(error) == "at t = 1.250 s: lost"
-    assert error.time == 1.25
-    assert str(InterruptedFlightError(time=0.5)) == "at t = 0.500 s: interrupted (Ctrl-C)"

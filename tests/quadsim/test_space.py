@@ -255,33 +255,6 @@ def test_footprints_are_as_wide_as_the_solid(obstacle: AnyObstacle) -> None:
     assert footprint(obstacle.solids[0], 50.0, 60.0) is None
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Capsule(name="a", position=(0, 0, 0), axis=(0, 0, 0), radius=1.0), "axis must not be 0"),
-        (lambda: Wall(name="a", position=(0, 0, 0), size=(1, 2, 2), window=(2, 1)), "window must lie within"),
-        (lambda: Fence(position=(0, 0, 0)), "position must be given with size, or rows with upper"),
-        (lambda: Fence(rows=((1, 0, 0),), upper=(1, 2)), "upper must have one number per row, 1"),
-        (lambda: Fence(rows=((0, 0, 0),), upper=(1,)), "not all 0"),
-        (lambda: Corridor(name="c", position=(0, 0, 0), size=(1, 1, 1), start=2, stop=1), "at least start = 2"),
-        (
-            lambda: Sphere(
-                name="a", position=(0, 0, 0), radius=1, velocity=(1, 0, 0), path=(Place(time=1, position=(0, 0, 0)),)
-            ),
-            "path must be absent where velocity",
-        ),
-        (
-            lambda: Sphere(name="a", position=(0, 0, 0), radius=1, start=2, path=(Place(time=1, position=(0, 0, 0)),)),
-            "rising times, all after start = 2",
-        ),
-        (lambda: shape_from_json({"type": "cube"}), "no shape named 'cube'"),
-    ],
-)
-def test_what_cannot_be_is_refused(make: object, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make()  # type: ignore[operator]
-
-
 def test_an_obstacle_is_a_union_of_solids() -> None:
     with pytest.raises(NotImplementedError):
         _ = Obstacle(name="a", position=(0.0, 0.0, 0.0)).solids

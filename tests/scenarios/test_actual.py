@@ -12,7 +12,6 @@ import pytest
 
 import quadsim
 from quadsim.controller import Moment
-from quadsim.errors import InputError
 from quadsim.flight import rundir
 from quadsim.report.comparison import comparison_rows
 from quadsim.state import STATE_NAMES, Array
@@ -117,11 +116,6 @@ def test_both_vehicles_are_recorded_and_shown(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.command, flight.command)
 
 
-def test_a_flight_of_the_modelled_vehicle_records_one(constrained_flight: Flight) -> None:
-    assert "actual" not in constrained_flight.summary
-    assert constrained_flight.actual == constrained_flight.vehicle
-
-
 def test_what_the_effects_leave_to_the_vehicle_is_that_of_the_actual_one() -> None:
     scenario = load_scenario("hummingbird-real-rotors", ["actual.rotor_rise=0.05"])
     written = resolve(scenario, build_vehicle(scenario))
@@ -130,26 +124,6 @@ def test_what_the_effects_leave_to_the_vehicle_is_that_of_the_actual_one() -> No
     assert written.vehicle.rotor_rise == 0.0125
     again = parse_scenario(tomllib.loads(written.to_toml()))
     assert resolve(again, build_vehicle(again)).to_toml() == written.to_toml()
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (["actual.mas=4.4"], "actual.mas is not a field of the scenario file; did you mean 'mass'?"),
-        (["actual.file='hummingbird'"], "actual.file is not a field of the scenario file"),
-        (["actual.mass='heavy'"], "actual.mass must be a number; got 'heavy'"),
-        (["actual.mass=-1"], "actual.mass must be positive; got -1.0"),
-        (["actual.speed_max=150.0"], "actual.speed_max must be no lower than its hover speed"),
-        (
-            ["effects.rotors={rise=0.02, fall=0.02}", "actual.rotor_rise=0.05"],
-            r"actual.rotor_rise must be absent where effects.rotors.rise = 0.02 states it; got 0.05",
-        ),
-    ],
-)
-def test_messages(settings: list[str], message: str) -> None:
-    with pytest.raises(InputError) as caught:
-        load_scenario("hover", settings)
-    assert message in str(caught.value)
 
 
 def test_campaigns_draw_it_by_its_value_or_relative_to_the_model() -> None:
@@ -171,9 +145,3 @@ def test_campaigns_draw_it_by_its_value_or_relative_to_the_model() -> None:
     assert one.actual is not None
     assert one.actual.mass == drawn["draw.mass"]
     assert one.actual.inertia == pytest.approx([0.033 * drawn["draw.inertia"]] * 2 + [0.066])
-
-
-def test_sweeps_take_it(tmp_path: Path) -> None:
-    hover = quadsim.load("hover").replace({"duration": 1.0})
-    found = quadsim.sweep(hover, {"actual.mass": [4.0, 4.4]}, workers=1, progress=False)
-    assert found["rmse.z"][0] < 1e-6 < found["rmse.z"][1]

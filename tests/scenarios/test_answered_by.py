@@ -17,7 +17,6 @@ from mpc.qp import KKT_EVERY
 from mpc.solvers import QPSolver
 from mpc.solvers.piqp_backends import PiqpMultistage
 from quadsim.controller import Command, Moment
-from quadsim.flight.log import RESIDUALS
 from scenarios.flight import summarise
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
@@ -48,14 +47,6 @@ def test_another_solver_answers_what_is_left_to_it_under_its_own_name() -> None:
     pytest.importorskip("clarabel")
     flight = fly_scenario(load_scenario("paper-constrained", ["controller.solver=clarabel", "duration=5"]))
     assert Counter(flight.log.control.answered_by)["clarabel"] == 1
-
-
-@pytest.mark.parametrize(("law", "by"), [("lqr", "law"), ("pid", "law"), ("geometric", "law")])
-def test_a_law_without_a_solver_commands(law: str, by: str) -> None:
-    control = fly_scenario(load_scenario("hover", [f"controller={law}", "duration=1"])).log.control
-    assert set(zip(control.status, control.answered_by, strict=True)) == {("commanded", by)}
-    for name in RESIDUALS:
-        assert np.isnan(getattr(control, name)).all(), name
 
 
 def test_an_unconstrained_mpc_is_a_gain() -> None:

@@ -240,7 +240,7 @@ def accepted(table: dict[str, Any]) -> Scenario | None:
     return scenario
 
 
-@settings(max_examples=40, derandomize=True, database=None)
+@settings(max_examples=25, derandomize=True, database=None)
 @given(table=tables())
 def test_any_valid_scenario_flies_and_its_resolved_file_flies_it_again(table: dict[str, Any]) -> None:
     scenario = accepted(table)
@@ -265,16 +265,3 @@ def test_any_valid_scenario_flies_and_its_resolved_file_flies_it_again(table: di
     if not any(getattr(each, "fault", None) == "nan" for each in scenario.events):
         assert np.all(np.isfinite(control.state))
     json.dumps(summarise(flight), allow_nan=False)
-
-
-def test_most_of_what_is_drawn_is_accepted_and_some_is_refused() -> None:
-    """Else the test above would hold little."""
-    found = []
-
-    @settings(max_examples=60, derandomize=True, database=None)
-    @given(table=tables())
-    def count(table: dict[str, Any]) -> None:
-        found.append(accepted(table) is not None)
-
-    count()
-    assert 0.5 < np.mean(found) < 1.0

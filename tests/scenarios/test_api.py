@@ -101,14 +101,6 @@ def test_the_page_of_the_api_has_every_name() -> None:
     assert named == {f"{package.__name__}.{name}" for package, names in handed_out.items() for name in names}
 
 
-def test_commands_fly_load_and_measure_through_it_alone() -> None:
-    """They import nothing that does so by itself; types of what is returned, and its tables, they may."""
-    inner = r"scenarios\.(?:run|loading|build|courses|parts|design\.(?!vehicle_figures)|campaign\.(?:replay|plan))"
-    for path in (EXAMPLES.parent / "scenarios/commands").glob("*.py"):
-        imported = re.findall(r"^ *from (scenarios\.[\w.]+) import", path.read_text(encoding="utf-8"), re.MULTILINE)
-        assert not [name for name in imported if re.match(inner, name)], path.name
-
-
 def test_importing_it_imports_nothing_heavy() -> None:
     code = "import quadsim, sys; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
@@ -284,19 +276,6 @@ def test_a_force_of_a_file_acts_in_a_sweep(hover: Scenario, tmp_path: Path, monk
     assert swept["rmse.z"].tolist() == [by_file.metrics["rmse.z"]]
 
 
-@pytest.mark.parametrize(
-    ("force", "message"),
-    [
-        (lambda time: np.zeros(6), "cannot be called with time, state: TypeError: too many positional arguments"),
-        (functools.partial(pull, nwton=1.0), "unexpected keyword argument 'nwton'"),
-        (3.0, "a function force"),
-    ],
-)
-def test_what_is_no_force_is_refused(force: object, message: str, hover: Scenario) -> None:
-    with pytest.raises(InputError, match=message):
-        quadsim.fly(hover, forces=[force], progress=False)
-
-
 def test_a_force_that_fails_ends_the_flight_with_its_reason(hover: Scenario) -> None:
     def bad(time: float, state: Array) -> Array:
         return np.zeros(6) if time < 0.5 else np.full(5, np.nan)
@@ -398,12 +377,6 @@ def test_ctrl_c_ends_a_flight_in_order() -> None:
     assert flown.log.interrupted
     assert 0.0 < flown.time[-1] < 599.0
     assert flown.outcome == "aborted"
-
-
-def test_without_a_terminal_no_progress_is_printed(hover: Scenario, capfd: pytest.CaptureFixture[str]) -> None:
-    assert not sys.stderr.isatty()
-    quadsim.fly(hover)
-    assert capfd.readouterr() == ("", "")
 
 
 def test_controllers_fly_without_a_simulator() -> None:

@@ -30,7 +30,7 @@ def fly(directory: Path, kinds: list[str]) -> list[dict[str, object]]:
         "name": "hostile",
         "scenario": "hover",
         "flights": len(kinds),
-        "limits": {"flight": 20.0, "memory": 300.0},
+        "limits": {"flight": 6.0, "memory": 300.0},
         "set": {"duration": 0.5, "constraints": [], "controller": law},
         "vary": [
             {"name": "kind", "fields": ["controller.settings.kind"], "distribution": "grid", "values": names},

@@ -347,33 +347,6 @@ def test_a_solver_that_fails_where_all_constraints_can_hold_is_distinguished(fil
     assert found["sentence"].endswith("it is the solver that failed")
 
 
-def test_it_is_the_same_each_time_and_holds_copies(file: str) -> None:
-    queried = query_case(file, CASES["two polytopes"])
-    assert json.dumps(queried.found) == json.dumps(query_cached(file, "two polytopes").found)
-    assert queried.unanswered is not None
-    queried.controller.reset(np.full(4, queried.vehicle.hover_speed))
-    assert getattr(queried.controller, "unanswered", 1) is None
-
-
-def test_the_words_of_the_file(file: str) -> None:
-    found = query_cached(file, "start beyond the tilt bound").found
-    assert found["sentence"].startswith(
-        "no answer at t = 0.00 s (primal_infeasible); cannot hold together: roll upper at +0.05 s .. +0.15 s by 14 deg;"
-    )
-    assert "slew of rotors 2, 4 lower; slew of rotors 2, 4 upper" in found["sentence"]
-    assert 'controller.type = "robust", controller.soft = {} (without the field solver)' in found["advice"]
-    assert "controller.fallback = {} (level hover; an answer again after 0.20 s, by the model)" in found["advice"]
-
-
-def test_the_example_of_the_documentation_is_what_a_flight_reports(fly_once: Callable[..., Flight]) -> None:
-    found = fly_once("paper-constrained-lag20").diagnosis
-    assert found is not None
-    text = (Path(__file__).resolve().parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
-    sentence, advised = re.findall(r"```text\n(no answer .*)\n(to try: .*); \.\.\.\n```", text)[0]
-    assert found["sentence"] == sentence
-    assert found["advice"].startswith(advised)
-
-
 def test_a_flight_whose_sqp_does_not_converge_says_so_and_what_helps() -> None:
     """Upside down the real-time iteration tumbles; every QP is solved, and the plans follow no dynamics."""
     tumble = quadsim.load("nonlinear").replace(

@@ -34,7 +34,6 @@ class Law:
 ENDS = {
     "raises": ("raise ValueError('half way')", "ValueError: half way"),
     "exits": ("sys.exit(0)", "SystemExit: 0"),
-    "is short of memory": ("raise MemoryError", "MemoryError"),
 }
 BARE = ("--no-video", "--no-recording", "--no-figures")
 OWN = ("--set", "duration=1.0", "--set", "constraints=[]", "--set", 'controller="late:Law"')
@@ -81,17 +80,6 @@ def test_a_controller_that_exits_does_not_pass_a_check(tmp_path: Path) -> None:
     done = quadsim_command("check", "hover", *OWN, "--junit", "w.xml", here=tmp_path)
     assert done.returncode == 2
     assert not (tmp_path / "w.xml").exists()
-
-
-def test_a_force_that_raises_ends_the_flight_likewise(tmp_path: Path) -> None:
-    def force(time: float, state: object) -> list[float]:
-        if time > 0.42:
-            raise KeyError("gone")
-        return [0.0] * 6
-
-    flown = quadsim.fly(quadsim.load("hover", {"duration": 1.0}), forces=[force], progress=False)
-    assert (flown.outcome, flown.time.size) == ("aborted", 8)
-    assert str(flown.log.reason).endswith("the force force raised KeyError: 'gone'")
 
 
 def test_a_prediction_that_raises_after_the_flight_loses_nothing_else() -> None:
@@ -165,21 +153,8 @@ def test_a_law_that_raises_as_it_takes_over_ends_the_flight_there(tmp_path: Path
     assert "ZeroDivisionError" in "".join(flown.log.traceback)
 
 
-def test_a_controller_that_changes_the_directory_moves_no_output(tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "late.py").write_text(LAW.format(late="os.chdir('/')"))
-    options = ("--no-video", "--recording", "--figures")
-    done = quadsim_command("run", "hover", *OWN, *options, "--out", "here/run", here=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert summary_of(tmp_path / "here" / "run")["products"] == {"figures": "made", "flight.rrd": "made"}
-    assert "written to here/run" in done.stdout
-    assert quadsim_command("check", "hover", *OWN, "--junit", "v.xml", here=tmp_path).returncode == 0
-    assert (tmp_path / "v.xml").is_file()
-
-
 BROKEN = {
     "no ffmpeg": ({"IMAGEIO_FFMPEG_EXE": "/bin/false"}, "flight.mp4", ("--no-recording", "--no-figures")),
-    "no such backend": ({"MPLBACKEND": "nonsense"}, "figures", ("--no-recording", "--no-video")),
     "no rerun": ({"RERUN": "off"}, "flight.rrd", ("--no-figures", "--no-video")),
 }
 
@@ -195,7 +170,7 @@ def test_a_product_that_fails_is_named_and_decides_the_status_only_if_asked_for(
     assert summary["products"][product].startswith("failed: ")
     assert f"{product} failed: " in done.stderr
     assert json.loads(done.stdout) == summary
-    option = {"flight.mp4": "--video", "figures": "--figures", "flight.rrd": "--recording"}[product]
+    option = {"flight.mp4": "--video", "flight.rrd": "--recording"}[product]
     done = quadsim_command(*run, option, here=tmp_path, **environment)
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
@@ -203,37 +178,22 @@ def test_a_product_that_fails_is_named_and_decides_the_status_only_if_asked_for(
     assert quadsim_command("check", "runs/hover-2", here=tmp_path).returncode == 0
 
 
-def test_a_film_asked_for_later_that_fails_is_status_2_and_leaves_the_run(tmp_path: Path) -> None:
-    assert quadsim_command("run", "hover", "--set", "duration=0.5", *BARE, here=tmp_path).returncode == 0
-    before = summary_of(tmp_path / "runs" / "hover")
-    assert quadsim_command("video", "runs/hover", here=tmp_path, IMAGEIO_FFMPEG_EXE="/bin/false").returncode == 2
-    assert summary_of(tmp_path / "runs" / "hover") == before
-    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["hover"]
-
-
-@pytest.mark.parametrize("film", [True, False])
-def test_ctrl_c_keeps_what_was_flown(tmp_path: Path, film: bool) -> None:
-    """In flight and while it is filmed: the file that appears first shows which."""
-    (tmp_path / "late.py").write_text(LAW.format(late="pass" if film else "time.sleep(0.2)"))
-    options = ("--set", f"duration={20 if film else 30}.0", "--no-recording", "--no-figures")
+def test_ctrl_c_while_a_film_is_made_keeps_what_was_flown(tmp_path: Path) -> None:
+    (tmp_path / "late.py").write_text(LAW.format(late="pass"))
+    options = ("--set", "duration=20.0", "--no-recording", "--no-figures")
     command = [sys.executable, "-m", "scenarios.cli", "run", "hover", *OWN, *options]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         summary, started = tmp_path / "runs" / "hover" / "summary.json", clock.monotonic()
-        while clock.monotonic() - started < 120.0 and not (summary if film else summary.parent).exists():
+        while clock.monotonic() - started < 120.0 and not summary.exists():
             clock.sleep(0.1)
-        clock.sleep(1.0 if film else 4.0)
+        clock.sleep(1.0)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)
         process.communicate(timeout=120)
     found = summary_of(summary.parent)
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["hover"]
-    if film:
-        assert (process.returncode, found["verdict"]) == (0, "satisfied")
-        assert found["products"]["flight.mp4"].startswith(("interrupted (Ctrl-C)", "failed: "))
-    else:
-        assert (process.returncode, found["verdict"]) == (1, "aborted")
-        assert found["reason"].endswith("interrupted (Ctrl-C)")
-        assert found["duration"] > 0.9
+    assert (process.returncode, found["verdict"]) == (0, "satisfied")
+    assert found["products"]["flight.mp4"].startswith(("interrupted (Ctrl-C)", "failed: "))
 
 
 def test_python_keeps_a_flight_whose_film_was_asked_for_and_fails(
@@ -247,12 +207,3 @@ def test_python_keeps_a_flight_whose_film_was_asked_for_and_fails(
     with pytest.raises(OutputError, match="it is not empty"):
         flown.save(tmp_path / "run")
     flown.save(tmp_path / "run", overwrite=True, video=False, recording=False, figures=False)
-
-
-def test_check_says_what_a_campaign_is(tmp_path: Path) -> None:
-    scenario = quadsim.load("hover", {"duration": 0.5})
-    mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "uniform", "low": 4.0, "high": 4.4}
-    quadsim.campaign(scenario, vary=[mass], flights=2, workers=1, out=tmp_path / "c", report=False, progress=False)
-    done = quadsim_command("check", "c", here=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith("quadsim: c is a campaign, not a run: quadsim replay c --worst makes a run")

@@ -46,12 +46,13 @@ def test_constrained_flight_keeps_every_bound_and_arrives(constrained_flight: Fl
     assert constrained_flight.log.plant.t.size == 60_001  # audited at the physics rate
 
 
-@pytest.mark.parametrize("arm_length", [0.2, 0.3, 0.5])
-@pytest.mark.parametrize("drag_to_thrust", [0.012, 0.024, 0.048])
+@pytest.mark.parametrize("arm_length", [0.2, 0.5])
+@pytest.mark.parametrize("drag_to_thrust", [0.012, 0.048])
 def test_it_holds_over_the_parameters_the_paper_leaves_out(
-    varied_flights: dict[tuple[float, float], Flight], arm_length: float, drag_to_thrust: float
+    fly_once: Callable[..., Flight], arm_length: float, drag_to_thrust: float
 ) -> None:
-    flight = varied_flights[arm_length, drag_to_thrust]
+    changes = (f"vehicle.arm_length={arm_length}", f"vehicle.drag_to_thrust={drag_to_thrust}")
+    flight = fly_once("paper-constrained", *changes)
     assert (flight.vehicle.arm_length, flight.vehicle.drag_to_thrust) == (arm_length, drag_to_thrust)
     assert_constrained_flight_holds(flight, plant_tolerance=0.1)
 

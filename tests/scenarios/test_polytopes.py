@@ -17,7 +17,6 @@ from scenarios.build import build_controller, build_problem
 from scenarios.limits import build_limits
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.schema.problems import ScenarioError
 from tests.support import scenario_table, small_log
 
 MIXED: dict[str, Any] = {
@@ -33,36 +32,6 @@ def table(**changes: Any) -> dict[str, Any]:
     small = scenario_table()
     small["controller"]["polytopes"] = [{**MIXED, **changes}]
     return small
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"of": ["pitch", "x", "height"]}, "no signal named 'height'"),
-        ({"of": ["x", "x", "y"]}, "of must have distinct names"),
-        ({"rows": [[1.0, 2.0], [0.0, 1.0]]}, "rows must be lists of 3 numbers, not all 0; got [1.0, 2.0]"),
-        ({"rows": [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]}, "not all 0"),
-        ({"lower": None, "upper": None}, "lower must be given, or upper, or both"),
-        ({"upper": [4.0]}, "upper must have one number per row, 2; got [4.0]"),
-        ({"lower": [5.0, 10.0]}, "lower must be below upper = 4.0; got 5.0"),
-        ({"tolerance_sampled": 1.0}, "tolerance_sampled must be at most tolerance = 0.0; got 1.0"),
-    ],
-)
-def test_wrong_rows_are_refused_by_their_field(changes: dict[str, Any], message: str) -> None:
-    wrong = table(**changes)
-    wrong["controller"]["polytopes"][0] = {
-        key: value for key, value in wrong["controller"]["polytopes"][0].items() if value is not None
-    }
-    with pytest.raises(ScenarioError) as caught:
-        parse_scenario(wrong)
-    assert message in str(caught.value)
-    assert "controller.polytopes" in str(caught.value)
-
-
-def test_a_polytope_must_not_be_called_like_a_constraint() -> None:
-    small = table(name="roll", rows=[[1.0, 0.0, 0.0]], lower=[-1.0], upper=[1.0])
-    with pytest.raises(ScenarioError, match="constraints must have distinct names"):
-        parse_scenario(small)
 
 
 def problem_of(small: dict[str, Any]) -> Problem:
@@ -104,18 +73,6 @@ def test_every_term_has_both_rates() -> None:
         assert signal.plant is not None
         assert signal.sampled(log.control).shape == log.control.t.shape
         assert signal.plant(log.plant).shape == log.plant.t.shape
-
-
-def test_a_turned_model_has_no_rows_of_world_axes() -> None:
-    """The model of `heading` moves in axes turned by the yaw, where a row of x would be another one each period."""
-    with pytest.raises(ScenarioError, match="fence must not be of x where heading turns the model"):
-        load_scenario("robust", ['controller.polytopes=[{name="fence", of=["x"], rows=[[1.0]], upper=[3.0]}]'])
-
-
-@pytest.mark.parametrize("state", ["x", "vy", "yaw"])
-def test_nor_has_it_output_bounds_of_them(state: str) -> None:
-    with pytest.raises(ScenarioError, match=f"output_bounds must not be of {state} where heading turns"):
-        load_scenario("robust", [f"controller.output_bounds.{state}=[-3.0, 3.0]"])
 
 
 def test_the_robust_controller_takes_them_too() -> None:

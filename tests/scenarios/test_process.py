@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -16,7 +15,7 @@ import psutil
 import pytest
 
 from quadsim.flight import rundir
-from scenarios.commands import COMMANDS, EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
+from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -32,17 +31,9 @@ def quadsim(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, check=False, timeout=60)
 
 
-def test_a_process_prints_one_message_and_no_traceback(tmp_path: Path) -> None:
-    done = quadsim("run", "hover", "--set", "controller.horizon=0", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (EXIT_WRONG_INPUT, "")
-    assert done.stderr == "quadsim: hover.toml: controller.horizon must be >= 1; got 0\n"
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("options", [[], ["--json"]])
-def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0(options: list[str]) -> None:
+def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0() -> None:
     """`quadsim list | true`."""
-    command = [sys.executable, "-m", "scenarios.cli", "list", *options]
+    command = [sys.executable, "-m", "scenarios.cli", "list"]
     process = subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     assert process.stdout is not None
     assert process.stderr is not None
@@ -74,9 +65,8 @@ sys.exit(main())
 @pytest.mark.parametrize(
     ("stop", "delay"),
     [
-        *((signal.SIGINT, delay) for delay in (0.0, 0.03, 0.3)),
+        (signal.SIGINT, 0.0),
         (signal.SIGTERM, 0.1),
-        (signal.SIGHUP, 0.0),
     ],
 )
 def test_a_signal_in_the_first_moments_ends_it_in_order(tmp_path: Path, stop: signal.Signals, delay: float) -> None:
@@ -95,54 +85,7 @@ def test_a_signal_in_the_first_moments_ends_it_in_order(tmp_path: Path, stop: si
     assert {path.name for path in tmp_path.iterdir()} <= {"runs"}
 
 
-CAMPAIGN = """
-name = "little"
-scenario = "hover"
-flights = 2
-set = { duration = 0.2, constraints = [] }
-[[vary]]
-name = "mass"
-fields = ["vehicle.mass"]
-distribution = "uniform"
-low = 4.0
-high = 4.4
-"""
-TUNING = """
-name = "little"
-trials = 1
-batch = 1
-flights = [1]
-require = "P(lost) < 0.9 @ 50%"
-fresh = { flights = 2 }
-objectives = [{ name = "error", expression = "rmse.z" }]
-campaign = { scenario = "hover", set = { duration = 0.2, constraints = [] } }
-[[search]]
-name = "horizon"
-fields = ["controller.horizon"]
-distribution = "integer"
-low = 10
-high = 20
-"""
-SCRIPT = "duration = 0.2\n"
 HELD = "import numpy as np\ndef held(now, state, reference):\n    import random\n    return np.full(4, 192.8)\n"
-BRIEF = ("--set", "duration=0.2")
-ONE_OF_EACH = {  # of every command; the first writes the run that others read
-    "run": ["run", "hover", *BRIEF, "--no-video", "--out", "run"],
-    "check": ["check", "hover", *BRIEF, "--set", "controller='my_law:held'", "--set", "constraints=[]"],
-    "list": ["list"],
-    "compare": ["compare", "run", "run", "--out", "page"],
-    "live": ["live", "run", "--script", "script.toml", "--out", "live"],
-    "video": ["video", "run", "--out", "film.mp4", "--workers", "1"],
-    "view": ["view", "run", "--web"],
-    "scenario": ["scenario", "--for", "lopes2011"],
-    "vehicle": ["vehicle", "lopes2011", "--out", "vehicle.png"],
-    "campaign": ["campaign", "campaign.toml", "--out", "campaign", "--workers", "1", "--no-report"],
-    "replay": ["replay", "campaign", *TABLES, "--out", "replayed"],
-    "tune": ["tune", "tuning.toml", "--out", "tuning", "--workers", "1", "--no-report"],
-    "reproduce": ["reproduce", "quadrotor-uav"],
-    "export": ["export", "paper-unconstrained", *BRIEF, "--out", "exported"],
-    "doctor": ["doctor"],
-}
 
 
 @pytest.fixture
@@ -154,36 +97,23 @@ def trapped(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_python_itself_does_import_from_the_current_directory(trapped: Path) -> None:
-    """Else the next test could not fail."""
-    subprocess.run([sys.executable, "-c", "import mujoco"], cwd=trapped, check=False, capture_output=True)
-    assert (trapped / "executed").read_text()
-
-
 def test_no_command_imports_from_the_current_directory(trapped: Path) -> None:
     """But for a controller that was named, whose own imports find what is installed first."""
-    for name, text in {"campaign": CAMPAIGN, "tuning": TUNING, "script": SCRIPT}.items():
-        (trapped / f"{name}.toml").write_text(text)
     (trapped / "my_law.py").write_text(HELD)
+    settings = [*SHORT, "--set", "constraints=[]", "--set", "controller='my_law:held'"]
+    done = subprocess.run(
+        [Path(sysconfig.get_path("scripts")) / "quadsim", "run", "hover", *settings, "--no-video", "--out", "run"],
+        cwd=trapped,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120.0,
+    )
     executed = trapped / "executed"
-    assert {*COMMANDS} <= {*ONE_OF_EACH}
-    for name, arguments in ONE_OF_EACH.items():
-        process = subprocess.Popen(
-            [Path(sysconfig.get_path("scripts")) / "quadsim", *arguments],
-            cwd=trapped,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(timeout=6.0 if name == "view" else 120.0)
-        with contextlib.suppress(ProcessLookupError):  # a viewer stays
-            os.killpg(process.pid, signal.SIGTERM)
-        _, errors = process.communicate()
-        assert not executed.exists(), (name, executed.read_text(), errors)
-        assert process.returncode == EXIT_DONE or name in ("video", "view", "vehicle", "check"), (name, errors)
-        assert (f"quadsim: imported my_law from {trapped}/my_law.py\n" in errors) == (name == "check")
+    assert not executed.exists(), executed.read_text()
+    assert (done.returncode, done.stderr) == (EXIT_DONE, f"quadsim: imported my_law from {trapped}/my_law.py\n")
+    subprocess.run([sys.executable, "-c", "import mujoco"], cwd=trapped, check=False, capture_output=True)
+    assert executed.read_text(), "else nothing above could fail"
 
 
 def spent(process: subprocess.Popen[str]) -> float:
@@ -198,20 +128,7 @@ def listening() -> None:
         signal.signal(stop, signal.SIG_DFL)
 
 
-def test_who_was_started_by_nohup_goes_on(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", ITSELF, "0.5", str(int(signal.SIGHUP)), "run", "hover", *TABLES, *SHORT]
-    done = subprocess.run(
-        command,
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        timeout=60,
-        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
-    )
-    assert (done.returncode, done.stderr) == (EXIT_DONE, b"")
-
-
-@pytest.mark.parametrize("closed", [(1,), (0, 1, 2), (0, 2)])
+@pytest.mark.parametrize("closed", [(1,), (0, 2)])
 def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "scenarios.cli", "run", "hover", *TABLES, *SHORT, "--out", "run"],
@@ -228,18 +145,6 @@ def test_closed_streams_do_no_harm(tmp_path: Path, closed: tuple[int, ...]) -> N
     else:
         assert (done.returncode, done.stderr) == (EXIT_DONE, "")
         rundir.load_run(tmp_path / "run")
-
-
-def test_characters_that_a_terminal_lacks_are_spelt_out(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "scenarios.cli", "check", "hover", *SHORT],
-        cwd=tmp_path,
-        env=environment() | {"PYTHONIOENCODING": "ascii"},
-        capture_output=True,
-        timeout=60,
-    )
-    assert (done.returncode, done.stderr) == (EXIT_DONE, b"")
-    assert rb"\xb15" in done.stdout  # of the bounds on roll
 
 
 def test_a_long_flight_that_is_stopped_is_saved_up_to_there(tmp_path: Path) -> None:

@@ -130,21 +130,6 @@ def test_a_verdict_that_the_tables_do_not_give_is_reported(
     assert not (runs / "page").exists()
 
 
-def test_every_number_that_the_tables_give_is_held_against_them(flown: Path, tmp_path: Path) -> None:
-    run = shutil.copytree(flown / "good", tmp_path / "run")
-    for path in (("tracking", "rmse", "x"), ("control", "speed_max"), ("controller", "active_max")):
-
-        def change(summary: dict[str, Any], path: tuple[str, ...] = path) -> None:
-            for key in path[:-1]:
-                summary = summary[key]
-            summary[path[-1]] += 1
-
-        shutil.copyfile(flown / "good" / rundir.SUMMARY_FILE, run / rundir.SUMMARY_FILE)
-        rewrite(run, change)
-        with pytest.raises(FileError, match=rf"{'.'.join(path)} is recorded as .*, and the tables give "):
-            reaudit(run)
-
-
 def put(run: Path, name: str, column: str, change: Callable[[Any], Any]) -> None:
     """Change a column of a table, and its hash, as one does who makes a mistake in writing it."""
     table = pq.read_table(run / name)
@@ -220,50 +205,8 @@ def test_a_margin_between_the_rows_is_believed(flown: Path, tmp_path: Path) -> N
     assert reaudit(run).satisfied
 
 
-def test_a_run_whose_scenario_names_another_file_reads_none(flown: Path, tmp_path: Path) -> None:
-    run = shutil.copytree(flown / "good", tmp_path / "run")
-    path = run / rundir.SCENARIO_FILE
-    path.write_text('base = "../other.toml"\n' + path.read_text())
-    rehash(run, rundir.SCENARIO_FILE)
-    with pytest.raises(FileError, match=r"scenario\.toml: has a base, and a run's scenario is whole"):
-        reaudit(run)
-
-
-def test_files_of_others_are_reported_and_files_of_ours_that_are_not_listed_are_an_error(
-    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = shutil.copytree(flown / "good", tmp_path / "run")
-    (run / "notes.txt").write_text("mine")
-    assert main(["check", str(run)]) == EXIT_DONE
-    assert capsys.readouterr().err == f"quadsim: {run}: not of this run: notes.txt\n"
-    (run / "flight.mp4").write_bytes(b"another film")
-    assert main(["check", str(run)]) == EXIT_WRONG_INPUT
-    assert "flight.mp4 is there, and summary.json does not list it" in capsys.readouterr().err
-
-
-def test_a_film_does_not_hide_what_was_tampered_with(
-    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = shutil.copytree(flown / "good", tmp_path / "run")
-    monkeypatch.setattr("quadsim.report.film.video.render_video", lambda _, path, **__: path.write_bytes(b"film"))
-    assert main(["video", str(run)]) == EXIT_DONE
-    assert main(["check", str(run)]) == EXIT_DONE  # the new film is listed, the digest still stands
-    (run / "horizon.parquet").write_bytes(b"another")
-    assert main(["video", str(run)]) == EXIT_WRONG_INPUT
-    assert main(["check", str(run)]) == EXIT_WRONG_INPUT
-    assert capsys.readouterr().err.count("horizon.parquet is not the file that was written") == 2
-
-
-def test_a_run_without_its_film_is_compared_and_not_checked(flown: Path, tmp_path: Path) -> None:
-    run = shutil.copytree(flown / "good", tmp_path / "run")
-    rewrite(run, lambda summary: summary["files"].update({"flight.mp4": "sha256:0"}))
-    assert reaudit(run, products=False).satisfied
-    with pytest.raises(FileError, match=r"flight\.mp4 is missing"):
-        reaudit(run)
-
-
-@pytest.mark.parametrize("rate", [1000.0, 50.0, 1.0])
-@pytest.mark.parametrize("name", ["nan-position", "hard-landing", "lost-rotor", "crazyflie-real-rotors", "gps-outage"])
+@pytest.mark.parametrize("rate", [1000.0, 1.0])
+@pytest.mark.parametrize("name", ["nan-position", "hard-landing", "lost-rotor"])
 def test_what_a_run_records_is_what_its_tables_give(
     name: str, rate: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fly_once: Callable[..., Flight]
 ) -> None:
@@ -271,7 +214,7 @@ def test_what_a_run_records_is_what_its_tables_give(
 
     Each is flown once: a log holds the plant at the physics rate, whatever the rate of its file.
     """
-    flight = fly_once(name, *(["duration=6.0"] if name == "crazyflie-real-rotors" else []))  # nothing comes later
+    flight = fly_once(name)
     scenario = flight.scenario.model_copy(update={"log_rate": rate})
     monkeypatch.setattr("scenarios.run.fly_scenario", lambda *_: replace(flight, scenario=scenario))
     out = str(tmp_path / "run")
@@ -319,24 +262,3 @@ def test_permanent_fallback_is_no_success_and_reports_why(stuck: Path, capsys: p
     assert printed["diagnosis"] == summary["diagnosis"]
     assert printed["diagnosis"]["conflict"][0]["name"] == "left"
     assert printed["reaudit"]["satisfied"] is False
-
-
-def forgiven(summary: dict[str, Any]) -> None:
-    summary["satisfied"] = summary["as_expected"] = True
-    summary["controller"]["unrecovered"] = 0
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (forgiven, "controller.unrecovered is recorded as 0, and the tables give 10"),
-        (lambda summary: summary.update(satisfied=True), "satisfied is recorded as True"),
-    ],
-)
-def test_fallback_for_good_cannot_be_edited_away(
-    stuck: Path, tmp_path: Path, change: Change, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = shutil.copytree(stuck, tmp_path / "run")
-    rewrite(run, change)
-    assert main(["check", str(run)]) == EXIT_WRONG_INPUT
-    assert message in capsys.readouterr().err

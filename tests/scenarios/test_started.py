@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import gc
 import tomllib
-import weakref
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from threadpoolctl import threadpool_info, threadpool_limits
 
-import quadsim
 from quadsim.errors import CommandError, FlightError, InputError
 from quadsim.sim.loop import ClosedLoop
 from scenarios.flight import Flight
@@ -262,43 +258,3 @@ def test_a_controller_takes_over_before_a_period_is_observed() -> None:
         assert started.observation.k == 0
         with pytest.raises(InputError, match="before a period is observed"):
             loop.switch(loop.controller)
-
-
-def test_a_script_that_starts_a_flight_reads_as_documented() -> None:
-    with quadsim.start("hover", live=True) as started:
-        event = started.apply({"type": "setpoint", "z": 0.5})
-        assert event.at == 0.0
-        assert quadsim.StartedFlight is type(started)
-
-
-def test_a_flight_that_is_closed_leaves_nothing_in_cycles() -> None:
-    """What was flown is many megabytes, and cycles are looked for rarely."""
-    gc.disable()
-    try:
-        with start(cut("robust"), live=True) as started:
-            started.step()
-        loop, last = weakref.ref(started.loop), weakref.ref(started.loop.last)
-        del started
-        assert loop() is None
-        assert last() is None
-    finally:
-        gc.enable()
-
-
-def threads() -> set[int]:
-    return {library["num_threads"] for library in threadpool_info()}
-
-
-def test_linear_algebra_has_one_thread_once_a_flight_has_started() -> None:
-    with threadpool_limits(limits=2):
-        assert threads() == {2}
-        with quadsim.start("hover"):
-            assert threads() == {1}
-
-
-def test_the_cycle_collector_looks_through_nothing_from_before_a_flight_while_it_flies() -> None:
-    frozen: list[int] = []
-    with start(load_scenario("hover", ["duration=0.2"])) as started:
-        started.complete(lambda *_: frozen.append(gc.get_freeze_count()))
-    assert min(frozen[1:]) > 10_000
-    assert gc.get_freeze_count() == 0

@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from mpc.baselines.attitude import Measured, hat
 from mpc.baselines.geometric import GeometricController, Integrals, geometric_settings
-from mpc.baselines.preview import PREVIEW_DEGREE, Target, target_of_motion
+from mpc.baselines.preview import Target, target_of_motion
 from mpc.baselines.wanted import Wanted, wanted_attitude
 from mpc.flatness import motion_along
-from quadsim.errors import ParameterError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -125,14 +124,3 @@ def test_a_motion_s_samples_give_its_derivatives_and_near_its_end_as_many_as_the
         np.testing.assert_allclose(near_end.position, motion.position[-left], atol=1e-12)
         assert bool(np.any(near_end.acceleration)) == (left >= 3)
         assert bool(np.any(near_end.snap)) == (left >= 5)
-
-
-def test_drag_is_refused_where_nothing_is_fed_forward(vehicle: Vehicle) -> None:
-    with pytest.raises(ParameterError, match=r"controller\.drag must be zero where feedforward is not true"):
-        geometric_settings(vehicle, period=0.05, drag=(0.1, 0.1, 0.0))
-
-
-def test_a_preview_too_short_for_snap_is_refused(vehicle: Vehicle) -> None:
-    settings = geometric_settings(vehicle, period=0.05, feedforward=True, horizon=PREVIEW_DEGREE)
-    with pytest.raises(ParameterError, match=r"controller\.horizon must be at least 5, for a snap"):
-        GeometricController(vehicle, settings)

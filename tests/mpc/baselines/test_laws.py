@@ -12,10 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mpc.answer import ActuatorBounds
-from mpc.baselines.geometric import geometric_settings
-from mpc.baselines.pid import pid_settings
 from quadsim.controller import Moment, Phase
-from quadsim.errors import CommandError, ParameterError
+from quadsim.errors import CommandError
 from quadsim.state import INDEX, make_state
 from quadsim.vehicle import Vehicle
 
@@ -167,38 +165,3 @@ def test_the_command_in_force_is_what_slews_count_from(law: str, vehicle: Vehicl
     late = Moment(acting=np.full(4, 100.0))
     speeds = controller.step(late, make_state(), held(controller, [0.0, 0.0, 5.0, 0.0])).speeds
     np.testing.assert_allclose(speeds, 105.0)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"velocity_max": 0.0}, "velocity_max must be positive"),
-        ({"velocity_integral": -1.0}, "velocity_integral must be between 0 and 20"),
-        ({"rate_integral": math.nan}, "rate_integral must be between 0 and 20"),
-        ({"rate_derivative": 1.0}, "rate_derivative must be between 0 and 0.9"),
-        ({"velocity_derivative": 1.0}, "velocity_derivative must be between 0 and 0.9"),
-        ({"yaw_weight": 0.0}, "yaw_weight must be between 0.05 and 1"),
-        ({"tilt_max": 90.0}, "tilt_max must be between 0.1 and 80"),
-        ({"rate_max": (220.0, 0.0, 200.0)}, "rate_max must be positive"),
-    ],
-)
-def test_wrong_settings_of_the_cascade_are_named(vehicle: Vehicle, change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ParameterError, match=message):
-        pid_settings(vehicle, period=0.05, **change)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"k_x": 0.0}, "k_x must be positive"),
-        ({"k_i": -1.0}, "k_i must be at least 0 and finite"),
-        ({"k_I": math.nan}, "k_I must be at least 0 and finite"),
-        ({"sigma": math.inf}, "sigma must be positive and finite"),
-        ({"yaw_share": 2.0}, "yaw_share must be between 0.05 and 1"),
-        ({"tilt_max": 90.0}, "tilt_max must be between 0.1 and 80"),
-        ({"period": 0.0}, "period must be positive"),
-    ],
-)
-def test_wrong_settings_of_geometric_control_are_named(vehicle: Vehicle, change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ParameterError, match=message):
-        geometric_settings(vehicle, **{"period": 0.05, **change})

@@ -12,7 +12,7 @@ import scipy.linalg
 from mpc.baselines.allocation import allocate
 from mpc.baselines.attitude import motion_of
 from mpc.baselines.geometric import GeometricController, Integrals
-from mpc.baselines.lqr import LQRSettings, lqr_gain
+from mpc.baselines.lqr import lqr_gain
 from mpc.baselines.pid import CascadedPID, Memory
 from mpc.baselines.preview import Target
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
@@ -156,12 +156,6 @@ def test_weights_that_leave_the_vehicle_adrift_are_refused(vehicle: Vehicle) -> 
     adrift = Objective(C_r=np.eye(12)[[0, 2, 4]], Q_y=np.eye(3), Q_u=np.eye(4))
     with pytest.raises(ParameterError, match=r"controller\.output_weights must be such that every state .*; got \{'"):
         lqr_gain(hover_model(vehicle, PERIOD), adrift)
-
-
-def test_a_tilt_beyond_reason_is_refused(vehicle: Vehicle, build: Callable[..., Any]) -> None:
-    objective = build("lqr", vehicle).settings.objective
-    with pytest.raises(ParameterError, match=r"controller\.tilt_max must be between 0.1 and 80"):
-        LQRSettings(period=PERIOD, objective=objective, tilt_max=90.0)
 
 
 def test_a_model_of_another_make_has_its_gain_too() -> None:

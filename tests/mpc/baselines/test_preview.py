@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mpc.baselines.preview import differentiator, target_of, wrapped
-from quadsim.errors import ParameterError
 
 
 @pytest.mark.parametrize("samples", [3, 10, 25])
@@ -40,10 +39,3 @@ def test_a_jump_of_the_velocity_becomes_a_hump_of_its_area() -> None:
 @pytest.mark.parametrize(("angle", "expected"), [(3.5, 3.5 - 2.0 * math.pi), (-4.0, 2.0 * math.pi - 4.0), (1.0, 1.0)])
 def test_headings_wrap_to_the_short_way(angle: float, expected: float) -> None:
     assert wrapped(angle) == pytest.approx(expected)
-
-
-def test_a_preview_too_short_or_without_period_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"controller\.horizon must be at least 3"):
-        differentiator(2, 0.05)
-    with pytest.raises(ParameterError, match=r"controller\.period must be positive"):
-        differentiator(5, 0.0)

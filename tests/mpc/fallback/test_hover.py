@@ -92,12 +92,6 @@ def test_the_law_s_plan_is_its_closed_loop() -> None:
     np.testing.assert_allclose(np.delete(state, [INDEX["z"], INDEX["vz"]]), 0.0, atol=1e-3)
 
 
-@pytest.mark.parametrize("tilt", [0.0, 2.0, math.nan])
-def test_an_impossible_tilt_is_refused(tilt: float) -> None:
-    with pytest.raises(ParameterError, match=r"controller\.tilt must be between 0 and pi/2 rad"):
-        HoverLaw(model(), tilt=tilt)
-
-
 @pytest.mark.parametrize("make", [StateCompletion, lambda other: HoverLaw(other, tilt=0.2)])
 def test_another_kind_of_model_is_refused(make: Callable[[LinearModel], object]) -> None:
     other = LinearModel(A=np.eye(3), B=np.ones((3, 2)), u_bar=np.zeros(2), period=PERIOD)

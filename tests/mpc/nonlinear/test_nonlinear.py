@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from support import linearised
 from mpc.model import hover_model
 from mpc.nonlinear import model as module
 from mpc.nonlinear.model import NonlinearModel, derivative, nonlinear_model
-from quadsim.errors import ParameterError
 from quadsim.rotation import body_to_euler_rates, body_to_world, euler_to_body_rates
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics
@@ -170,22 +168,3 @@ def test_a_state_that_runs_away_is_no_number(vehicle: Vehicle) -> None:
     with np.errstate(all="ignore"):
         assert not np.isfinite(advance(model, x[None], u[None])).all()
         assert np.isnan(advance(model, 1e200 * x[None], u[None])).all()
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"period": 0.0}, r"controller\.period must be positive and finite; got 0\.0"),
-        ({"period": math.inf}, r"controller\.period must be positive and finite; got inf"),
-        ({"substeps": 0}, r"controller\.substeps must be a whole number >= 1; got 0"),
-        ({"rotor_lag": 0.0}, r"controller\.rotor_lag must be positive and finite, or None; got 0\.0"),
-        ({"acceleration": np.zeros(2)}, r"controller\.acceleration must be three finite numbers"),
-        (
-            {"angular_acceleration": np.full(3, np.nan)},
-            r"controller\.angular_acceleration must be three",
-        ),
-    ],
-)
-def test_impossible_numbers_are_refused(vehicle: Vehicle, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ParameterError, match=message):
-        replace(nonlinear_model(vehicle, PERIOD), **changes)

@@ -380,32 +380,6 @@ def test_what_is_not_linear_in_the_model_is_refused() -> None:
         law(ActuatorBounds.alike((0.0, 800.0), (-60.0, 60.0)))
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"horizon": 0}, "controller.horizon must be a whole number >= 1; got 0"),
-        ({"tilt": 2.0}, "controller.tilt must be positive and below pi/2, or None; got 2.0"),
-        ({"terminal": -1.0}, 'controller.terminal must be at least 0 and finite, or "lqr"; got -1.0'),
-        (
-            {"attitude_error": AttitudeError.DIFFERENCE, "weights": Weights(attitude=(1.0, 1.0, 2.0))},
-            'controller.weights.attitude must be one number where attitude_error = "difference"; got (1.0, 1.0, 2.0)',
-        ),
-    ],
-)
-def test_impossible_settings_are_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ParameterError) as caught:
-        NonlinearSettings(**settings)
-    assert str(caught.value) == message
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"position": 0.0}, {"move": -1.0}, {"input": (1.0, 1.0, 1.0)}, {"velocity": math.inf}]
-)
-def test_impossible_weights_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ParameterError, match=rf"controller\.weights\.{next(iter(wrong))} must be"):
-        Weights(**wrong)
-
-
 # --- what a controller must stand ----------------------------------------------------------------------------------
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,6 @@ from mpc.nonlinear.rigidbody import (
     thrust_axis,
 )
 from quadsim.assets import vehicle_path
-from quadsim.errors import ParameterError
 from quadsim.rotation import (
     body_to_euler_rates,
     body_to_world,
@@ -134,17 +132,3 @@ def test_the_angle_of_the_thrust_axis_is_the_tilt_of_euler_angles_at_any_attitud
     states[:, ANGLES] = quaternion_to_euler(q)
     np.testing.assert_allclose(tilt(states), np.arccos(thrust_axis(q)[:, 2]), atol=1e-6)
     np.testing.assert_allclose(rotation(q), body_to_world(states[:, ANGLES]), atol=1e-7)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"step": 0.0}, "controller.node must be positive and finite; got 0.0"),
-        ({"substeps": 0}, "controller.substeps must be a whole number >= 1; got 0"),
-        ({"rotor_lag": -1.0}, "controller.rotor_lag must be positive and finite, or None; got -1.0"),
-    ],
-)
-def test_impossible_numbers_are_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ParameterError) as caught:
-        replace(rigid_body(VEHICLE, 0.1), **changes)
-    assert str(caught.value) == message

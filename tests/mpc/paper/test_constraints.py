@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from support import paper_problem, random_problem
 
-from mpc.constraints import Bounds
 from mpc.paper.constraints import inequalities
 from mpc.paper.prediction import prediction, rollout
-from quadsim.errors import ParameterError
 
 
 @pytest.mark.parametrize("horizon", [1, 2, 9])
@@ -35,16 +33,3 @@ def test_shapes_and_pairs_of_the_paper() -> None:
     np.testing.assert_array_equal(rows.A_ineq[rows.upper_rows], -rows.A_ineq[rows.lower_rows])
     np.testing.assert_array_equal(rows.G1[400 // 2 :], 0.0)  # slew rows do not see the state
     np.testing.assert_array_equal(rows.u_max, np.full(200, 250.0))
-
-
-def test_crossed_bounds_are_refused() -> None:
-    with pytest.raises(ParameterError, match=r"controller\.u_min must be below u_max"):
-        Bounds(
-            C_c=np.zeros((0, 2)), y_min=np.zeros(0), y_max=np.zeros(0),
-            delta_min=-np.ones(1), delta_max=np.ones(1), u_min=np.ones(1), u_max=np.zeros(1),
-        )  # fmt: skip
-    with pytest.raises(ParameterError, match=r"controller\.delta_min must be numbers"):
-        Bounds(
-            C_c=np.zeros((0, 2)), y_min=np.zeros(0), y_max=np.zeros(0),
-            delta_min=np.full(1, np.nan), delta_max=np.ones(1), u_min=np.zeros(1), u_max=np.ones(1),
-        )  # fmt: skip

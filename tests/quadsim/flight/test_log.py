@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support import small_log
@@ -170,38 +167,6 @@ def test_a_damaged_file_is_named_wherever_it_is_damaged(short_run_directory: Pat
         except FileError:
             noticed += 1
     assert noticed > 0
-
-
-@pytest.mark.parametrize("name", UNITS)
-def test_a_foreign_table_is_refused(tmp_path: Path, name: str) -> None:
-    write(tmp_path, small_log())
-    pq.write_table(pa.table({"t": [0.0, 1.0], "predicted_x": ["a", "b"]}), tmp_path / name)
-    with pytest.raises(FileError, match="lacks or misstates a column of the flight log"):
-        read_log(tmp_path)
-
-
-@pytest.mark.parametrize(("name", "column"), [(FLIGHT_FILE, "x"), (FLIGHT_FILE, "iterations"), (PLANT_FILE, "t")])
-def test_a_column_of_texts_is_refused(tmp_path: Path, name: str, column: str) -> None:
-    write(tmp_path, small_log())
-    table = pq.read_table(tmp_path / name)
-    texts = pa.array(["no number"] * table.num_rows)
-    pq.write_table(table.set_column(table.schema.get_field_index(column), column, texts), tmp_path / name)
-    with pytest.raises(FileError, match="lacks or misstates a column of the flight log"):
-        read_log(tmp_path)
-
-
-def test_reading_leaves_no_thread_behind_to_abort_python_as_it_ends(tmp_path: Path) -> None:
-    write(tmp_path, small_log())
-    code = """
-import sys
-from pathlib import Path
-import psutil
-from quadsim.flight.parquet import read_log
-before = psutil.Process().num_threads()
-read_log(Path(sys.argv[1]))
-sys.exit(psutil.Process().num_threads() - before)
-"""
-    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
 
 
 def test_a_residual_that_was_not_computed_is_null_on_disk_and_nan_inside(tmp_path: Path) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import gc
 import math
-import weakref
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -137,21 +135,6 @@ def test_a_controller_that_raises_ends_the_flight_with_its_traceback(
     assert (log.control.t.size, log.aborted, log.interrupted) == (2, True, False)
     assert log.traceback[-1].startswith(type(error).__name__)
     assert any("in step" in line for line in log.traceback)
-
-
-def test_a_flight_that_ended_early_is_let_go_at_once(vehicle: Vehicle, speeds: Array) -> None:
-    """Without waiting for Python to look for cycles: a campaign's worker would hold hundreds of them."""
-    speeds[3] = math.nan
-    gc.collect()
-    gc.disable()
-    try:
-        log = fly_scripted(vehicle, Scripted(speeds))
-        assert log.reason is not None
-        states = weakref.ref(log.plant.state)
-        del log
-        assert states() is None
-    finally:
-        gc.enable()
 
 
 # --- flights that are lost -----------------------------------------------------------------------------------------

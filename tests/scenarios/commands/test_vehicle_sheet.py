@@ -144,21 +144,6 @@ def test_the_command_prints_figures_and_sources(name: str, capsys: pytest.Captur
     assert ("rotors that rise" in printed) == (vehicle.rotor_rise is not None)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["lopez2011"], "no vehicle named 'lopez2011'; did you mean 'lopes2011'?"),
-        (["gone.toml"], "gone.toml: no such vehicle file"),
-        (["lopes2011", "--out", "drawing.jpg"], "--out must be a file ending in .png; got 'drawing.jpg'"),
-    ],
-)
-def test_wrong_input_is_named(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["vehicle", *arguments]) == 2
-    output = capsys.readouterr()
-    assert output.err.startswith(f"quadsim: {message}")
-    assert output.out == ""
-
-
 def test_the_portrait_shows_the_vehicle(tmp_path: Path) -> None:
     try:
         rendering_backend()

@@ -7,11 +7,9 @@ import math
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from quadsim.errors import FileError
 from scenarios.courses.csv_course import Table, read_table, through_rows
 
 ROWS = "0,0,0,1,0\n1,2,0,1,0.5\n3,2,4,2,1\n"
@@ -95,52 +93,3 @@ def test_any_table_comes_back_from_its_text(tmp_path: Path, data: st.DataObject)
     table = read_table(write(tmp_path, text))
     assert table.velocities is not None
     np.testing.assert_array_equal(np.column_stack([table.t, table.poses, table.velocities]), rows)
-
-
-HEADER_RULE = "row 1: the header must be t,x,y,z,yaw or t,x,y,z,yaw,vx,vy,vz"
-WRONG = {
-    "": f"{HEADER_RULE}; got none",
-    "t,x,y,z\n0,0,0,0\n1,0,0,0\n": f"{HEADER_RULE}; got 4 columns, t,x,y,z of them",
-    "0,0,0,0,0\n1,0,0,0,0\n": f"{HEADER_RULE}; got 5 columns, none of them",
-    "root:x:0:0:root\nsecret,of,an,other,one\n": f"{HEADER_RULE}; got 1 columns, none of them",
-    "t,x,y,z,yaw\n": "must have 2 or more rows below its header; got 0",
-    "t,x,y,z,yaw\n0,0,0,0,0\n": "must have 2 or more rows below its header; got 1",
-    "t,x,y,z,yaw\n0,0,0,0,0\n1,0,0,0\n": "row 3: must have 5 cells (t,x,y,z,yaw); got 4",
-    "t,x,y,z,yaw\n0,0,0,0,0\n\n1,0,0,0,0\n": "row 3: must have 5 cells (t,x,y,z,yaw); got 0",
-    "t,x,y,z,yaw\n0,0,0,0,0\n1,0,,0,0\n": "row 3, column y: is empty",
-    "t,x,y,z,yaw\n0,0,0, ,0\n1,0,0,0,0\n": "row 2, column z: is empty",
-    "t,x,y,z,yaw\n0,0,0,0,0\n1,high,0,0,0\n": "row 3, column x: must be a number; got 'high'",
-    "t,x,y,z,yaw\n0,0,0,0,nan\n1,0,0,0,0\n": "row 2, column yaw: must be a finite number within +-1e+06; got 'nan'",
-    "t,x,y,z,yaw\n0,0,0,0,0\ninf,0,0,0,0\n": "row 3, column t: must be a finite number within +-1e+06; got 'inf'",
-    "t,x,y,z,yaw\n0,0,2e6,0,0\n1,0,0,0,0\n": "row 2, column y: must be a finite number within +-1e+06; got '2e6'",
-    "t,x,y,z,yaw\n-1,0,0,0,0\n1,0,0,0,0\n": "row 2, column t: must be >= 0; got -1",
-    "t,x,y,z,yaw\n0,0,0,0,0\n2,0,0,0,0\n1,0,0,0,0\n": (
-        "row 4, column t: must be above that of the row before = 2; got 1"
-    ),
-    "t,x,y,z,yaw\n0,0,0,0,0\n1,0,0,0,0\n1,0,0,0,0\n": (
-        "row 4, column t: must be above that of the row before = 1; got 1"
-    ),
-    "t,x,y,z,yaw,vx,vy,vz\n0,0,0,0,0,0,0,0\n1,0,0,0,0,0,fast,0\n": "row 3, column vy: must be a number; got 'fast'",
-}
-
-
-@pytest.mark.parametrize(("text", "message"), WRONG.items())
-def test_a_wrong_file_is_named_with_its_row_and_column(tmp_path: Path, text: str, message: str) -> None:
-    path = write(tmp_path, text)
-    with pytest.raises(FileError) as caught:
-        read_table(path)
-    assert str(caught.value) == f"{path}: {message}"
-
-
-@pytest.mark.parametrize("content", [b"\xff\xfet,x", b't,x,y,z,yaw\n"0,0,0,0,0\n'])
-def test_a_file_that_is_no_text_table_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "course.csv"
-    path.write_bytes(content)
-    with pytest.raises(FileError, match=r"course\.csv: cannot be read \("):
-        read_table(path)
-
-
-def test_a_missing_file_and_a_directory_are_named(tmp_path: Path) -> None:
-    for path in (tmp_path / "gone.csv", tmp_path):
-        with pytest.raises(FileError, match=r"cannot be read \("):
-            read_table(path)

@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 from support import scenario_table
 
-from quadsim.errors import FileError, ParameterError
+from quadsim.errors import FileError
 from quadsim.state import Array
-from scenarios.courses.make import build_course, build_course_steps, build_reference
+from scenarios.courses.make import build_course, build_reference
 from scenarios.courses.smoothing import smooth
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.schema.course import MOST_POINTS
-from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 
 INITIAL = (1.0, -2.0, 3.0)
@@ -146,11 +144,6 @@ def test_yaw_turns_are_in_degrees_and_leave_the_position() -> None:
     np.testing.assert_array_equal(poses[:, :3], np.tile(INITIAL, (3, 1)))
 
 
-def test_only_steps_have_steps_to_settle() -> None:
-    assert build_course_steps(scenario("steps"))
-    assert not any(build_course_steps(scenario(kind)) for kind in REFERENCES if kind != "steps")
-
-
 # --- tables --------------------------------------------------------------------------------------------------------
 
 
@@ -177,16 +170,6 @@ def test_a_table_is_found_beside_its_scenario_and_stored_by_its_whole_path_and_h
     np.testing.assert_allclose(poses[-1], [5.0, -2.0, 3.0, 0.5])  # yaw in radians
 
 
-def test_a_table_is_found_in_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = beside(tmp_path, file="tables/other.csv")
-    (tmp_path / "elsewhere" / "tables").mkdir(parents=True)
-    (tmp_path / "elsewhere" / "tables" / "other.csv").write_text(TABLE)
-    monkeypatch.chdir(tmp_path / "elsewhere")
-    reference = load_scenario(str(path)).reference
-    assert reference.type == "csv"
-    assert reference.file == str(tmp_path / "elsewhere" / "tables" / "other.csv")
-
-
 def test_a_table_that_changed_after_the_scenario_was_resolved_is_refused(tmp_path: Path) -> None:
     made = load_scenario(str(beside(tmp_path)))
     (tmp_path / "course.csv").write_text(TABLE.replace("5,-2", "6,-2"))
@@ -194,87 +177,3 @@ def test_a_table_that_changed_after_the_scenario_was_resolved_is_refused(tmp_pat
         FileError, match=r"course\.csv: is not the file of the scenario: its SHA-256 is not [0-9a-f]{64}$"
     ):
         build_course(made)
-
-
-def test_a_wrong_table_and_a_missing_one_are_named(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match=r"course\.csv: row 3, column z: is empty$"):
-        load_scenario(str(beside(tmp_path, TABLE.replace("5,-2,3", "5,-2,"))))
-    with pytest.raises(FileError, match=r"gone\.csv: cannot be read"):
-        build_course(load_scenario(str(beside(tmp_path, file="gone.csv"))))
-
-
-# --- what is wrong -------------------------------------------------------------------------------------------------
-
-WRONG: list[tuple[str, dict[str, Any], str]] = [
-    (
-        "spiral",
-        {},
-        "reference must be one of 'steps', 'waypoints', 'minimum_snap', 'circle', 'helix', 'figure_eight', ",
-    ),
-    ("circle", {"type": ["circle"]}, "reference must be one of 'steps', "),
-    ("circle", {"radios": 2.0}, "reference.radios is not a field of the scenario file; did you mean 'radius'? "),
-    ("circle", {"radius": None}, "reference.radius is missing"),
-    ("circle", {"radius": 0.0}, "reference.radius must be > 0.0; got 0.0"),
-    ("circle", {"speed": 0.0}, "reference.speed must be >= 0.001; got 0.0"),
-    ("circle", {"speed": -1.0}, "reference.speed must be >= 0.001; got -1.0"),
-    ("circle", {"period": 3.0}, "reference.period must be given, or speed, but not both; got period and speed"),
-    ("circle", {"speed": None}, "reference.period must be given, or speed, but not both; got neither"),
-    ("circle", {"turns": 0.0}, "reference.turns must not be 0"),
-    ("circle", {"ramp": 12.6}, "reference.ramp must be at most the time of all turns at full speed = 12.5664 s; got"),
-    ("circle", {"yaw": 0.0, "yaw_along_path": True}, "reference.yaw must be absent where yaw_along_path is true"),
-    ("circle", {"start": -1.0}, "reference.start must be >= 0.0; got -1.0"),
-    ("circle", {"centre": [1.0]}, "reference.centre must be a list of 2 numbers; got [1.0]"),
-    ("helix", {"climb": None}, "reference.climb is missing"),
-    ("helix", {"ramp": 17.0}, "reference.ramp must be at most the time of all turns at full speed = 16 s; got 17.0"),
-    ("figure_eight", {"width": 0.0}, "reference.width must be > 0.0; got 0.0"),
-    ("waypoints", {"points": []}, f"reference.points must have 1 to {MOST_POINTS} entries; got 0"),
-    ("waypoints", {"points": POINTS * 101}, f"reference.points must have 1 to {MOST_POINTS} entries; got 202"),
-    ("waypoints", {"points": [{"position": [1.0, 2.0]}]}, "reference.points.0.position must be a list of 3 numbers"),
-    ("waypoints", {"points": [*POINTS, {"positon": [1.0, 2.0, 3.0]}]}, "reference.points.2.positon is not a field"),
-    ("waypoints", {"speed": 0.0}, "reference.speed must be >= 0.001; got 0.0"),
-    (
-        "waypoints",
-        {"points": [POINTS[0], POINTS[0]]},
-        "reference.points.1.position must be 0.001 m or more from that before it (to stay at a point give it a hold); "
-        "got [4.0, 2.0, 3.0] after [4.0, 2.0, 3.0]",
-    ),
-    ("minimum_snap", {"points": []}, f"reference.points must have 1 to {MOST_POINTS} entries; got 0"),
-    ("minimum_snap", {"speed": None}, "reference.times must be given, or speed, but not both; got neither"),
-    ("minimum_snap", {"times": [1.0, 2.0]}, "reference.times must be given, or speed, but not both; got times and sp"),
-    ("minimum_snap", {"speed": None, "times": [1.0]}, "reference.times must have one time for each of the 2 points; "),
-    ("minimum_snap", {"speed": None, "times": [2.0, 1.0]}, "reference.times must increase, by 0.001 s or more; got ["),
-    ("minimum_snap", {"speed": None, "times": [2.0, 2.0]}, "reference.times must increase, by 0.001 s or more; got ["),
-    ("minimum_snap", {"speed": None, "times": [0.0, 2.0]}, "reference.times.0 must be >= 0.001; got 0.0"),
-    (
-        "minimum_snap",
-        {"points": [POINTS[0], POINTS[0]]},
-        "reference.points.1.position must be 0.001 m or more from that before it (or give times instead of speed); got",
-    ),
-    ("yaw_turns", {"turns": []}, f"reference.turns must have 1 to {MOST_POINTS} entries; got 0"),
-    ("yaw_turns", {"turns": [{"start": 1.0, "yaw": 9.0, "rate": 0.0}]}, "reference.turns.0.rate must be >= 0.001; got"),
-    (
-        "yaw_turns",
-        {"turns": [{"start": start, "yaw": 9.0, "rate": 1.0} for start in (2.0, 2.0)]},
-        "reference.turns.1.start must be above that before it = 2.0; got 2.0",
-    ),
-    ("csv", {}, "reference.file is missing"),
-    ("csv", {"file": "a.csv", "sha256": "12"}, "reference.sha256 must be of the form ^[0-9a-f]{64}$; got '12'"),
-]
-
-
-@pytest.mark.parametrize(("kind", "fields", "message"), WRONG)
-def test_a_wrong_field_is_named(kind: str, fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(ScenarioError) as caught:
-        scenario(kind, **fields)
-    assert str(caught.value).startswith(f"scenario: {message}")
-
-
-def test_a_first_point_that_leaves_no_way_to_go_is_named() -> None:
-    with pytest.raises(ParameterError) as caught:
-        build_course(scenario("minimum_snap", points=[{"position": list(INITIAL)}, *POINTS]))
-    assert str(caught.value) == (
-        "reference.points.0.position must be 0.001 m or more from the initial position, where the course begins "
-        "(or give times instead of speed); got [1.0, -2.0, 3.0]"
-    )
-    stays = scenario("minimum_snap", points=[{"position": list(INITIAL)}], speed=None, times=[5.0])
-    np.testing.assert_allclose(build_course(stays).sample(np.linspace(0, 5, 9))[:, :3], np.tile(INITIAL, (9, 1)))

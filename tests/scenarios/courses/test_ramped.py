@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import tomllib
 from typing import Any
 
@@ -12,7 +11,6 @@ import pytest
 from scipy.integrate import cumulative_trapezoid
 
 from mpc.flatness import attitudes, motion_along
-from quadsim.errors import ParameterError
 from quadsim.motion import Motion
 from quadsim.rotation import quaternion_to_euler
 from quadsim.state import Array
@@ -204,34 +202,3 @@ def test_flatness_of_a_hover_that_turns() -> None:
     np.testing.assert_allclose(torque_z[4:-4], 0.06 * 0.8, atol=1e-3)
     attitude, _ = attitudes(still, period=PERIOD, gravity=9.81, yaw=0.7)
     np.testing.assert_allclose(quaternion_to_euler(attitude)[:, 2], 0.7)
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"ramp": 8.0}, "reference.ramp must be below speed / acceleration = 8 s; got 8.0"),
-        ({"response_time": 1.0}, "reference.response_time must be 0: the course is smooth by itself; got 1.0"),
-        ({"sampling": 0.0012, "acceleration": 0.1}, "reference.sampling must make at most 100000 samples, 0.00164 s"),
-        ({"heading": "north"}, "reference.heading must be one of 'free' or 'held'; got 'north'"),
-        ({"radius": 0.0}, "reference.radius must be > 0.0; got 0.0"),
-    ],
-)
-def test_what_cannot_be_flown_is_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(ScenarioError, match=re.escape(message)):
-        changed(**fields)
-
-
-def test_a_start_on_a_reference_needs_one_that_states_it() -> None:
-    rule = "initial.on_reference must be false where the course states positions alone, as one of type circle does"
-    with pytest.raises(ParameterError, match=re.escape(rule)):
-        load_scenario("circle", ["initial.on_reference=true"])
-    with pytest.raises(ScenarioError, match="euler must have roll and pitch 0 where on_reference is true"):
-        load_scenario("torrente-loop4-ideal", ["initial.euler=[1.0, 0.0, 0.0]"])
-
-
-@pytest.mark.parametrize(
-    "setting", ["effects.load.mass_factor=1.1", "events=[{type='payload_pickup', at=1.0, mass=0.1}]"]
-)
-def test_the_integrator_refuses_a_load_before_it_is_flown(setting: str) -> None:
-    with pytest.raises(ParameterError, match=re.escape("plant.integrator must be mujoco where there is a load")):
-        load_scenario("torrente-loop4-ideal", [setting])

@@ -11,7 +11,7 @@ import pytest
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, load_vehicle
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT, console
+from scenarios.commands import EXIT_DONE, console
 from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
 from scenarios.design.shortfalls import shortfalls
 from scenarios.design.vehicle_template import ADVICE, parameter_meanings, vehicle_template
@@ -87,29 +87,6 @@ def test_from_a_template_to_a_scenario_by_the_command_line(
     Path("first.toml").write_text(capsys.readouterr().out, encoding="utf-8")
     assert main(["vehicle", "mine.toml", "--scenario", "first.toml"]) == EXIT_DONE
     assert "none: the vehicle meets all of them" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            ["vehicle"],
-            "vehicle needs a name or a TOML file, or --template (there are: crazyflie2, hummingbird, lopes2011, "
-            "torrente2021)",
-        ),
-        (["scenario", "--for", "none"], "no vehicle named 'none'"),
-        (
-            ["scenario", "--for", "hummingbird", "--course", "x"],
-            "no course named 'x' (there are: figure-eight, hover, step)",
-        ),
-        (["scenario", "hover", "--for", "hummingbird"], "--for must be given without a scenario; got 'hummingbird'"),
-        (["scenario", "hover", "--course", "step"], "--course must be given with --for alone; got 'step'"),
-        (["scenario", "--for", "hummingbird", "--set", "duration=3.0"], "--for must be given without --set"),
-    ],
-)
-def test_wrong_requests_are_refused(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(arguments) == EXIT_WRONG_INPUT
-    assert message in capsys.readouterr().err
 
 
 def test_the_speed_at_which_a_course_fits_is_reported_before_the_flight(

@@ -88,13 +88,6 @@ def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
     assert flown == {name for name in scenario_names() if load_scenario(name).group == "papers"}
 
 
-def test_the_published_number_stands_in_each_scenarios_description() -> None:
-    for number in load_paper("torrente2021").numbers:
-        if not number.set and number.measure.endswith("mean"):
-            texts = load_scenario(number.scenario).description
-            assert f"mean error {' to '.join(f'{value:.4f}' for value in sorted({*number.span}))} m" in texts
-
-
 @pytest.mark.parametrize(
     ("relation", "ours", "within"),
     [
@@ -110,13 +103,6 @@ def test_the_published_number_stands_in_each_scenarios_description() -> None:
 def test_a_number_is_judged_by_its_relation_and_tolerance(relation: Any, ours: float, within: bool) -> None:
     spec = NumberSpec(name="n", scenario="hover", published=1.0, relation=relation, absolute=0.01, source="s")
     assert Reproduced(spec=spec, ours=ours).within is within
-
-
-def test_of_several_published_numbers_the_nearest_counts() -> None:
-    spec = NumberSpec(name="n", scenario="hover", published=[1.0, 1.1], relative=0.1, source="s")
-    found = [Reproduced(spec=spec, ours=ours) for ours in (0.95, 1.05, 1.2, 1.3)]
-    assert [number.difference for number in found] == pytest.approx([-0.05, 0.0, 0.1, 0.2])
-    assert [number.within for number in found] == [True, True, True, False]
 
 
 def test_a_flight_that_ends_early_reproduces_nothing(tmp_path: Path) -> None:
@@ -171,11 +157,6 @@ def test_one_flight_serves_all_that_is_measured_of_it(tmp_path: Path, monkeypatc
     ("measure", "there"),
     [
         ("tracking.rmse.w", "tracking.rmse has: x, y, z, yaw"),
-        ("tracking.rmse", ""),
-        ("traking.rmse.x", "summary.json has: scenario, "),
-        ("constraints.role.worst_margin", "constraints has: roll, pitch"),
-        ("constraints.roll.worst", "constraints.roll has: name, signal, "),
-        ("vehicle.inertia.x", "vehicle.inertia has: 0, 1, 2"),
         ("scenario", ""),
     ],
 )
@@ -197,11 +178,6 @@ def test_a_scenario_beside_the_papers_file_is_found(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace('scenario = "hover"', 'scenario = "mine.toml"'))
     paper = load_paper(str(path))
     assert scenario_of(paper, paper.numbers[0]).name == "mine"
-
-
-def test_a_share_of_nothing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match="absolute must be given where the published number is 0"):
-        load_paper(written(tmp_path, ("0.0", "relative = 0.1")))
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,11 @@ import math
 import tomllib
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
-from pydantic import Tag
 
 from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import GeometricController
@@ -28,7 +27,7 @@ from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.robust.tightening import TighteningSettings, margins
 from mpc.solvers import QPSolver
 from mpc.unconstrained import UnconstrainedMPC
-from quadsim.controller import LAW_NAMES, SOLVED, Controller, Moment
+from quadsim.controller import SOLVED, Controller, Moment
 from quadsim.errors import ParameterError
 from scenarios.build import build_controller, build_plant, build_problem, resolve
 from scenarios.courses.feasibility_check import report
@@ -36,12 +35,8 @@ from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_once, fly_scenario
-from scenarios.schema.controller import _Table
 from scenarios.schema.json_schema import scenario_schema
-from scenarios.schema.plugin import FORM, LAWS
-from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import CONTROLLERS
 
 ROBUST: dict[str, Any] = {
     "type": "robust",
@@ -377,46 +372,6 @@ def test_nodes_that_do_not_fit_are_refused(fields: dict[str, Any], message: str)
     assert str(caught.value) == message
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"solver": "piqb"}, "controller.solver: no solver named 'piqb'"),
-        ({"rotor_lag": 1e-9}, "controller.rotor_lag must be 0, or at least 0.0001 s; got 1e-09"),
-        ({"tilt": 90.0}, "controller.tilt must be < 90.0; got 90.0"),
-        (
-            {"output_bounds": {"roll": [-1.0, 1.0]}},
-            "output_bounds must be of x, vx, y, vy, z, vz; got 'roll'",
-        ),
-        (
-            {"input_bounds": {"slew": [-1.0, 1.0]}},
-            'input_bounds.slew must be absent where inputs = "thrust"',
-        ),
-        ({"input_bounds": {"speed": [-1.0, 1.0]}}, "controller.input_bounds.speed must have a lower bound >= 0 rad/s"),
-        ({"weights": {"position": 0.0}}, "controller.weights.position must be > 0.0; got 0.0"),
-        (
-            {"weights": {"position": [1.0, 2.0]}},
-            "weights.position must be a list of 3 numbers; got [1.0, 2.0]",
-        ),
-        (
-            {"attitude_error": "difference", "weights": {"attitude": [1.0, 1.0, 1.0]}},
-            'controller.weights.attitude must be one number where attitude_error = "difference"',
-        ),
-        ({"weights": {"position": [1.0, -2.0, 3.0]}}, "controller.weights.position.1 must be > 0.0; got -2.0"),
-        ({"weights": {"position": "far"}}, "controller.weights.position must be a number; got 'far'"),
-        ({"weights": {"position": {}}}, "controller.weights.position must be a number; got {}"),
-        ({"terminal": "lqg"}, "controller.terminal must be one of 'none' or 'lqr'; got 'lqg'"),
-        ({"terminal": -1.0}, "controller.terminal must be >= 0.0; got -1.0"),
-        ({"terminal": [1.0]}, "controller.terminal must be a number; got [1.0]"),
-    ],
-)
-def test_wrong_fields_of_nonlinear_mpc_are_named(fields: dict[str, Any], message: str) -> None:
-    """Of a field of several types in one line, about the type that was given."""
-    with pytest.raises(ScenarioError) as caught:
-        scenario({"type": "nonlinear", **fields})
-    assert message in str(caught.value)
-    assert len(caught.value.problems) == 1
-
-
 def test_fields_of_the_baselines_arrive() -> None:
     bounds = {"speed": [1.0, 300.0], "slew": [-20.0, 30.0]}
     lqr, pid, geometric = (
@@ -445,61 +400,6 @@ def test_fields_of_the_baselines_arrive() -> None:
 
 
 # --- the file ------------------------------------------------------------------------------------------------------
-
-
-WRONG = {
-    "controller.rotor_lag=-1": "controller.rotor_lag must be >= 0.0; got -1",
-    "controller.rotor_lag=1e-9": "controller.rotor_lag must be 0, or at least 0.0001 s; got 1e-09",
-    "controller.rotor_lag=rotor": "controller.rotor_lag must be one of 'vehicle'; got 'rotor'",
-    "controller.delay=-1": "controller.delay must be >= 0.0; got -1",
-    "controller.soft.linear=-1": "controller.soft.linear must be >= 0.0; got -1",
-    "controller.soft=true": "controller.soft must be a table; got True",
-    "controller.offset_free.force_wak=1": "controller.offset_free.force_wak is not a field of the scenario file; did "
-    "you mean 'force_walk'? (there are: velocity_noise, rate_noise, velocity_walk, rate_walk, force_walk, torque_walk, "
-    "largest_force, largest_torque)",
-    "controller.offset_free.force_walk=0": "controller.offset_free.force_walk must be > 0.0; got 0",
-    "controller.heading=1": "controller.heading must be true or false; got 1",
-    "controller.largest_turn=0": "controller.largest_turn must be > 0.0; got 0",
-    "controller.move_weight=0": "controller.move_weight must be > 0.0; got 0",
-    "controller.tightening.turning=-1": "controller.tightening.turning must be >= 0.0; got -1",
-    "controller.output_bounds={}": "controller.tightening must be absent where there are no output_bounds to tighten",
-    "controller.fallback=false": "controller.fallback must be a table; got False",
-    "controller.fallback.enabled=0": "controller.fallback.enabled must be true or false; got 0",
-    "controller.fallback.tilt=90": "controller.fallback.tilt must be < 90.0; got 90",
-    "controller.output_bounds.rol=[0, 1]": "controller.output_bounds.rol is not a state; did you mean 'roll'? (there "
-    "are: x, vx, y, vy, z, vz, roll, roll_rate, pitch, pitch_rate, yaw, yaw_rate)",
-    "controller.solver=daqp": "controller.solver is not a field of the scenario file ...",
-    "controller=lqt": "controller must be one of 'unconstrained', 'constrained', 'robust', 'nonlinear', 'lqr', 'pid', "
-    "'geometric', 'package.module:Class' in its field type; got 'lqt'; did you mean 'lqr'?",
-    "controller={type='lqr', input_weights={speed=1}}": "controller.input_weights must be given where output_weights "
-    "are, and nowhere else",
-    "controller={type='lqr', output_weights={zz=1}, input_weights={speed=1}}": "controller.output_weights.zz is not a "
-    "state; did you mean 'z'? ...",
-    "controller={type='pid', horizon=2}": "controller.horizon must be >= 3; got 2",
-    "controller={type='pid', tilt=90}": "controller.tilt must be <= 80.0; got 90",
-    "controller={type='geometric', velocity=1}": "controller.velocity is not a field of the scenario file ...",
-}
-
-
-@pytest.mark.parametrize(("setting", "message"), WRONG.items(), ids=WRONG)
-def test_a_wrong_field_is_named(setting: str, message: str) -> None:
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario("robust", [setting])
-    reported, begins = str(caught.value).removeprefix("robust.toml: "), message.endswith("...")
-    assert reported.startswith(message[:-3]) if begins else reported == message
-
-
-@pytest.mark.parametrize("name", ["lqr", "pid", "geometric"])
-def test_a_baseline_has_no_optimisation(name: str) -> None:
-    with pytest.raises(ParameterError, match=rf"^controller\.type must be one that minimises .*; got '{name}'$"):
-        build_problem(scenario(name), build_vehicle(scenario(name)))
-
-
-def test_every_law_is_listed_and_distinguished_by_its_name() -> None:
-    tags = {note.tag for kind in get_args(get_args(_Table)[0]) for note in get_args(kind) if isinstance(note, Tag)}
-    assert tags == {*LAWS, FORM}
-    assert list(CONTROLLERS) == list(LAWS)
-    assert {*LAW_NAMES} == tags - {FORM}  # and has a name to be shown by
 
 
 def test_a_law_with_too_narrow_bounds_is_refused_in_the_files_words() -> None:

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from quadsim.controller import MISSED, Command, Controller, Moment
-from quadsim.errors import ParameterError
 from quadsim.sim.computation import Computation
 from quadsim.sim.effects import (
     Air,
@@ -217,8 +216,3 @@ class Spy:
         command = self._law.step(now, state, reference)
         self.plans.append(command.plan.copy())
         return command
-
-
-def test_wind_that_nothing_meets_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"effects\.air\.rotor_drag must be positive, or body_drag given"):
-        build_wind(*scenario("effects.air.wind=[1.0, 0.0, 0.0]"))

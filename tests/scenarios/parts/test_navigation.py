@@ -15,7 +15,6 @@ from quadsim.vehicle import Vehicle
 from scenarios.loading import parse_scenario
 from scenarios.parts.navigation import build_fault, build_navigation, build_sensors
 from scenarios.run import fly_scenario
-from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 
 SENSORS: dict[str, Any] = {
@@ -74,49 +73,3 @@ def test_a_flight_by_estimate_is_the_same_each_time() -> None:
     assert np.array_equal(logs[0].state, logs[1].state)
     error = logs[0].state - logs[0].truth
     assert 1e-6 < np.abs(error[:, [0, 2, 4]]).max() < 0.5
-
-
-@pytest.mark.parametrize(
-    ("tables", "message"),
-    [
-        (
-            {"sensors": {"position": {"rate": 30.0}}},
-            "sensors.position.rate must be a divisor of the physics rate of 1000 Hz; got 30.0",
-        ),
-        (
-            {"sensors": {"position": {"rate": 20.0, "delay": 0.0005}}},
-            "sensors.position.delay must be a whole multiple of the physics step of 0.001 s; got 0.0005",
-        ),
-        ({"sensors": {"rates": {}}}, "sensors.rates.rate is missing"),
-        ({"sensors": {"rates": {"rate": 0.0}}}, "sensors.rates.rate must be >= 0.01; got 0.0"),
-        ({"sensors": {"rates": {"rate": 10.0, "noise": -1.0}}}, "sensors.rates.noise must be >= 0.0; got -1.0"),
-        (
-            {"sensors": {"rates": {"rate": 10.0, "noise": [1.0, 2.0]}}},
-            "sensors.rates.noise must be a list of 3 numbers; got [1.0, 2.0]",
-        ),
-        ({"sensors": {"rates": {"rate": 10.0, "dropout": 2.0}}}, "sensors.rates.dropout must be <= 1.0; got 2.0"),
-        (
-            {"sensors": {"rates": {"rate": 10.0, "outliers": {"probability": 0.1, "size": 0.5}}}},
-            "sensors.rates.outliers.size must be >= 1.0; got 0.5",
-        ),
-        ({"sensors": {"gps": {"rate": 10.0}}}, "sensors.gps is not a field of the scenario file"),
-        (
-            {"estimator": ESTIMATOR},
-            "estimator must have sensors.position to work with; got []",
-        ),
-        (
-            {"estimator": ESTIMATOR, "sensors": {"position": SENSORS["position"]}},
-            "estimator must have sensors.attitude to work with; got ['position']",
-        ),
-        (
-            {"estimator": ESTIMATOR, "sensors": SENSORS | {"rates": {"rate": 10.0, "noise": [0.0, 1.0, 1.0]}}},
-            "sensors.rates.noise must be positive, for the estimator to weigh its samples; got [0.0, 1.0, 1.0]",
-        ),
-        ({"estimator": {"type": "magic"}, "sensors": SENSORS}, "estimator.type must be"),
-        ({"estimator": ESTIMATOR | {"gate": 1.0}, "sensors": SENSORS}, "estimator.gate must be "),
-    ],
-)
-def test_wrong_tables_are_refused_with_their_field(tables: dict[str, Any], message: str) -> None:
-    with pytest.raises(ScenarioError) as caught:
-        scenario(**tables)
-    assert caught.value.problems[0].startswith(message)

@@ -13,21 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import scenario_table
 
-from mpc.ocp import Objective
 from mpc.solvers import SOLVERS
 from quadsim.assets import vehicle_path
-from quadsim.errors import FileError, InputError, ParameterError, UnknownNameError
+from quadsim.errors import UnknownNameError
 from quadsim.flight.audit import SIGNALS
 from quadsim.state import STATE_NAMES
-from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS
-from scenarios.build import resolve
 from scenarios.limits import build_limits
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.problems import ScenarioError
-from scenarios.schema.scenario import MOST_STEPS, Scenario
-from scenarios.schema.settings import apply_setting
-from scenarios.shipped import LIBRARY, scenario_names, scenario_path
+from scenarios.schema.scenario import Scenario
+from scenarios.shipped import LIBRARY
 
 
 def reread(scenario: Scenario) -> Scenario:
@@ -35,19 +31,6 @@ def reread(scenario: Scenario) -> Scenario:
 
 
 # --- what is right -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", scenario_names())
-def test_every_file_of_the_library_comes_back_from_its_resolved_text(name: str) -> None:
-    scenario = load_scenario(name)
-    resolved = resolve(scenario, build_vehicle(scenario))
-    assert scenario.name == name
-    assert reread(scenario) == scenario
-    assert reread(resolved) == resolved
-    assert build_vehicle(reread(resolved)) == build_vehicle(scenario)
-    numbers = resolved.vehicle.overrides()  # its file alone defines it
-    assert numbers.keys() >= VEHICLE_UNITS.keys() - set(OPTIONAL_PARAMETERS)
-    assert set(numbers) == {key for key in VEHICLE_UNITS if getattr(build_vehicle(scenario), key) is not None}
 
 
 def test_defaults_are_written_out() -> None:
@@ -100,277 +83,7 @@ def test_a_description_says_what_was_changed() -> None:
     assert parse_scenario(tomllib.loads(more.to_toml())).description == more.description
 
 
-def test_a_description_of_one_s_own_stays_as_it_is() -> None:
-    found = load_scenario("hover", ["controller.horizon=30", "description=mine"])
-    assert found.description == "mine"
-    assert load_scenario("hover").replace({"description": "mine"}).description == "mine"
-
-
-def test_a_long_value_is_cut_in_a_description() -> None:
-    events = [{"type": "push", "at": float(at), "duration": 0.1, "force": [0.1, 0.0, 0.0]} for at in range(9)]
-    found = load_scenario("hover").replace({"events": events})
-    assert found.description.endswith("...)")
-    assert len(found.description) < 160
-
-
-# --- what is wrong in one field ------------------------------------------------------------------------------------
-
-WRONG = {
-    # given by --set on paper-constrained: the whole message after the file's name, or its beginning before " ..."
-    "duraton=3": "duraton is not a field of the scenario file; did you mean 'duration'? (there are: name, ...",
-    "controller.horizn=3": "controller.horizn is not a field of the scenario file; did you mean 'horizon'? ...",
-    "vehicle.weight=3": "vehicle.weight is not a field of the scenario file (there are: file, mass, gravity, ...",
-    "vehicle.rotor_lag=1": (
-        "vehicle.rotor_lag is not a field of the scenario file; did you mean 'rotor_rise' and 'rotor_fall'? ..."
-    ),
-    "plant.step=1": "plant.step is not a field of the scenario file; did you mean 'timestep'? ...",
-    "reference.x=[{start=0,stop=1,valu=2}]": "reference.x.0.valu is not a field of the scenario file; did you ...",
-    "constraints.roll.upr=3": "constraints.roll.upr is not a field of the scenario file; did you mean 'upper'? ...",
-    "name=3": "name must be a text; got 3",
-    "name=A/B": "name must be of the form ^[a-z0-9][a-z0-9._-]*$; got 'A/B'",
-    "duration=long": "duration must be a number; got 'long'",
-    "duration=true": "duration must be a number; got True",
-    "duration=nan": "duration must be a finite number; got nan",
-    "duration=inf": "duration must be a finite number; got inf",
-    "duration=0": "duration must be > 0.0; got 0",
-    "duration=-1.0": "duration must be > 0.0; got -1.0",
-    "duration=1e9": "duration must be <= 86400.0; got 1000000000.0",
-    "control_period=0": "control_period must be > 0.0; got 0",
-    "group=nowhere": "group must be one of 'paper', 'papers', 'courses', 'air', 'faults', 'ground', 'space', 'sensors' "
-    "or 'other'; ...",
-    "expect=fine": "expect must be one of 'satisfied', 'violated', 'lost', 'aborted' or 'incomplete'; got 'fine'",
-    "name='" + 81 * "a" + "'": "name must be a text of 80 or fewer characters; got '" + 81 * "a" + "'",
-    "seed=-1": "seed must be >= 0; got -1",
-    "seed=1.5": "seed must be a whole number; got 1.5",
-    "log_rate=0": "log_rate must be >= 0.01; got 0",
-    "vehicle=3": "vehicle must be a table; got 3",
-    "vehicle.file=3": "vehicle.file must be a text; got 3",
-    "vehicle.mass=heavy": "vehicle.mass must be a number; got 'heavy'",
-    "vehicle.inertia=[1, 1]": "vehicle.inertia must be a list of 3 numbers; got [1, 1]",
-    "vehicle.rotor_spins=[1, 1, 1, 1, 1]": "vehicle.rotor_spins must be a list of 4 numbers; got [1, 1, 1, 1, 1]",
-    "initial.position=[0, nan, 0]": "initial.position.1 must be a finite number; got nan",
-    "initial.position=[0, 1e7, 0]": "initial.position.1 must be <= 1000000.0; got 10000000.0",
-    "plant.timestep=0": "plant.timestep must be >= 1e-06; got 0",
-    "plant.timestep=0.02": "plant.timestep must be <= 0.01; got 0.02",
-    "plant.limit_speeds=1": "plant.limit_speeds must be true or false; got 1",
-    "reference.response_time=-1": "reference.response_time must be >= 0.0; got -1",
-    "reference.x=3": "reference.x must be a list; got 3",
-    "reference.x=[3]": "reference.x.0 must be a table; got 3",
-    "controller=3": "controller must be a table or a controller's name; got 3",
-    "controller={horizon = 3}": "controller must be a table with a field type; got None",
-    "controller={type = 'nonlinear', compiled = true}": (
-        "controller.compiled must be absent for nonlinear: only MPC with fixed matrices "
-        "(unconstrained, constrained, robust) can be compiled; got True"
-    ),
-    "controller.type=mpc": "controller must be one of 'unconstrained', 'constrained', 'robust', ...",
-    "controller.horizon=0": "controller.horizon must be >= 1; got 0",
-    "controller.horizon=1001": "controller.horizon must be <= 1000; got 1001",
-    "controller.horizon=2.0": "controller.horizon must be a whole number; got 2.0",
-    "controller.output_weights={}": "controller.output_weights must be of 1 or more entries; got {}",
-    "controller.output_weights.x=0": "controller.output_weights.x must be > 0.0; got 0",
-    "controller.output_weights.x=1e13": "controller.output_weights.x must be <= 1000000000000.0; got 10000000000000.0",
-    "controller.output_weights.constrained=0": "controller.output_weights.constrained must be > 0.0; got 0",
-    "controller.output_weights.zz=1": "controller.output_weights.zz is not a state; did you mean 'z'? (there are: ...",
-    "controller.input_weights.speed=-1": "controller.input_weights.speed must be > 0.0; got -1",
-    "controller.input_weights.speed=big": "controller.input_weights.speed must be a number; got 'big'",
-    "controller.input_weights.speed=[1, 2]": "controller.input_weights.speed must be a list of 4 numbers; got [1, 2]",
-    "controller.input_weights.speed=[1, 2, 0, 1]": "controller.input_weights.speed.2 must be > 0.0; got 0",
-    "controller.solver=gurobi": "controller.solver: no solver named 'gurobi' (there are: ...",
-    "controller.output_bounds.rol=[0, 1]": "controller.output_bounds.rol is not a state; did you mean 'roll'? ...",
-    "controller.output_bounds.roll=[-5]": "controller.output_bounds.roll must be a list of 2 numbers; got [-5]",
-    "constraints=3": "constraints must be a list; got 3",
-    "constraints=[3]": "constraints.0 must be a table; got 3",
-    "constraints.roll.tolerance=-1": "constraints.roll.tolerance must be >= 0.0; got -1",
-    "constraints.roll.required=0": "constraints.roll.required must be true or false; got 0",
-    "constraints.roll.signal=rol": "constraints.roll.signal: no signal named 'rol'; did you mean 'roll'? ...",
-    "constraints.roll.name=a b": "constraints.a b.name must be of the form ^[A-Za-z0-9_.-]+$; got 'a b'",
-    # fields that contradict each other
-    "control_period=0.0505": (
-        "control_period must be a whole multiple of the physics step plant.timestep = 0.001 s; got 0.0505"
-    ),
-    "duration=1.01": "duration must be a whole multiple of the control period = 0.05 s; got 1.01",
-    "log_rate=300": (
-        "log_rate must have a period that is a whole multiple of the physics step plant.timestep = 0.001 s; got 300.0"
-    ),
-    "initial.euler=[0, 90, 0]": (
-        "initial.euler must have a roll within +-180 deg and a pitch within +-90 deg; got [0.0, 90.0, 0.0]"
-    ),
-    "controller={type='geometric',drag=[1,0,0]}": (
-        "controller.drag must be zero where feedforward is not true; got [1.0, 0.0, 0.0]"
-    ),
-    "controller={type='geometric',feedforward=true,horizon=4}": (
-        "controller.horizon must be at least 5 where feedforward is true; got 4"
-    ),
-    "controller={type='geometric',indi={rate=300}}": (
-        "controller.indi.rate must be such that 1 / rate is a whole multiple of the physics step of 0.001 s; got 300.0"
-    ),
-    "controller={type='nonlinear',offset_free={},disturbance={}}": (
-        "controller.disturbance must be absent where offset_free is given: both estimate the same force"
-    ),
-    "reference.x=[{start=2,stop=2,value=0}]": "reference.x.0.start must be below stop = 2.0; got 2.0",
-    "controller.output_bounds.roll=[5, -5]": (
-        "controller.output_bounds.roll must have its lower bound below its upper; got [5.0, -5.0]"
-    ),
-    "controller.input_bounds.speed=[250, 0]": (
-        "controller.input_bounds.speed must have its lower bound below its upper; got [250.0, 0.0]"
-    ),
-    "controller.input_bounds.speed=[-1, 250]": (
-        "controller.input_bounds.speed must have a lower bound >= 0 rad/s; got [-1.0, 250.0]"
-    ),
-    "controller.input_bounds.slew=[5, -10]": (
-        "controller.input_bounds.slew must have its lower bound below its upper; got [5.0, -10.0]"
-    ),
-    "controller.input_bounds.slew=[1, 5]": (
-        "controller.input_bounds.slew must allow a speed to be held, so contain 0; got [1.0, 5.0]"
-    ),
-    "constraints.arrival_x.lower=5": "constraints.arrival_x.lower must be below upper = 0.01; got 5.0",
-    "constraints.roll.tolerance_sampled=1": (
-        "constraints.roll.tolerance_sampled must be at most tolerance = 0.05; got 1.0"
-    ),
-    "constraints.roll.stop=-1": "constraints.roll.stop must be at least start = 0.0; got -1.0",
-    "constraints.roll.name=pitch": "constraints must have distinct names; got ['pitch', 'pitch', 'speed', ...",
-    "constraints=[{name='a', signal='x_error'}]": (
-        "constraints.a must have lower, upper or both; no controller has bounds on x_error"
-    ),
-    "controller.type=unconstrained": (
-        "controller.solver is not a field of the scenario file "
-        "(there are: horizon, output_weights, input_weights, terminal, compiled, type)\n"
-        "  controller.output_bounds is not ..."
-    ),
-}
-
-
-@pytest.mark.parametrize(("setting", "message"), WRONG.items(), ids=WRONG)
-def test_a_wrong_field_is_named_with_what_was_given_and_what_is_allowed(setting: str, message: str) -> None:
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario("paper-constrained", [setting])
-    reported, source = str(caught.value), "paper-constrained.toml: "
-    if message.endswith("..."):
-        assert reported.startswith(source + message[:-3])
-    else:
-        assert reported == source + message
-    assert caught.value.source == "paper-constrained.toml"
-    assert caught.value.exit_status == 2
-
-
-@pytest.mark.parametrize("field", ["name", "duration", "vehicle", "vehicle.file", "reference", "controller.horizon"])
-def test_a_missing_field_is_named(field: str) -> None:
-    table = scenario_table()
-    *path, last = field.split(".")
-    inner = table
-    for key in path:
-        inner = inner[key]
-    del inner[last]
-    with pytest.raises(ScenarioError, match=rf"^scenario: {field} is missing$"):
-        parse_scenario(table)
-
-
-def test_all_wrong_fields_are_named_at_once() -> None:
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario("hover", ["controller.horizon=0", "vehicle.mass=true", "sed=1"])
-    fields = [problem.split()[0] for problem in caught.value.problems]
-    assert sorted(fields) == ["controller.horizon", "sed", "vehicle.mass"]
-
-
-@pytest.mark.parametrize(
-    ("settings", "count"),
-    [
-        (["duration=20", "plant.timestep=1e-6"], "at most 10000000 physics steps; got 20000000 of them"),
-        (["duration=3600", "controller.horizon=1000"], "at most 10000000 planned steps; got 72000000 of them"),
-    ],
-)
-def test_a_flight_that_would_not_fit_into_memory_is_refused(settings: list[str], count: str) -> None:
-    assert MOST_STEPS == 10_000_000
-    with pytest.raises(ScenarioError, match=f"duration must make {count}"):
-        load_scenario("paper-constrained", settings)
-
-
-@pytest.mark.parametrize("name", ["Q_y", "Q_u"])
-@pytest.mark.parametrize(
-    "matrix",
-    [
-        [[1.0, 2.0], [2.0, 1.0]],  # indefinite
-        [[1.0, 0.0], [0.0, 0.0]],  # semidefinite
-        [[1.0, 0.5], [0.0, 1.0]],  # not symmetric
-        [[np.nan, 0.0], [0.0, 1.0]],
-    ],
-)
-def test_weights_that_are_not_positive_definite_are_refused(name: str, matrix: list[list[float]]) -> None:
-    given = {"C_r": np.eye(2), "Q_y": np.eye(2), "Q_u": np.eye(2)} | {name: np.array(matrix)}
-    with pytest.raises(ParameterError, match=f"^controller.{name} must be symmetric and positive definite; got "):
-        Objective(**given)
-
-
 # --- what is wrong with the file, a name or a setting --------------------------------------------------------------
-
-
-def test_a_missing_file_is_named() -> None:
-    with pytest.raises(FileError, match=r"^nowhere/mine.toml: no such scenario file$"):
-        load_scenario("nowhere/mine.toml")
-
-
-def test_a_directory_is_no_scenario_file(tmp_path: Path) -> None:
-    (tmp_path / "x.toml").mkdir()
-    with pytest.raises(FileError, match="no such scenario file"):
-        load_scenario(str(tmp_path / "x.toml"))
-
-
-def test_an_unknown_scenario_is_answered_with_those_there_are() -> None:
-    with pytest.raises(UnknownNameError) as caught:
-        scenario_path("paper-constraint")
-    assert str(caught.value) == (
-        "no scenario named 'paper-constraint'; did you mean 'paper-constrained'? "
-        f"(there are: {', '.join(scenario_names())}); or give a path ending in .toml"
-    )
-
-
-@pytest.mark.parametrize(
-    ("content", "problem"),
-    [
-        (b"name = ", "is not valid TOML: "),
-        (b"name = 'a'\nname = 'b'\n", "is not valid TOML: "),
-        (b"\xff\xfe\x00", "cannot be read "),
-        (b"", "name is missing\n  description is missing"),
-    ],
-)
-def test_a_file_that_is_no_scenario_is_refused(tmp_path: Path, content: bytes, problem: str) -> None:
-    path = tmp_path / "bad.toml"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=rf"bad\.toml: {problem}"):
-        load_scenario(str(path))
-
-
-def test_an_unknown_vehicle_is_answered_with_those_there_are() -> None:
-    with pytest.raises(
-        UnknownNameError,
-        match=r"no vehicle named 'lopes'; did you mean 'lopes2011'\? \(there are: crazyflie2, hummingbird, lopes2011",
-    ):
-        build_vehicle(load_scenario("hover", ["vehicle.file=lopes"]))
-
-
-def test_a_missing_vehicle_file_is_named() -> None:
-    with pytest.raises(FileError, match=r"^gone\.toml: no such vehicle file$"):
-        build_vehicle(load_scenario("hover", ["vehicle.file=gone.toml"]))
-
-
-@pytest.mark.parametrize("setting", ["duration", "=3", "a..b=3", ".a=3", "a.=3", ""])
-def test_a_setting_must_be_a_path_and_a_value(setting: str) -> None:
-    with pytest.raises(ParameterError) as caught:
-        apply_setting({}, setting)
-    assert str(caught.value) == f"--set must be of the form dotted.path=value; got {setting!r}"
-
-
-def test_a_setting_does_not_go_through_a_number() -> None:
-    with pytest.raises(
-        ParameterError, match=r"^--set must be a path to a field; duration has none; got 'duration\.x=3'$"
-    ):
-        load_scenario("hover", ["duration.x=3"])
-
-
-@pytest.mark.parametrize("name", ["rol", "0"])
-def test_a_setting_names_a_constraint_that_there_is(name: str) -> None:
-    with pytest.raises(UnknownNameError, match=rf"^no entry of constraints named '{name}'.*\(there are: .*roll.*\)$"):
-        load_scenario("paper-constrained", [f"constraints.{name}.upper=3"])
 
 
 def test_settings_replace_add_and_reach_into_constraints() -> None:
@@ -530,24 +243,9 @@ def test_an_entry_without_a_name_is_set_by_its_index() -> None:
         load_scenario("hover", [both, "events.1.at=late"])
 
 
-@pytest.mark.parametrize(("setting", "field"), [("initial.position.0.x=3", "0"), ("events.0.at=3", "events")])
-def test_a_setting_goes_through_tables_and_lists_alone(setting: str, field: str) -> None:
-    table: dict[str, Any] = {"initial": {"position": [0.0, 0.0, 0.0]}, "events": []}
-    with pytest.raises(ParameterError) as caught:
-        apply_setting(table, setting)
-    assert str(caught.value) == f"--set must be a path to a field; {field} has none; got {setting!r}"
-
-
 def test_a_number_of_a_list_is_set_by_its_index() -> None:
     assert load_scenario("hover", ["initial.euler.2=30.0"]).initial.euler == [0.0, 0.0, 30.0]
     with pytest.raises(UnknownNameError, match=r"^no entry of initial\.euler named '3' \(there are: 0, 1, 2\)$"):
         load_scenario(
             "hover", ["initial.position=[0.0, 0.0, 1.0]", "initial.euler=[0.0, 0.0, 0.0]", "initial.euler.3=1"]
         )
-
-
-def test_a_setting_that_names_a_whole_entry_of_a_list_is_refused() -> None:
-    with pytest.raises(
-        ParameterError, match=r"--set must be a path to a field; constraints\.roll is an entry of a list"
-    ):
-        load_scenario("paper-constrained", ["constraints.roll=5"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,18 +12,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rerun as rr
 from rerun.chunk import RrdReader
 
 import quadsim.report.recording as recording_module
 from quadsim.controller import SOLVED, UNCONSTRAINED
-from quadsim.errors import FileError, OutputError, ViewerUnavailableError
-from quadsim.flight.audit import HELD, SIGNALS, Limit, margins_sampled
+from quadsim.errors import OutputError
+from quadsim.flight.audit import SIGNALS, margins_sampled
 from quadsim.flight.rundir import Run
-from quadsim.report.recording import layout, open_viewer, texts, viewer_problem, world, write_recording
-from quadsim.report.recording.style import FRONT_PANELS, PANELS, TIMELINE, VERDICTS, panels
+from quadsim.report.recording import layout, open_viewer, world, write_recording
+from quadsim.report.recording.style import PANELS, TIMELINE
 from quadsim.rotation import body_to_world
-from quadsim.state import EULER, INDEX, POSITION
+from quadsim.state import EULER, POSITION
 
 
 class Content:
@@ -79,10 +77,6 @@ def record(tmp_path: Path) -> Callable[[Run], Content]:
     return write_and_read
 
 
-def with_limits(run: Run, *limits: Limit) -> Run:
-    return dataclasses.replace(run, limits=limits)
-
-
 def test_the_vehicle_is_where_the_plant_was(content: Content, short_run: Run) -> None:
     plant = short_run.log.plant
     np.testing.assert_allclose(content.times("/world/vehicle"), plant.t, atol=1e-9)
@@ -126,15 +120,6 @@ def test_the_flown_path_grows_piece_by_piece_without_gaps(content: Content, shor
     np.testing.assert_allclose(whole, position, atol=1e-5)
 
 
-def test_dashes_lie_on_the_path_and_cover_half_of_it() -> None:
-    path = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [3.0, 4.0, 0.0]])
-    dashes = world._dashes(path)
-    assert sum(float(np.linalg.norm(end - start)) for start, end in dashes) == pytest.approx(3.5, abs=0.25)
-    assert all(point[1] == 0.0 or point[0] == 3.0 for dash in dashes for point in dash)
-    assert len(world._dashes(1e4 * path)) <= 251
-    assert world._dashes(path[:1]) == world._dashes(path[:0]) == []
-
-
 @pytest.mark.parametrize("name", SIGNALS)
 def test_signals_are_the_audited_ones(name: str, content: Content, short_run: Run) -> None:
     signal, log = SIGNALS[name], short_run.log
@@ -145,13 +130,6 @@ def test_signals_are_the_audited_ones(name: str, content: Content, short_run: Ru
     np.testing.assert_array_equal(content.rows(f"/signals/{name}", "scalars"), expected.reshape(len(t), -1))
     assert all(signal.unit in label for label in content.rows(f"/signals/{name}", "names")[0])
     assert sum(name in names for names in PANELS.values()) == 1
-
-
-def test_curves_keep_their_peaks_when_the_viewer_is_zoomed_out(content: Content) -> None:
-    curves = {entity for entity in content.entities if entity.split("/")[1] in ("signals", "margins", "solver")}
-    assert len(curves) > len(SIGNALS)
-    for entity in curves:
-        assert content.rows(entity, "aggregation_policy") == [[rr.components.AggregationPolicy.MinMax.value]]
 
 
 def test_references_are_in_the_units_of_their_signals(record: Callable[[Run], Content], short_run: Run) -> None:
@@ -174,37 +152,6 @@ def test_bounds_margins_and_verdicts_of_the_scenario(content: Content, short_run
     states = [state for row in content.rows("/verdicts/speed", "state") for state in row]
     assert set(states) == {"holds", "active"}  # the paper's take-off is at full speed
     assert all(before != after for before, after in itertools.pairwise(states))
-
-
-def test_a_limit_with_one_bound_and_a_window(record: Callable[[Run], Content], short_run: Run) -> None:
-    t, z = short_run.log.control.t, short_run.log.control.state[:, POSITION[2]]
-    below = float(np.interp(3.0, t, z))  # the vehicle climbs through it at 3 s
-    limit = Limit(name="ceiling", signal="z", upper=below, start=1.0, stop=4.0)
-    content = record(with_limits(short_run, limit))
-    assert content.rows("/limits/ceiling", "scalars") == [[below]] * 2
-    np.testing.assert_allclose(content.times("/limits/ceiling"), [1.0, 4.0])
-    np.testing.assert_allclose(content.times("/margins/ceiling"), t[(t > 0.99) & (t < 4.01)])
-    states = [row[0] for row in content.rows("/verdicts/ceiling", "state")]
-    assert states[0] == states[-1] == "not in force"
-    assert states[1] == "holds"
-    assert states[-2] == "violated"
-    assert content.times("/verdicts/ceiling")[states.index("violated")] == pytest.approx(3.0, abs=0.1)
-    assert set(states) <= set(VERDICTS)
-
-
-def test_a_run_without_limits(record: Callable[[Run], Content], short_run: Run) -> None:
-    run = dataclasses.replace(with_limits(short_run), summary={**short_run.summary, "constraints": []})
-    content = record(run)
-    assert not [entity for entity in content.entities if entity.startswith(("/limits", "/margins", "/verdicts"))]
-    assert "| constraint |" not in content.rows("/summary", "text")[0][0]
-
-
-def test_times_are_held_against_the_deadline(content: Content, short_run: Run) -> None:
-    timing = short_run.log.timing
-    np.testing.assert_array_equal(np.ravel(content.rows("/solver/step_ms", "scalars")), timing.step_ms)
-    np.testing.assert_array_equal(np.ravel(content.rows("/solver/solve_ms", "scalars")), timing.solve_ms)
-    np.testing.assert_array_equal(content.rows("/solver/deadline_ms", "scalars"), [[50.0], [50.0]])
-    np.testing.assert_array_equal(np.ravel(content.rows("/solver/active", "scalars")), short_run.log.control.active)
 
 
 def test_an_ideal_flight_has_no_effects(content: Content) -> None:
@@ -240,12 +187,6 @@ def test_forces_torques_wind_and_lagging_rotors_have_their_curves(
     )
 
 
-def test_a_force_without_a_position_is_not_drawn(record: Callable[[Run], Content], short_run: Run) -> None:
-    plant = dataclasses.replace(short_run.log.plant, wrench=np.zeros((short_run.log.plant.t.size, 6)))
-    content = record(dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant)))
-    assert not [entity for entity in content.entities if "effects" in entity or "external_force" in entity]
-
-
 def test_events_report_each_change_of_the_solver_and_the_end(record: Callable[[Run], Content], short_run: Run) -> None:
     control = short_run.log.control
     status, fallback = [SOLVED] * control.t.size, control.fallback.copy()
@@ -270,12 +211,6 @@ def test_events_report_each_change_of_the_solver_and_the_end(record: Callable[[R
     assert levels == ["INFO", "INFO", "INFO", "WARN", "WARN", "INFO", "ERROR"]
     times = [0.0, 1.0, 1.5, 2.0, 2.1, 2.15, log.plant.t[-1]]
     np.testing.assert_allclose(content.times("/events"), times, atol=1e-9)
-
-
-def test_events_report_what_happened_on_the_way(record: Callable[[Run], Content], short_run: Run) -> None:
-    summary = {**short_run.summary, "events": [{"time": 0.5, "text": "rotor 2 loses 20 %"}]}
-    content = record(dataclasses.replace(short_run, summary=summary))
-    assert "rotor 2 loses 20 %" in [row[0] for row in content.rows("/events", "text")]
 
 
 def test_events_report_why_there_was_no_answer_and_when_the_fallback_began_for_good(
@@ -303,29 +238,6 @@ def test_events_report_why_there_was_no_answer_and_when_the_fallback_began_for_g
     assert "cannot hold together: roll upper" in content.rows("/summary", "text")[0][0]
 
 
-def on_the_ground(run: Run, *phases: str) -> Run:
-    """The flight as if its first periods had been of other phases."""
-    control = run.log.control
-    phase = (*phases, *("flying",) * (control.t.size - len(phases)))
-    return dataclasses.replace(run, log=dataclasses.replace(run.log, control=dataclasses.replace(control, phase=phase)))
-
-
-def test_events_report_the_phases_of_a_flight_with_a_ground(record: Callable[[Run], Content], short_run: Run) -> None:
-    content = record(on_the_ground(short_run, *["landed"] * 5, *["armed"] * 5))
-    times, rows = content.times("/events"), content.rows("/events", "text")
-    phases = {round(float(time), 9): row[0] for time, row in zip(times, rows, strict=True) if "phase" in row[0]}
-    assert phases == {0.0: "phase: landed", 0.25: "phase: armed", 0.5: "phase: flying"}
-    assert np.all(np.diff(times) >= 0.0)
-    assert [level for _, text, level in texts._phase_changes(on_the_ground(short_run, "crashed"))] == ["WARN", "INFO"]
-
-
-def test_no_horizon_is_drawn_on_the_ground(record: Callable[[Run], Content], short_run: Run) -> None:
-    content = record(on_the_ground(short_run, "landed", "armed"))
-    strips = content.rows("/world/horizon", "strips")
-    assert [len(row[0]) for row in strips[:2]] == [0, 0]
-    assert len(strips[2][0]) > 10
-
-
 def test_the_wind_is_an_arrow_that_meets_the_vehicle(record: Callable[[Run], Content], short_run: Run) -> None:
     t = short_run.log.plant.t
     wind = np.outer(1.0 + np.sin(t), [3.0, -4.0, 0.0])
@@ -339,89 +251,11 @@ def test_the_wind_is_an_arrow_that_meets_the_vehicle(record: Callable[[Run], Con
     np.testing.assert_allclose(tips, -0.3 * vectors[:, :2], atol=1e-6)
 
 
-def test_a_roll_that_wraps_has_gaps(record: Callable[[Run], Content], short_run: Run) -> None:
-    plant = short_run.log.plant
-    state = plant.state.copy()
-    state[:, INDEX["roll"]] = (4.0 * plant.t) % (2.0 * np.pi) - np.pi
-    turned = dataclasses.replace(short_run.log, plant=dataclasses.replace(plant, state=state))
-    drawn = np.ravel(record(dataclasses.replace(short_run, log=turned)).rows("/signals/roll", "scalars"))
-    assert np.nanmax(np.abs(np.diff(drawn))) < 10.0
-    assert np.count_nonzero(np.isnan(drawn)) == 3
-
-
-def test_a_vehicle_upside_down_has_its_quaternion(record: Callable[[Run], Content], short_run: Run) -> None:
-    plant = short_run.log.plant
-    half = 0.5 * 3.0 * plant.t  # a roll at a steady rate, through upside down
-    attitude = np.stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half], axis=1)
-    turned = dataclasses.replace(plant, attitude=attitude, body_rates=np.tile([3.0, 0.0, 0.0], (plant.t.size, 1)))
-    run = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=turned))
-    content = record(run)
-    np.testing.assert_array_equal(content.rows("/signals/quaternion", "scalars"), attitude)
-    np.testing.assert_array_equal(content.rows("/signals/body_rates", "scalars"), turned.body_rates)
-    x, y, z, w = np.array(content.rows("/world/vehicle/body", "quaternion"))[:, 0].T
-    np.testing.assert_allclose(np.stack([w, x, y, z], axis=1), attitude, atol=1e-6)
-    assert panels(run.log)["Tilt"] == ("tilt",)
-    assert list(panels(run.log)).index("Tilt") < FRONT_PANELS
-    assert {name for names in panels(run.log).values() for name in names} == set(SIGNALS)
-
-
-def test_a_lost_vehicle_leaves_the_picture(short_run: Run) -> None:
-    state = short_run.log.plant.state.copy()
-    state[-1, POSITION] += (0.0, 0.0, -1e4)
-    log = dataclasses.replace(short_run.log, plant=dataclasses.replace(short_run.log.plant, state=state))
-    eye, target = layout._overview(dataclasses.replace(short_run, log=log))
-    course = short_run.log.control.reference[:, :3]
-    assert np.linalg.norm(eye - target) < 5.0 * np.linalg.norm(np.ptp(course, axis=0)) + 20.0
-
-
-def test_the_axis_of_what_stands_still_has_the_least_span(short_run: Run) -> None:
-    assert layout._least_range(short_run, ("x", "y", "z")) is None
-    assert layout._least_range(short_run, ("roll", "pitch")) is None
-    assert layout._least_range(short_run, ("x_estimate_error",)) == (-0.005, 0.005)
-
-
-def test_the_summary_reports_what_the_flight_met(short_run: Run) -> None:
-    summary = {**short_run.summary, "expected": "lost", "as_expected": False}
-    summary["course"] = {"sentence": "The course requires nothing."}
-    text = texts._summary(dataclasses.replace(short_run, summary=summary))
-    assert "Verdict: incomplete, expected: lost." in text
-    assert "The course requires nothing." in text
-    yaw = math.degrees(short_run.summary["tracking"]["rmse"]["yaw"])
-    assert f"yaw {yaw:.3g} deg" in text
-
-
-def test_the_summary_prints_each_verdict_with_its_tolerance(content: Content, short_run: Run) -> None:
-    (text,) = content.rows("/summary", "text")[0]
-    for entry in short_run.summary["constraints"]:
-        (row,) = (line for line in text.splitlines() if line.startswith(f"| {entry['name']} |"))
-        assert f"| {entry['tolerance']:g} |" in row
-        assert row.endswith(f"{entry['unit']} |")
-        assert f"**{HELD[entry['verdict']]}**" in row
-    assert "RMS" in text
-    assert "beyond 50 ms" in text
-
-
-def test_the_summary_of_what_is_measured_alone_and_of_single_bounds(short_run: Run) -> None:
-    entry = {**short_run.summary["constraints"][0], "required": False, "satisfied": False, "lower": None}
-    summary = {**short_run.summary, "constraints": [{**entry, "worst_margin": 0.25, "worst_margin_sampled": -0.5}]}
-    text = texts._summary(dataclasses.replace(short_run, summary=summary))
-    assert "| (roll) | **violated** | -0.5 | 0.01 | ≤ 5 deg |" in text
-    assert "In brackets" in text
-    assert texts._verdict({**entry, "lower": -1.0, "upper": None}).endswith("| 0.05 | ≥ -1 deg |")
-
-
 def test_an_aborted_flight_is_recorded_with_its_reason(record: Callable[[Run], Content], aborted_run: Run) -> None:
     content = record(aborted_run)
     assert content.rows("/events", "level")[-1] == ["ERROR"]
     assert aborted_run.log.reason is not None
     assert aborted_run.log.reason in content.rows("/summary", "text")[0][0]
-
-
-def test_a_flight_that_never_began_is_recorded(record: Callable[[Run], Content], empty_run: Run) -> None:
-    content = record(empty_run)
-    assert len(content.rows("/world/vehicle", "translation")) == 1
-    assert not content.entities & {"/world/horizon", "/world/flown", "/solver/solve_ms", "/limits/roll"}
-    assert "command is not finite" in content.rows("/events", "text")[-1][0]
 
 
 def test_a_flight_without_predictions_or_finite_end_is_recorded(
@@ -473,67 +307,12 @@ def test_rerun_finds_nothing_wrong_with_the_file_and_the_layout_is_in_force(path
     assert path.stat().st_size < 2_000_000
 
 
-def test_equal_flights_have_one_identity_and_others_another(path: Path, short_run: Run, tmp_path: Path) -> None:
-    write_recording(short_run, tmp_path / "again.rrd")
-    write_recording(with_limits(short_run), tmp_path / "other.rrd")
-    first, again, other = (RrdReader(p).recordings() for p in (path, tmp_path / "again.rrd", tmp_path / "other.rrd"))
-    assert first == again
-    assert first != other
-
-
-def test_nothing_but_the_recording_is_left(short_run: Run, tmp_path: Path) -> None:
-    target = tmp_path / "flight.rrd"
-    before = dict(os.environ)
-    rr.set_strict_mode(False)
-    write_recording(short_run, target)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["flight.rrd"]
-    assert target.read_bytes()[:3] == b"RRF"
-    assert dict(os.environ) == before
-    assert not rr.strict_mode()
-    assert rr.get_global_data_recording() is None
-
-
-def test_what_is_there_is_not_replaced(short_run: Run, tmp_path: Path) -> None:
-    target = tmp_path / "flight.rrd"
-    target.write_bytes(b"mine")
-    with pytest.raises(OutputError, match="it is already there; choose another file"):
-        write_recording(short_run, target)
-    assert target.read_bytes() == b"mine"
-    assert [entry.name for entry in tmp_path.iterdir()] == ["flight.rrd"]
-
-
-def test_a_full_disk_leaves_nothing(short_run: Run, tmp_path: Path) -> None:
-    """No file may grow beyond 100 kB meanwhile."""
-    resource = pytest.importorskip("resource")
-    target = tmp_path / "flight.rrd"
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
-    try:
-        with pytest.raises(OutputError, match=r"flight\.rrd: File too large"):
-            write_recording(short_run, target)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_place_that_cannot_be_written_is_reported(short_run: Run, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="Not a directory"):
         write_recording(short_run, tmp_path / "file" / "flight.rrd")
     with pytest.raises(OutputError, match="No such file or directory"):
         write_recording(short_run, tmp_path / "missing" / "flight.rrd")
-
-
-def test_rerun_switched_off_is_reported(short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("RERUN", "off")
-    with pytest.raises(OutputError, match="environment variable RERUN"):
-        write_recording(short_run, tmp_path / "flight.rrd")
-    assert not list(tmp_path.iterdir())
-
-
-def test_rerun_is_imported_when_a_recording_is_written_and_not_before() -> None:
-    program = "import sys, quadsim.report.recording; sys.exit('rerun' in sys.modules)"
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
 @pytest.fixture
@@ -562,36 +341,3 @@ def test_the_viewer_is_given_the_file_and_listens_to_this_machine_alone(
     assert "--web-viewer" in notes.read_text().split()
     viewer(130)  # closed by Ctrl-C
     open_viewer(path, web=True)
-
-
-def test_a_viewer_that_fails_is_an_error(
-    viewer: Callable[[int], Path], path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DISPLAY", ":0")
-    viewer(3)
-    with pytest.raises(ViewerUnavailableError, match=r"status 3.*--web"):
-        open_viewer(path)
-    with pytest.raises(ViewerUnavailableError, match=r"message above$"):
-        open_viewer(path, web=True)
-
-
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="displays are found through the environment on Linux")
-def test_without_a_display_the_browser_is_proposed(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("DISPLAY", raising=False)
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    with pytest.raises(ViewerUnavailableError, match=r"no display.*--web"):
-        open_viewer(path)
-    assert "no display" in str(viewer_problem())
-    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
-    assert viewer_problem() is None
-
-
-def test_a_recording_that_is_missing_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match="no such recording"):
-        open_viewer(tmp_path / "flight.rrd", web=True)
-
-
-def test_the_real_viewer_can_be_started() -> None:
-    done = rerun("--version")
-    assert done.returncode == 0
-    assert rr.__version__ in done.stdout
