@@ -7,7 +7,7 @@ Three tables, as in the file contract: what happened once per control period (`f
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,79 +28,67 @@ from quadsim.flight.log import (
     PlantLog,
     TimingLog,
 )
-from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
+from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS
 from quadsim.vehicle import N_ROTORS
 
 FLIGHT_FILE: Final = "flight.parquet"
 TIMING_FILE: Final = "timing.parquet"
 PLANT_FILE: Final = "plant.parquet"
 HORIZON_FILE: Final = "horizon.parquet"
-_TRUE: Final = "true_"  # how the columns of the true state begin, which are there where the measured one differs
-_REFERENCES: Final = tuple(f"ref_{name}" for name in REFERENCE_NAMES)
-_COMMANDED: Final = tuple(f"u{i}" for i in range(1, N_ROTORS + 1))
-_TURNING: Final = tuple(f"w{i}" for i in range(1, N_ROTORS + 1))
-_SPEED_UNITS: Final = ("rad/s",) * N_ROTORS
-_TIMES: Final = {"t": "s", "solve_ms": "ms", "step_ms": "ms"}
+_Fields = dict[str, dict[str, str]]  # the fields of a log, each with its columns and their units
+_STATE: Final = dict(zip(STATE_NAMES, STATE_UNITS, strict=True))
+_TEXTS: Final = ("status", "answered_by", "phase")
 _COUNTS: Final = ("iterations", "active", "fallback")
-_NUMBERS: Final = {"slack": "rad", **dict.fromkeys(RESIDUALS, "-"), "delay": "s"}
-"""Columns of one number in each period, with their units; those of counts have none."""
+_CONTROL: Final[_Fields] = {
+    "t": {"t": "s"},
+    "state": _STATE,
+    "reference": {f"ref_{name}": unit for name, unit in zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)},
+    "speeds": {f"u{i}": "rad/s" for i in range(1, N_ROTORS + 1)},
+    **{name: {name: "-"} for name in (*_TEXTS, *_COUNTS)},
+    "slack": {"slack": "rad"},
+    **{name: {name: "-"} for name in RESIDUALS},
+    "delay": {"delay": "s"},
+    "truth": {f"true_{name}": unit for name, unit in _STATE.items()},  # where the measured state differs
+    "attitude": QUATERNION,
+    "body_rates": BODY_RATES,
+    "sqp": SQP_RESIDUAL,
+}
+_TIMING: Final[_Fields] = {"t": {"t": "s"}, "solve_ms": {"solve_ms": "ms"}, "step_ms": {"step_ms": "ms"}}
+_PLANT: Final[_Fields] = {
+    "t": {"t": "s"},
+    "state": _STATE,
+    "speeds": {f"w{i}": "rad/s" for i in range(1, N_ROTORS + 1)},
+    "wrench": WRENCH,
+    "wind": WIND,
+    "attitude": QUATERNION,
+    "body_rates": BODY_RATES,
+}
+_OPTIONAL: Final = frozenset({"truth", "attitude", "body_rates", "sqp", "wrench", "wind"})
+_GAPS: Final = frozenset({*RESIDUALS, *SQP_RESIDUAL})  # columns that are null in some periods
 
-_Column = tuple[str, str, Any]
+_Column = tuple[str, str, pa.Array]
 
 
-def _columns(rows: Array, names: Iterable[str], units: Iterable[str]) -> Iterator[_Column]:
-    return zip(names, units, rows.T, strict=True)
-
-
-def _state_columns(state: Array, prefix: str = "") -> Iterator[_Column]:
-    return _columns(state, (prefix + name for name in STATE_NAMES), STATE_UNITS)
-
-
-def _optional(*groups: tuple[Array | None, Mapping[str, str]]) -> Iterator[_Column]:
-    """The columns of those groups that are there, each with its names and units."""
-    for rows, units in groups:
+def _columns(log: ControlLog | TimingLog | PlantLog, fields: _Fields) -> Iterator[_Column]:
+    """The columns of the fields that are there, each with its name and unit."""
+    for field, units in fields.items():
+        rows = getattr(log, field)
         if rows is not None:
-            yield from _columns(rows, units, units.values())
+            for (name, unit), values in zip(units.items(), [rows] if len(units) == 1 else rows.T, strict=True):
+                yield name, unit, pa.array(values, pa.string() if name in _TEXTS else None, from_pandas=name in _GAPS)
 
 
-def _table(columns: Sequence[_Column], metadata: Mapping[str, str]) -> pa.Table:
+def _table(columns: Iterable[_Column], metadata: Mapping[str, str]) -> pa.Table:
     arrays, schema = [], []
-    for name, unit, values in columns:
-        array = values if isinstance(values, pa.Array) else pa.array(values, from_pandas=name in RESIDUALS)
+    for name, unit, array in columns:
         arrays.append(array)
-        nullable = name in RESIDUALS or name in SQP_RESIDUAL
-        schema.append(pa.field(name, array.type, nullable=nullable, metadata={"unit": unit}))
+        schema.append(pa.field(name, array.type, nullable=name in _GAPS, metadata={"unit": unit}))
     return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata=dict(metadata)))
 
 
-def _flight_table(log: ControlLog, metadata: Mapping[str, str]) -> pa.Table:
-    columns: list[_Column] = [
-        ("t", "s", log.t),
-        *_state_columns(log.state),
-        *_columns(log.reference, _REFERENCES, REFERENCE_UNITS),
-        *_columns(log.speeds, _COMMANDED, _SPEED_UNITS),
-        ("status", "-", pa.array(log.status, pa.string())),
-        ("answered_by", "-", pa.array(log.answered_by, pa.string())),
-        ("phase", "-", pa.array(log.phase, pa.string())),
-        *((name, "-", getattr(log, name)) for name in _COUNTS),
-        *((name, unit, getattr(log, name)) for name, unit in _NUMBERS.items()),
-        *([] if log.measured_perfectly else _state_columns(log.truth, _TRUE)),
-        *_optional((log.attitude, QUATERNION), (log.body_rates, BODY_RATES)),
-        *((name, unit, pa.array(rows, from_pandas=True)) for name, unit, rows in _optional((log.sqp, SQP_RESIDUAL))),
-    ]
-    before = ",".join(repr(float(speed)) for speed in log.speeds_before)
-    return _table(columns, {**metadata, "speeds_before": before})
-
-
-def _plant_table(log: PlantLog, metadata: Mapping[str, str]) -> pa.Table:
-    columns = [("t", "s", log.t), *_state_columns(log.state), *_columns(log.speeds, _TURNING, _SPEED_UNITS)]
-    columns += _optional(
-        (log.wrench, WRENCH), (log.wind, WIND), (log.attitude, QUATERNION), (log.body_rates, BODY_RATES)
-    )
-    return _table(columns, metadata)
-
-
-def _horizon_table(t: Array, predicted: np.ndarray[Any, np.dtype[np.float32]], metadata: Mapping[str, str]) -> pa.Table:
+def _horizon_table(
+    t: pa.Array, predicted: np.ndarray[Any, np.dtype[np.float32]], metadata: Mapping[str, str]
+) -> pa.Table:
     horizon = predicted.shape[1]
     lists = (pa.FixedSizeListArray.from_arrays(predicted[:, :, i].ravel(), horizon) for i in range(3))
     return _table(
@@ -110,13 +98,16 @@ def _horizon_table(t: Array, predicted: np.ndarray[Any, np.dtype[np.float32]], m
 
 def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, str]) -> dict[str, pa.Table]:
     """A flight's tables `flight`, `timing`, `plant`, and `horizon` where positions were predicted; see `write_log`."""
+    control = log.control
+    fields = {name: units for name, units in _CONTROL.items() if name != "truth" or not control.measured_perfectly}
+    before = ",".join(repr(float(speed)) for speed in control.speeds_before)
     tables = {
-        "flight": _flight_table(log.control, metadata),
-        "timing": _table([(name, unit, getattr(log.timing, name)) for name, unit in _TIMES.items()], metadata),
-        "plant": _plant_table(log.plant.every(plant_stride), metadata),
+        "flight": _table(_columns(control, fields), {**metadata, "speeds_before": before}),
+        "timing": _table(_columns(log.timing, _TIMING), metadata),
+        "plant": _table(_columns(log.plant.every(plant_stride), _PLANT), metadata),
     }
     if log.predicted is not None:
-        tables["horizon"] = _horizon_table(log.control.t, log.predicted, metadata)
+        tables["horizon"] = _horizon_table(pa.array(control.t), log.predicted, metadata)
     return tables
 
 
@@ -153,26 +144,26 @@ def read_parquet(path: Path) -> pa.Table:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
 
 
-def _stack(table: pa.Table, names: Sequence[str]) -> Array:
-    return np.stack([_numbers(table, name) for name in names], axis=1)
+def _fields(table: pa.Table, fields: _Fields) -> dict[str, Any]:
+    """The fields of a log by name; None for those that its table may lack and does."""
+    found: dict[str, Any] = {}
+    for field, units in fields.items():
+        there = field not in _OPTIONAL or set(units) <= set(table.column_names)
+        columns: list[Any] = [_values(table, name) for name in units] if there else [None]
+        found[field] = columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
+    return found
 
 
-def _stack_if_there(table: pa.Table, names: Sequence[str]) -> Array | None:
-    return _stack(table, names) if set(names) <= set(table.column_names) else None
-
-
-def _numbers(table: pa.Table, name: str, kind: type = np.float64) -> np.ndarray[Any, Any]:
+def _values(table: pa.Table, name: str) -> Any:
     column = table.column(name)
-    if column.null_count and name not in RESIDUALS and name not in SQP_RESIDUAL:
+    if name in _TEXTS:
+        texts = tuple(column.to_pylist())
+        if not all(isinstance(text, str) for text in texts):
+            raise ValueError(f"{name} is not text throughout")
+        return texts
+    if column.null_count and name not in _GAPS:
         raise ValueError(f"{name} has gaps")
-    return np.asarray(column.to_numpy(), dtype=kind)
-
-
-def _texts(table: pa.Table, name: str) -> tuple[str, ...]:
-    texts = tuple(table.column(name).to_pylist())
-    if not all(isinstance(text, str) for text in texts):
-        raise ValueError(f"{name} is not text throughout")
-    return texts
+    return np.asarray(column.to_numpy(), dtype=np.int64 if name in _COUNTS else np.float64)
 
 
 def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
@@ -184,34 +175,11 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
     flight, timing, plant = (read_parquet(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE))
     try:
         before = np.array([float(text) for text in (flight.schema.metadata or {})[b"speeds_before"].split(b",")])
-        state = _stack(flight, STATE_NAMES)
-        truth = _stack_if_there(flight, [_TRUE + name for name in STATE_NAMES])
-        control = ControlLog(
-            t=_numbers(flight, "t"),
-            state=state,
-            truth=state if truth is None else truth,
-            reference=_stack(flight, _REFERENCES),
-            speeds=_stack(flight, _COMMANDED),
-            speeds_before=before,
-            status=_texts(flight, "status"),
-            answered_by=_texts(flight, "answered_by"),
-            phase=_texts(flight, "phase"),
-            **{name: _numbers(flight, name, np.int64) for name in _COUNTS},
-            **{name: _numbers(flight, name) for name in _NUMBERS},
-            attitude=_stack_if_there(flight, list(QUATERNION)),
-            body_rates=_stack_if_there(flight, list(BODY_RATES)),
-            sqp=_stack_if_there(flight, list(SQP_RESIDUAL)),
-        )
-        plant_log = PlantLog(
-            t=_numbers(plant, "t"),
-            state=_stack(plant, STATE_NAMES),
-            speeds=_stack(plant, _TURNING),
-            wrench=_stack_if_there(plant, list(WRENCH)),
-            wind=_stack_if_there(plant, list(WIND)),
-            attitude=_stack_if_there(plant, list(QUATERNION)),
-            body_rates=_stack_if_there(plant, list(BODY_RATES)),
-        )
-        timing_log = TimingLog(**{name: _numbers(timing, name) for name in _TIMES})
+        values = _fields(flight, _CONTROL)
+        if values["truth"] is None:
+            values["truth"] = values["state"]
+        control = ControlLog(**values, speeds_before=before)
+        plant_log, timing_log = PlantLog(**_fields(plant, _PLANT)), TimingLog(**_fields(timing, _TIMING))
         predicted = _read_predicted(directory)
         _require_whole(control, timing_log, plant_log, predicted)
     except FileError:
