@@ -26,7 +26,7 @@ from scenarios.campaign.statistics.inference import paired_difference
 from scenarios.campaign.statistics.requirement import judge
 from scenarios.many import count_workers
 from scenarios.schema.scenario import Scenario
-from scenarios.tuning.objective import STATISTICS, objective_values
+from scenarios.tuning.objective import objective_values
 from scenarios.tuning.page import Summary, write_page
 from scenarios.tuning.plan import START, TuningPlan
 from scenarios.tuning.search import JOURNAL_FILE, Search, require_optuna
@@ -142,9 +142,12 @@ def _summary(
     both = np.isfinite(values[0]) & np.isfinite(values[1])
     objectives = []
     for i, objective in enumerate(plan.spec.objectives):
-        pairs, of = [each[both[:, i], i] for each in values], STATISTICS[objective.statistic]
+        pairs = [each[both[:, i], i] for each in values]
         found = [search.scores[candidate].values for candidate in (START, answer)]
-        numbers = [*(each[i] if each else None for each in found), *(of(each) if each.size else None for each in pairs)]
+        numbers = [
+            *(each[i] if each else None for each in found),
+            *(float(each.mean()) if each.size else None for each in pairs),
+        ]
         named = zip(("start", "best", "fresh_start", "fresh_best"), numbers, strict=True)
         objectives.append({**objective.model_dump(), **dict(named), **asdict(paired_difference(pairs[0], pairs[1]))})
     return {

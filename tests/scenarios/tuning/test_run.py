@@ -229,7 +229,7 @@ def test_where_all_fail_the_answer_reports_it(tmp_path: Path) -> None:
 def test_two_objectives_have_a_front_of_files_that_fly(tmp_path: Path) -> None:
     objectives = [
         {"name": "error", "expression": "rmse.x"},
-        {"name": "z", "expression": "search.z", "statistic": "max"},
+        {"name": "z", "expression": "search.z"},
     ]
     with pytest.raises(InputError, match=r"objectives\.z\.expression: no column of numbers named 'search\.z'"):
         load_tuning(str(write_tuning(tmp_path, objectives=objectives)))
