@@ -42,7 +42,7 @@ def campaign(**changes: Any) -> dict[str, Any]:
         ({"objectives": [{"name": "e", "expression": "verdict"}]}, "objectives.e.expression: no column of numbers"),
         (
             {"objectives": [{"name": "e", "expression": "rmse.x +"}]},
-            "objectives.e.expression: .* must be arithmetic on",
+            "e.expression: .* must be arithmetic on",
         ),
         ({"objectives": 3 * TUNING["objectives"]}, "objectives must be of 2 or fewer entries; got 3"),
         ({"campaign": campaign(seed=3)}, "campaign must not have seed: a tuning has its own"),
