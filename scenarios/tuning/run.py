@@ -14,7 +14,8 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from quadsim.errors import FileError, InputError, OutputError
+from quadsim.errors import InputError, OutputError
+from quadsim.flight.summary import read_json
 from quadsim.outputs import SUMMARY_FILE, Growing, growing, to_json
 from scenarios.campaign import manifest as records
 from scenarios.campaign.pilot import fly_flights
@@ -107,17 +108,11 @@ def tune(
 
         folders = {START: "start", answer: "start" if answer == START else f"candidate-{answer}"}
         campaigns = [plan.of(candidates[each], name=f"{name}-{folder}", fresh=True) for each, folder in folders.items()]
+        finish = partial(fly_campaign, workers=workers, cluster=cluster, report=report, watch=watch)
+        targets = [files.path / folder for folder in folders.values()]
         tables = [
-            fly_campaign(
-                campaign,
-                target := files.path / folder,
-                workers=workers,
-                cluster=cluster,
-                resume=records.is_campaign(target),
-                report=report,
-                watch=watch,
-            ).table
-            for campaign, folder in zip(campaigns, folders.values(), strict=True)
+            finish(campaign, target, resume=records.is_campaign(target)).table
+            for campaign, target in zip(campaigns, targets, strict=True)
         ]
         comparison = None
         if answer != START:
@@ -190,12 +185,8 @@ def _require_same(manifest: Mapping[str, Any], directory: Path) -> None:
         FileError: its manifest is damaged.
         InputError: it is another one, or other code began it.
     """
-    path = directory / MANIFEST_FILE
-    try:
-        before = json.loads(path.read_bytes())
-        differing = [key for key in manifest if key != "machine" and before.get(key) != manifest[key]]
-    except (ValueError, AttributeError) as error:
-        raise FileError(path, f"is no tuning's manifest ({error})") from error
+    before = read_json(directory / MANIFEST_FILE, {"format": str}, "a tuning's manifest")
+    differing = [key for key in manifest if key != "machine" and before.get(key) != manifest[key]]
     if differing:
         raise InputError(
             f"{directory}: --resume needs the same tuning and the same code, and its {', '.join(differing)} differs "
