@@ -153,12 +153,7 @@ def _field(name: str) -> Iterator[None]:
 
 
 def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None) -> TuningPlan:
-    """Read and check a tuning, with the campaign and the scenario it names.
-
-    Args:
-        name: of one that ships, or a path ending in `.toml`.
-        trials: instead of the file's.
-        seed: instead of the file's.
+    """Read and check a tuning that ships, or a file: its campaign, its scenario, and `trials` and `seed` where given.
 
     Raises:
         InputError: the file is missing or malformed, a field is not allowed, or what it searches cannot be flown.
