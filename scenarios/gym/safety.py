@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
-from quadsim.controller import UNCONSTRAINED, Command
+from quadsim.controller import UNCONSTRAINED
 from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle
 from scenarios.gym.environment import QuadrotorEnv
@@ -89,7 +89,11 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         if self._vehicle is None:
             raise ResetNeeded("call env.reset() first")
         wanted = self._base.actions.command(action, None, 1).speeds
-        command = self.answer(wanted)
+        self._filter.wanted = wanted
+        seen, horizon = self._base.started.observation, self._law.horizon
+        preview = seen.preview[:horizon]
+        preview = np.concatenate([preview, np.repeat(preview[-1:], horizon - len(preview), axis=0)])
+        command = self._law.step(seen.moment, seen.state, preview)
         correction = float(np.abs(command.speeds - wanted).max())
         intervened = command.status != UNCONSTRAINED
         self.steps += 1
@@ -97,11 +101,3 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         observed, reward, terminated, truncated, info = self.env.step(self._base.action_for(command))
         report = {"intervened": intervened, "correction": correction, "fallback": command.fallback}
         return observed, reward, terminated, truncated, {**info, "filter": report}
-
-    def answer(self, wanted: np.ndarray[Any, np.dtype[np.float64]]) -> Command:
-        """What is flown in this period for wanted rotor speeds (4,) [rad/s]; computed once per period."""
-        self._filter.wanted = wanted
-        seen, horizon = self._base.started.observation, self._law.horizon
-        preview = seen.preview[:horizon]
-        preview = np.concatenate([preview, np.repeat(preview[-1:], horizon - len(preview), axis=0)])
-        return self._law.step(seen.moment, seen.state, preview)

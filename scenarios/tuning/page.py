@@ -92,12 +92,10 @@ def write_page(directory: Path, *, study: Study, summary: Summary, folders: Sequ
         def value(trial: FrozenTrial, i: int = i) -> float:  # infinite ones are left out
             return trial.values[i] if trial.number in feasible else math.inf
 
-        shares = visualization.plot_param_importances(
-            study, evaluator=PedAnovaImportanceEvaluator(), target=value, target_name=name
-        )
+        by = {"target": value, "target_name": name}
+        shares = visualization.plot_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), **by)
         plots.append(_plot(shares, f"importance{i}", f"importance for {name}", 170 + 34 * len(summary["search"])))
-        slices = visualization.plot_slice(study, target=value, target_name=name)
-        plots.append(_plot(slices, f"slice{i}", f"{name} by field", 380))
+        plots.append(_plot(visualization.plot_slice(study, **by), f"slice{i}", f"{name} by field", 380))
     holds = summary["fresh"]["best"]["requirement"]["holds"]
     pages = [*folders, *(() if summary["answer"] == START else ("comparison",))]
     page = render_page(

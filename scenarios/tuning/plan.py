@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -66,12 +67,12 @@ class TuningPlan:
     @cached_property
     def guard(self) -> Event:
         """The event that counts in the search."""
-        return parse_event(self.spec.guard or self.requirement.event.text)
+        return parse_event(self.spec.guard or self.requirement.event.text, self.start.columns)
 
     @cached_property
     def expressions(self) -> tuple[Expression, ...]:
         """Of the objectives, in their order."""
-        return tuple(parse_expression(objective.expression) for objective in self.spec.objectives)
+        return tuple(parse_expression(each.expression, self.start.columns) for each in self.spec.objectives)
 
     @cached_property
     def _data(self) -> dict[str, Any]:
@@ -120,17 +121,15 @@ class TuningPlan:
         """
         self.start.check()
         columns = self.start.columns
-        texts = {"require": self.requirement.event.text, "guard": self.guard.text}
-        checks: dict[str, Callable[[Mapping[str, pa.DataType]], object]] = {
-            name: partial(parse_event, text) for name, text in texts.items()
-        }
-        for objective, expression in zip(self.spec.objectives, self.expressions, strict=True):
-            checks[f"objectives.{objective.name}.expression"] = expression.require_columns
-        for field, check in checks.items():
-            try:
-                check(columns)
-            except InputError as error:
-                raise InputError(f"{field}: {error}") from error
+        with _field("require"):
+            parse_event(self.requirement.event.text, columns)
+            if not self.requirement.at_most:
+                raise InputError(f"{self.spec.require!r} must keep a probability small, with < or <=")
+        with _field("guard"):
+            _ = self.guard
+        for objective in self.spec.objectives:
+            with _field(f"objectives.{objective.name}.expression"):
+                parse_expression(objective.expression, columns)
         check_ends(self.spec.search, self._check_at, table="search")
 
     def _check_at(self, entry: VaryBase, value: Value) -> None:
@@ -144,13 +143,17 @@ class TuningPlan:
         check_parts(scenario)
 
 
-def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None) -> TuningPlan:
-    """Read and check a tuning, with the campaign and the scenario it names.
+@contextmanager
+def _field(name: str) -> Iterator[None]:
+    """Name the field of the file in what it raises."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
 
-    Args:
-        name: of one that ships, or a path ending in `.toml`.
-        trials: instead of the file's.
-        seed: instead of the file's.
+
+def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None) -> TuningPlan:
+    """Read and check a tuning that ships, or a file: its campaign, its scenario, and `trials` and `seed` where given.
 
     Raises:
         InputError: the file is missing or malformed, a field is not allowed, or what it searches cannot be flown.
@@ -163,11 +166,11 @@ def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None
     _locate(data, path.parent)
     data |= {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     if isinstance(campaign := data.get("campaign"), dict):
-        match data.get("flights", TuningSpec.model_fields["flights"].default):
+        match data.get("flights"):
             case [*_, int(most)]:
                 data["campaign"] = _whole_campaign(campaign, most)
-            case _:  # refused by the tuning's own field
-                data["campaign"] = _whole_campaign(campaign, 1)
+            case _:
+                data["campaign"] = _whole_campaign(campaign, TuningSpec.model_fields["flights"].default[-1])
     try:
         spec = TuningSpec.model_validate(data)
     except ValidationError as error:

@@ -14,7 +14,8 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 
-from quadsim.errors import FileError, InputError, OutputError
+from quadsim.errors import InputError, OutputError
+from quadsim.flight.summary import read_json
 from quadsim.outputs import SUMMARY_FILE, Growing, growing, to_json
 from scenarios.campaign import manifest as records
 from scenarios.campaign.pilot import fly_flights
@@ -26,7 +27,7 @@ from scenarios.campaign.statistics.inference import paired_difference
 from scenarios.campaign.statistics.requirement import judge
 from scenarios.many import count_workers
 from scenarios.schema.scenario import Scenario
-from scenarios.tuning.objective import STATISTICS, objective_values
+from scenarios.tuning.objective import objective_values
 from scenarios.tuning.page import Summary, write_page
 from scenarios.tuning.plan import START, TuningPlan
 from scenarios.tuning.search import JOURNAL_FILE, Search, require_optuna
@@ -107,17 +108,11 @@ def tune(
 
         folders = {START: "start", answer: "start" if answer == START else f"candidate-{answer}"}
         campaigns = [plan.of(candidates[each], name=f"{name}-{folder}", fresh=True) for each, folder in folders.items()]
+        finish = partial(fly_campaign, workers=workers, cluster=cluster, report=report, watch=watch)
+        targets = [files.path / folder for folder in folders.values()]
         tables = [
-            fly_campaign(
-                campaign,
-                target := files.path / folder,
-                workers=workers,
-                cluster=cluster,
-                resume=records.is_campaign(target),
-                report=report,
-                watch=watch,
-            ).table
-            for campaign, folder in zip(campaigns, folders.values(), strict=True)
+            finish(campaign, target, resume=records.is_campaign(target)).table
+            for campaign, target in zip(campaigns, targets, strict=True)
         ]
         comparison = None
         if answer != START:
@@ -142,9 +137,12 @@ def _summary(
     both = np.isfinite(values[0]) & np.isfinite(values[1])
     objectives = []
     for i, objective in enumerate(plan.spec.objectives):
-        pairs, of = [each[both[:, i], i] for each in values], STATISTICS[objective.statistic]
+        pairs = [each[both[:, i], i] for each in values]
         found = [search.scores[candidate].values for candidate in (START, answer)]
-        numbers = [*(each[i] if each else None for each in found), *(of(each) if each.size else None for each in pairs)]
+        numbers = [
+            *(each[i] if each else None for each in found),
+            *(float(each.mean()) if each.size else None for each in pairs),
+        ]
         named = zip(("start", "best", "fresh_start", "fresh_best"), numbers, strict=True)
         objectives.append({**objective.model_dump(), **dict(named), **asdict(paired_difference(pairs[0], pairs[1]))})
     return {
@@ -187,12 +185,8 @@ def _require_same(manifest: Mapping[str, Any], directory: Path) -> None:
         FileError: its manifest is damaged.
         InputError: it is another one, or other code began it.
     """
-    path = directory / MANIFEST_FILE
-    try:
-        before = json.loads(path.read_bytes())
-        differing = [key for key in manifest if key != "machine" and before.get(key) != manifest[key]]
-    except (ValueError, AttributeError) as error:
-        raise FileError(path, f"is no tuning's manifest ({error})") from error
+    before = read_json(directory / MANIFEST_FILE, {"format": str}, "a tuning's manifest")
+    differing = [key for key in manifest if key != "machine" and before.get(key) != manifest[key]]
     if differing:
         raise InputError(
             f"{directory}: --resume needs the same tuning and the same code, and its {', '.join(differing)} differs "

@@ -74,14 +74,7 @@ class TuningPilot:
 
 
 class Search:
-    """The study and the flights of its candidates: trial n is candidate n, and trial 0 the start.
-
-    Args:
-        plan: the tuning.
-        files: its directory.
-        fly: gives the rows of a pilot's flights.
-        watch: called with what `scenarios.campaign.run.Standing` has.
-    """
+    """The study and the flights of its candidates: trial n is candidate n, and trial 0 the start."""
 
     def __init__(
         self, plan: TuningPlan, files: Growing, fly: Callable[..., Generator[Row]], watch: Callable[..., None]
@@ -178,12 +171,10 @@ class Search:
                     self._store.add(row)
                     self._rows[row["flight"]] = row
                     self._flown += 1
-                    self._watch(
-                        flown=len(self._rows),
-                        flights=most * (1 + self._plan.spec.trials) - self._spared,
-                        failed=sum(bool(row["failed"]) for row in self._rows.values()),
-                        rate=self._flown / max(clock.perf_counter() - self._started, 1e-9),
-                    )
+                    flights = most * (1 + self._plan.spec.trials) - self._spared
+                    failed = sum(bool(row["failed"]) for row in self._rows.values())
+                    rate = self._flown / max(clock.perf_counter() - self._started, 1e-9)
+                    self._watch(flown=len(self._rows), flights=flights, failed=failed, rate=rate)
         finally:
             self._store.flush()
 
@@ -212,13 +203,12 @@ class Search:
             least = min(scores.values(), key=lambda each: (each.excess, -each.flights, each.values, each.candidate))
             return least.candidate, []
         values = np.array([scores[candidate].values for candidate in front])
-        low, width = values.min(axis=0), np.ptp(values, axis=0)
-        distances = np.linalg.norm((values - low) / np.where(width > 0.0, width, 1.0), axis=1)
+        width = np.ptp(values, axis=0)
+        distances = np.linalg.norm((values - values.min(axis=0)) / np.where(width > 0.0, width, 1.0), axis=1)
         near = [front[i] for i in np.argsort(distances, kind="stable")]
         if not start.feasible:
             return near[0], front
-        no_worse = (c for c in near if all(np.less_equal(scores[c].values, start.values)))
-        return next(no_worse, START), front
+        return next((c for c in near if np.less_equal(scores[c].values, start.values).all()), START), front
 
 
 def _distribution(kinds: Any, entry: SearchSpec) -> Any:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 
 import tomlkit
 from annotated_types import MaxLen, MinLen
 from pydantic import Field, model_validator
 
-from quadsim.errors import InputError
-from scenarios.campaign.results.events import parse_event
 from scenarios.campaign.spec import (
     MOST_FLIGHTS,
     CampaignSpec,
@@ -19,10 +17,8 @@ from scenarios.campaign.spec import (
     UniformSpec,
     check_fields,
 )
-from scenarios.campaign.statistics.requirement import parse_requirement
 from scenarios.schema.base import LARGEST_SEED, Spec
 from scenarios.schema.writing import to_toml
-from scenarios.tuning.objective import parse_expression
 
 OWN: Final = ("flights", "seed", "name", "description")
 """Fields of a campaign that a tuning has itself."""
@@ -42,15 +38,6 @@ class ObjectiveSpec(Spec):
         "where more is better"
     )
     unit: Annotated[str, Field(max_length=20)] = Field(default="-", description="of it, for tables and plots")
-    statistic: Literal["mean", "median", "max"] = Field(default="mean", description="of the flights that completed")
-
-    @model_validator(mode="after")
-    def _check(self) -> ObjectiveSpec:
-        try:
-            parse_expression(self.expression)
-        except InputError as error:
-            raise ValueError(f"expression {error}") from error
-        return self
 
 
 class FreshSpec(Spec):
@@ -108,16 +95,6 @@ class TuningSpec(Spec):
             if isinstance(entry, ChoiceSpec) and entry.weights is not None:
                 raise ValueError(f"search.{entry.name}.weights must be absent: nothing is drawn")
         check_fields(self.search, "search", {field: each.name for each in self.campaign.vary for field in each.fields})
-        try:
-            required = parse_requirement(self.require)
-        except InputError as error:
-            raise ValueError(f"require: {error}") from error
-        if not required.at_most:
-            raise ValueError(f"require must keep a probability small, with < or <=; got {self.require!r}")
-        try:
-            parse_event(self.guard or required.event.text)
-        except InputError as error:
-            raise ValueError(f"guard: {error}") from error
         return self
 
     def to_toml(self) -> str:

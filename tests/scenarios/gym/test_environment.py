@@ -96,14 +96,15 @@ def test_an_episode_of_the_own_controller_has_the_bytes_of_a_run(name: str, acti
 
 def test_margins_see_a_violation_that_samples_miss() -> None:
     """The paper's controller bounds samples of a linear model, and is beyond 5 deg of roll between some of them."""
-    env = quadsim.gym.make_env(short("paper-constrained", 27.0))
+    env = quadsim.gym.make_env("paper-constrained")
     infos = flown(env)
     missed = [
         now["margins"]["roll"]
         for before, now in itertools.pairwise(infos)
         if now["margins"]["roll"] < 0.0 <= min(before["margins_sampled"]["roll"], now["margins_sampled"]["roll"])
     ]
-    assert len(missed) >= 3
+    assert len(missed) == pytest.approx(40, abs=5)
+    assert min(missed) == pytest.approx(-0.018, abs=0.002)
     assert all(info["constraint_values"][0] == -info["margins"]["roll"] for info in infos)
     plant = env.unwrapped.flight().plant
     assert np.degrees(np.abs(plant["roll"])).max() == pytest.approx(5.0 - min(i["margins"]["roll"] for i in infos))
@@ -224,16 +225,12 @@ def test_wrong_options_are_named() -> None:
         make("hover", preview=51)
     with pytest.raises(ParameterError, match="render_mode must be rgb_array"):
         make("hover", render_mode="ansi")
-    with pytest.raises(UnknownNameError, match="no campaign named 'nothing'"):
-        make("hover", vary="nothing")
     slow = quadsim.load("hover").replace({"controller.input_bounds.speed": [0.0, 150.0]})
     with pytest.raises(ParameterError, match="below and above the hover speed"):
         make(slow)
     env = make("hover")
     with pytest.raises(ParameterError, match="seed must be from 0"):
         env.reset(seed=-1)
-    with pytest.raises(ParameterError, match="seed must be from 0"):
-        env.reset(seed="a")  # type: ignore[arg-type]
     env.reset()
     with pytest.raises(ParameterError, match=r"action must be of shape \(4,\); got \(3,\)"):
         env.step(np.zeros(3))
@@ -246,8 +243,6 @@ def test_wrong_options_are_named() -> None:
     varied = make("paper-constrained", vary="paper-nominal")
     with pytest.raises(ParameterError, match=r"options.flight must be from 0 to"):
         varied.reset(options={"flight": -1})
-    with pytest.raises(ParameterError, match=r"options.flight must be from 0 to"):
-        varied.reset(options={"flight": 1.7})
 
 
 def test_the_inner_loop_flies_thrust_and_body_rates() -> None:

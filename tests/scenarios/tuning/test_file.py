@@ -16,9 +16,8 @@ from scenarios.tuning.plan import load_tuning
 
 
 def entry(**changes: Any) -> list[dict[str, Any]]:
-    """`[[search]]` with its first entry changed; None takes a field away."""
-    first = {**TUNING["search"][0], **changes}
-    return [{name: value for name, value in first.items() if value is not None}, TUNING["search"][1]]
+    """`[[search]]` with its first entry changed."""
+    return [{**TUNING["search"][0], **changes}, TUNING["search"][1]]
 
 
 def campaign(**changes: Any) -> dict[str, Any]:
@@ -31,34 +30,20 @@ def campaign(**changes: Any) -> dict[str, Any]:
         ({"trials": 7}, "trials must be a multiple of batch, 6; got 7"),
         ({"flights": [4, 4]}, r"flights must rise; got \[4, 4\]"),
         ({"fresh": {"seed": 0}}, "fresh.seed must not be seed, 0, whose draws choose the answer"),
-        ({"require": "P(violation) > 0.2 @ 50%"}, "require must keep a probability small, with < or <="),
+        ({"require": "P(violation) > 0.2 @ 50%"}, "require: .* must keep a probability small, with < or <="),
         ({"require": "never"}, r"require: requirement 'never' must read P\(EVENT\)"),
         ({"require": "P(rmse.q > 1) < 0.1 @ 90%"}, "require: no column named 'rmse.q'"),
-        ({"guard": "worse"}, "guard: no event named 'worse'"),
         ({"guard": "rmse.q > 1"}, "guard: no column named 'rmse.q'"),
-        ({"search": []}, "search must be of 1 or more entries"),
-        ({"search": entry(low=2.0)}, "search.speed.low must be below high; got 2 and 1"),
-        ({"search": entry(low=0.0)}, "search.speed.low must be > 0"),
         ({"search": entry(distribution="normal")}, "search.speed must be one of 'uniform', 'log_uniform', 'integer'"),
-        ({"search": entry(low=None)}, "search.speed.low is missing"),
         ({"search": entry(fields=["controller.input_weights.sped"])}, "search.speed at 0.0001: .*sped is not a field"),
         ({"search": entry(fields=["seed"])}, "search.speed.fields must not have seed"),
         ({"search": entry(fields=["effects.load.mass_factor"])}, "must not have effects.load.mass_factor, which mass"),
         ({"search": entry(name="z")}, r"search must have distinct names; got \['z', 'z'\]"),
+        ({"objectives": [{"name": "e", "expression": "verdict"}]}, "objectives.e.expression: no column of numbers"),
         (
-            {"search": entry(fields=["controller.output_bounds"])},
-            "search.speed at 0.0001: controller.output_bounds must",
+            {"objectives": [{"name": "e", "expression": "rmse.x +"}]},
+            "e.expression: .* must be arithmetic on",
         ),
-        (
-            {"objectives": [{"name": "error", "expression": "rmse.q"}]},
-            "objectives.error.expression: no column of numbers",
-        ),
-        (
-            {"objectives": [{"name": "error", "expression": "verdict"}]},
-            "objectives.error.expression: no column of numb",
-        ),
-        ({"objectives": [{"name": "e", "expression": "open('x')"}]}, "objectives.e.expression must be made of columns"),
-        ({"objectives": [{"name": "e", "expression": "rmse.x +"}]}, "objectives.e.expression must be arithmetic on"),
         ({"objectives": 3 * TUNING["objectives"]}, "objectives must be of 2 or fewer entries; got 3"),
         ({"campaign": campaign(seed=3)}, "campaign must not have seed: a tuning has its own"),
         ({"campaign": campaign(base="papers")}, "no campaign named 'papers'"),
