@@ -129,7 +129,7 @@ def test_every_requirement_is_pinned() -> None:
     project, groups = pyproject["project"], pyproject["dependency-groups"]
     required = itertools.chain(project["dependencies"], *project["optional-dependencies"].values(), *groups.values())
     open_ended = (requirement for requirement in required if "==" not in requirement)
-    names = {plain(re.split(r"[<>=]", requirement, maxsplit=1)[0]) for requirement in open_ended}
+    names = {plain(re.split(r"[<>=[]", requirement, maxsplit=1)[0]) for requirement in open_ended}
     assert names - {plain(pin.partition("==")[0]) for pin in pins} == set()
 
 

@@ -84,7 +84,7 @@ def test_other_numbers_than_the_controllers_are_reported(tmp_path: Path, capsys:
     options = [part for setting in settings for part in ("--set", setting)]
     assert main(["run", "hover", *options, "--out", str(tmp_path / "run"), "--no-video", "--no-recording"]) == EXIT_DONE
     assert line in capsys.readouterr().out
-    quadsim.compare(tmp_path / "run", out=tmp_path / "page", cost=False)
+    quadsim.compare(tmp_path / "run", out=tmp_path / "page")
     assert line in (tmp_path / "page/index.html").read_text()
     assert reaudit(tmp_path / "run").satisfied
 
