@@ -18,21 +18,10 @@ from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError, RaisedError
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
-from quadsim.sim.effects import (
-    LOADING,
-    Change,
-    Effects,
-    Force,
-    LagChange,
-    Load,
-    MassChange,
-    Payload,
-    PushChange,
-    RotorChange,
-    RotorDynamics,
-)
+from quadsim.sim.effects import LOADING, Change, Effects, Force, LagChange, MassChange, PushChange, RotorChange
 from quadsim.sim.effects.forces import StepForces
-from quadsim.sim.effects.load import apply_mass, mass_properties
+from quadsim.sim.effects.load import Load, Payload, apply_mass, mass_properties
+from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator, Segment, physics_to_state
 from quadsim.sim.rigid_body import RigidBody, check_free

@@ -10,8 +10,9 @@ import math
 from collections.abc import Iterable, Sequence
 
 from quadsim.errors import ParameterError
-from quadsim.sim.effects import LOADING, Change, Effects, Load
+from quadsim.sim.effects import LOADING, Change, Effects
 from quadsim.sim.effects.forces import StepForces, Wrench
+from quadsim.sim.effects.load import Load
 from quadsim.space import Obstacle
 from quadsim.vehicle import Vehicle
 

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated
 
 from annotated_types import Gt, Lt, doc
 
-from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorSettings:
-    """Tuning of the error-state filter; validated when made.
+    """Tuning of the error-state filter.
 
     Densities are those of white noise on all three axes alike: integrated for a time t they give the standard deviation
     density sqrt(t).  The gate is that of the chi-square test of a sample's innovation.
-
-    Raises:
-        ParameterError: a value is not finite or not possible.
     """
 
     acceleration_noise: Annotated[NonNegative, doc("[m/s^2/sqrt(Hz)] unmodelled white acceleration")] = 0.3
@@ -41,11 +36,3 @@ class EstimatorSettings:
     patience: Annotated[
         NonNegative, doc("[s] after which a sensor that was rejected all along is accepted again; 0 for never")
     ] = 1.0
-
-    def __post_init__(self) -> None:
-        for name in (field.name for field in fields(EstimatorSettings)):
-            value = getattr(self, name)
-            if not math.isfinite(value) or value < 0.0:
-                raise ParameterError("estimator", name, value, "a finite number >= 0")
-        if not 0.0 < self.gate < 1.0:
-            raise ParameterError("estimator", "gate", self.gate, "above 0 and below 1")
