@@ -178,7 +178,7 @@ class LostError(FlightError):
     """The vehicle is beyond one of the flight's loss criteria.
 
     Attributes:
-        criterion: which, e.g. `tilt`; see `quadsim.flight.lost.CRITERIA`.
+        criterion: which, e.g. `tilt`; see `quadsim.sim.phase.CRITERIA`.
         value: what it was, in the criterion's unit.
         limit: what it may be.
     """

@@ -25,10 +25,10 @@ from quadsim.report.comparison import (
     run_names,
     verdict_cell,
 )
+from quadsim.report.curves import line_colour
 from quadsim.report.figure import Scene
 from quadsim.report.flight_figures import overview, page_figures
 from quadsim.report.page import PAGE_FILE, RunView, Section, render_page
-from quadsim.report.palette import line_colour
 from quadsim.report.table import to_markdown
 from quadsim.report.to_matplotlib import write_pngs
 from quadsim.report.to_plotly import Plot, scene_to_plot, to_plot

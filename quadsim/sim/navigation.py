@@ -10,9 +10,8 @@ import numpy as np
 
 from quadsim.errors import ParameterError
 from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
-from quadsim.sim.estimation.estimate import MEAN_QUATERNION, MEAN_RATES
+from quadsim.sim.estimation.estimate import MEAN_QUATERNION, MEAN_RATES, EstimatorSettings
 from quadsim.sim.estimation.filter import ErrorStateFilter, Tally
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.sensing.sampler import Sample, Sampler, truth
 from quadsim.sim.sensing.sensor import Sensor, SensorFault, SensorName
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns

@@ -33,7 +33,7 @@ from quadsim.assets import own_packages
 from quadsim.errors import FileError, OutputError, ViewerUnavailableError
 from quadsim.flight.rundir import Run
 from quadsim.outputs import writing_file
-from quadsim.report.palette import line_colour
+from quadsim.report.curves import line_colour
 from quadsim.report.recording.layout import blueprint
 from quadsim.report.recording.signals import send_effects, send_limit, send_signals, send_solver
 from quadsim.report.recording.style import on_screen

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from quadsim.flight.audit import SIGNALS
-from quadsim.report.palette import line_colour
+from quadsim.report.curves import line_colour
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 

@@ -18,9 +18,8 @@ from typing import Final
 import numpy as np
 
 from quadsim.errors import ParameterError
-from quadsim.sim.estimation.estimate import N_ERRORS, Estimate, retract
+from quadsim.sim.estimation.estimate import N_ERRORS, Estimate, EstimatorSettings, retract
 from quadsim.sim.estimation.prediction import Drive, drive, lifts, motion_model, predict, stand
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.estimation.update import doubt, update
 from quadsim.sim.sensing.sampler import Sample
 from quadsim.sim.sensing.sensor import AXES, Sensor, SensorName

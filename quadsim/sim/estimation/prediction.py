@@ -34,8 +34,8 @@ from quadsim.sim.estimation.estimate import (
     RATES,
     VELOCITY,
     Estimate,
+    EstimatorSettings,
 )
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from quadsim.errors import ParameterError
+from quadsim.sim.estimation.estimate import EstimatorSettings
 from quadsim.sim.estimation.filter import ErrorStateFilter
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.sensing.sampler import Sample
 from quadsim.sim.sensing.sensor import FaultKind, Outliers, Sensor, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
