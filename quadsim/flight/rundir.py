@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError
-from quadsim.flight.audit import Finding, Limit, SpaceLimit, SumLimit
+from quadsim.flight.audit import Finding, Held, Limit, SpaceLimit, SumLimit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_log
 from quadsim.flight.summary import SUMMARY_FILE as SUMMARY_FILE
@@ -79,6 +79,17 @@ def finding_from_json(entry: Mapping[str, Any]) -> Finding:
     names = ("peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time", "time_violated")
     values = {name: math.nan if entry[name] is None else float(entry[name]) for name in names}
     return Finding(limit=limit_from_json(entry), **values)
+
+
+def constraint_verdict(entry: Mapping[str, Any]) -> Held:
+    """The verdict on a constraint of a summary that follows from its margins."""
+    return finding_from_json(entry).verdict
+
+
+def deciding_margin(entry: Mapping[str, Any]) -> tuple[float | None, float]:
+    """The margin that this verdict rests on, None where there is none, and its tolerance."""
+    margin, tolerance = finding_from_json(entry).deciding
+    return None if math.isnan(margin) else margin, tolerance
 
 
 def load_run(directory: Path) -> Run:

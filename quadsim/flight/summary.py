@@ -10,7 +10,6 @@ from types import NoneType
 from typing import Any, Final
 
 from quadsim.errors import FileError, printable
-from quadsim.flight.audit import Held
 from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 
 NUMBER: Final = (int, float)
@@ -37,12 +36,7 @@ _CONSTRAINT: Final = {
 
 
 def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """A JSON object from a file of quadsim's.
-
-    Args:
-        path: of the file.
-        form: the type of each entry that has to be there.
-        what: the file, for messages.
+    """A JSON object from a file of quadsim's, `what` for messages; `form` has the type of each entry that it must have.
 
     Raises:
         FileError: it cannot be read, is no JSON, or an entry is missing or of another type.
@@ -102,24 +96,3 @@ def require_inside(directory: Path) -> None:
         for path in (Path(folder, name) for name in sorted((*folders, *files))):
             if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(home):
                 raise FileError(path, f"is a link that leads out of {directory}; nothing is read through it")
-
-
-def constraint_verdict(entry: Mapping[str, Any]) -> Held:
-    """The verdict on a constraint that follows from its margins; see `quadsim.flight.audit.Finding.verdict`."""
-    if entry["worst_time"] is None:
-        return "incomplete"
-    margin, tolerance = deciding_margin(entry)
-    return "satisfied" if margin is not None and margin >= -tolerance else "violated"
-
-
-def deciding_margin(entry: Mapping[str, Any]) -> tuple[float | None, float]:
-    """The margin that a constraint's verdict rests on, and its tolerance; see `Finding.deciding_margin`.
-
-    None where there is none: its window was not reached, or a value was no number.
-    """
-    at_physics_rate, at_samples = entry["worst_margin"], entry["worst_margin_sampled"]
-    tolerance, tolerance_sampled = entry["tolerance"], entry["tolerance_sampled"]
-    broken = at_samples is not None and at_samples < -tolerance_sampled
-    if broken and at_physics_rate is not None and at_physics_rate >= -tolerance:
-        return at_samples, tolerance_sampled
-    return at_physics_rate, tolerance

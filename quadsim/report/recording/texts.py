@@ -10,8 +10,7 @@ import numpy as np
 from quadsim.controller import OPTIMAL, Phase, counts
 from quadsim.flight.audit import HELD
 from quadsim.flight.metrics import unrecovered
-from quadsim.flight.rundir import Run
-from quadsim.flight.summary import constraint_verdict, deciding_margin
+from quadsim.flight.rundir import Run, constraint_verdict, deciding_margin
 from quadsim.report.comparison import failure_sentences, fallback_sentence, tracking_values, verdict_cell
 from quadsim.report.recording.style import time_column
 from quadsim.state import Array
