@@ -286,7 +286,7 @@ def margins_at(limit: Limit, t: Array, values: Array) -> Array:
 
 
 def smallest_margins(log: FlightLog, limits: Sequence[Limit]) -> dict[str, float]:
-    """The smallest signed margin of each limit by its name, at the finest rate there is; NaN outside its time window."""
+    """Smallest signed margin of each limit by its name, at the finest rate there is; NaN outside its time window."""
     return {limit.name: _worst(limit, *limit.source.finest(log))[1] for limit in limits}
 
 

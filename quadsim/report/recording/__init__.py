@@ -17,19 +17,15 @@ Everything stands on one timeline, `sim_time`, the simulated time:
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
-import pickle
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from quadsim.assets import own_packages
 from quadsim.errors import FileError, OutputError, ViewerUnavailableError
 from quadsim.flight.rundir import Run
 from quadsim.outputs import writing_file
@@ -91,35 +87,6 @@ def _identity(run: Run) -> str:
     for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
         digest.update(np.ascontiguousarray(array).tobytes())
     return f"{run.name}-{digest.hexdigest()[:16]}"
-
-
-@contextlib.contextmanager
-def recording_in_background(directory: Path, path: Path) -> Iterator[None]:
-    """Write the recording of a run directory to a file while the block runs; it is complete once the block is left.
-
-    A Ctrl-C does not reach the process, which has no terminal of its own: whatever ends the block early ends it too,
-    and what it wrote until then is not under the recording's name.
-
-    Raises:
-        OutputError: the file cannot be written, as from `write_recording`.
-    """
-    with subprocess.Popen(
-        [sys.executable, "-P", "-m", "quadsim.report.recording", str(directory), str(path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={**os.environ, **own_packages()},
-        process_group=0,
-    ) as process:
-        try:
-            yield
-            raised, output = process.communicate()
-        finally:
-            process.kill()  # of no consequence to one that is done
-    if raised:
-        raise pickle.loads(raised)
-    if process.returncode:
-        last = output.decode(errors="replace").strip().rpartition("\n")[2]
-        raise OutputError(path, last or f"its process ended with status {process.returncode}")
 
 
 def viewer_problem() -> str | None:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quadsim.controller import OPTIMAL, Phase, counts
-from quadsim.flight.audit import HELD
+from quadsim.controller import OPTIMAL, Phase
 from quadsim.flight.metrics import unrecovered
-from quadsim.flight.rundir import Run, constraint_verdict, deciding_margin
-from quadsim.report.comparison import failure_sentences, fallback_sentence, tracking_values, verdict_cell
+from quadsim.flight.rundir import Run
+from quadsim.report.comparison import comparison_rows, fallback_sentence
 from quadsim.report.recording.style import time_column
+from quadsim.report.table import to_markdown
 from quadsim.state import Array
 
 if TYPE_CHECKING:
@@ -75,42 +75,7 @@ def _outcome(run: Run) -> str:
 
 
 def _summary(run: Run) -> str:
-    """How the flight went, as Markdown."""
-    constraints, tracking, control = (run.summary[key] for key in ("constraints", "tracking", "controller"))
-    lines = [f"**{run.name}: {_outcome(run)}**", ""]
-    if constraints:
-        head = "| constraint | | deciding margin | tolerance | bounds |"
-        lines += [head, "|---|---|---:|---:|---|", *map(_verdict, constraints), ""]
-        lines += [line for note in run.summary.get("audit_notes", ()) for line in (f"{note}.", "")]
-    if not all(entry["required"] for entry in constraints):
-        lines += ["In brackets: measured, not required.", ""]
-    if tracking:
-        measured = {name: tracking_values([run.summary], "rmse", name) for name in tracking["rmse"]}
-        errors = (f"{name} {_number(values[0])} {unit}" for name, (unit, values) in measured.items())
-        lines += [f"Tracking error, RMS: {', '.join(errors)}.", ""]
-    course = [run.summary["course"]["sentence"]] if "course" in run.summary else []
-    for text in (f"Verdict: {verdict_cell(run.summary).text}.", *failure_sentences(run.summary), *course):
-        lines += [text, ""]
-    if "step_ms" in control:
-        step = control["step_ms"]
-        lines += [
-            f"Answered by: {counts(control['answered_by'])}.",
-            "",
-            f"Controller step: median {step['p50']:.3g}, p99 {step['p99']:.3g}, longest {step['max']:.3g} ms; "
-            f"{control['deadline_misses']} beyond {control['deadline_ms']:g} ms.",
-        ]
-    return "\n".join(lines)
-
-
-def _verdict(entry: Mapping[str, Any]) -> str:
-    """One constraint of the summary as a row of a Markdown table."""
-    lower, upper = _number(entry["lower"]), _number(entry["upper"])
-    margin, tolerance = deciding_margin(entry)
-    bounds = f"≤ {upper}" if lower == "-" else f"≥ {lower}" if upper == "-" else f"{lower} to {upper}"
-    name = entry["name"] if entry["required"] else f"({entry['name']})"
-    verdict = HELD[constraint_verdict(entry)]
-    return f"| {name} | **{verdict}** | {_number(margin)} | {tolerance:g} | {bounds} {entry['unit']} |"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
+    """How the flight went, as Markdown: of the table of its page what is said of the flight, and each verdict."""
+    rows = [row for row in comparison_rows([run]) if row.group in ("Flight", "Tracking") or row.headline]
+    course = f"\n{run.summary['course']['sentence']}\n" if "course" in run.summary else ""
+    return to_markdown(rows, [run.name]) + course

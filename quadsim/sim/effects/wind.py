@@ -18,7 +18,6 @@ from quadsim.vehicle import Vehicle
 
 SEA_LEVEL_DENSITY: Final = 1.225
 """Density of air [kg/m^3] at sea level in the International Standard Atmosphere (ISO 2533)."""
-_BLOCK: Final = 4096  # physics steps whose wind is computed at a time
 
 
 _Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
@@ -128,7 +127,7 @@ class WindField:
         rng: np.random.Generator,
         changes: tuple[WindChange, ...] = (),
     ) -> None:
-        self._mean, self._made, self._turbulent = mean, 0, np.empty((0, 3))
+        self._mean = mean
         x, y, _ = mean
         speed = math.hypot(x, y)
         self._along = (x / speed, y / speed) if speed > 0.0 else (1.0, 0.0)
@@ -139,8 +138,7 @@ class WindField:
 
     def reset(self) -> None:
         """Rewind: the same wind again."""
-        # Steps whose wind is known, that of the last of them, and what of it is turbulence.
-        self._made, self._ahead, self._turbulent = 0, np.empty((0, 3)), np.empty((0, 3))
+        self._step = 0
         if self._turbulence is not None:
             self._turbulence.reset()
 
@@ -150,28 +148,15 @@ class WindField:
         self._means = np.array([self._mean, *(change.velocity for change in ordered)], float)
         self._change_times = np.array([change.at for change in ordered])
         self._gusts = gusts
-        self._ahead = self._air(self._made - len(self._turbulent), self._turbulent)
 
     def advance(self, steps: int) -> Array:
         """(steps, 3) wind velocity at the middle of each of the next physics steps, world frame, z up [m/s]."""
-        while len(self._ahead) < steps:
-            block = self._next_turbulence()
-            self._ahead = np.concatenate([self._ahead, self._air(self._made, block)])
-            self._turbulent = np.concatenate([self._turbulent, block])
-            self._made += len(block)
-        wind, self._ahead, self._turbulent = self._ahead[:steps].copy(), self._ahead[steps:], self._turbulent[steps:]
-        return wind
-
-    def _air(self, first: int, turbulence: Array) -> Array:
-        """(M, 3) wind in the middle of each of M physics steps from `first` on, of which (M, 3) is turbulence."""
-        middles = self._timestep * (np.arange(len(turbulence), dtype=np.float64) + (first + 0.5))
+        middles = self._timestep * (np.arange(steps, dtype=np.float64) + (self._step + 0.5))
+        self._step += steps
         wind: Array = self._means[np.searchsorted(self._change_times, middles, side="right")]
         wind += gust_velocity(self._gusts, middles)
-        return wind if self._turbulence is None else wind + turbulence
-
-    def _next_turbulence(self) -> Array:
         if self._turbulence is None:
-            return np.zeros((_BLOCK, 3))
-        along, across, vertical = self._turbulence.advance(_BLOCK).T
+            return wind
+        along, across, vertical = self._turbulence.advance(steps).T
         x, y = self._along  # spelt out, as a matrix product may round by the number of rows
-        return np.stack([x * along - y * across, y * along + x * across, vertical], axis=1)
+        return wind + np.stack([x * along - y * across, y * along + x * across, vertical], axis=1)

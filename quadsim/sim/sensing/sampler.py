@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,6 @@ _COLUMNS = {
     SensorName.RATES: slice(11, 14),
 }
 """Where a sensor's quantity is in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
-
-_BLOCK: Final = 256  # samples whose errors are drawn at a time
 
 Flags = NDArray[np.bool_]
 Steps = NDArray[np.int64]
@@ -80,7 +78,6 @@ class Sampler:
         self._of_noise, self._of_bias, self._of_dropout, self._of_outliers = copy.deepcopy(self._initial)
         self._walked: Array | None = None
         self._through: Array | None = None
-        self._errors, self._lost = np.empty((0, 3)), np.empty(0, dtype=bool)  # of the next samples, drawn ahead
 
     def sample(self, physics: Array, first: int) -> list[Sample]:
         """The samples taken during a segment of motion, those lost left out.
@@ -95,35 +92,22 @@ class Sampler:
         if not count:
             return []
         taken = range(first + begin, first + len(physics), self._stride)
-        errors, lost = self._next_errors(count)
+        errors = self._walk(count) + self._draw_noise(count) + 0.0  # which leaves no -0
+        lost = self._of_dropout.random(count) < self.sensor.dropout
         if self._faults:
-            return self._sample_with_faults(rows, errors, lost, np.array(taken, dtype=np.int64))
-        return self._samples(taken, self._measure(rows, errors), lost)
-
-    def _sample_with_faults(self, rows: Array, errors: Array, lost: Flags, taken: Steps) -> list[Sample]:
-        values = self._measure(rows, errors + self._offset(taken))
-        lost = lost | self._befallen(FaultKind.DROPOUT, taken)
-        self._freeze(values, lost, self._befallen(FaultKind.FREEZE, taken))
-        self._blank(values, taken)
-        return self._samples(taken.tolist(), values, lost)
-
-    def _samples(self, taken: Sequence[int], values: Array, lost: Flags) -> list[Sample]:
+            steps = np.array(taken, dtype=np.int64)
+            values = self._measure(rows, errors + self._offset(steps))
+            lost |= self._befallen(FaultKind.DROPOUT, steps)
+            self._freeze(values, lost, self._befallen(FaultKind.FREEZE, steps))
+            self._blank(values, steps)
+        else:
+            values = self._measure(rows, errors)
         name, latency = self.sensor.name, self._latency
         return [
             Sample(name, step, step + latency, value)
             for step, value, gone in zip(taken, values, lost.tolist(), strict=True)
             if not gone
         ]
-
-    def _next_errors(self, count: int) -> tuple[Array, Flags]:
-        """(count, 3) bias and noise of the next samples, and (count,) which of them are lost; but for faults."""
-        while len(self._errors) < count:
-            errors = self._walk(_BLOCK) + self._draw_noise(_BLOCK) + 0.0  # which leaves no -0
-            lost = self._of_dropout.random(_BLOCK) < self.sensor.dropout
-            self._errors, self._lost = np.concatenate([self._errors, errors]), np.concatenate([self._lost, lost])
-        errors, self._errors = self._errors[:count], self._errors[count:]
-        lost, self._lost = self._lost[:count], self._lost[count:]
-        return errors, lost
 
     def _walk(self, count: int) -> Array:
         """(count, 3) bias at each sample: its constant at the first of all, then a random walk."""
