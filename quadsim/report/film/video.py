@@ -142,7 +142,11 @@ def render_gif(
     with _making(path, overwrite) as new:
         film = new.with_suffix(".mp4")
         backend = _film(shot, film, workers, None)
-        _work([_to_gif(film, new, width)], backend, new.parent)
+        # small by few colours and little noise
+        scaled = f"scale={width}:-2:flags=area,hqdn3d=3:3:0:0,split[a][b]"
+        colours = "[a]palettegen=max_colors=96:stats_mode=diff[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
+        looping = ("-i", str(film), "-filter_complex", f"{scaled};{colours}", "-loop", "0", str(new))
+        _work([(*_ffmpeg(), *looping)], backend, new.parent)
 
 
 def render_portrait(
@@ -175,21 +179,9 @@ def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None
     _work(commands, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
     listing = path.parent / "pieces.txt"
     listing.write_text("".join(f"file '{name}'\n" for name in names), encoding="utf-8")
-    _work([_join(listing, path)], backend, path.parent)
+    joined = ("-f", "concat", "-safe", "0", "-i", str(listing), "-c", "copy", "-movflags", "+faststart", str(path))
+    _work([(*_ffmpeg(), *joined)], backend, path.parent)
     return backend
-
-
-def _join(listing: Path, path: Path) -> tuple[str, ...]:
-    """The command that joins the MP4 files which an ffmpeg concat list names, without encoding again."""
-    copied = ("-f", "concat", "-safe", "0", "-i", str(listing), "-c", "copy", "-movflags", "+faststart")
-    return (*_ffmpeg(), *copied, str(path))
-
-
-def _to_gif(film: Path, path: Path, width: int) -> tuple[str, ...]:
-    """The command that makes a looping GIF of an MP4, `width` pixels wide, small by few colours and little noise."""
-    picture = f"scale={width}:-2:flags=area,hqdn3d=3:3:0:0,split[a][b];[a]palettegen=max_colors=96:stats_mode=diff[p]"
-    dither = "[b][p]paletteuse=dither=none:diff_mode=rectangle"
-    return (*_ffmpeg(), "-i", str(film), "-filter_complex", f"{picture};{dither}", "-loop", "0", str(path))
 
 
 def _ffmpeg() -> tuple[str, ...]:

@@ -31,9 +31,8 @@ from quadsim.flight.rundir import Run
 from quadsim.outputs import writing_file
 from quadsim.report.curves import line_colour
 from quadsim.report.recording.layout import blueprint
-from quadsim.report.recording.signals import send_effects, send_limit, send_signals, send_solver
+from quadsim.report.recording.signals import send_effects, send_limit, send_signals, send_solver, send_texts
 from quadsim.report.recording.style import on_screen
-from quadsim.report.recording.texts import send_texts
 from quadsim.report.recording.world import send_airframe, send_scene, send_space
 
 _CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"

@@ -1,18 +1,22 @@
-"""What is seen in the plots: signals, references, bounds, margins, verdicts, the solver, and effects."""
+"""What is seen in the plots: signals, references, bounds, margins, verdicts, the solver, effects; and what is read."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from quadsim.controller import OPTIMAL, Phase
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
 from quadsim.flight.log import BODY_RATES, QUATERNION, FlightLog
+from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
+from quadsim.report.comparison import comparison_rows, fallback_sentence
 from quadsim.report.curves import break_at_wraps, commanded_speeds, effect_curves, reference_curve
 from quadsim.report.recording.style import BOUND, REFERENCE, SERIES, VERDICTS, Colour, panels, time_column
+from quadsim.report.table import to_markdown
 from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -37,16 +41,13 @@ def send_signals(recording: rr.RecordingStream, log: FlightLog) -> None:
             else:
                 rotors = {f"rotor {i} [{signal.unit}]": shade for i, shade in enumerate(SERIES, start=1)}
                 _send_curves(recording, f"signals/{name}", t, values, rotors, stepped=True)
-    plant = log.plant
     for name, vectors, columns in (
-        ("quaternion", plant.attitude, QUATERNION),
-        ("body_rates", plant.body_rates, BODY_RATES),
+        ("quaternion", log.plant.attitude, QUATERNION),
+        ("body_rates", log.plant.body_rates, BODY_RATES),
     ):
         if vectors is not None:
-            named = {
-                f"{column} [{unit}]": colour for (column, unit), colour in zip(columns.items(), SERIES, strict=False)
-            }
-            _send_curves(recording, f"signals/{name}", plant.t, vectors, named)
+            labels = [f"{column} [{unit}]" for column, unit in columns.items()]
+            _send_curves(recording, f"signals/{name}", log.plant.t, vectors, dict(zip(labels, SERIES, strict=False)))
     for name in REFERENCE_NAMES:
         values, label = reference_curve(log.control, name), f"{name} ref [{SIGNALS[name].unit}]"
         _send_curves(recording, f"reference/{name}", log.control.t, values, {label: REFERENCE})
@@ -108,6 +109,49 @@ def send_effects(recording: rr.RecordingStream, log: FlightLog) -> None:
     if commanded is not None:
         labels = {f"rotor {i}, commanded [rad/s]": REFERENCE for i in range(1, N_ROTORS + 1)}
         _send_curves(recording, "effects/commanded", log.plant.t, commanded, labels, stepped=True)
+
+
+def send_texts(recording: rr.RecordingStream, run: Run) -> None:
+    """The summary, and what happened when.
+
+    Changes of the status, of who answers and of the phase; why the first QP without an answer had none; when permanent
+    fallback begins; the flight's events and its end.
+    """
+    import rerun as rr
+
+    log, summary = run.log.control, run.summary
+    found, periods = summary.get("diagnosis") or {}, unrecovered(log)
+    answers = list(zip(log.status, log.answered_by, log.fallback.tolist(), strict=True))
+    events = [
+        (
+            t,
+            f"{status}{'' if fallback else f' by {by}'}, fallback {fallback}",
+            "INFO" if status in OPTIMAL | {Phase.LANDED} and not fallback else "WARN",
+        )
+        for t, (status, by, fallback) in _changes(log.t, answers)
+    ]
+    if any(phase != Phase.FLYING for phase in log.phase):
+        for t, phase in _changes(log.t, log.phase):
+            events.append((t, f"phase: {phase}", "WARN" if phase == Phase.CRASHED else "INFO"))
+    events += [(found["time"], found[name], "ERROR") for name in ("sentence", "advice") if found.get(name)]
+    if periods:
+        events.append((float(log.t[-periods]), fallback_sentence(periods), "ERROR"))
+    events += [(event["time"], event["text"], "WARN") for event in summary.get("events", ())]
+    completed = run.log.reason is None
+    events.append(
+        (run.end, "completed" if completed else f"aborted: {run.log.reason}", "INFO" if completed else "ERROR")
+    )
+    times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
+    recording.send_columns("events", [time_column(np.array(times))], rr.TextLog.columns(text=texts, level=levels))
+    rows = [row for row in comparison_rows([run]) if row.group in ("Flight", "Tracking") or row.headline]
+    document = rr.TextDocument(to_markdown(rows, [run.name]), media_type=rr.MediaType.MARKDOWN)
+    recording.log("summary", document, static=True)
+
+
+def _changes(t: Array, values: Sequence[Any]) -> list[tuple[float, Any]]:
+    """The first value and those that differ from the one before, each with its time [s]."""
+    pairs = zip(t.tolist(), [None, *values], values, strict=False)
+    return [(time, value) for time, before, value in pairs if value != before]
 
 
 def _send_curves(

@@ -29,7 +29,8 @@ def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
     """The vehicle from primitives, in its body frame; what points forward is orange, rotors look as in the plots."""
     import rerun as rr
 
-    unit, rotors, azimuths = _unit(vehicle), vehicle.rotor_positions, np.radians(vehicle.rotor_azimuths)
+    unit, rotors = vehicle.arm_length / _DRAWN_ARM, vehicle.rotor_positions
+    azimuths = np.radians(vehicle.rotor_azimuths)
     up = np.array([0.0, 0.0, unit])
     gaps = np.linalg.norm(rotors[:, None] - rotors[None], axis=2)[~np.eye(N_ROTORS, dtype=bool)]
     arm = [vehicle.arm_length / 2, 0.011 * unit, 0.011 * unit]
@@ -95,9 +96,13 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     recording.send_columns("world/vehicle/body", [time_column(plant.t)], rr.Transform3D.columns(quaternion=attitude))
     recording.send_columns("world/vehicle/body/thrust", [time_column(plant.t)], arrows)
     if plant.wrench is not None and np.any(plant.wrench[:, :3]):
-        _send_force(recording, run.vehicle, plant.t, plant.wrench[:, :3])
+        vehicle = run.vehicle
+        scale = _FORCE_SCALE * vehicle.arm_length / (vehicle.mass * vehicle.gravity / N_ROTORS)
+        _send_arrows(recording, run, "external_force", scale * plant.wrench[:, :3], style.FORCE, behind=0.0)
     if plant.wind is not None and np.any(plant.wind):
-        _send_wind(recording, run.vehicle, plant.t, plant.wind)
+        strongest = float(np.linalg.norm(plant.wind, axis=1).max())
+        drawn = _WIND_LENGTH * run.vehicle.arm_length / strongest * plant.wind
+        _send_arrows(recording, run, "wind", drawn, style.WIND, behind=1.3)
 
     if control.t.size:
         starts = np.searchsorted(plant.t, control.t - 1e-9)
@@ -151,34 +156,17 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
         recording.send_columns(entity, [time_column(times[np.isfinite(times)])], strips)
 
 
-def _unit(vehicle: Vehicle) -> float:
-    """The scale of the drawing."""
-    return vehicle.arm_length / _DRAWN_ARM
-
-
-def _send_force(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, force: Array) -> None:
-    """The external force (M, 3) [N] as an arrow in the world frame that moves with the vehicle."""
+def _send_arrows(
+    recording: rr.RecordingStream, run: Run, name: str, vectors: Array, colour: Colour, *, behind: float
+) -> None:
+    """Arrows (M, 3) above the rotor discs that move with the vehicle, begun by `behind` of their length before it."""
     import rerun as rr
 
-    entity, unit = "world/vehicle/external_force", _unit(vehicle)
-    above_the_discs = [0.0, 0.0, 0.08 * unit]
-    look = rr.Arrows3D.from_fields(origins=above_the_discs, radii=0.01 * unit, colors=style.FORCE)
-    scale = _FORCE_SCALE * vehicle.arm_length / (vehicle.mass * vehicle.gravity / N_ROTORS)
-    recording.log(entity, look, static=True)
-    recording.send_columns(entity, [time_column(t)], rr.Arrows3D.columns(vectors=scale * force))
-
-
-def _send_wind(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, wind: Array) -> None:
-    """The wind (M, 3) [m/s] as an arrow in the world frame that meets the vehicle from upwind."""
-    import rerun as rr
-
-    entity, unit = "world/vehicle/wind", _unit(vehicle)
-    look = rr.Arrows3D.from_fields(radii=0.01 * unit, colors=style.WIND)
-    vectors = _WIND_LENGTH * vehicle.arm_length / float(np.linalg.norm(wind, axis=1).max()) * wind
-    above_the_discs = np.array([0.0, 0.0, 0.08 * unit])
-    recording.log(entity, look, static=True)
-    columns = rr.Arrows3D.columns(vectors=vectors, origins=above_the_discs - 1.3 * vectors)
-    recording.send_columns(entity, [time_column(t)], columns)
+    entity, unit = f"world/vehicle/{name}", run.vehicle.arm_length / _DRAWN_ARM
+    recording.log(entity, rr.Arrows3D.from_fields(radii=0.01 * unit, colors=colour), static=True)
+    origins = np.array([0.0, 0.0, 0.08 * unit]) - behind * vectors
+    columns = rr.Arrows3D.columns(vectors=vectors, origins=origins)
+    recording.send_columns(entity, [time_column(run.log.plant.t)], columns)
 
 
 def _log_lines(
