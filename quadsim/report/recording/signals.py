@@ -137,10 +137,8 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     if periods:
         events.append((float(log.t[-periods]), fallback_sentence(periods), "ERROR"))
     events += [(event["time"], event["text"], "WARN") for event in summary.get("events", ())]
-    completed = run.log.reason is None
-    events.append(
-        (run.end, "completed" if completed else f"aborted: {run.log.reason}", "INFO" if completed else "ERROR")
-    )
+    reason = run.log.reason
+    events.append((run.end, "completed", "INFO") if reason is None else (run.end, f"aborted: {reason}", "ERROR"))
     times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
     recording.send_columns("events", [time_column(np.array(times))], rr.TextLog.columns(text=texts, level=levels))
     rows = [row for row in comparison_rows([run]) if row.group in ("Flight", "Tracking") or row.headline]
