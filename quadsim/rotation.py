@@ -28,12 +28,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion: ...
 @overload
 def multiply(a: Array, b: Array) -> Array: ...
 def multiply(a: Any, b: Any) -> Any:
-    """Hamilton's product: the rotation b, then, in the frame that b leads to, a: body to world of both.
-
-    Args:
-        a: a tuple of plain numbers, or (..., 4).
-        b: the same.
-    """
+    """Hamilton's product of tuples of plain numbers or (..., 4): the rotation b, then, in the frame it leads to, a."""
     if isinstance(a, tuple):
         return _product(a, b)
     return np.stack(_product(np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)), axis=-1)
@@ -83,13 +78,9 @@ def logarithm(q: Quaternion) -> Vector:
 
 
 def quaternion_to_euler(quaternion: Array) -> Array:
-    """Roll, pitch, yaw [rad] of unit quaternions.
+    """Roll, pitch, yaw (..., 3) [rad] of unit quaternions (..., 4), scalar first, body to world.
 
-    Args:
-        quaternion: (..., 4), scalar first (w, x, y, z), body to world.
-
-    Returns:
-        (..., 3): roll and yaw in [-pi, pi], pitch in [-pi/2, pi/2].
+    Roll and yaw are in [-pi, pi], pitch in [-pi/2, pi/2].
     """
     w, x, y, z = _entries(quaternion)
     euler = np.empty((*x.shape, 3))

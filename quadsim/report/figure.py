@@ -124,11 +124,9 @@ class Panel:
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """Panels, row by row.
+    """Panels, row by row; `key` names its file and identifies it in a page.
 
-    Attributes:
-        key: name of its file, and its identifier in a page.
-        end: last instant of a horizontal axis of time that all panels without an `x_label` share [s]; None without one.
+    `end` is the last instant of the axis of time that all panels without an `x_label` share [s]; None without one.
     """
 
     key: str
@@ -148,12 +146,7 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Paths and solids in space, which pages show.
-
-    Attributes:
-        paths: lines (K, 3) [m] with label, colour, group and whether they are dashed; NaN is a gap.
-        solids: points (K, 3) [m] whose convex hull is a solid, with its name.
-    """
+    """Paths and solids in space, which pages show."""
 
     key: str
     title: str

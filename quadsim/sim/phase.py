@@ -64,10 +64,8 @@ class PhaseMonitor:
     def advance(self, t: Array, states: Array, preview: Array) -> Phase:
         """The phase of the control period that starts now.
 
-        Args:
-            t: (M,) times of the states [s].
-            states: (M, 12) true states since the last period began, the last of them now.
-            preview: (N, 4) reference x, y, z [m], yaw [rad] that the controller is about to see.
+        Of true states (M, 12) at times (M,) [s] since the last period began, the last of them now, and of the reference
+        (N, 4) that the controller is about to see.
         """
         if self._touches_obstacle(t, states):
             self._phase = Phase.CRASHED
@@ -106,7 +104,7 @@ def check_loss(limits: Mapping[str, float], time: float, state: Array, reference
     Args:
         limits: the largest value of each of `CRITERIA`; one that is left out is not checked.
         time: of the sample [s].
-        state: (12,) true state, as `quadsim.state` orders it.
+        state: (12,) the true one.
         reference: (4,) x, y, z [m], yaw [rad] at the same time.
         lowest: height of the lowest of the start and the reference so far [m].
 

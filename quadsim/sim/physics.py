@@ -43,15 +43,13 @@ def inner_steps(rate: float, timestep: float) -> int:
 
 
 def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
-    """The paper's state from MuJoCo's.
+    """The paper's states (M, 12) from MuJoCo's.
+
+    With Euler-angle rates (Sec. 2.2 takes body rates for them), yaw unwrapped along the rows as by `YawTurns`.
 
     Args:
         physics: (M, 14) time, position (world), quaternion wxyz, velocity (world), angular rates (body).
         yaw: near which turn the first row's yaw is [rad].
-
-    Returns:
-        (M, 12) states with Euler-angle rates (Sec. 2.2 takes body rates for them; see `quadsim.state`), yaw
-        unwrapped along the rows, as by `quadsim.state.YawTurns`.
     """
     state = np.empty((physics.shape[0], N_STATES))
     euler = quaternion_to_euler(physics[:, 4:8])

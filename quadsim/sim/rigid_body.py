@@ -22,11 +22,6 @@ Rates = tuple[list[float], Wrench]
 def check_free(effects: Effects, changes: Iterable[Change], obstacles: Sequence[Obstacle] = ()) -> None:
     """Refuse what this integration does not know.
 
-    Args:
-        effects: resolved.
-        changes: what happens on the way.
-        obstacles: what may be touched.
-
     Raises:
         ParameterError: there is a floor or an obstacle to touch, a load, or drag of MuJoCo's.
     """

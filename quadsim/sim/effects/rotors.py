@@ -77,15 +77,12 @@ class RotorDynamics:
             raise ParameterError("effects.rotors", "inertia", self.inertia, rule)
 
     def respond(self, speeds: Array, target: Array, elapsed: Array) -> tuple[Array, Array]:
-        """Speeds and accelerations some time after a command.
+        """Speeds (M, 4) [rad/s] and accelerations (M, 4) [rad/s^2] at times `elapsed` (M,) [s] after a command.
 
         Args:
             speeds: (4,) rotor speeds when the command came [rad/s].
             target: (4,) the command, within what the rotors can hold [rad/s].
             elapsed: (M,) times since then [s].
-
-        Returns:
-            (M, 4) speeds [rad/s] and (M, 4) accelerations [rad/s^2].
         """
         gap = target - speeds
         sign, distance = np.sign(gap), np.abs(gap)

@@ -83,10 +83,7 @@ class Dryden:
 class Turbulence:
     """The turbulence that passes a vehicle, an evolving state; stationary from its first sample on.
 
-    Args:
-        dryden: its strength and size.
-        timestep: time between samples [s].
-        rng: its randomness; a child of it is used, so that others may draw from it at any time.
+    It draws from a child of `rng`, so that others may draw from that at any time.
     """
 
     def __init__(self, dryden: Dryden, *, timestep: float, rng: np.random.Generator) -> None:

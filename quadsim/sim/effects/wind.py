@@ -106,15 +106,8 @@ class WindField:
     """The wind at the vehicle, an evolving state: the same everywhere, mean(t) + gusts(t) + turbulence(t).
 
     The turbulence's longitudinal axis is the horizontal direction of the mean wind at time zero, or world x where
-    there is none, whatever the mean changes to later.
-
-    Args:
-        mean: (3,) mean wind from time zero on, world frame, z up [m/s]; where the air goes, not where it comes from.
-        gusts: discrete gusts, added up.
-        turbulence: strength and size of the turbulence; None for none.
-        timestep: physics step [s].
-        rng: randomness of the turbulence; a child of it is used, so that others may draw from it at any time.
-        changes: steps of the mean wind, in any order; of two at one time the later one counts.
+    there is none, whatever the mean changes to later.  The mean is where the air goes, not where it comes from; of two
+    changes at one time the later one counts.
     """
 
     def __init__(

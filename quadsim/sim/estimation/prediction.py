@@ -95,15 +95,9 @@ def drive(model: MotionModel, speeds: Array) -> Drive:
 
 
 def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: float) -> Estimate:
-    """The estimate some time later.
+    """The estimate a time h [s] later, short against the time in which the vehicle turns.
 
     The mean by the midpoint rule, the attitude on the sphere; the covariance as F P F' + Q(h), F to third order in h.
-
-    Args:
-        model: the modelled vehicle.
-        estimate: the estimate now.
-        driven: what the rotors do meanwhile.
-        duration: h [s]; short against the time in which the vehicle turns.
     """
     h, a = duration, driven.acceleration
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, p, q, r, *bias = estimate.mean.tolist()
@@ -182,13 +176,7 @@ def lifts(model: MotionModel, driven: Drive) -> bool:
 
 
 def stand(model: MotionModel, estimate: Estimate, duration: float) -> Estimate:
-    """The estimate some time later of a vehicle that stands.
-
-    Args:
-        model: the modelled vehicle.
-        estimate: the estimate now; its velocity and rates are not used.
-        duration: h [s].
-    """
+    """The estimate a time h [s] later of a vehicle that stands; its velocity and rates are not used."""
     mean = estimate.mean.copy()
     mean[VELOCITY] = mean[MEAN_RATES] = 0.0
     covariance = _RETAINED * estimate.covariance + _VARIANCE + duration * _WALK

@@ -45,9 +45,6 @@ class Sampler:
     """Takes a sensor's samples; the same ones again after a reset, however the time is cut into calls.
 
     Noise, bias, dropouts and outliers each draw from a generator of their own, so none changes another's draws.
-
-    Attributes:
-        sensor: what it takes samples of.
     """
 
     def __init__(
@@ -82,9 +79,8 @@ class Sampler:
     def sample(self, physics: Array, first: int) -> list[Sample]:
         """The samples taken during a segment of motion, those lost left out.
 
-        Args:
-            physics: (M, 14) MuJoCo's states at successive physics steps.
-            first: number of the first of these steps; segments follow one another from step 0.
+        Of MuJoCo's states (M, 14) at successive physics steps, the first of number `first`; segments follow one another
+        from step 0.
         """
         begin = -first % self._stride
         rows = physics[begin :: self._stride]
