@@ -84,7 +84,7 @@ class Navigation:
             sampler.reschedule(faults)
 
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
-        """Start again at MuJoCo's state (14,) and rotor speeds (4,) [rad/s], with the same draws; yaw is near `yaw` [rad]."""
+        """Start again at MuJoCo's state (14,) and rotor speeds [rad/s], the same draws; yaw is near `yaw` [rad]."""
         self._step, self._yaw, self._physics = 0, YawTurns(yaw), physics.copy()
         self.attitude: tuple[Array, Array] = physics[4:8].copy(), physics[11:14].copy()
         self._held = {name: truth(name, physics[None])[0] for name in SensorName}

@@ -71,7 +71,8 @@ class Sensor(Sampling):
         Raises:
             ParameterError: the rate does not divide the physics rate.
         """
-        return _whole(f"sensors.{self.name}", "rate", self.rate, 1.0 / (self.rate * timestep), _divides(timestep))
+        rule = f"a divisor of the physics rate of {1.0 / timestep:g} Hz"
+        return whole(f"sensors.{self.name}", "rate", self.rate, 1.0 / (self.rate * timestep), rule)
 
     def latency(self, timestep: float) -> int:
         """Physics steps from taking a sample to its arrival.
@@ -80,7 +81,7 @@ class Sensor(Sampling):
             ParameterError: the delay is not a whole number of physics steps.
         """
         rule = f"a whole multiple of the physics step of {timestep} s"
-        return _whole(f"sensors.{self.name}", "delay", self.delay, self.delay / timestep, rule, smallest=0)
+        return whole(f"sensors.{self.name}", "delay", self.delay, self.delay / timestep, rule, smallest=0)
 
 
 class FaultKind(StrEnum):
@@ -110,12 +111,13 @@ class SensorFault:
         return first, math.ceil(self.stop / timestep - 1e-6) if math.isfinite(self.stop) else None
 
 
-def _divides(timestep: float) -> str:
-    return f"a divisor of the physics rate of {1.0 / timestep:g} Hz"
+def whole(owner: str, name: str, value: float, count: float, rule: str, *, smallest: int = 1) -> int:
+    """The whole number that a count of physics steps is, which follows from a parameter.
 
-
-def _whole(owner: str, name: str, value: float, count: float, rule: str, *, smallest: int = 1) -> int:
-    whole = round(count)
-    if whole < smallest or not math.isclose(whole, count, rel_tol=1e-9, abs_tol=1e-9):
+    Raises:
+        ParameterError: it is none, or too small.
+    """
+    steps = round(count)
+    if steps < smallest or not math.isclose(steps, count, rel_tol=1e-9, abs_tol=1e-9):
         raise ParameterError(owner, name, value, rule)
-    return whole
+    return steps
