@@ -29,11 +29,9 @@ import numpy as np
 from quadsim.errors import FileError, OutputError, ViewerUnavailableError
 from quadsim.flight.rundir import Run
 from quadsim.outputs import writing_file
-from quadsim.report.curves import line_colour
-from quadsim.report.recording.layout import blueprint
-from quadsim.report.recording.signals import send_effects, send_limit, send_signals, send_solver, send_texts
-from quadsim.report.recording.style import on_screen
-from quadsim.report.recording.world import send_airframe, send_scene, send_space
+from quadsim.report.recording.plots import send_plots, send_texts
+from quadsim.report.recording.style import TIMELINE
+from quadsim.report.recording.world import scene_views, send_airframe, send_scene, send_space
 
 _CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
 _VIEWER: Final = (sys.executable, "-P", "-c", _CALL, "--bind=127.0.0.1", "--port=auto")
@@ -54,6 +52,7 @@ def write_recording(run: Run, path: Path) -> None:
 def _encode(run: Run, path: Path) -> bytes:
     """The file's content, made in memory: rerun's own file writer hides from Python why it failed."""
     import rerun as rr
+    import rerun.blueprint as rrb
 
     recording = rr.RecordingStream(f"quadsim {run.name}", recording_id=_identity(run), send_properties=False)
     if not rr.is_enabled(recording):
@@ -63,17 +62,20 @@ def _encode(run: Run, path: Path) -> bytes:
     rr.set_strict_mode(True)  # otherwise what cannot be recorded is left out with a warning
     try:
         recording.send_recording_name(run.name)
-        recording.send_blueprint(blueprint(run), make_active=True, make_default=True)
         send_airframe(recording, run.vehicle)
         send_scene(recording, run)
         send_space(recording, run)
-        send_signals(recording, run.log)
-        for limit in run.limits:
-            peers = [peer.name for peer in run.limits if peer.unit == limit.unit]  # in one plot of margins
-            send_limit(recording, limit, run.log, on_screen(line_colour(peers.index(limit.name))))
-        send_solver(recording, run)
-        send_effects(recording, run.log)
         send_texts(recording, run)
+        views = rrb.Horizontal(scene_views(run), send_plots(recording, run), column_shares=[4, 5])
+        layout = rrb.Blueprint(  # nothing is left to be clicked or unfolded
+            views,
+            rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="playing", loop_mode="all"),
+            rrb.BlueprintPanel(state="collapsed"),
+            rrb.SelectionPanel(state="collapsed"),
+            auto_layout=False,
+            auto_views=False,
+        )
+        recording.send_blueprint(layout, make_active=True, make_default=True)
         return bytes(memory.drain_as_bytes())
     finally:
         rr.set_strict_mode(strict)

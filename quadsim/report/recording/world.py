@@ -10,7 +10,7 @@ import numpy as np
 from quadsim.controller import Phase
 from quadsim.flight.rundir import Run
 from quadsim.report.recording import style
-from quadsim.report.recording.style import Colour, time_column
+from quadsim.report.recording.style import TIMELINE, Colour, time_column
 from quadsim.report.scene import obstacles_in, region_edges
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import EULER, POSITION, Array
@@ -18,6 +18,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 if TYPE_CHECKING:
     import rerun as rr
+    import rerun.blueprint as rrb
 
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
@@ -154,6 +155,49 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
         times = np.array([max(limit.start, 0.0), limit.stop])
         strips = rr.LineStrips3D.columns(strips=[*edges]).partition([len(edges), 0][: 1 + np.isfinite(limit.stop)])
         recording.send_columns(entity, [time_column(times[np.isfinite(times)])], strips)
+
+
+def scene_views(run: Run) -> rrb.Vertical:
+    """Course and vehicle in space, and the summary."""
+    import rerun.blueprint as rrb
+
+    behind = run.vehicle.arm_length * np.array([-3.0, -3.5, 2.2])
+    return rrb.Vertical(
+        _view("Course", "/world", *_overview(run)),
+        rrb.Horizontal(
+            _view("Vehicle", "/world/vehicle", behind, np.zeros(3)),
+            rrb.TextDocumentView(name="Summary", origin="/summary"),
+        ),
+        row_shares=[3, 2],
+    )
+
+
+def _overview(run: Run) -> tuple[Array, Array]:
+    """Where the eye is and where it looks [m] to see the whole course."""
+    path, course = run.log.plant.state[:, POSITION], run.log.control.reference[:, :3]
+    path = path[np.isfinite(path).all(axis=1)]  # a flight that diverged ends in anything
+    course = course if len(course) else path
+    low, high, least = course.min(axis=0), course.max(axis=0), 10 * run.vehicle.arm_length
+    slack = max(float((high - low).max()), least)
+    path = np.clip(path, low - slack, high + slack)  # a lost vehicle leaves the picture
+    low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
+    centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), least)
+    return centre + size * np.array([0.35, -0.9, 0.3]), centre
+
+
+def _view(name: str, origin: str, eye: Array, target: Array) -> rrb.Spatial3DView:
+    """The scene seen from a point at rest in the frame of `origin`, and the ground, in the frame of the world."""
+    import rerun.blueprint as rrb
+
+    start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    return rrb.Spatial3DView(
+        name=name,
+        origin=origin,
+        contents="/world/**",
+        line_grid=rrb.LineGrid3D(visible=origin == "/world", spacing=1.0),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=target),
+        overrides={"/world/flown": rrb.VisibleTimeRanges(timeline=TIMELINE, start=start, end=now)},
+    )
 
 
 def _send_arrows(

@@ -1,4 +1,4 @@
-"""What is seen in the plots: signals, references, bounds, margins, verdicts, the solver, effects; and what is read."""
+"""What is seen in the plots and what is read: sent to a recording, each with the view that shows it."""
 
 from __future__ import annotations
 
@@ -10,65 +10,116 @@ import numpy as np
 
 from quadsim.controller import OPTIMAL, Phase
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
-from quadsim.flight.log import BODY_RATES, QUATERNION, FlightLog
+from quadsim.flight.log import BODY_RATES, QUATERNION
 from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import comparison_rows, fallback_sentence
-from quadsim.report.curves import break_at_wraps, commanded_speeds, effect_curves, reference_curve
-from quadsim.report.recording.style import BOUND, REFERENCE, SERIES, VERDICTS, Colour, panels, time_column
+from quadsim.report.curves import (
+    break_at_wraps,
+    commanded_speeds,
+    effect_curves,
+    least_range,
+    line_colour,
+    reference_curve,
+)
+from quadsim.report.recording.style import (
+    BOUND,
+    FRONT_PANELS,
+    REFERENCE,
+    SERIES,
+    VERDICTS,
+    Colour,
+    on_screen,
+    panels,
+    time_column,
+)
 from quadsim.report.table import to_markdown
 from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
     import rerun as rr
+    import rerun.blueprint as rrb
 
 _ACTIVE: Final = 0.002  # A limit is active where its margin is below this fraction of the allowed band
 
 
-def send_signals(recording: rr.RecordingStream, log: FlightLog) -> None:
-    """Every signal there is, at the log rate where it exists between the control samples; and the reference.
+def send_plots(recording: rr.RecordingStream, run: Run) -> rrb.Tabs:
+    """All that is shown over time, at the log rate where it exists between the control samples; the views of it."""
+    import rerun.blueprint as rrb
 
-    Of flights that may turn upside down quaternion and body rates as well.
-    """
-    for names in panels(log).values():
+    signals, events = _send_signals(recording, run), rrb.TextLogView(name="Events", origin="/events")
+    margins, effects = _send_limits(recording, run), _send_effects(recording, run)
+    times, *solver = _send_solver(recording, run)
+    lanes = [f"verdicts/{limit.name}" for limit in run.limits if limit.start == 0.0]
+    verdicts = rrb.StateTimelineView(name="Constraints on the whole flight", contents=lanes)
+    return rrb.Tabs(
+        rrb.Grid(*signals[:FRONT_PANELS], verdicts, times, grid_columns=2, name="Flight"),
+        rrb.Grid(*signals[FRONT_PANELS:], grid_columns=2, name="More signals"),
+        rrb.Grid(*margins, *solver, events, grid_columns=2, name="Margins and solver"),
+        *([rrb.Grid(*effects, grid_columns=2, name="Effects")] if effects else []),
+    )
+
+
+def _send_signals(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
+    """Every signal there is, and the reference; of flights that may turn upside down quaternion and body rates too."""
+    log, views = run.log, []
+    for title, names in panels(log).items():
+        contents, values = [], []
         for colour, name in zip(SERIES, names, strict=False):
-            signal = SIGNALS[name]
-            t, values = signal.finest(log)
-            if values.ndim == 1:
-                t, values = break_at_wraps(t, values, signal.unit)
-                _send_curves(recording, f"signals/{name}", t, values, {f"{name} [{signal.unit}]": colour})
+            unit = SIGNALS[name].unit
+            t, curve = SIGNALS[name].finest(log)
+            labels = {f"{name} [{unit}]": colour}
+            if curve.ndim == 2:
+                labels = {f"rotor {i} [{unit}]": shade for i, shade in enumerate(SERIES, start=1)}
             else:
-                rotors = {f"rotor {i} [{signal.unit}]": shade for i, shade in enumerate(SERIES, start=1)}
-                _send_curves(recording, f"signals/{name}", t, values, rotors, stepped=True)
+                t, curve = break_at_wraps(t, curve, unit)
+            contents.append(f"signals/{name}")
+            values.append(curve)
+            _send_curves(recording, contents[-1], t, curve, labels, stepped=curve.ndim == 2)
+            if name in REFERENCE_NAMES:
+                contents.append(f"reference/{name}")
+                values.append(reference_curve(log.control, name))
+                _send_curves(recording, contents[-1], log.control.t, values[-1], {f"{name} ref [{unit}]": REFERENCE})
+        bounding = [limit for limit in run.limits if limit.signal in names]
+        values += [np.array([limit.lower, limit.upper]) for limit in bounding]
+        contents += [f"limits/{limit.name}" for limit in bounding]
+        views.append(_view(title, contents, run, ends=least_range(values, SIGNALS[names[0]].unit)))
     for name, vectors, columns in (
         ("quaternion", log.plant.attitude, QUATERNION),
         ("body_rates", log.plant.body_rates, BODY_RATES),
     ):
         if vectors is not None:
-            labels = [f"{column} [{unit}]" for column, unit in columns.items()]
-            _send_curves(recording, f"signals/{name}", log.plant.t, vectors, dict(zip(labels, SERIES, strict=False)))
-    for name in REFERENCE_NAMES:
-        values, label = reference_curve(log.control, name), f"{name} ref [{SIGNALS[name].unit}]"
-        _send_curves(recording, f"reference/{name}", log.control.t, values, {label: REFERENCE})
+            labels = dict(zip((f"{column} [{unit}]" for column, unit in columns.items()), SERIES, strict=False))
+            _send_curves(recording, f"signals/{name}", log.plant.t, vectors, labels)
+            views.append(_view(name.replace("_", " ").capitalize(), [f"signals/{name}"], run))
+    return views
 
 
-def send_limit(recording: rr.RecordingStream, limit: Limit, log: FlightLog, colour: Colour) -> None:
-    """A limit's bounds over its time window, its margins, and what they say."""
+def _send_limits(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
+    """Each limit's bounds over its time window, its margins, and what they say; margins of one unit in one plot."""
+    views = []
+    for unit in dict.fromkeys(limit.unit for limit in run.limits):
+        peers = [limit for limit in run.limits if limit.unit == unit]
+        for i, limit in enumerate(peers):
+            _send_limit(recording, limit, run, on_screen(line_colour(i)))
+        views.append(_view(f"Margins [{unit}]", [f"margins/{limit.name}" for limit in peers], run))
+    return views
+
+
+def _send_limit(recording: rr.RecordingStream, limit: Limit, run: Run, colour: Colour) -> None:
     import rerun as rr
 
-    t = log.control.t
-    margins = margins_sampled(limit, log)
+    t, margins = run.log.control.t, margins_sampled(limit, run.log)
     inside = np.isfinite(margins)
     if not inside.any():
         return
     bounds = {sign: bound for sign, bound in (("≥", limit.lower), ("≤", limit.upper)) if math.isfinite(bound)}
-    window = np.array([t[inside][0], min(limit.stop, log.plant.t[-1])])
+    window = np.array([t[inside][0], min(limit.stop, run.end)])
     labels = {f"{limit.name} {sign} {bound:g} {limit.unit}": BOUND for sign, bound in bounds.items()}
     _send_curves(recording, f"limits/{limit.name}", window, np.tile([*bounds.values()], (2, 1)), labels)
-    _send_curves(
-        recording, f"margins/{limit.name}", t[inside], margins[inside], {f"{limit.name} [{limit.unit}]": colour}
-    )
+    labels = {f"{limit.name} [{limit.unit}]": colour}
+    _send_curves(recording, f"margins/{limit.name}", t[inside], margins[inside], labels)
 
     names, entity = list(VERDICTS), f"verdicts/{limit.name}"
     band = limit.upper - limit.lower
@@ -81,7 +132,7 @@ def send_limit(recording: rr.RecordingStream, limit: Limit, log: FlightLog, colo
     recording.send_columns(entity, [time_column(t[changes])], states)
 
 
-def send_solver(recording: rr.RecordingStream, run: Run) -> None:
+def _send_solver(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
     """Clock times, and what is known of the answers."""
     control, timing = run.log.control, run.log.timing
     first, second = SERIES[:2]
@@ -98,17 +149,26 @@ def send_solver(recording: rr.RecordingStream, run: Run) -> None:
     if deadline is not None:
         ends = run.log.plant.t[[0, -1]]
         _send_curves(recording, "solver/deadline_ms", ends, np.full(2, deadline), {"deadline [ms]": BOUND})
+    return [
+        _view("Computation", ["solver/solve_ms", "solver/step_ms", "solver/deadline_ms"], run),
+        _view("Solver", ["solver/iterations", "solver/active"], run),
+        _view("Fallback and slack", ["solver/fallback", "solver/slack"], run),
+    ]
 
 
-def send_effects(recording: rr.RecordingStream, log: FlightLog) -> None:
-    """External force and torque and the wind, and the commands of rotors that turn otherwise; what there is of it."""
-    for entry in effect_curves(log):
-        labels = {f"{axis} [{entry.unit}]": colour for axis, colour in zip("xyz", SERIES, strict=False)}
-        _send_curves(recording, f"effects/{entry.key}", log.plant.t, entry.values, labels)
-    commanded = commanded_speeds(log)
+def _send_effects(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
+    """Commands that rotors do not follow at once, external force and torque, wind: what there is of it."""
+    t, views = run.log.plant.t, []
+    commanded = commanded_speeds(run.log)
     if commanded is not None:
         labels = {f"rotor {i}, commanded [rad/s]": REFERENCE for i in range(1, N_ROTORS + 1)}
-        _send_curves(recording, "effects/commanded", log.plant.t, commanded, labels, stepped=True)
+        _send_curves(recording, "effects/commanded", t, commanded, labels, stepped=True)
+        views.append(_view("Rotor speeds, commanded and acting", ["effects/commanded", "signals/speed"], run))
+    for entry in effect_curves(run.log):
+        labels = {f"{axis} [{entry.unit}]": colour for axis, colour in zip("xyz", SERIES, strict=False)}
+        _send_curves(recording, f"effects/{entry.key}", t, entry.values, labels)
+        views.append(_view(f"{entry.title[0].upper()}{entry.title[1:]}", [f"effects/{entry.key}"], run))
+    return views
 
 
 def send_texts(recording: rr.RecordingStream, run: Run) -> None:
@@ -175,3 +235,20 @@ def _send_curves(
     )
     recording.log(entity, style, static=True)
     recording.send_columns(entity, [time_column(t)], rr.Scalars.columns(scalars=np.asarray(values, float)))
+
+
+def _view(
+    title: str, contents: Sequence[str], run: Run, *, ends: tuple[float, float] | None = None
+) -> rrb.TimeSeriesView:
+    """Curves over the whole flight, and the legend to their right; `ends` of the vertical axis."""
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    first, last = (rr.TimeRangeBoundary.absolute(seconds=seconds) for seconds in (0.0, 1.4 * max(run.end, 1e-3)))
+    return rrb.TimeSeriesView(
+        name=title,
+        contents=list(contents),
+        plot_legend=rrb.PlotLegend("RightTop"),
+        axis_y=None if ends is None else rrb.ScalarAxis(range=ends),
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last)),
+    )
