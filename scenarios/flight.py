@@ -22,6 +22,7 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import HELD, SIGNALS, Finding, margins_at, margins_sampled
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import log_tables, write_log
+from quadsim.flight.summary import limit_to_json
 from quadsim.outputs import absolute, adding, amend, to_json, writing
 from quadsim.sim.airframe import outline
 from quadsim.sim.estimation.filter import Tally
@@ -432,7 +433,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "course": asdict(report(scenario, flight.vehicle)),
         **({"events": events} if (events := story(scenario, log.control.t.size * scenario.control_period)) else {}),
         "tracking": numbers["tracking"],
-        "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
+        "constraints": [limit_to_json(finding) for finding in flight.findings],
         "audit_notes": audit_notes(scenario),
         "control": numbers["control"],
         "diagnosis": flight.diagnosis,

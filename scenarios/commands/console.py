@@ -17,7 +17,7 @@ from rich.text import Text
 from quadsim.controller import OPTIMAL, Phase, counts, law_name
 from quadsim.errors import printable
 from quadsim.flight.audit import HELD
-from quadsim.flight.rundir import constraint_verdict, deciding_margin
+from quadsim.flight.summary import constraint_verdict, deciding_margin
 from quadsim.report.comparison import (
     crash,
     event_sentences,

@@ -22,9 +22,9 @@ from typing import IO, Final
 
 from quadsim.assets import own_packages
 from quadsim.errors import OutputError, ParameterError, RenderingUnavailableError
-from quadsim.flight.rundir import Run, load_run
+from quadsim.flight.rundir import load_run
 from quadsim.outputs import writing_file
-from quadsim.report.film.frames import Shot, film_span
+from quadsim.report.film.frames import Shot, film_end
 from quadsim.vehicle import Vehicle
 
 BACKENDS: Final = ("egl", "osmesa")  # what can render without a screen, in the order tried
@@ -86,9 +86,6 @@ def render_video(
     width: int = 1280,
     height: int = 720,
     fps: int = 30,
-    start: float = 0.0,
-    stop: float | None = None,
-    speed: float = 1.0,
     overwrite: bool = False,
 ) -> None:
     """Film a run as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all.
@@ -101,49 +98,33 @@ def render_video(
         width: [pixels], even.
         height: [pixels], even.
         fps: frames per second.
-        start: first simulated time shown [s].
-        stop: last simulated time shown [s]; the flight's end when None.
-        speed: simulated seconds per second of film.
         overwrite: whether to replace a file that is there.
 
     Raises:
         FileError: the run cannot be read, or holds nothing to film.
         OutputError: the film cannot be written, or a renderer failed; nothing is left behind.
-        ParameterError: a size, rate or time that cannot be.
+        ParameterError: there are to be no workers.
         RenderingUnavailableError: this machine cannot render.
     """
-    shot = _plan(load_run(run_directory), start, stop, Shot(
-        run=str(run_directory), width=width, height=height, fps=fps, speed=speed, count=1
-    ))  # fmt: skip
+    end = film_end(load_run(run_directory))
+    shot = Shot(run=str(run_directory), width=width, height=height, fps=fps, count=max(1, round(end * fps)))
     with _making(path, overwrite) as new:
         _film(shot, new, workers, progress)
 
 
-def render_gif(
-    run_directory: Path,
-    path: Path,
-    *,
-    width: int = 480,
-    fps: int = 8,
-    start: float = 0.0,
-    stop: float | None = None,
-    speed: float = 6.0,
-    workers: int | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Film a run as a small looping GIF in 16:9, a time-lapse by default; arguments and errors as `render_video`.
+def render_gif(run_directory: Path, path: Path, *, workers: int | None = None, overwrite: bool = False) -> None:
+    """Film a run as a small looping GIF in 16:9, six times as fast as it was; arguments and errors as `render_video`.
 
     It is rendered at twice its size, with large captions, and scaled down, which smooths its edges.
     """
-    shot = _plan(load_run(run_directory), start, stop, Shot(
-        run=str(run_directory), width=2 * width, height=2 * round(width * 9 / 16), fps=fps, speed=speed, count=1,
-        compact=True,
-    ))  # fmt: skip
+    fps, speed = 8, 6.0
+    count = max(1, round(film_end(load_run(run_directory)) * fps / speed))
+    shot = Shot(run=str(run_directory), width=960, height=540, fps=fps, speed=speed, count=count, compact=True)
     with _making(path, overwrite) as new:
         film = new.with_suffix(".mp4")
         backend = _film(shot, film, workers, None)
         # small by few colours and little noise
-        scaled = f"scale={width}:-2:flags=area,hqdn3d=3:3:0:0,split[a][b]"
+        scaled = "scale=480:-2:flags=area,hqdn3d=3:3:0:0,split[a][b]"
         colours = "[a]palettegen=max_colors=96:stats_mode=diff[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
         looping = ("-i", str(film), "-filter_complex", f"{scaled};{colours}", "-loop", "0", str(new))
         _work([(*_ffmpeg(), *looping)], backend, new.parent)
@@ -156,14 +137,6 @@ def render_portrait(
     with _making(path, overwrite) as new:
         command = (*_WORKER, "portrait", json.dumps(asdict(vehicle)), str(new), str(width), str(height))
         _work([command], rendering_backend(), new.parent)
-
-
-def _plan(run: Run, start: float, stop: float | None, shot: Shot) -> Shot:
-    first, last = film_span(run)
-    stop = last if stop is None else min(stop, last)
-    if not first <= start <= stop:
-        raise ParameterError("film", "start", start, f"between {first:g} s and its stop at {stop:g} s")
-    return replace(shot, start=start, count=max(1, round((stop - start) * shot.fps / shot.speed)))
 
 
 def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None) -> str:
