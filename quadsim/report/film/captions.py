@@ -139,15 +139,10 @@ class Overlay:
             now, wanted, row = factor * values[j], factor * reference[j], y + 24 + 27 * j
             painter.text(x, row, f"{name} [{'deg' if angle else 'm'}]", colour=ink.GREY)
             unknown = angle and self._footage.tilt is not None and self._footage.tilt[i] > 0.5 * math.pi
-            for right, value, colour in (
-                (118, now, ink.WHITE),
-                (192, wanted, ink.AMBER),
-                (262, now - wanted, ink.GREY),
-            ):
+            columns = (118, now, ink.WHITE), (192, wanted, ink.AMBER), (262, now - wanted, ink.GREY)
+            for right, value, colour in columns:
                 shown = f"{round(value, digits) + 0.0:+.{digits}f}"  # no "-0.00"
-                text = (
-                    ABSENT if unknown and colour is not ink.AMBER else shown
-                )  # upside down there is no heading to hold
+                text = ABSENT if unknown and colour is not ink.AMBER else shown  # upside down none is to be held
                 painter.text(x + right, row, text, colour=colour, anchor="ra")
 
     def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:
@@ -195,13 +190,11 @@ class Overlay:
         unit = height / (high - low)
         zero = top + height + unit * min(low, 0.0)
         for j, value in enumerate(values):
-            left, broken = x + 50 * j, _breaks(limit, value)
+            left, broken, shown = x + 50 * j, _breaks(limit, value), form.format(round(value, 1) + 0.0)
+            colour = ink.RED if broken else ink.WHITE
             painter.box(left, top, 34, height, ink.FAINT)
             painter.box(left, zero, 34, -unit * float(np.clip(value, low, high)), ink.RED if broken else ink.BLUE)
-            shown = form.format(round(value, 1) + 0.0)
-            painter.text(
-                left + 17, top + height + 5, shown, size=13, colour=ink.RED if broken else ink.WHITE, anchor="ma"
-            )
+            painter.text(left + 17, top + height + 5, shown, size=13, colour=colour, anchor="ma")
         for bound in _bounds(limit):
             if bound != 0.0:
                 painter.box(x - 4, zero - unit * bound - 1, 192, 2, ink.AMBER)

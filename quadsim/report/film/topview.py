@@ -88,11 +88,8 @@ class TopView:
         painter.text(bar + 4, y + 6, "z", size=13, colour=ink.GREY, anchor="ma")
         painter.box(bar, bottom, 8, -room[1], ink.FAINT)
         painter.box(bar, bottom, 8, level(footage.position[i, 2]) - bottom, ink.BLUE)
-        for right, label, colour in (
-            (0.05, "reference", ink.AMBER),
-            (0.40, "flown", ink.BLUE),
-            (0.64, "predicted", ink.GREEN),
-        ):
+        legend = (0.05, "reference", ink.AMBER), (0.40, "flown", ink.BLUE), (0.64, "predicted", ink.GREEN)
+        for right, label, colour in legend:
             painter.text(x + right * width, y + height - 20, label, size=0.056 * width, colour=colour)
 
 
