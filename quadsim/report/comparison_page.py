@@ -52,8 +52,8 @@ def write_comparison(runs: Sequence[Run], directory: Path, *, overwrite: bool = 
     """Write a comparison of runs, which appears complete or not at all; returns the page, `directory/index.html`.
 
     The directory holds the page, the overlay `comparison.png`, the table `comparison.md`, and of each run its video
-    `NAME.mp4` and a folder `NAME` of its other files; it can be moved or zipped as it is.  Aborted runs and ones without
-    video, recording or constraints, are welcome.
+    `NAME.mp4` and a folder `NAME` of its other files; it can be moved or zipped as it is.  Runs that were aborted, and
+    runs without video, recording or constraints are welcome.
 
     Raises:
         ParameterError: no run is given.
