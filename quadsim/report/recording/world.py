@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+import mujoco
 import numpy as np
 
 from quadsim.controller import Phase
@@ -13,6 +14,8 @@ from quadsim.report.recording import style
 from quadsim.report.recording.style import TIMELINE, Colour, time_column
 from quadsim.report.scene import obstacles_in, region_edges
 from quadsim.rotation import euler_to_quaternion
+from quadsim.sim.airframe import DISC_NAMES, DRAWN_ARM, FLOOR, compile_model
+from quadsim.space import Solid
 from quadsim.state import EULER, POSITION, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -23,53 +26,47 @@ if TYPE_CHECKING:
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
 _WIND_LENGTH: Final = 1.5  # how long a flight's strongest wind is drawn, in arm lengths
-_DRAWN_ARM: Final = 0.3  # arm length [m] for which the airframe's parts are measured, as in `models/quadrotor.xml`
 
 
 def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
-    """The vehicle from primitives, in its body frame; what points forward is orange, rotors look as in the plots."""
+    """The vehicle as films show it, in its body frame, but for rotor discs in the colours of the plots."""
     import rerun as rr
 
-    unit, rotors = vehicle.arm_length / _DRAWN_ARM, vehicle.rotor_positions
-    azimuths = np.radians(vehicle.rotor_azimuths)
-    up = np.array([0.0, 0.0, unit])
-    gaps = np.linalg.norm(rotors[:, None] - rotors[None], axis=2)[~np.eye(N_ROTORS, dtype=bool)]
-    arm = [vehicle.arm_length / 2, 0.011 * unit, 0.011 * unit]
-    parts: dict[str, rr.AsComponents] = {
-        "arms": rr.Boxes3D(
-            centers=rotors / 2,
-            half_sizes=np.tile(arm, (N_ROTORS, 1)),
-            quaternions=_vector_first(euler_to_quaternion(azimuths[:, None] * [0.0, 0.0, 1.0])),
-            colors=[style.FORWARD if x > 0.1 * vehicle.arm_length else style.CARBON for x in rotors[:, 0]],
-            fill_mode="solid",
-        ),
-        "hub": rr.Ellipsoids3D(
-            centers=unit * np.array([[0.0, 0.0, 0.01], [0.065, 0.0, 0.0]]),
-            half_sizes=unit * np.array([[0.065, 0.052, 0.034], [0.022, 0.022, 0.022]]),
-            colors=[style.SHELL, style.FORWARD],
-            fill_mode="solid",
-        ),
-        "motors": rr.Cylinders3D(
-            centers=rotors + 0.006 * up,
-            lengths=[0.04 * unit] * N_ROTORS,
-            radii=[0.023 * unit] * N_ROTORS,
-            colors=style.METAL,
-            fill_mode="solid",
-        ),
-        "discs": rr.Cylinders3D(
-            centers=rotors + 0.034 * up,
-            lengths=[0.003 * unit] * N_ROTORS,
-            radii=[min(0.125 * unit, 0.48 * float(gaps.min()))] * N_ROTORS,
-            colors=[(*colour[:3], 110) for colour in style.SERIES],
-            fill_mode="solid",
-        ),
-        "legs": rr.LineStrips3D(
-            [[0.45 * rotor, 0.6 * rotor - 0.12 * up] for rotor in rotors], radii=0.007 * unit, colors=style.CARBON
-        ),
-        "thrust": rr.Arrows3D.from_fields(origins=rotors + 0.036 * up, radii=0.01 * unit, colors=list(style.SERIES)),
-    }
-    for name, part in parts.items():
-        recording.log(f"world/vehicle/body/{name}", part, static=True)
+    model = compile_model(vehicle, visuals=True)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    colours = dict(zip(DISC_NAMES, ((*colour[:3], 110) for colour in style.SERIES), strict=True))
+    for i in range(model.ngeom):
+        geom = model.geom(i)
+        if geom.name != FLOOR and not geom.name.startswith("blades"):
+            kind = mujoco.mjtGeom(int(geom.type[0])).name.removeprefix("mjGEOM_").lower()
+            solid = Solid(kind, tuple(geom.size), data.geom_xpos[i].copy(), data.geom_xmat[i].reshape(3, 3).copy())
+            lightened = 76 + 179 * model.mat_rgba[geom.matid[0]]  # the viewer's background may be black
+            colour = colours.get(geom.name) or tuple(int(shade) for shade in lightened)
+            recording.log(f"world/vehicle/body/{geom.name}", _part(solid, colour), static=True)
+    unit = vehicle.arm_length / DRAWN_ARM
+    origins = vehicle.rotor_positions + np.array([0.0, 0.0, 0.036 * unit])
+    arrows = rr.Arrows3D.from_fields(origins=origins, radii=0.01 * unit, colors=list(style.SERIES))
+    recording.log("world/vehicle/body/thrust", arrows, static=True)
+
+
+def _part(solid: Solid, colour: Any) -> rr.AsComponents:
+    """A solid, or an ellipsoid of half axes `size`."""
+    import rerun as rr
+
+    a, b, _ = solid.size
+    turned = {"quaternions": _vector_first(solid.quaternion)[None], "colors": colour, "fill_mode": "solid"}
+    centres: Any = [solid.centre]
+    match solid.kind:
+        case "box":
+            return rr.Boxes3D(centers=centres, half_sizes=[solid.size], **turned)
+        case "cylinder":
+            return rr.Cylinders3D(centers=centres, lengths=[2.0 * b], radii=[a], **turned)
+        case "capsule":
+            begin = solid.centre - b * solid.turn[:, 2]
+            return rr.Capsules3D(translations=[begin], lengths=[2.0 * b], radii=[a], **turned)
+    half = (a, a, a) if solid.kind == "sphere" else solid.size
+    return rr.Ellipsoids3D(centers=centres, half_sizes=[half], **turned)
 
 
 def send_scene(recording: rr.RecordingStream, run: Run) -> None:
@@ -124,25 +121,10 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
     """Obstacles, which move where they do, and regions, which are there while they hold."""
     import rerun as rr
 
-    look: dict[str, Any] = {"colors": style.OBSTACLE, "fill_mode": "solid"}
     for obstacle in obstacles_in(run.limits):
         entity = f"world/obstacles/{obstacle.name}"
         for i, solid in enumerate(obstacle.solids):
-            a, b, _ = solid.size
-            turned = {"quaternions": _vector_first(solid.quaternion)[None], **look}
-            centres, radii = [solid.centre], [a]
-            part: rr.AsComponents
-            match solid.kind:
-                case "box":
-                    part = rr.Boxes3D(centers=centres, half_sizes=[solid.size], **turned)
-                case "sphere":
-                    part = rr.Ellipsoids3D(centers=centres, radii=radii, **look)
-                case "cylinder":
-                    part = rr.Cylinders3D(centers=centres, lengths=[2.0 * b], radii=radii, **turned)
-                case "capsule":
-                    begin = solid.centre - b * solid.turn[:, 2]
-                    part = rr.Capsules3D(translations=[begin], lengths=[2.0 * b], radii=radii, **turned)
-            recording.log(f"{entity}/{i}", part, static=True)
+            recording.log(f"{entity}/{i}", _part(solid, style.OBSTACLE), static=True)
         if obstacle.moves:
             t = run.log.plant.t
             moving = rr.Transform3D.columns(translation=obstacle.positions(t))
@@ -206,7 +188,7 @@ def _send_arrows(
     """Arrows (M, 3) above the rotor discs that move with the vehicle, begun by `behind` of their length before it."""
     import rerun as rr
 
-    entity, unit = f"world/vehicle/{name}", run.vehicle.arm_length / _DRAWN_ARM
+    entity, unit = f"world/vehicle/{name}", run.vehicle.arm_length / DRAWN_ARM
     recording.log(entity, rr.Arrows3D.from_fields(radii=0.01 * unit, colors=colour), static=True)
     origins = np.array([0.0, 0.0, 0.08 * unit]) - behind * vectors
     columns = rr.Arrows3D.columns(vectors=vectors, origins=origins)
