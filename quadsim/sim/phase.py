@@ -48,12 +48,10 @@ class PhaseMonitor:
         self, outline: Outline | None, *, period: float, obstacles: Sequence[Obstacle] = (), radius: float = 0.0
     ) -> None:
         self._outline, self._obstacles, self._radius = outline, Solids(obstacles), radius
-        if outline is None:
-            self.reset()
-            return
-        self._takeoff_height = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + TAKEOFF_RISE
-        self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # higher up nothing can touch
-        self._periods_of_rest = math.ceil(REST / period - 1e-9)
+        if outline is not None:
+            self._takeoff_height = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + TAKEOFF_RISE
+            self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # higher up nothing can touch
+            self._periods_of_rest = math.ceil(REST / period - 1e-9)
         self.reset()
 
     def reset(self) -> None:
@@ -67,7 +65,7 @@ class PhaseMonitor:
         Of true states (M, 12) at times (M,) [s] since the last period began, the last of them now, and of the reference
         (N, 4) that the controller is about to see.
         """
-        if self._touches_obstacle(t, states):
+        if (self._obstacles.clearances(t, states[:, POSITION])[0] <= self._radius).any():
             self._phase = Phase.CRASHED
         if self._outline is None:
             return self._phase or Phase.FLYING
@@ -86,9 +84,6 @@ class PhaseMonitor:
         elif self._phase is not Phase.CRASHED:
             self._phase = Phase.ARMED if wanted else Phase.LANDED
         return self._phase
-
-    def _touches_obstacle(self, t: Array, states: Array) -> bool:
-        return bool((self._obstacles.clearances(t, states[:, POSITION])[0] <= self._radius).any())
 
     def _crashed(self, outline: Outline, states: Array) -> bool:
         if self._touched and np.degrees(tilt(states[-1:])[0]) > CAPSIZED:

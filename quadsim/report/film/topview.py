@@ -75,7 +75,9 @@ class TopView:
         if self._acting:
             painter.arrow(spot - 1.25 * self._wind[i], self._wind[i], ink.CYAN)
             painter.arrow(spot, self._force[i], ink.VIOLET)
-        metres = _round_length(0.22 * width / unit)
+        longest = 0.22 * width / unit  # of 1, 2, 5 times a power of ten
+        power = 10.0 ** math.floor(math.log10(longest))
+        metres = max(power * factor for factor in (1.0, 2.0, 5.0) if power * factor <= longest)
         painter.box(x + width - 60 - unit * metres, y + 18, unit * metres, 2, ink.GREY)
         painter.text(x + width - 60, y + 4, f"{metres:g} m", size=12, colour=ink.GREY, anchor="ra")
 
@@ -98,9 +100,3 @@ def _arrows(vectors: Array, of_flight: Array) -> Array:
     longest = max(float(np.linalg.norm(of_flight[:, :2], axis=1).max()), 1e-9)
     arrows: Array = vectors[:, :2] * (1.0, -1.0) * (_LONGEST_ARROW / longest)
     return arrows
-
-
-def _round_length(length: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is no longer than a length."""
-    power = 10.0 ** math.floor(math.log10(length))
-    return max(power * factor for factor in (1.0, 2.0, 5.0) if power * factor <= length)

@@ -54,7 +54,12 @@ def _encode(run: Run, path: Path) -> bytes:
     import rerun as rr
     import rerun.blueprint as rrb
 
-    recording = rr.RecordingStream(f"quadsim {run.name}", recording_id=_identity(run), send_properties=False)
+    digest = hashlib.sha256(repr((run.vehicle, run.limits)).encode())
+    for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    # the viewer merges recordings that share an identity
+    identity = f"{run.name}-{digest.hexdigest()[:16]}"
+    recording = rr.RecordingStream(f"quadsim {run.name}", recording_id=identity, send_properties=False)
     if not rr.is_enabled(recording):
         raise OutputError(path, "rerun is switched off by the environment variable RERUN")
     memory = recording.memory_recording()
@@ -80,14 +85,6 @@ def _encode(run: Run, path: Path) -> bytes:
     finally:
         rr.set_strict_mode(strict)
         recording.disconnect()
-
-
-def _identity(run: Run) -> str:
-    """The same for equal flights and different for others: the viewer merges recordings that share it."""
-    digest = hashlib.sha256(repr((run.vehicle, run.limits)).encode())
-    for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return f"{run.name}-{digest.hexdigest()[:16]}"
 
 
 def viewer_problem() -> str | None:

@@ -158,16 +158,11 @@ def _gathered(density: Array) -> tuple[Array, Array, Array]:
     return read_only(density), read_only(0.5 * (N @ density + density @ N.T)), read_only(N @ density @ N.T / 3.0)
 
 
-def _blocks() -> tuple[Array, Array, Array]:
-    retained, variance, walk = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
-    retained[VELOCITY] = retained[RATES] = 0.0
-    variance[VELOCITY], variance[RATES] = STILL_VELOCITY**2, STILL_RATE**2
-    walk[POSITION], walk[ATTITUDE] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
-    return read_only(np.outer(retained, retained)), read_only(np.diag(variance)), read_only(np.diag(walk))
-
-
-_RETAINED, _VARIANCE, _WALK = _blocks()
-"""(15, 15) each: 1 where neither velocity nor rates have a part and else 0; their variance; the growth of the rest."""
+_RETAINED, _VARIANCE, _WALK = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
+"""1 where neither velocity nor rates have a part and else 0; their variance; the growth of the rest."""
+_RETAINED[VELOCITY] = _RETAINED[RATES] = 0.0
+_VARIANCE[VELOCITY], _VARIANCE[RATES] = STILL_VELOCITY**2, STILL_RATE**2
+_WALK[POSITION], _WALK[ATTITUDE] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
 
 
 def lifts(model: MotionModel, driven: Drive) -> bool:
@@ -179,6 +174,6 @@ def stand(model: MotionModel, estimate: Estimate, duration: float) -> Estimate:
     """The estimate a time h [s] later of a vehicle that stands; its velocity and rates are not used."""
     mean = estimate.mean.copy()
     mean[VELOCITY] = mean[MEAN_RATES] = 0.0
-    covariance = _RETAINED * estimate.covariance + _VARIANCE + duration * _WALK
+    covariance = np.outer(_RETAINED, _RETAINED) * estimate.covariance + np.diag(_VARIANCE + duration * _WALK)
     covariance[GYRO_BIAS, GYRO_BIAS] += duration * model.noise[0][GYRO_BIAS, GYRO_BIAS]
     return Estimate(mean=mean, covariance=covariance)
