@@ -29,9 +29,6 @@ import numpy as np
 from quadsim.errors import FileError, OutputError, ViewerUnavailableError
 from quadsim.flight.rundir import Run
 from quadsim.outputs import writing_file
-from quadsim.report.recording.plots import send_plots, send_texts
-from quadsim.report.recording.style import TIMELINE
-from quadsim.report.recording.world import scene_views, send_airframe, send_scene, send_space
 
 _CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
 _VIEWER: Final = (sys.executable, "-P", "-c", _CALL, "--bind=127.0.0.1", "--port=auto")
@@ -53,6 +50,10 @@ def _encode(run: Run, path: Path) -> bytes:
     """The file's content, made in memory: rerun's own file writer hides from Python why it failed."""
     import rerun as rr
     import rerun.blueprint as rrb
+
+    from quadsim.report.recording.plots import send_plots, send_texts
+    from quadsim.report.recording.style import TIMELINE
+    from quadsim.report.recording.world import scene_views, send_airframe, send_scene, send_space
 
     digest = hashlib.sha256(repr((run.vehicle, run.limits)).encode())
     for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
 from quadsim.controller import OPTIMAL, Phase
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
@@ -37,17 +39,11 @@ from quadsim.report.table import to_markdown
 from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
-if TYPE_CHECKING:
-    import rerun as rr
-    import rerun.blueprint as rrb
-
 _ACTIVE: Final = 0.002  # A limit is active where its margin is below this fraction of the allowed band
 
 
 def send_plots(recording: rr.RecordingStream, run: Run) -> rrb.Tabs:
     """All that is shown over time, at the log rate where it exists between the control samples; the views of it."""
-    import rerun.blueprint as rrb
-
     signals, events = _send_signals(recording, run), rrb.TextLogView(name="Events", origin="/events")
     margins, effects = _send_limits(recording, run), _send_effects(recording, run)
     times, *solver = _send_solver(recording, run)
@@ -108,8 +104,6 @@ def _send_limits(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeries
 
 
 def _send_limit(recording: rr.RecordingStream, limit: Limit, run: Run, colour: Colour) -> None:
-    import rerun as rr
-
     t, margins = run.log.control.t, margins_sampled(limit, run.log)
     inside = np.isfinite(margins)
     if not inside.any():
@@ -177,8 +171,6 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     Changes of the status, of who answers and of the phase; why the first QP without an answer had none; when permanent
     fallback begins; the flight's events and its end.
     """
-    import rerun as rr
-
     log, summary = run.log.control, run.summary
     found, periods = summary.get("diagnosis") or {}, unrecovered(log)
     answers = list(zip(log.status, log.answered_by, log.fallback.tolist(), strict=True))
@@ -222,8 +214,6 @@ def _send_curves(
     stepped: bool = False,
 ) -> None:
     """One curve per column of `values` (len(t),) or (len(t), j), at times `t` [s]; nothing where there is no row."""
-    import rerun as rr
-
     if not t.size:
         return
     style = rr.SeriesLines(
@@ -241,9 +231,6 @@ def _view(
     title: str, contents: Sequence[str], run: Run, *, ends: tuple[float, float] | None = None
 ) -> rrb.TimeSeriesView:
     """Curves over the whole flight, and the legend to their right; `ends` of the vertical axis."""
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     first, last = (rr.TimeRangeBoundary.absolute(seconds=seconds) for seconds in (0.0, 1.4 * max(run.end, 1e-3)))
     return rrb.TimeSeriesView(
         name=title,

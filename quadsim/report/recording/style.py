@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import rerun as rr
 
 from quadsim.flight.audit import SIGNALS
+from quadsim.flight.log import FlightLog
 from quadsim.report.curves import line_colour
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
-
-if TYPE_CHECKING:
-    import rerun as rr
-
-    from quadsim.flight.log import FlightLog
 
 TIMELINE: Final = "sim_time"
 
@@ -76,6 +74,4 @@ VERDICTS: Final = {
 
 def time_column(t: Array) -> rr.TimeColumn:
     """Instants [s] on the recording's one timeline."""
-    import rerun as rr
-
     return rr.TimeColumn(TIMELINE, duration=t)

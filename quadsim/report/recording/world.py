@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
 from quadsim.controller import Phase
 from quadsim.flight.rundir import Run
@@ -19,10 +21,6 @@ from quadsim.space import Solid
 from quadsim.state import EULER, POSITION, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-if TYPE_CHECKING:
-    import rerun as rr
-    import rerun.blueprint as rrb
-
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
 _WIND_LENGTH: Final = 1.5  # how long a flight's strongest wind is drawn, in arm lengths
@@ -30,8 +28,6 @@ _WIND_LENGTH: Final = 1.5  # how long a flight's strongest wind is drawn, in arm
 
 def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
     """The vehicle as films show it, in its body frame, but for rotor discs in the colours of the plots."""
-    import rerun as rr
-
     model = compile_model(vehicle, visuals=True)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -52,8 +48,6 @@ def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
 
 def _part(solid: Solid, colour: Any) -> rr.AsComponents:
     """A solid, or an ellipsoid of half axes `size`."""
-    import rerun as rr
-
     a, b, _ = solid.size
     turned = {"quaternions": _vector_first(solid.quaternion)[None], "colors": colour, "fill_mode": "solid"}
     centres: Any = [solid.centre]
@@ -71,8 +65,6 @@ def _part(solid: Solid, colour: Any) -> rr.AsComponents:
 
 def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     """Axes and paths, how the vehicle moves through them, and what the controller predicts."""
-    import rerun as rr
-
     control, plant = run.log.control, run.log.plant
     position = plant.state[:, POSITION]
     thickness = min(0.02, 0.06 * run.vehicle.arm_length)
@@ -119,8 +111,6 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
 
 def send_space(recording: rr.RecordingStream, run: Run) -> None:
     """Obstacles, which move where they do, and regions, which are there while they hold."""
-    import rerun as rr
-
     for obstacle in obstacles_in(run.limits):
         entity = f"world/obstacles/{obstacle.name}"
         for i, solid in enumerate(obstacle.solids):
@@ -141,8 +131,6 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
 
 def scene_views(run: Run) -> rrb.Vertical:
     """Course and vehicle in space, and the summary."""
-    import rerun.blueprint as rrb
-
     behind = run.vehicle.arm_length * np.array([-3.0, -3.5, 2.2])
     return rrb.Vertical(
         _view("Course", "/world", *_overview(run)),
@@ -169,8 +157,6 @@ def _overview(run: Run) -> tuple[Array, Array]:
 
 def _view(name: str, origin: str, eye: Array, target: Array) -> rrb.Spatial3DView:
     """The scene seen from a point at rest in the frame of `origin`, and the ground, in the frame of the world."""
-    import rerun.blueprint as rrb
-
     start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     return rrb.Spatial3DView(
         name=name,
@@ -186,8 +172,6 @@ def _send_arrows(
     recording: rr.RecordingStream, run: Run, name: str, vectors: Array, colour: Colour, *, behind: float
 ) -> None:
     """Arrows (M, 3) above the rotor discs that move with the vehicle, begun by `behind` of their length before it."""
-    import rerun as rr
-
     entity, unit = f"world/vehicle/{name}", run.vehicle.arm_length / DRAWN_ARM
     recording.log(entity, rr.Arrows3D.from_fields(radii=0.01 * unit, colors=colour), static=True)
     origins = np.array([0.0, 0.0, 0.08 * unit]) - behind * vectors
@@ -203,8 +187,6 @@ def _log_lines(
     strips: Sequence[Array] | None = None,
 ) -> None:
     """Lines that stay, or the look alone of lines to come; `width` in points on the screen."""
-    import rerun as rr
-
     look = rr.LineStrips3D.from_fields(strips=strips, radii=rr.Radius.ui_points(width), colors=colour)
     recording.log(entity, look, static=True)
 
