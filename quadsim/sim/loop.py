@@ -221,10 +221,7 @@ class ClosedLoop:
         return self._observed
 
     def step(self, command: Command | None = None) -> Sample:
-        """Fly one control period.
-
-        Args:
-            command: held instead of the controller's answer, which is not called then.
+        """Fly one control period, with a command that is held instead of asking the controller, where one is given.
 
         Raises:
             FlightError: the flight has ended in this period, which is not part of it.

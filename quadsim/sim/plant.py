@@ -149,11 +149,7 @@ class Plant:
         return self._speeds.copy()
 
     def reset(self, state: Array, speeds: Array | None = None) -> None:
-        """Put the vehicle at a state at time zero, and everything that acts on it back to its start.
-
-        Args:
-            state: (12,).
-            speeds: (4,) rotor speeds [rad/s]; hover where absent.
+        """Put the vehicle at a state (12,) at time zero, at rotor speeds (4,) [rad/s] or hover, and all else to its start.
 
         Raises:
             ParameterError: the state is not 12 finite numbers.
@@ -211,11 +207,7 @@ class Plant:
         return np.clip(speeds, *self._speed_range)
 
     def advance(self, speeds: Array, steps: int) -> Segment:
-        """Hold a command for a number of physics steps.
-
-        Args:
-            speeds: (4,) commanded rotor speeds [rad/s].
-            steps: physics steps, at least 1.
+        """Hold commanded rotor speeds (4,) [rad/s] for a number of physics steps, at least 1.
 
         Raises:
             CommandError: the command is not four finite numbers; nothing moved.
