@@ -149,7 +149,7 @@ class Plant:
         return self._speeds.copy()
 
     def reset(self, state: Array, speeds: Array | None = None) -> None:
-        """Put the vehicle at a state (12,) at time zero, at rotor speeds (4,) [rad/s] or hover, and all else to its start.
+        """Put the vehicle at a state (12,) at time zero, at rotor speeds (4,) or hover [rad/s], all else to its start.
 
         Raises:
             ParameterError: the state is not 12 finite numbers.
