@@ -87,21 +87,33 @@ class Sampler:
         count = len(rows)
         if not count:
             return []
-        taken = range(first + begin, first + len(physics), self._stride)
+        taken = np.arange(first + begin, first + len(physics), self._stride)
         errors = self._walk(count) + self._draw_noise(count) + 0.0  # which leaves no -0
         lost = self._of_dropout.random(count) < self.sensor.dropout
-        if self._faults:
-            steps = np.array(taken, dtype=np.int64)
-            values = self._measure(rows, errors + self._offset(steps))
-            lost |= self._befallen(FaultKind.DROPOUT, steps)
-            self._freeze(values, lost, self._befallen(FaultKind.FREEZE, steps))
-            self._blank(values, steps)
-        else:
-            values = self._measure(rows, errors)
+        befallen = [(fault, _within(taken, window)) for fault, window in self._faults]
+        offset, frozen = np.zeros((count, 3)), np.zeros(count, dtype=bool)
+        for fault, held in befallen:
+            match fault.kind:
+                case FaultKind.BIAS:
+                    offset[held] += fault.offset
+                case FaultKind.DROPOUT:
+                    lost |= held
+                case FaultKind.FREEZE:
+                    frozen |= held
+        values = self._measure(rows, errors + offset)
+        if befallen:
+            for value, gone, stuck in zip(values, lost, frozen, strict=True):
+                if stuck and self._through is not None:
+                    value[:] = self._through
+                elif not gone:
+                    self._through = value.copy()
+        for fault, held in befallen:
+            if fault.kind is FaultKind.NAN:
+                values[np.ix_(np.flatnonzero(held), np.array(fault.axes))] = np.nan
         name, latency = self.sensor.name, self._latency
         return [
             Sample(name, step, step + latency, value)
-            for step, value, gone in zip(taken, values, lost.tolist(), strict=True)
+            for step, value, gone in zip(taken.tolist(), values, lost.tolist(), strict=True)
             if not gone
         ]
 
@@ -132,33 +144,6 @@ class Sampler:
             for (w, x, y, z), (a, b, c) in zip(rows[:, _COLUMNS[name]].tolist(), errors.tolist(), strict=True)
         ]
         return quaternion_to_euler(np.array(turned))
-
-    def _befallen(self, kind: FaultKind, taken: Steps) -> Flags:
-        """(count,) whether a fault of a kind holds at these steps."""
-        held = np.zeros(len(taken), dtype=bool)
-        for fault, window in self._faults:
-            if fault.kind is kind:
-                held |= _within(taken, window)
-        return held
-
-    def _offset(self, taken: Steps) -> Array:
-        offset = np.zeros((len(taken), 3))
-        for fault, window in self._faults:
-            if fault.kind is FaultKind.BIAS:
-                offset[_within(taken, window)] += fault.offset
-        return offset
-
-    def _freeze(self, values: Array, lost: Flags, frozen: Flags) -> None:
-        for value, gone, held in zip(values, lost, frozen, strict=True):
-            if held and self._through is not None:
-                value[:] = self._through
-            elif not gone:
-                self._through = value.copy()
-
-    def _blank(self, values: Array, taken: Steps) -> None:
-        for fault, window in self._faults:
-            if fault.kind is FaultKind.NAN:
-                values[np.ix_(np.flatnonzero(_within(taken, window)), np.array(fault.axes))] = np.nan
 
 
 def _within(taken: Steps, window: tuple[int, int | None]) -> Flags:
