@@ -51,7 +51,6 @@ class Band:
     high: Array
     colour: str
     label: str = ""
-    group: str = ""
     opacity: float = 0.25
 
 

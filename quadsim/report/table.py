@@ -88,9 +88,9 @@ def _markdown(head: Sequence[str], names: int, lines: Sequence[Sequence[Cell]]) 
     return "".join("| " + " | ".join(printable(text).replace("|", r"\|") for text in row) + " |\n" for row in table)
 
 
-def section(grid: Grid, level: int = 2) -> str:
+def section(grid: Grid) -> str:
     """A grid under its title, with its note, as Markdown."""
-    return f"{level * '#'} {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
+    return f"## {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
 
 
 def format_number(value: float | None) -> str:

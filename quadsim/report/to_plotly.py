@@ -147,9 +147,7 @@ def _draw_panel(canvas: Canvas, panel: Panel, place: dict[str, int], points: int
     for band in panel.bands:
         x, y = np.concatenate([band.x, band.x[::-1]]), np.concatenate([band.high, band.low[::-1]])
         look = {"fill": "toself", "fillcolor": band.colour, "opacity": band.opacity, "line": {"width": 0}}
-        canvas.add_trace(
-            Scatter(x=x, y=y, mode="lines", hoverinfo="skip", legendgroup=band.group or None, **look), **place
-        )
+        canvas.add_trace(Scatter(x=x, y=y, mode="lines", hoverinfo="skip", **look), **place)
     for series in panel.series:
         _draw_series(canvas, series, place, points)
     line = {"color": BOUND, "width": 1.4, "dash": "dash"}
