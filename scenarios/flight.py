@@ -495,7 +495,7 @@ def _add_products(flight: Flight, directory: Path, outputs: Outputs, progress: P
             progress("recording", 0, 1)
             write_recording(run, folder / rundir.RECORDING_FILE)
         progress("recording", 1, 1)
-    if outputs.figures is not False and flown:
+    if outputs.figures is not False and flown and (not interrupted or flight.log.interrupted):
         with product(rundir.FIGURES_DIR, outputs.figures) as folder:
             from quadsim.report.flight_figures import write_figures
 
