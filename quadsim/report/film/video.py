@@ -90,15 +90,8 @@ def render_video(
 ) -> None:
     """Film a run as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all.
 
-    Args:
-        run_directory: a run with its summary and Parquet files.
-        path: the MP4 to write.
-        workers: rendering processes, at most; the machine's cores when None.
-        progress: called with frames done and frames in all, in the caller's thread.
-        width: [pixels], even.
-        height: [pixels], even.
-        fps: frames per second.
-        overwrite: whether to replace a file that is there.
+    Width and height are even [pixels].  `workers` is how many processes render, at most; the machine's cores when None.
+    `progress` is called with frames done and frames in all, in the caller's thread.
 
     Raises:
         FileError: the run cannot be read, or holds nothing to film.
