@@ -56,36 +56,23 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "scenarios.api": (
-        "check",
-        "compare",
-        "feasibility",
-        "film",
-        "fitting",
-        "fly",
-        "load",
-        "make_controller",
-        "read",
-        "resolve",
-        "start",
-        "view",
-    ),
-    "scenarios.catalogue": ("Catalogue", "LibraryScenario", "catalogue", "scenarios"),
-    "scenarios.export.exporter": ("export",),
-    "scenarios.export.in_the_loop": ("fly_exported",),
-    "scenarios.flight": ("Flight",),
-    "scenarios.junit": ("write_junit",),
-    "scenarios.many_flights": ("campaign", "replay", "reproduce", "sweep", "tune"),
-    "scenarios.run": ("StartedFlight",),
-    "scenarios.schema.json_schema": ("scenario_schema",),
-    "scenarios.schema.scenario": ("Scenario",),
-    "scenarios.self_check": ("doctor",),
-    "scenarios.vehicles": ("draw_vehicle", "first_scenario", "load_vehicle", "vehicle_report", "vehicle_template"),
-    "quadsim.controller": ("Command", "Moment"),
-    "quadsim.errors": ("QuadsimError",),
-    "quadsim.vehicle": ("Vehicle",),
+    "scenarios.api": "check compare feasibility film fitting fly load make_controller read resolve start view",
+    "scenarios.catalogue": "Catalogue LibraryScenario catalogue scenarios",
+    "scenarios.export.exporter": "export",
+    "scenarios.export.in_the_loop": "fly_exported",
+    "scenarios.flight": "Flight",
+    "scenarios.junit": "write_junit",
+    "scenarios.many_flights": "campaign replay reproduce sweep tune",
+    "scenarios.run": "StartedFlight",
+    "scenarios.schema.json_schema": "scenario_schema",
+    "scenarios.schema.scenario": "Scenario",
+    "scenarios.self_check": "doctor",
+    "scenarios.vehicles": "draw_vehicle first_scenario load_vehicle vehicle_report vehicle_template",
+    "quadsim.controller": "Command Moment",
+    "quadsim.errors": "QuadsimError",
+    "quadsim.vehicle": "Vehicle",
 }
-_PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
+_PUBLIC = {name: module for module, names in _MODULES.items() for name in names.split()}
 __all__ = [*_PUBLIC]
 
 

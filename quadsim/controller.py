@@ -89,14 +89,7 @@ class InnerLoop(Protocol):
         ...
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
-        """The rotor speeds to hold until the next call (4,) [rad/s].
-
-        Args:
-            time: when it is [s].
-            commanded: (4,) command in force [rad/s].
-            rates: (3,) true body rates [rad/s].
-            rotors: (4,) true rotor speeds [rad/s].
-        """
+        """The rotor speeds (4,) to hold until the next call; all speeds in rad/s, `rates` (3,) the true body rates."""
         ...
 
 
@@ -199,12 +192,9 @@ class Controller(Protocol):
         ...
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """The command for the period that starts now.
+        """The command for the period that starts now, of a measured state xi(k) (12,).
 
-        Args:
-            now: when it is, and where the flight stands.
-            state: (12,) measured state xi(k).
-            reference: (N, 4) filtered x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.
+        The reference (N, 4) is filtered x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.
 
         Raises:
             FlightError: no command can be given.

@@ -20,12 +20,7 @@ _HIDDEN: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 
 
 def printable(text: str, *, keep: str = "") -> str:
-    r"""A text with every character that steers a terminal written as an escape, e.g. `\x1b`.
-
-    Args:
-        text: any text, also one that no file can hold.
-        keep: such characters that stay.
-    """
+    r"""A text with each character that steers a terminal as an escape, e.g. `\x1b`, but for those to `keep`."""
     if text.isprintable():
         return text
     return "".join(
@@ -60,11 +55,8 @@ class InputError(QuadsimError, ValueError):
 class ParameterError(InputError):
     """A parameter is outside what is allowed.
 
-    Attributes:
-        owner: the thing the parameter belongs to, e.g. `vehicle`; empty for an option of the command line.
-        name: the parameter.
-        value: what was given.
-        rule: what is allowed, as the end of "must be ...".
+    The owner is what it belongs to, e.g. `vehicle`, empty for an option of the command line; the rule is the end of
+    "must be ...".
     """
 
     def __init__(self, owner: str, name: str, value: object, rule: str) -> None:
@@ -73,11 +65,7 @@ class ParameterError(InputError):
 
 
 class ExportError(InputError):
-    """A controller that has no C of its own.
-
-    Attributes:
-        reason: why, as the end of "... cannot be exported: ...".
-    """
+    """A controller that has no C of its own; the reason is the end of "... cannot be exported: ..."."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(f"this scenario's controller cannot be exported: {reason}")
@@ -89,14 +77,9 @@ class CompilerError(InputError):
 
 
 class UnknownNameError(InputError):
-    """A name that is not one of a known set; the message lists the set and the nearest member, or those that are meant.
+    """A name of a kind that is not one of a known set.
 
-    Args:
-        kind: what it was to be a name of.
-        name: what was given.
-        allowed: the set.
-        hint: what to say besides.
-        meant: members of the set that mean the same, however they are spelt.
+    The message lists the set and its nearest member, or those that are `meant`: the same thing, spelt otherwise.
     """
 
     def __init__(self, kind: str, name: str, allowed: Iterable[str], hint: str = "", meant: Sequence[str] = ()) -> None:
@@ -157,11 +140,7 @@ class ViewerUnavailableError(QuadsimError):
 
 
 class FlightError(QuadsimError):
-    """Something that ends a flight; it becomes the flight's recorded reason.
-
-    Attributes:
-        time: simulated time [s] at which it happened.
-    """
+    """Something that ends a flight at a simulated time [s]; it becomes the flight's recorded reason."""
 
     exit_status = 1
 
@@ -175,13 +154,7 @@ class DivergenceError(FlightError):
 
 
 class LostError(FlightError):
-    """The vehicle is beyond one of the flight's loss criteria.
-
-    Attributes:
-        criterion: which, e.g. `tilt`; see `quadsim.flight.lost.CRITERIA`.
-        value: what it was, in the criterion's unit.
-        limit: what it may be.
-    """
+    """The vehicle is beyond one of the flight's loss criteria; see `quadsim.sim.phase.CRITERIA`."""
 
     def __init__(self, criterion: str, quantity: str, unit: str, *, value: float, limit: float, time: float) -> None:
         message = f"lost: {quantity} {value:.5g} {unit}, beyond lost.{criterion} = {limit:g} {unit}"
@@ -202,11 +175,7 @@ class PlanExhaustedError(FlightError):
 
 
 class RaisedError(FlightError):
-    """The controller or a force raised something, or asked Python to exit.
-
-    Attributes:
-        traceback: its last lines.
-    """
+    """The controller or a force raised something, or asked Python to exit; `traceback` has its last lines."""
 
     def __init__(self, what: str, error: BaseException, *, time: float) -> None:
         lines = "".join(traceback.format_exception(error)).splitlines()

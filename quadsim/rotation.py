@@ -28,12 +28,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion: ...
 @overload
 def multiply(a: Array, b: Array) -> Array: ...
 def multiply(a: Any, b: Any) -> Any:
-    """Hamilton's product: the rotation b, then, in the frame that b leads to, a: body to world of both.
-
-    Args:
-        a: a tuple of plain numbers, or (..., 4).
-        b: the same.
-    """
+    """Hamilton's product of tuples of plain numbers or (..., 4): the rotation b, then, in the frame it leads to, a."""
     if isinstance(a, tuple):
         return _product(a, b)
     return np.stack(_product(np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)), axis=-1)
@@ -83,20 +78,15 @@ def logarithm(q: Quaternion) -> Vector:
 
 
 def quaternion_to_euler(quaternion: Array) -> Array:
-    """Roll, pitch, yaw [rad] of unit quaternions.
+    """Roll, pitch, yaw (..., 3) [rad] of unit quaternions (..., 4), scalar first, body to world.
 
-    Args:
-        quaternion: (..., 4), scalar first (w, x, y, z), body to world.
-
-    Returns:
-        (..., 3): roll and yaw in [-pi, pi], pitch in [-pi/2, pi/2].
+    Roll and yaw are in [-pi, pi], pitch in [-pi/2, pi/2].
     """
-    w, x, y, z = _entries(quaternion)
-    euler = np.empty((*x.shape, 3))
-    euler[..., 0] = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    euler[..., 1] = np.arcsin(np.minimum(np.maximum(2.0 * (w * y - z * x), -1.0), 1.0))
-    euler[..., 2] = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    return euler
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(np.minimum(np.maximum(2.0 * (w * y - z * x), -1.0), 1.0))
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return np.stack([roll, pitch, yaw], axis=-1)
 
 
 def euler_to_quaternion(euler: Array) -> Array:
@@ -129,15 +119,12 @@ def body_to_euler_rates(euler: Array, body_rates: Array) -> Array:
     result grows without bound.  The paper (Sec. 2.2) takes the two sets of rates as equal, which holds at small
     angles only.
     """
-    roll, pitch, _ = _entries(euler)
-    p, q, r = _entries(body_rates)
+    roll, pitch, _ = np.moveaxis(euler, -1, 0)
+    p, q, r = np.moveaxis(body_rates, -1, 0)
     sin_roll, cos_roll = np.sin(roll), np.cos(roll)
     lateral = q * sin_roll + r * cos_roll
-    rates = np.empty((*lateral.shape, 3))
-    rates[..., 0] = p + lateral * np.tan(pitch)
-    rates[..., 1] = q * cos_roll - r * sin_roll
-    rates[..., 2] = lateral / np.cos(pitch)
-    return rates
+    rates = [p + lateral * np.tan(pitch), q * cos_roll - r * sin_roll, lateral / np.cos(pitch)]
+    return np.stack(rates, axis=-1)
 
 
 def euler_to_body_rates(euler: Array, euler_rates: Array) -> Array:
@@ -172,9 +159,3 @@ def body_to_world(euler: Array) -> Array:
         [-sp, cp * sr, cp * cr],
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _entries(vectors: Array) -> tuple[Array, ...]:
-    """The entries of vectors (..., m), each of shape (...)."""
-    array = np.asarray(vectors, float)
-    return tuple([array[..., i] for i in range(array.shape[-1])])

@@ -158,9 +158,7 @@ class Obstacle:
 
     def clearances(self, t: Array, points: Array) -> tuple[Array, Array]:
         """Signed distance (s, K) [m] of points (K, 3) at times (K,) to each of its s solids, and normals (s, K, 3)."""
-        relative = points - self.positions(t)
-        found = [solid.clearance(relative) for solid in self.solids]
-        return np.stack([distance for distance, _ in found]), np.stack([normal for _, normal in found])
+        return Solids([self]).clearances(t, points)
 
     def clearance(self, t: Array, points: Array) -> Array:
         """(K,) signed distance [m]; inside a wall, whose solids overlap, at most that deep."""

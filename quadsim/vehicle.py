@@ -192,11 +192,9 @@ class Vehicle:
 
 
 def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehicle:
-    """Read a vehicle file.
+    """Read a vehicle file: `name`, `description` and one table `{value, unit, source}` per parameter.
 
-    Args:
-        path: a TOML file with `name`, `description` and one table `{value, unit, source}` per parameter.
-        overrides: parameter values that replace the file's.
+    `overrides` are parameter values that replace the file's.
 
     Raises:
         FileError: the file is missing, is not TOML, or lacks or misnames a parameter.

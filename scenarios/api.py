@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from quadsim.controller import Controller
 from quadsim.errors import FileError, InputError, ParameterError
 from quadsim.flight import rundir
-from quadsim.flight.summary import require_inside
+from quadsim.flight.summary import finding_from_json, require_inside
 from quadsim.outputs import absolute, adding
 from quadsim.sim.effects import Force
 from quadsim.vehicle import Vehicle
@@ -282,7 +282,7 @@ def read(directory: str | Path) -> Flight:
         scenario=stored_scenario(directory),
         vehicle=Vehicle(**run.summary["vehicle"]),
         log=run.log,
-        findings=tuple(rundir.finding_from_json(entry) for entry in run.summary["constraints"]),
+        findings=tuple(finding_from_json(entry) for entry in run.summary["constraints"]),
         controller=law["name"],
         solver=law["solver"],
         simulate_s=run.summary["wall_s"]["simulate"],

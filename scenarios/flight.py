@@ -22,6 +22,7 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import HELD, SIGNALS, Finding, margins_at, margins_sampled
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import log_tables, write_log
+from quadsim.flight.summary import limit_to_json
 from quadsim.outputs import absolute, adding, amend, to_json, writing
 from quadsim.sim.airframe import outline
 from quadsim.sim.estimation.filter import Tally
@@ -31,7 +32,7 @@ from quadsim.vehicle import Vehicle
 from scenarios.courses.feasibility_check import report
 from scenarios.courses.make import build_course_steps
 from scenarios.limits import audit_notes
-from scenarios.machine import machine, usable_cores, versions
+from scenarios.machine import machine, versions
 from scenarios.parts.effects import build_computation
 from scenarios.parts.story import story
 from scenarios.parts.vehicle import build_actual
@@ -432,7 +433,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "course": asdict(report(scenario, flight.vehicle)),
         **({"events": events} if (events := story(scenario, log.control.t.size * scenario.control_period)) else {}),
         "tracking": numbers["tracking"],
-        "constraints": [rundir.limit_to_json(finding) for finding in flight.findings],
+        "constraints": [limit_to_json(finding) for finding in flight.findings],
         "audit_notes": audit_notes(scenario),
         "control": numbers["control"],
         "diagnosis": flight.diagnosis,
@@ -487,26 +488,20 @@ def _add_products(flight: Flight, directory: Path, outputs: Outputs, progress: P
         amend(directory, {"products": {name: problem}})
         _log.warning("%s %s", name, problem)
 
-    with contextlib.ExitStack() as beside:
-        if outputs.recording is not False:
-            from quadsim.report.recording import recording_in_background, write_recording
+    if outputs.recording is not False:
+        with product(rundir.RECORDING_FILE, outputs.recording) as folder:
+            from quadsim.report.recording import write_recording
 
             progress("recording", 0, 1)
-            if outputs.figures is not False and flown and usable_cores() > 1:  # while the figures are drawn
-                folder = beside.enter_context(product(rundir.RECORDING_FILE, outputs.recording))
-                beside.enter_context(recording_in_background(directory, folder / rundir.RECORDING_FILE))
-            else:
-                with product(rundir.RECORDING_FILE, outputs.recording) as folder:
-                    write_recording(run, folder / rundir.RECORDING_FILE)
-        if outputs.figures is not False and flown:
-            with product(rundir.FIGURES_DIR, outputs.figures) as folder:
-                from quadsim.report.flight_figures import write_figures
-
-                progress("figures", 0, 1)
-                write_figures(run, folder / rundir.FIGURES_DIR)
-                progress("figures", 1, 1)
-    if outputs.recording is not False:
+            write_recording(run, folder / rundir.RECORDING_FILE)
         progress("recording", 1, 1)
+    if outputs.figures is not False and flown and (not interrupted or flight.log.interrupted):
+        with product(rundir.FIGURES_DIR, outputs.figures) as folder:
+            from quadsim.report.flight_figures import write_figures
+
+            progress("figures", 0, 1)
+            write_figures(run, folder / rundir.FIGURES_DIR)
+            progress("figures", 1, 1)
     if outputs.video is not False and flown and not interrupted:
         with product(rundir.VIDEO_FILE, outputs.video) as folder:
             from quadsim.report.film.video import render_video

@@ -22,7 +22,7 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
-from quadsim.flight.summary import constraint_verdict
+from quadsim.flight.summary import constraint_verdict, limit_to_json
 from quadsim.report.comparison import verdict
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
@@ -59,7 +59,7 @@ class Reaudit:
 
     def to_json(self) -> dict[str, Any]:
         """The audit made again, for `quadsim check --json`."""
-        entries = [rundir.limit_to_json(finding) for finding in self.findings]
+        entries = [limit_to_json(finding) for finding in self.findings]
         return {"rate": self.rate, "satisfied": self.satisfied, "constraints": entries, "notes": list(self.notes)}
 
 
@@ -263,7 +263,7 @@ def _constraint_differences(
     entry: Mapping[str, Any], finding: Finding, scenario: Scenario, log: FlightLog
 ) -> Iterator[str]:
     """Where a summary differs from the tables in one constraint."""
-    again = rundir.limit_to_json(finding)
+    again = limit_to_json(finding)
     recorded = {"terms": None, "shape": None, "radius": None, **entry}
     for key in _DEMANDS:
         if recorded[key] != again.get(key):

@@ -21,7 +21,9 @@ MPC_MAY_IMPORT = {
     f"quadsim.{name}" for name in ("vehicle", "state", "rotation", "errors", "fields", "controller", "motion", "space")
 }  # fmt: skip
 RENDER_WORKER = "quadsim.report.film.render_worker"
-"""Only ever run as a child process, so it alone may import at its top what is heavy."""
+"""Only ever run as a child process, so it may import at its top what is heavy."""
+RECORDING = re.compile(r"quadsim\.report\.recording\.(plots|style|world)")
+"""Imported when a recording is made, and so may import rerun at their top."""
 FOR_DRAWING = {
     "matplotlib": r"quadsim\.report\.to_matplotlib",
     "plotly": r"quadsim\.report\.to_plotly",
@@ -148,7 +150,12 @@ def test_controllers_run_without_a_simulator() -> None:
 def test_a_library_for_outputs_is_imported_in_one_room_and_late(library: str, imports: list[Import]) -> None:
     uses = [item for item in imports if item.library == library]
     assert len({item.room for item in uses}) <= 1
-    assert not [item for item in uses if item.at_start and item.importer != RENDER_WORKER]
+    assert not [i for i in uses if i.at_start and i.importer != RENDER_WORKER and not RECORDING.fullmatch(i.importer)]
+
+
+def test_what_records_is_imported_late(imports: list[Import]) -> None:
+    uses = [item for item in imports if RECORDING.fullmatch(item.imported)]
+    assert not [i for i in uses if i.at_start and not RECORDING.fullmatch(i.importer)]
 
 
 @pytest.mark.parametrize("library", FOR_DRAWING)

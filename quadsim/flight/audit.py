@@ -98,13 +98,13 @@ SIGNALS: Final[dict[str, Signal]] = {
 }
 
 
-def _rotor_signal(i: int) -> Signal:
+def _rotor(i: int) -> Signal:
     return Signal(unit="rad/s", sampled=lambda log: log.speeds[:, i], plant=lambda log: log.speeds[:, i])
 
 
 TERMS: Final[dict[str, Signal]] = {
     **{name: SIGNALS[name] for name in STATE_NAMES},
-    **{f"speed_{i + 1}": _rotor_signal(i) for i in range(N_ROTORS)},
+    **{f"speed_{i + 1}": _rotor(i) for i in range(N_ROTORS)},
 }
 """What a sum may have as its terms."""
 SUM: Final = "sum"  # the signal of a limit on a sum of terms
@@ -217,8 +217,7 @@ class SpaceLimit(Limit):
     radius: float  # of the vehicle's bounding ball [m]
 
     def _check_signal(self) -> None:
-        if self.signal != CLEARANCE:
-            raise UnknownNameError("signal", self.signal, [CLEARANCE])
+        """None is to be known: it is a distance."""
 
     @property
     def source(self) -> Signal:
@@ -251,7 +250,8 @@ class Finding:
         """
         if math.isnan(self.worst_time):
             return "incomplete"
-        return "satisfied" if self.deciding_margin >= -self.deciding_tolerance else "violated"  # NaN: violated
+        margin, tolerance = self.deciding
+        return "satisfied" if margin >= -tolerance else "violated"  # NaN: violated
 
     @property
     def satisfied(self) -> bool:
@@ -259,20 +259,20 @@ class Finding:
         return self.verdict == "satisfied"
 
     @property
-    def _at_samples(self) -> bool:
-        """Whether the samples alone violate it."""
-        broken = self.worst_margin_sampled < -self.limit.tolerance_sampled
-        return broken and self.worst_margin >= -self.limit.tolerance
+    def deciding(self) -> tuple[float, float]:
+        """The signed margin that the verdict rests on, at the physics rate unless the samples alone violate the limit.
+
+        With it the tolerance that belongs to it.
+        """
+        sampled, margin = self.worst_margin_sampled, self.worst_margin
+        if sampled < -self.limit.tolerance_sampled and margin >= -self.limit.tolerance:
+            return sampled, self.limit.tolerance_sampled
+        return margin, self.limit.tolerance
 
     @property
     def deciding_margin(self) -> float:
-        """The signed margin that the verdict rests on: at the physics rate, unless the samples alone violate it."""
-        return self.worst_margin_sampled if self._at_samples else self.worst_margin
-
-    @property
-    def deciding_tolerance(self) -> float:
-        """The tolerance that belongs to it."""
-        return self.limit.tolerance_sampled if self._at_samples else self.limit.tolerance
+        """The first of `deciding`."""
+        return self.deciding[0]
 
 
 def margins_sampled(limit: Limit, log: FlightLog) -> Array:
@@ -286,16 +286,11 @@ def margins_at(limit: Limit, t: Array, values: Array) -> Array:
 
 
 def smallest_margins(log: FlightLog, limits: Sequence[Limit]) -> dict[str, float]:
-    """The smallest signed margin of each limit by its name, at the finest rate there is; NaN outside its time window.
-
-    Args:
-        log: of one control period or more; its plant rows at the physics rate.
-        limits: distinct names.
-    """
+    """Smallest signed margin of each limit by its name, at the finest rate there is; NaN outside its time window."""
     return {limit.name: _worst(limit, *limit.source.finest(log))[1] for limit in limits}
 
 
-def audit(log: FlightLog, limits: tuple[Limit, ...]) -> tuple[Finding, ...]:
+def audit(log: FlightLog, limits: Sequence[Limit]) -> tuple[Finding, ...]:
     """Hold a flight, its plant rows at the physics rate, against its limits: one finding for each, in order."""
     return tuple(_find(log, limit) for limit in limits)
 

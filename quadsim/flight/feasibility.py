@@ -132,7 +132,7 @@ def assess(
 
     Args:
         needed: the demand.
-        vehicle: its rotor limits.
+        vehicle: of which the rotor limits count.
         bounds: lower and upper bound by name, a state of `quadsim.state` in SI, `speed` [rad/s] of the rotors or `slew`
             [rad/s per period].
         tightened: what tightening leaves of them at the end of the horizon, of states; looked at where the bounds
@@ -140,6 +140,7 @@ def assess(
         jumps: times [s] at which the course jumps.
     """
     bounds = bounds or {}
+    tilts = [math.degrees(abs(side)) for name in ("roll", "pitch") if name in bounds for side in bounds[name]]
     peaks = {
         "tilt": math.degrees(float(tilt(needed.state).max())),
         "velocity": float(np.linalg.norm(needed.state[:, VELOCITY], axis=1).max()),
@@ -152,7 +153,7 @@ def assess(
         "thrust_min": float(needed.thrusts.min()),
     }
     problems = _problems(needed, vehicle, bounds, tightened or {})
-    sentence = _sentence(peaks, vehicle, bounds, jumps, problems)
+    sentence = _sentence(peaks, vehicle, min(tilts, default=None), jumps, problems)
     return Feasibility(**peaks, jumps=tuple(jumps), problems=problems, sentence=sentence)
 
 
@@ -211,17 +212,16 @@ def _beyond(name: str, unit: str, values: Array, allowed: tuple[float, float], k
 def _sentence(
     peaks: Mapping[str, float],
     vehicle: Vehicle,
-    bounds: Mapping[str, tuple[float, float]],
+    allowed: float | None,
     jumps: Sequence[float],
     problems: Sequence[str],
 ) -> str:
-    tilts = [math.degrees(abs(side)) for name in ("roll", "pitch") if name in bounds for side in bounds[name]]
-    allowed = f" (bound {min(tilts):.4g} deg)" if tilts else ""
+    bound = "" if allowed is None else f" (bound {allowed:.4g} deg)"
     times = ", ".join(f"{time:g}" for time in jumps[:4]) + (", ..." if len(jumps) > 4 else "")
     turned = f", a yaw of {round(peaks['yaw'], 1):g} deg" if peaks["yaw"] > 0.5 else ""
     subject = f"The course steps (at t = {times} s); the rest requires" if jumps else "The course requires"
     sentence = (
-        f"{subject} up to {round(peaks['tilt'], 2):g} deg of tilt{allowed}, "
+        f"{subject} up to {round(peaks['tilt'], 2):g} deg of tilt{bound}, "
         f"{round(peaks['velocity'], 2):g} m/s{turned}, "
         f"and rotor speeds of {peaks['rotor_min']:.4g} to {peaks['rotor_max']:.4g} rad/s "
         f"(limits {vehicle.speed_min:.4g} and {vehicle.speed_max:.4g} rad/s)."

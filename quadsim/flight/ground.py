@@ -27,16 +27,10 @@ class Outline:
 
 
 def clearance(states: Array, points: Array, radius: float, floor: float) -> Array:
-    """How far the lowest of several points stays clear of the floor.
+    """How far the lowest of several points stays clear of the floor, negative inside it.
 
-    Args:
-        states: (M, 12).
-        points: (P, 3) in the body frame [m].
-        radius: of the sphere around each point [m].
-        floor: height of the floor [m].
-
-    Returns:
-        (M,) min over p of (position + R p)_z - radius - floor [m]; negative inside the floor.
+    min over p of (position + R p)_z - radius - floor [m], (M,), of states (M, 12), points (P, 3) in the body frame [m],
+    a sphere's radius around each of them and the floor's height [m].
     """
     down = body_to_world(states[:, EULER])[:, 2, :] @ points.T
     lowest: Array = states[:, INDEX["z"]] + down.min(axis=1) - radius - floor
@@ -49,11 +43,10 @@ def touchdown(t: Array, states: Array, clearances: Array) -> dict[str, float] | 
     Args:
         t: (M,) [s].
         states: (M, 12), at the physics rate: at the log rate the speed is that of up to a log period before.
-        clearances: (M,) of what may meet the ground first [m]; see `clearance`.
+        clearances: (M,) of what may meet the ground first [m].
 
     Returns:
-        Of the last state before: `time` [s], `speed` downwards and `horizontal_speed` [m/s], and `tilt` of the thrust
-        axis from the vertical [deg].
+        Of the last state before: `time` [s], `speed` downwards and `horizontal_speed` [m/s], and `tilt` [deg].
     """
     flown = np.flatnonzero(clearances > AIRBORNE)
     if not flown.size:

@@ -44,16 +44,24 @@ def tracking(log: ControlLog) -> dict[str, Any]:
     """
     state = log.truth[:, REFERENCE_STATES]
     error = state - log.reference
+    distance = np.linalg.norm(error[:, :3], axis=1)
     lowest = np.minimum(log.reference.min(axis=0), state[0])
     highest = np.maximum(log.reference.max(axis=0), state[0])
     beyond = np.maximum((state - highest).max(axis=0), (lowest - state).max(axis=0))
+    by_channel = {
+        "rmse": np.sqrt(np.mean(error**2, axis=0)),
+        "max_error": np.abs(error).max(axis=0),
+        "final_error": error[-1],
+        "overshoot": np.maximum(beyond, 0.0),
+    }
     return {
         "unit": dict(zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)),
-        "rmse": _by_channel(np.sqrt(np.mean(error**2, axis=0))),
-        "max_error": _by_channel(np.abs(error).max(axis=0)),
-        "final_error": _by_channel(error[-1]),
-        "overshoot": _by_channel(np.maximum(beyond, 0.0)),
-        "position_error": _spread(np.linalg.norm(error[:, :3], axis=1)),
+        **{name: dict(zip(REFERENCE_NAMES, values.tolist(), strict=True)) for name, values in by_channel.items()},
+        "position_error": {  # papers often print the mean of the distance as RMSE
+            "mean": float(distance.mean()),
+            "rms": math.sqrt(float(np.mean(np.square(distance)))),
+            "max": float(distance.max()),
+        },
     }
 
 
@@ -65,11 +73,6 @@ def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict
     with a preview moves before the next step, on purpose.  What steps of the other channels disturb does count.  None
     where the output does not settle in that time, the flight ended before it was over, or there is no such time, the
     next step coming into view at once.
-
-    Args:
-        t: (K,) control samples [s].
-        outputs: (K, 4) x, y, z [m], yaw [rad].
-        steps: of the course.
 
     Returns:
         One entry per step, in order: the step's own values, and `settled` [s].
@@ -169,8 +172,7 @@ def estimation(log: ControlLog) -> dict[str, Any]:
     """
     error = log.measured_error
     finite = np.isfinite(error)
-    counted = np.maximum(finite.sum(axis=0), 1)
-    known = np.where(finite, error, 0.0)
+    known, counted = np.where(finite, error, 0.0), np.maximum(finite.sum(axis=0), 1)
     return {
         "unit": dict(zip(STATE_NAMES, STATE_UNITS, strict=True)),
         "rmse": dict(zip(STATE_NAMES, np.sqrt((known**2).sum(axis=0) / counted).tolist(), strict=True)),
@@ -204,13 +206,7 @@ def _largest(residuals: Array) -> dict[str, Any]:
 
 
 def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseStep] = ()) -> dict[str, Any]:
-    """`tracking`, `control` and `controller` of a summary; each is empty when no period was flown.
-
-    Args:
-        log: the flight.
-        deadline_ms: the control period [ms].
-        course: the steps that `tracking.settling` is about.
-    """
+    """`tracking`, `control` and `controller` of a summary; each is empty when no period was flown."""
     if not log.control.t.size:
         return {"tracking": {}, "control": {}, "controller": {}}
     settled = settling(log.control.t, log.control.truth[:, REFERENCE_STATES], course)
@@ -219,16 +215,3 @@ def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseSt
         "control": control(log.control),
         "controller": controller(log.control, log.timing, deadline_ms),
     }
-
-
-def _spread(distances: Array) -> dict[str, float]:
-    """Mean, root mean square and maximum of distances (K,).
-
-    Papers often print the mean of the distance as RMSE; here the two have different names.
-    """
-    rms = math.sqrt(float(np.mean(np.square(distances))))
-    return {"mean": float(distances.mean()), "rms": rms, "max": float(distances.max())}
-
-
-def _by_channel(values: Array) -> dict[str, float]:
-    return dict(zip(REFERENCE_NAMES, values.tolist(), strict=True))

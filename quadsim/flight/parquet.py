@@ -86,16 +86,6 @@ def _table(columns: Iterable[_Column], metadata: Mapping[str, str]) -> pa.Table:
     return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata=dict(metadata)))
 
 
-def _horizon_table(
-    t: pa.Array, predicted: np.ndarray[Any, np.dtype[np.float32]], metadata: Mapping[str, str]
-) -> pa.Table:
-    horizon = predicted.shape[1]
-    lists = (pa.FixedSizeListArray.from_arrays(predicted[:, :, i].ravel(), horizon) for i in range(3))
-    return _table(
-        [("t", "s", t), *((f"predicted_{axis}", "m", a) for axis, a in zip("xyz", lists, strict=True))], metadata
-    )
-
-
 def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, str]) -> dict[str, pa.Table]:
     """A flight's tables `flight`, `timing`, `plant`, and `horizon` where positions were predicted; see `write_log`."""
     control = log.control
@@ -106,8 +96,12 @@ def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, 
         "timing": _table(_columns(log.timing, _TIMING), metadata),
         "plant": _table(_columns(log.plant.every(plant_stride), _PLANT), metadata),
     }
-    if log.predicted is not None:
-        tables["horizon"] = _horizon_table(pa.array(control.t), log.predicted, metadata)
+    if (predicted := log.predicted) is not None:
+        columns: list[_Column] = [("t", "s", pa.array(control.t))]
+        for i, axis in enumerate("xyz"):
+            positions = pa.FixedSizeListArray.from_arrays(predicted[:, :, i].ravel(), predicted.shape[1])
+            columns.append((f"predicted_{axis}", "m", positions))
+        tables["horizon"] = _table(columns, metadata)
     return tables
 
 
@@ -118,12 +112,8 @@ def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: M
     in each file's schema.
     """
     for name, table in log_tables(log, plant_stride=plant_stride, metadata=metadata).items():
-        _write(table, directory / f"{name}.parquet")
-
-
-def _write(table: pa.Table, path: Path) -> None:
-    with path.open("wb") as file:  # Arrow by itself takes no path that is no Unicode
-        pq.write_table(table, file, compression="zstd")
+        with (directory / f"{name}.parquet").open("wb") as file:  # Arrow by itself takes no path that is no Unicode
+            pq.write_table(table, file, compression="zstd")
 
 
 def read_parquet(path: Path) -> pa.Table:
@@ -180,8 +170,13 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
             values["truth"] = values["state"]
         control = ControlLog(**values, speeds_before=before)
         plant_log, timing_log = PlantLog(**_fields(plant, _PLANT)), TimingLog(**_fields(timing, _TIMING))
-        predicted = _read_predicted(directory)
-        _require_whole(control, timing_log, plant_log, predicted)
+        predicted = _read_predicted(directory / HORIZON_FILE)
+        rows = {control.t.size, timing_log.t.size, *(() if predicted is None else (len(predicted),))}
+        if len(rows) > 1 or not plant_log.t.size:
+            raise ValueError("its tables have not as many rows as one another, or none")
+        for t in (control.t, plant_log.t):
+            if not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
+                raise ValueError("t does not increase")
     except FileError:
         raise
     except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
@@ -189,20 +184,7 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
     return FlightLog(control=control, timing=timing_log, plant=plant_log, predicted=predicted, reason=reason)
 
 
-def _require_whole(
-    control: ControlLog, timing: TimingLog, plant: PlantLog, predicted: np.ndarray[Any, np.dtype[np.float32]] | None
-) -> None:
-    """Refuse tables that are not of one flight."""
-    rows = {control.t.size, timing.t.size, *(() if predicted is None else (len(predicted),))}
-    if len(rows) > 1 or not plant.t.size:
-        raise ValueError("its tables have not as many rows as one another, or none")
-    for t in (control.t, plant.t):
-        if not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
-            raise ValueError("t does not increase")
-
-
-def _read_predicted(directory: Path) -> np.ndarray[Any, np.dtype[np.float32]] | None:
-    path = directory / HORIZON_FILE
+def _read_predicted(path: Path) -> np.ndarray[Any, np.dtype[np.float32]] | None:
     if not path.exists():
         return None
     table = read_parquet(path)

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError
-from quadsim.flight.audit import Finding, Limit, SpaceLimit, SumLimit
+from quadsim.flight.audit import Limit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_log
 from quadsim.flight.summary import SUMMARY_FILE as SUMMARY_FILE
+from quadsim.flight.summary import limit_from_json
 from quadsim.flight.summary import read_summary as read_summary
 from quadsim.outputs import file_hashes
-from quadsim.space import shape_from_json, shape_to_json
 from quadsim.vehicle import Vehicle
 
 SCENARIO_FILE: Final = "scenario.toml"
@@ -43,42 +42,6 @@ class Run:
     def end(self) -> float:
         """Last time of the flight [s]."""
         return float(self.log.plant.t[-1])
-
-
-def limit_to_json(finding: Finding) -> dict[str, Any]:
-    """One entry of `constraints` in `summary.json`; an absent bound, or a window the flight never reached, is null."""
-    limit = finding.limit
-    stated = {name: value for name, value in vars(limit).items() if name not in ("name", "signal", "terms", "shape")}
-    found = {name: value for name, value in vars(finding).items() if name != "limit"}
-    return {
-        "name": limit.name,
-        "signal": limit.signal,
-        **({"terms": dict(limit.terms)} if isinstance(limit, SumLimit) else {}),
-        **({"shape": shape_to_json(limit.shape)} if isinstance(limit, SpaceLimit) else {}),
-        "unit": limit.unit,
-        **{name: value if math.isfinite(value) else None for name, value in (stated | found).items()},
-        "satisfied": finding.satisfied,
-        "verdict": finding.verdict,
-    }
-
-
-def limit_from_json(entry: Mapping[str, Any]) -> Limit:
-    """The limit that `limit_to_json` wrote."""
-    absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
-    values = {field.name: entry[field.name] for field in fields(Limit)}
-    values |= {name: bound for name, bound in absent.items() if values[name] is None}
-    if entry.get("shape"):
-        return SpaceLimit(shape=shape_from_json(entry["shape"]), radius=float(entry["radius"]), **values)
-    if not entry.get("terms"):
-        return Limit(**values)
-    return SumLimit(terms=tuple((name, float(factor)) for name, factor in entry["terms"].items()), **values)
-
-
-def finding_from_json(entry: Mapping[str, Any]) -> Finding:
-    """The finding that `limit_to_json` wrote."""
-    names = ("peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time", "time_violated")
-    values = {name: math.nan if entry[name] is None else float(entry[name]) for name in names}
-    return Finding(limit=limit_from_json(entry), **values)
 
 
 def load_run(directory: Path) -> Run:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from types import NoneType
 from typing import Any, Final
 
 from quadsim.errors import FileError, printable
-from quadsim.flight.audit import Held
+from quadsim.flight.audit import Finding, Held, Limit, SpaceLimit, SumLimit
 from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
+from quadsim.space import shape_from_json, shape_to_json
 
 NUMBER: Final = (int, float)
 MAYBE_NUMBER: Final = (int, float, NoneType)
@@ -37,12 +40,7 @@ _CONSTRAINT: Final = {
 
 
 def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """A JSON object from a file of quadsim's.
-
-    Args:
-        path: of the file.
-        form: the type of each entry that has to be there.
-        what: the file, for messages.
+    """A JSON object from a file of quadsim's, `what` for messages; `form` has the type of each entry that it must have.
 
     Raises:
         FileError: it cannot be read, is no JSON, or an entry is missing or of another type.
@@ -104,22 +102,48 @@ def require_inside(directory: Path) -> None:
                 raise FileError(path, f"is a link that leads out of {directory}; nothing is read through it")
 
 
+def limit_to_json(finding: Finding) -> dict[str, Any]:
+    """One entry of `constraints` in `summary.json`; an absent bound, or a window the flight never reached, is null."""
+    limit = finding.limit
+    stated = {name: value for name, value in vars(limit).items() if name not in ("name", "signal", "terms", "shape")}
+    found = {name: value for name, value in vars(finding).items() if name != "limit"}
+    return {
+        "name": limit.name,
+        "signal": limit.signal,
+        **({"terms": dict(limit.terms)} if isinstance(limit, SumLimit) else {}),
+        **({"shape": shape_to_json(limit.shape)} if isinstance(limit, SpaceLimit) else {}),
+        "unit": limit.unit,
+        **{name: value if math.isfinite(value) else None for name, value in (stated | found).items()},
+        "satisfied": finding.satisfied,
+        "verdict": finding.verdict,
+    }
+
+
+def limit_from_json(entry: Mapping[str, Any]) -> Limit:
+    """The limit that `limit_to_json` wrote."""
+    absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
+    values = {field.name: entry[field.name] for field in fields(Limit)}
+    values |= {name: bound for name, bound in absent.items() if values[name] is None}
+    if entry.get("shape"):
+        return SpaceLimit(shape=shape_from_json(entry["shape"]), radius=float(entry["radius"]), **values)
+    if not entry.get("terms"):
+        return Limit(**values)
+    return SumLimit(terms=tuple((name, float(factor)) for name, factor in entry["terms"].items()), **values)
+
+
+def finding_from_json(entry: Mapping[str, Any]) -> Finding:
+    """The finding that `limit_to_json` wrote."""
+    names = ("peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time", "time_violated")
+    values = {name: math.nan if entry[name] is None else float(entry[name]) for name in names}
+    return Finding(limit=limit_from_json(entry), **values)
+
+
 def constraint_verdict(entry: Mapping[str, Any]) -> Held:
-    """The verdict on a constraint that follows from its margins; see `quadsim.flight.audit.Finding.verdict`."""
-    if entry["worst_time"] is None:
-        return "incomplete"
-    margin, tolerance = deciding_margin(entry)
-    return "satisfied" if margin is not None and margin >= -tolerance else "violated"
+    """The verdict on a constraint of a summary that follows from its margins."""
+    return finding_from_json(entry).verdict
 
 
 def deciding_margin(entry: Mapping[str, Any]) -> tuple[float | None, float]:
-    """The margin that a constraint's verdict rests on, and its tolerance; see `Finding.deciding_margin`.
-
-    None where there is none: its window was not reached, or a value was no number.
-    """
-    at_physics_rate, at_samples = entry["worst_margin"], entry["worst_margin_sampled"]
-    tolerance, tolerance_sampled = entry["tolerance"], entry["tolerance_sampled"]
-    broken = at_samples is not None and at_samples < -tolerance_sampled
-    if broken and at_physics_rate is not None and at_physics_rate >= -tolerance:
-        return at_samples, tolerance_sampled
-    return at_physics_rate, tolerance
+    """The margin that this verdict rests on, None where there is none, and its tolerance."""
+    margin, tolerance = finding_from_json(entry).deciding
+    return None if math.isnan(margin) else margin, tolerance

@@ -76,14 +76,9 @@ def comparison_rows(runs: Sequence[Run]) -> list[Row]:
     ]
 
 
-def is_completed(summary: Summary) -> bool:
-    """Whether the flight was flown to its end."""
-    return bool(summary["status"] == "completed")
-
-
 def outcome(summary: Summary) -> Cell:
     """Completed, or aborted with its reason."""
-    if is_completed(summary):
+    if summary["status"] == "completed":
         return Cell(text="completed", mark=Mark.GOOD)
     return Cell(text=f"aborted: {summary.get('reason')}", mark=Mark.BAD)
 
@@ -215,7 +210,7 @@ def _best_smallest(
     eligible = {
         i: abs(value)
         for i, (summary, value) in enumerate(zip(summaries, values, strict=True))
-        if value is not None and is_completed(summary)
+        if value is not None and summary["status"] == "completed"
     }
     differ = len({texts[i] for i in eligible}) > 1
     best = {i for i in eligible if differ and texts[i] == texts[min(eligible, key=eligible.__getitem__)]}

@@ -6,7 +6,7 @@ import itertools
 import re
 import shlex
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 from urllib.parse import quote
@@ -25,13 +25,13 @@ from quadsim.report.comparison import (
     run_names,
     verdict_cell,
 )
+from quadsim.report.curves import line_colour
 from quadsim.report.figure import Scene
 from quadsim.report.flight_figures import overview, page_figures
 from quadsim.report.page import PAGE_FILE, RunView, Section, render_page
-from quadsim.report.palette import line_colour
 from quadsim.report.table import to_markdown
 from quadsim.report.to_matplotlib import write_pngs
-from quadsim.report.to_plotly import Plot, scene_to_plot, to_plot
+from quadsim.report.to_plotly import scene_to_plot, to_plot
 
 OVERVIEW_FILE: Final = "comparison.png"
 TABLE_FILE: Final = "comparison.md"
@@ -49,18 +49,11 @@ _FILES: Final = {
 
 
 def write_comparison(runs: Sequence[Run], directory: Path, *, overwrite: bool = False) -> Path:
-    """Write a comparison of runs, which appears complete or not at all.
+    """Write a comparison of runs, which appears complete or not at all; returns the page, `directory/index.html`.
 
-    The directory holds `index.html`, the overlay `comparison.png`, the table `comparison.md`, and of each run its video
-    `NAME.mp4` and a folder `NAME` of its other files; it can be moved or zipped as it is.
-
-    Args:
-        runs: one or more; aborted ones, and ones without video, recording or constraints, are welcome.
-        directory: what to write.
-        overwrite: whether to replace an earlier output there.
-
-    Returns:
-        The page, `directory/index.html`.
+    The directory holds the page, the overlay `comparison.png`, the table `comparison.md`, and of each run its video
+    `NAME.mp4` and a folder `NAME` of its other files; it can be moved or zipped as it is.  Runs that were aborted, and
+    runs without video, recording or constraints are welcome.
 
     Raises:
         ParameterError: no run is given.
@@ -84,20 +77,16 @@ def write_comparison(runs: Sequence[Run], directory: Path, *, overwrite: bool = 
         ]
         courses = len(distinct_courses(runs))
         warning = f"The runs follow {courses} different courses, so their errors are not like for like."
-        plots = Section(title="Plots", plots=tuple(_plots(runs)), text=(warning,) if courses > 1 else ())
+        figures = [
+            scene_to_plot(figure) if isinstance(figure, Scene) else to_plot(figure, labelled=len(runs) == 1)
+            for figure in page_figures(runs)
+        ]
+        plots = Section(title="Plots", plots=tuple(figures), text=(warning,) if courses > 1 else ())
         title = " and ".join(names) if len(names) < 3 else f"{len(names)} runs: {', '.join(names)}"
         files = {"overlay of all runs (PNG)": OVERVIEW_FILE, "table (Markdown)": TABLE_FILE}
         page = render_page("comparison", title, [plots], runs=views, rows=rows, files=files)
         (partial / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
-
-
-def _plots(runs: Sequence[Run]) -> Iterator[Plot]:
-    for figure in page_figures(runs):
-        if isinstance(figure, Scene):
-            yield scene_to_plot(figure)
-        else:
-            yield to_plot(figure, labelled=len(runs) == 1)
 
 
 def _folder_names(names: Sequence[str]) -> list[str]:

@@ -1,4 +1,8 @@
-"""How curves are drawn on paper, on a page and on a screen: the least span of an axis, and where an angle wraps."""
+"""How curves are drawn on paper, on a page and on a screen: colours, the least span of an axis, where an angle wraps.
+
+Colours are distinct for colour-blind readers as well.  Runs and rotors take theirs in order from Okabe and Ito's
+palette (2008), its blue made lighter for dark pages, and less its vermilion, which is too near the red of the bounds.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +16,18 @@ from quadsim.flight.audit import SIGNALS, Limit
 from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.state import REFERENCE_NAMES, Array
 
+LINES: Final = ("#1b7fc4", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#8c6d31")
+REFERENCE: Final = "#7a7f87"
+BOUND: Final = "#dc2f38"
+OBSTACLE: Final = "#b85c48"
 LEAST_SPANS: Final = {"m": 0.01, "deg": 0.1, "m/s": 0.01, "deg/s": 0.1, "rad/s": 1.0}
 """Span of an axis, by its unit, below which there is nothing to see but rounding."""
 _HALF_TURN: Final = 180.0
+
+
+def line_colour(i: int) -> str:
+    """Colour of the i-th run, or rotor, counted from 0; they repeat after six."""
+    return LINES[i % len(LINES)]
 
 
 def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | None:

@@ -16,30 +16,20 @@ from quadsim.state import Array
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
-    """Values y over x, both (K,); NaN is a gap.
-
-    Attributes:
-        style: a line; steps, each held until the next x; points; or bars of one width, centred on x.
-        label: entry in the legend; series of the same label share one entry.
-        group: what a toggle of the page switches, e.g. `run0`.
-        width: of a line, or diameter of a marker [pt].
-        marker: a symbol by plotly's name.
-        base: (K,) where bars begin, for stacked ones.
-        flights: (K,) number of the flight behind each point, which a page shows on hover.
-    """
+    """Values y over x, both (K,); NaN is a gap."""
 
     x: Array
     y: Array
     colour: str
-    style: Literal["line", "steps", "points", "bars"] = "line"
-    label: str = ""
-    group: str = ""
+    style: Literal["line", "steps", "points", "bars"] = "line"  # steps are held until the next x; bars centred on x
+    label: str = ""  # entry in the legend; series of the same label share one
+    group: str = ""  # what a toggle of the page switches, e.g. `run0`
     dashed: bool = False
-    width: float = 1.3
-    marker: str = "circle"
+    width: float = 1.3  # of a line, or diameter of a marker [pt]
+    marker: str = "circle"  # by plotly's name
     opacity: float = 1.0
-    base: Array | None = None
-    flights: Array | None = None
+    base: Array | None = None  # (K,) where bars begin, for stacked ones
+    flights: Array | None = None  # (K,) number of the flight behind each point, which a page shows on hover
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +51,6 @@ class Band:
     high: Array
     colour: str
     label: str = ""
-    group: str = ""
     opacity: float = 0.25
 
 
@@ -79,19 +68,11 @@ class Area:
 class Panel:
     """Axes with what is drawn in them.
 
-    Attributes:
-        title: what y is; beside the axis, or above the panel where `x_label` names its own horizontal axis.
-        unit: of y; an axis of a known unit has a least span, below which there is only rounding.
-        x_range, y_range: ends of the axes; None fits them to what is drawn.
-        x_names, y_names: names of 0, 1, ... on an axis, in place of numbers.
-        equal: whether both axes have one scale.
-        whole: whether y counts things.
-        legend: whether the labels are explained in the panel, not in the legend of all panels.
-        height: of its row, relative to others.
+    An axis of a known unit has a least span, below which there is only rounding.
     """
 
-    title: str
-    unit: str = ""
+    title: str  # what y is; beside the axis, or above the panel where `x_label` names its own horizontal axis
+    unit: str = ""  # of y
     series: tuple[Series, ...] = ()
     bounds: tuple[Bound, ...] = ()
     bands: tuple[Band, ...] = ()
@@ -100,14 +81,14 @@ class Panel:
     y_label: str = ""
     x_log: bool = False
     y_log: bool = False
-    x_range: tuple[float, float] | None = None
+    x_range: tuple[float, float] | None = None  # ends of the axis; None fits it to what is drawn
     y_range: tuple[float, float] | None = None
-    x_names: tuple[str, ...] = ()
+    x_names: tuple[str, ...] = ()  # names of 0, 1, ... on the axis, in place of numbers
     y_names: tuple[str, ...] = ()
-    equal: bool = False
-    whole: bool = False
-    legend: bool = False
-    height: float = 1.0
+    equal: bool = False  # whether both axes have one scale
+    whole: bool = False  # whether y counts things
+    legend: bool = False  # whether the labels are explained in the panel, not in the legend of all panels
+    height: float = 1.0  # of its row, relative to others
 
     @property
     def heading(self) -> str:
@@ -124,11 +105,9 @@ class Panel:
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """Panels, row by row.
+    """Panels, row by row; `key` names its file and identifies it in a page.
 
-    Attributes:
-        key: name of its file, and its identifier in a page.
-        end: last instant of a horizontal axis of time that all panels without an `x_label` share [s]; None without one.
+    `end` is the last instant of the axis of time that all panels without an `x_label` share [s]; None without one.
     """
 
     key: str
@@ -148,14 +127,9 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Paths and solids in space, which pages show.
-
-    Attributes:
-        paths: lines (K, 3) [m] with label, colour, group and whether they are dashed; NaN is a gap.
-        solids: points (K, 3) [m] whose convex hull is a solid, with its name.
-    """
+    """Paths and solids in space, which pages show."""
 
     key: str
     title: str
-    paths: tuple[tuple[Array, str, str, str, bool], ...]
-    solids: tuple[tuple[Array, str], ...] = ()
+    paths: tuple[tuple[Array, str, str, str, bool], ...]  # (K, 3) [m], label, colour, group, dashed; NaN is a gap
+    solids: tuple[tuple[Array, str], ...] = ()  # points (K, 3) [m] whose convex hull is a solid, and its name

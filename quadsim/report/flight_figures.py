@@ -12,9 +12,18 @@ import numpy as np
 from quadsim.flight.audit import SIGNALS, SpaceLimit
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import distinct_courses, run_names
-from quadsim.report.curves import bounds_of, break_at_wraps, commanded_speeds, effect_curves, reference_curve
+from quadsim.report.curves import (
+    BOUND,
+    OBSTACLE,
+    REFERENCE,
+    bounds_of,
+    break_at_wraps,
+    commanded_speeds,
+    effect_curves,
+    line_colour,
+    reference_curve,
+)
 from quadsim.report.figure import Area, Band, Bound, Figure, Panel, Scene, Series
-from quadsim.report.palette import BOUND, OBSTACLE, REFERENCE, line_colour
 from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.report.to_matplotlib import write_pngs
 from quadsim.state import POSITION, REFERENCE_NAMES, STATE_NAMES, Array

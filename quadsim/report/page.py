@@ -57,15 +57,8 @@ def render_page(
 ) -> str:
     """A page of a kind, e.g. `campaign`.
 
-    Args:
-        kind: what it is of.
-        title: its heading.
-        sections: what it shows.
-        description: a sentence below the title.
-        verdict: the answer in one line.
-        runs: flights side by side, each with a card, a video and files; plots toggle the group `run0` and so on.
-        rows: the table of these flights.
-        files: URL of each file beside the page, by its label.
+    `verdict` is the answer in one line, `rows` the table of `runs`, whose plots toggle the group `run0` and so on;
+    `files` has the URL of each file beside the page, by its label.
     """
     groups = [(group, list(of_group)) for group, of_group in itertools.groupby(rows, lambda row: row.group)]
     shown = [part for part in map(_without_empty, sections) if part.text or part.plots or part.tables or part.folded]

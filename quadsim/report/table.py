@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
@@ -67,31 +67,30 @@ def line(*cells: Cell | str) -> tuple[Cell, ...]:
 
 def to_markdown(rows: Sequence[Row], names: Sequence[str]) -> str:
     """A Markdown table of the rows: headlines and the best values in bold type."""
-    lines = [_markdown_line("", "", *names), _markdown_line("---", "---", *("---:" for _ in names))]
-    group = ""
+    lines, group = [], ""
     for row in rows:
-        cells = [f"**{cell.text}**" if row.headline or cell.mark is Mark.BEST else cell.text for cell in row.cells]
+        cells = [replace(cell, mark=Mark.BEST) if row.headline else cell for cell in row.cells]
         label = f"{row.label} [{row.unit}]" if row.unit else row.label
-        lines.append(_markdown_line(f"**{row.group}**" if row.group != group else "", label, *cells))
+        lines.append(line(f"**{row.group}**" if row.group != group else "", label, *cells))
         group = row.group
-    return "\n".join(lines) + "\n"
+    return _markdown(("", "", *names), 2, lines)
 
 
 def grid_to_markdown(grid: Grid) -> str:
     """A Markdown table of the grid: the best values in bold type."""
-    lines = [_markdown_line(*grid.head), _markdown_line("---", *("---:" for _ in grid.head[1:]))]
-    for cells in grid.lines:
-        lines.append(_markdown_line(*(f"**{cell.text}**" if cell.mark is Mark.BEST else cell.text for cell in cells)))
-    return "\n".join(lines) + "\n"
+    return _markdown(grid.head, 1, grid.lines)
 
 
-def section(grid: Grid, level: int = 2) -> str:
+def _markdown(head: Sequence[str], names: int, lines: Sequence[Sequence[Cell]]) -> str:
+    """A table whose first columns, so many, are names, aligned to the left."""
+    texts = [[f"**{cell.text}**" if cell.mark is Mark.BEST else cell.text for cell in cells] for cells in lines]
+    table = [head, ["---"] * names + ["---:"] * (len(head) - names), *texts]
+    return "".join("| " + " | ".join(printable(text).replace("|", r"\|") for text in row) + " |\n" for row in table)
+
+
+def section(grid: Grid) -> str:
     """A grid under its title, with its note, as Markdown."""
-    return f"{level * '#'} {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
-
-
-def _markdown_line(*texts: str) -> str:
-    return "| " + " | ".join(printable(text).replace("|", r"\|") for text in texts) + " |"
+    return f"## {grid.title}\n\n{grid_to_markdown(grid)}\n{grid.note}".rstrip() + "\n"
 
 
 def format_number(value: float | None) -> str:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from quadsim.report.curves import BOUND, OBSTACLE
 from quadsim.report.figure import Figure, Panel, Scene, Series
-from quadsim.report.palette import BOUND, OBSTACLE
 from quadsim.state import Array
 
 if TYPE_CHECKING:
@@ -147,9 +147,7 @@ def _draw_panel(canvas: Canvas, panel: Panel, place: dict[str, int], points: int
     for band in panel.bands:
         x, y = np.concatenate([band.x, band.x[::-1]]), np.concatenate([band.high, band.low[::-1]])
         look = {"fill": "toself", "fillcolor": band.colour, "opacity": band.opacity, "line": {"width": 0}}
-        canvas.add_trace(
-            Scatter(x=x, y=y, mode="lines", hoverinfo="skip", legendgroup=band.group or None, **look), **place
-        )
+        canvas.add_trace(Scatter(x=x, y=y, mode="lines", hoverinfo="skip", **look), **place)
     for series in panel.series:
         _draw_series(canvas, series, place, points)
     line = {"color": BOUND, "width": 1.4, "dash": "dash"}

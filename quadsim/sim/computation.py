@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -10,7 +9,6 @@ import numpy as np
 from annotated_types import Ge, Le, doc
 
 from quadsim.controller import Command
-from quadsim.errors import ParameterError
 from quadsim.fields import Instant, Positive
 
 
@@ -39,11 +37,6 @@ class ComputationTime:
         ),
     ] = None
     jitter: Annotated[Seconds, doc("[s] mean of an exponentially distributed part")] = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("delay", "per_iteration", "jitter"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ParameterError("computation", name, getattr(self, name), "at least 0 s and finite")
 
 
 @dataclass(frozen=True, kw_only=True)

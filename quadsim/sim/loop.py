@@ -16,9 +16,9 @@ import numpy as np
 from quadsim.controller import FALLBACK, MISSED, Command, Controller, InnerLoop, Moment, Phase
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
-from quadsim.flight.lost import check_loss
 from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
+from quadsim.sim.phase import check_loss
 from quadsim.sim.physics import Segment, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, Array
@@ -53,13 +53,11 @@ class Rows:
 
     def row(self, k: int) -> Array:
         """See `Reference`."""
-        row: Array = self.values[k]
-        return row
+        return np.asarray(self.values[k])
 
     def preview(self, k: int, n: int) -> Array:
         """See `Reference`."""
-        rows: Array = self.values[k + 1 : k + 1 + n]
-        return rows
+        return np.asarray(self.values[k + 1 : k + 1 + n])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,11 +102,10 @@ class ClosedLoop:
         k: control periods flown so far.
         period: length of one [s].
         controller: what flies it now; see `switch`.
-        computation: how long commands take, in simulated time; None where they take none.
-        motion: of the reference from t_0 on; None where only positions are known.
-        quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
+        course: what is followed.
         answered: the latest time at which a command has come so far [s].
         before: called with k when a period begins, before anything of it is measured; what changes then acts in it.
+        last: the period flown last; None before the first.
         reason: why the flight has ended early; None while it has not.
     """
 
@@ -144,7 +141,7 @@ class ClosedLoop:
             computation: how long commands take, in simulated time; none where absent.
             rng: what `computation` draws from.
             ground: what knows where the flight stands with ground and obstacles; it is flying throughout where absent.
-            loss: limits by the names of `quadsim.flight.lost.CRITERIA`, checked once per control period until it has
+            loss: limits by the names of `quadsim.sim.phase.CRITERIA`, checked once per control period until it has
                 crashed; none where absent.
             motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
             quaternions: whether attitude and body rates are logged beside Euler angles and their rates.
@@ -166,7 +163,7 @@ class ClosedLoop:
         if ground is not None:
             ground.reset()
         self._plant, self._navigation, self._ground = plant, navigation, ground
-        self._reference: Reference = Rows(values=reference) if isinstance(reference, np.ndarray) else reference
+        self.course: Reference = Rows(values=reference) if isinstance(reference, np.ndarray) else reference
         self._steps, self._loss, self.quaternions = steps_per_period, loss, quaternions
         self._draws = rng if rng is not None else np.random.default_rng(0)
         self._start = plant.physics
@@ -176,7 +173,7 @@ class ClosedLoop:
         self._plan, self._age = self._acting[None], 0  # the last plan that came in time, and how many periods ago
         self._observed: Observation | None = None
         self._samples: list[Sample] | None = [] if recorded else None
-        self._last: Sample | None = None
+        self.last: Sample | None = None
         self._predicted: list[Array | None] = []  # of the controllers before this one, and how many periods they flew
         self._switched = 0
 
@@ -189,16 +186,6 @@ class ClosedLoop:
     def time(self) -> float:
         """t_k, when the next period starts [s]."""
         return self.k * self.period
-
-    @property
-    def course(self) -> Reference:
-        """What is followed."""
-        return self._reference
-
-    @property
-    def last(self) -> Sample | None:
-        """The period flown last; None before the first."""
-        return self._last
 
     def switch(self, controller: Controller) -> None:
         """Let another controller fly from the period that starts now on.
@@ -229,33 +216,20 @@ class ClosedLoop:
             FlightError: the vehicle is lost; the flight has ended.
         """
         if self._observed is None:
-            self._check_going_on()
-            try:
+            with self._going_on():
                 self._observed = self._observe()
-            except FlightError as error:
-                self._end(error)
-                raise
         return self._observed
 
     def step(self, command: Command | None = None) -> Sample:
-        """Fly one control period.
-
-        Args:
-            command: held instead of the controller's answer, which is not called then.
+        """Fly one control period, with a command that is held instead of asking the controller, where one is given.
 
         Raises:
             FlightError: the flight has ended in this period, which is not part of it.
             InputError: it had ended before.
         """
-        self._check_going_on()
-        try:
-            if self._observed is None:
-                self._observed = self._observe()
-            sample = self._fly(self._observed, command)
-        except FlightError as error:
-            self._end(error)
-            raise
-        self.k, self._observed, self._last = self.k + 1, None, sample
+        with self._going_on():
+            sample = self._fly(self.observation, command)
+        self.k, self._observed, self.last = self.k + 1, None, sample
         if self._samples is not None:
             self._samples.append(sample)
         return sample
@@ -275,18 +249,18 @@ class ClosedLoop:
             raise InputError("no period of this flight was recorded: it was begun with recorded=False")
         samples = self._samples
         control = _control_log(samples, self._initial_speeds, self.period)
-        plant_log = _plant_log(samples, self._start, self._initial_speeds, self._yaw, self._plant.timestep)
+        plant = _plant_log(samples, self._start, self._initial_speeds, self._yaw, self._plant.timestep)
         if self.quaternions:
             moments = [sample.observation.moment for sample in samples]
             attitudes = np.array([moment.attitude for moment in moments], float).reshape(-1, 4)
             rates = np.array([moment.body_rates for moment in moments], float).reshape(-1, 3)
             control = replace(control, attitude=attitudes, body_rates=rates)
             physics = np.concatenate([self._start[None], *(sample.segment.physics for sample in samples)])
-            plant_log = replace(plant_log, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
+            plant = replace(plant, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
         return FlightLog(
             control=control,
             timing=_timing_log(samples, control.t),
-            plant=plant_log,
+            plant=plant,
             predicted=_joined([*self._predicted, *([self._predict()] if self.k > self._switched else [])]),
             reason=self.reason,
             interrupted=self._interrupted,
@@ -294,9 +268,15 @@ class ClosedLoop:
             lost=self._criterion,
         )
 
-    def _check_going_on(self) -> None:
+    @contextlib.contextmanager
+    def _going_on(self) -> Iterator[None]:
         if self.reason is not None:
             raise InputError(f"the flight has ended {self.reason}")
+        try:
+            yield
+        except FlightError as error:
+            self._end(error)
+            raise
 
     def _end(self, error: FlightError) -> None:
         """Note why the flight ended; not the error itself, which would hold all that was flown in a cycle."""
@@ -311,10 +291,10 @@ class ClosedLoop:
         truth = plant.state()
         state = truth.copy() if navigation is None else navigation.state()
         attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
-        row, preview = self._reference.row(k), self._reference.preview(k, self.controller.horizon)
+        row, preview = self.course.row(k), self.course.preview(k, self.controller.horizon)
         phase = Phase.FLYING
         if self._ground is not None:
-            since = self._start[None] if self._last is None else self._last.segment.physics
+            since = self._start[None] if self.last is None else self.last.segment.physics
             phase = self._ground.advance(since[:, 0], physics_to_state(since), preview)
         self._lowest = min(self._lowest, float(row[_HEIGHT]))
         if self._loss is not None and phase is not Phase.CRASHED:
@@ -396,19 +376,7 @@ def fly(
     progress: Callable[[int], None] | None = None,
     **settings: Any,
 ) -> FlightLog:
-    """Fly a number of control periods.
-
-    Args:
-        plant: what is flown; it is reset first.
-        controller: what flies it; it is reset first.
-        reference: as of `ClosedLoop`.
-        periods: K.
-        progress: called with the number of periods flown, after each.
-        settings: what else `ClosedLoop` takes.
-
-    Returns:
-        The flight, with plant rows at the physics rate.
-    """
+    """Fly a number of control periods; arguments as of `ClosedLoop` and `complete`."""
     loop = ClosedLoop(plant, controller, reference, **settings)
     complete(loop, periods=periods, progress=progress)
     return loop.log()
@@ -418,12 +386,7 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
     """Fly on until a number of control periods have been flown in all.
 
     Whatever happens in flight ends up in its log: a typed flight error or Ctrl-C ends it early, with its reason and
-    everything up to it.
-
-    Args:
-        loop: the flight.
-        periods: K.
-        progress: called with the number of periods flown, after each.
+    everything up to it.  `progress` is called with the number of periods flown, after each.
     """
     gc.freeze()  # a pass of the collector over all imported modules takes up to 30 ms, as long as a control period
     try:

@@ -10,9 +10,8 @@ import numpy as np
 
 from quadsim.errors import ParameterError
 from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
-from quadsim.sim.estimation.estimate import MEAN_QUATERNION, MEAN_RATES
+from quadsim.sim.estimation.estimate import MEAN_QUATERNION, MEAN_RATES, EstimatorSettings
 from quadsim.sim.estimation.filter import ErrorStateFilter, Tally
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.sensing.sampler import Sample, Sampler, truth
 from quadsim.sim.sensing.sensor import Sensor, SensorFault, SensorName
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
@@ -85,13 +84,7 @@ class Navigation:
             sampler.reschedule(faults)
 
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
-        """Start again, with the same draws.
-
-        Args:
-            physics: (14,) MuJoCo's state at t = 0; see `quadsim.sim.physics.physics_to_state`.
-            speeds: (4,) rotor speeds in force [rad/s].
-            yaw: near which turn the yaw is [rad].
-        """
+        """Start again at MuJoCo's state (14,) and rotor speeds [rad/s], the same draws; yaw is near `yaw` [rad]."""
         self._step, self._yaw, self._physics = 0, YawTurns(yaw), physics.copy()
         self.attitude: tuple[Array, Array] = physics[4:8].copy(), physics[11:14].copy()
         self._held = {name: truth(name, physics[None])[0] for name in SensorName}

@@ -1,14 +1,15 @@
-"""The phase of a flight, once per control period: on the ground, about to take off, flying or crashed."""
+"""What is determined once per control period: the phase of the flight, and whether its vehicle is lost."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
 
 from quadsim.controller import Phase
+from quadsim.errors import LostError
 from quadsim.flight.ground import AIRBORNE, TOUCH, Outline, clearance
 from quadsim.space import Obstacle, Solids
 from quadsim.state import INDEX, POSITION, REFERENCE_NAMES, Array, tilt
@@ -16,6 +17,14 @@ from quadsim.state import INDEX, POSITION, REFERENCE_NAMES, Array, tilt
 TAKEOFF_RISE: Final = 0.05  # how far above the resting height a reference has to rise to require flight [m]
 REST: Final = 0.2  # how long the feet have to touch the ground without a break for the vehicle to have landed [s]
 CAPSIZED: Final = 60.0  # tilt [deg] beyond which a vehicle that touches the ground has crashed
+
+CRITERIA: Final = {
+    "tilt": ("the thrust axis is tilted by", "deg"),
+    "distance": ("the distance from the reference is", "m"),
+    "depth": ("the depth below the lowest of start and reference is", "m"),
+    "speed": ("the speed is", "m/s"),
+}
+"""Each criterion by its name in `[lost]`, with its unit; the first that is met is the reason."""
 
 
 class PhaseMonitor:
@@ -39,12 +48,10 @@ class PhaseMonitor:
         self, outline: Outline | None, *, period: float, obstacles: Sequence[Obstacle] = (), radius: float = 0.0
     ) -> None:
         self._outline, self._obstacles, self._radius = outline, Solids(obstacles), radius
-        if outline is None:
-            self.reset()
-            return
-        self._takeoff_height = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + TAKEOFF_RISE
-        self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # higher up nothing can touch
-        self._periods_of_rest = math.ceil(REST / period - 1e-9)
+        if outline is not None:
+            self._takeoff_height = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + TAKEOFF_RISE
+            self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # higher up nothing can touch
+            self._periods_of_rest = math.ceil(REST / period - 1e-9)
         self.reset()
 
     def reset(self) -> None:
@@ -55,12 +62,10 @@ class PhaseMonitor:
     def advance(self, t: Array, states: Array, preview: Array) -> Phase:
         """The phase of the control period that starts now.
 
-        Args:
-            t: (M,) times of the states [s].
-            states: (M, 12) true states since the last period began, the last of them now.
-            preview: (N, 4) reference x, y, z [m], yaw [rad] that the controller is about to see.
+        Of true states (M, 12) at times (M,) [s] since the last period began, the last of them now, and of the reference
+        (N, 4) that the controller is about to see.
         """
-        if self._touches_obstacle(t, states):
+        if (self._obstacles.clearances(t, states[:, POSITION])[0] <= self._radius).any():
             self._phase = Phase.CRASHED
         if self._outline is None:
             return self._phase or Phase.FLYING
@@ -80,12 +85,32 @@ class PhaseMonitor:
             self._phase = Phase.ARMED if wanted else Phase.LANDED
         return self._phase
 
-    def _touches_obstacle(self, t: Array, states: Array) -> bool:
-        return bool((self._obstacles.clearances(t, states[:, POSITION])[0] <= self._radius).any())
-
     def _crashed(self, outline: Outline, states: Array) -> bool:
         if self._touched and np.degrees(tilt(states[-1:])[0]) > CAPSIZED:
             return True
         if states[:, INDEX["z"]].min() - outline.floor > self._reach:
             return False
         return float(clearance(states, outline.hull, 0.0, outline.floor).min()) <= TOUCH
+
+
+def check_loss(limits: Mapping[str, float], time: float, state: Array, reference: Array, lowest: float) -> None:
+    """End the flight where its vehicle is lost.
+
+    Args:
+        limits: the largest value of each of `CRITERIA`; one that is left out is not checked.
+        time: of the sample [s].
+        state: (12,) the true one.
+        reference: (4,) x, y, z [m], yaw [rad] at the same time.
+        lowest: height of the lowest of the start and the reference so far [m].
+
+    Raises:
+        LostError: a criterion is met.
+    """
+    x, vx, y, vy, z, vz, roll, _, pitch, *_ = state.tolist()  # of so few numbers floats are quicker than arrays
+    tilt = math.degrees(math.acos(math.cos(roll) * math.cos(pitch)))
+    distance = math.dist((x, y, z), reference[:3].tolist())
+    values = (tilt, distance, lowest - z, math.hypot(vx, vy, vz))
+    for (name, (quantity, unit)), value in zip(CRITERIA.items(), values, strict=True):
+        limit = limits.get(name, math.inf)
+        if value > limit:
+            raise LostError(name, quantity, unit, value=value, limit=limit, time=time)

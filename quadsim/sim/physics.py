@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from quadsim.errors import ParameterError
 from quadsim.rotation import body_to_euler_rates, quaternion_to_euler
+from quadsim.sim.sensing.sensor import whole
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array
 
 Integrator = Literal["mujoco", "rk4"]  # who takes the physics steps: MuJoCo, or `quadsim.sim.rigid_body`
@@ -22,11 +22,8 @@ def steps_per_period(control_period: float, timestep: float) -> int:
     Raises:
         ParameterError: the period is not a whole, positive number of steps.
     """
-    steps = round(control_period / timestep)
-    if steps < 1 or not math.isclose(steps * timestep, control_period, rel_tol=1e-9):
-        rule = f"a whole multiple of the physics step of {timestep} s"
-        raise ParameterError("scenario", "control_period", control_period, rule)
-    return steps
+    rule = f"a whole multiple of the physics step of {timestep} s"
+    return whole("scenario", "control_period", control_period, control_period / timestep, rule)
 
 
 def inner_steps(rate: float, timestep: float) -> int:
@@ -35,23 +32,18 @@ def inner_steps(rate: float, timestep: float) -> int:
     Raises:
         ParameterError: they are not a whole, positive number.
     """
-    steps = round(1.0 / (rate * timestep))
-    if steps < 1 or not math.isclose(steps * rate * timestep, 1.0, rel_tol=1e-9):
-        rule = f"such that 1 / rate is a whole multiple of the physics step of {timestep} s"
-        raise ParameterError("controller.inner", "rate", rate, rule)
-    return steps
+    rule = f"such that 1 / rate is a whole multiple of the physics step of {timestep} s"
+    return whole("controller.inner", "rate", rate, 1.0 / (rate * timestep), rule)
 
 
 def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
-    """The paper's state from MuJoCo's.
+    """The paper's states (M, 12) from MuJoCo's.
+
+    With Euler-angle rates (Sec. 2.2 takes body rates for them), yaw unwrapped along the rows as by `YawTurns`.
 
     Args:
         physics: (M, 14) time, position (world), quaternion wxyz, velocity (world), angular rates (body).
         yaw: near which turn the first row's yaw is [rad].
-
-    Returns:
-        (M, 12) states with Euler-angle rates (Sec. 2.2 takes body rates for them; see `quadsim.state`), yaw
-        unwrapped along the rows, as by `quadsim.state.YawTurns`.
     """
     state = np.empty((physics.shape[0], N_STATES))
     euler = quaternion_to_euler(physics[:, 4:8])

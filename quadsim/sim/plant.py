@@ -18,21 +18,10 @@ from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError, RaisedError
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
-from quadsim.sim.effects import (
-    LOADING,
-    Change,
-    Effects,
-    Force,
-    LagChange,
-    Load,
-    MassChange,
-    Payload,
-    PushChange,
-    RotorChange,
-    RotorDynamics,
-)
+from quadsim.sim.effects import LOADING, Change, Effects, Force, LagChange, MassChange, PushChange, RotorChange
 from quadsim.sim.effects.forces import StepForces
-from quadsim.sim.effects.load import apply_mass, mass_properties
+from quadsim.sim.effects.load import Load, Payload, apply_mass, mass_properties
+from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator, Segment, physics_to_state
 from quadsim.sim.rigid_body import RigidBody, check_free
@@ -160,11 +149,7 @@ class Plant:
         return self._speeds.copy()
 
     def reset(self, state: Array, speeds: Array | None = None) -> None:
-        """Put the vehicle at a state at time zero, and everything that acts on it back to its start.
-
-        Args:
-            state: (12,).
-            speeds: (4,) rotor speeds [rad/s]; hover where absent.
+        """Put the vehicle at a state (12,) at time zero, at rotor speeds (4,) or hover [rad/s], all else to its start.
 
         Raises:
             ParameterError: the state is not 12 finite numbers.
@@ -222,11 +207,7 @@ class Plant:
         return np.clip(speeds, *self._speed_range)
 
     def advance(self, speeds: Array, steps: int) -> Segment:
-        """Hold a command for a number of physics steps.
-
-        Args:
-            speeds: (4,) commanded rotor speeds [rad/s].
-            steps: physics steps, at least 1.
+        """Hold commanded rotor speeds (4,) [rad/s] for a number of physics steps, at least 1.
 
         Raises:
             CommandError: the command is not four finite numbers; nothing moved.

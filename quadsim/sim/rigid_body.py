@@ -10,8 +10,9 @@ import math
 from collections.abc import Iterable, Sequence
 
 from quadsim.errors import ParameterError
-from quadsim.sim.effects import LOADING, Change, Effects, Load
+from quadsim.sim.effects import LOADING, Change, Effects
 from quadsim.sim.effects.forces import StepForces, Wrench
+from quadsim.sim.effects.load import Load
 from quadsim.space import Obstacle
 from quadsim.vehicle import Vehicle
 
@@ -20,11 +21,6 @@ Rates = tuple[list[float], Wrench]
 
 def check_free(effects: Effects, changes: Iterable[Change], obstacles: Sequence[Obstacle] = ()) -> None:
     """Refuse what this integration does not know.
-
-    Args:
-        effects: resolved.
-        changes: what happens on the way.
-        obstacles: what may be touched.
 
     Raises:
         ParameterError: there is a floor or an obstacle to touch, a load, or drag of MuJoCo's.
@@ -65,12 +61,8 @@ class RigidBody:
     ) -> tuple[list[float], list[float]]:
         """The state (13,) a step later, and the mean of the forces and torques that acted, as `StepForces.at` has them.
 
-        Args:
-            state: (13,) now.
-            thrusts: (4,) [N].
-            of_rotors: (6,) a row of `StepForces.of_rotors`.
-            wind: (3,) velocity of the air, world [m/s].
-            held: (6,) force, world [N], and torque, body [N m], that stay the same over the step.
+        Of thrusts (4,) [N], a row (6,) of `StepForces.of_rotors`, the velocity (3,) of the air, world [m/s], and force,
+        world [N], and torque, body [N m], (6,) that stay the same over the step.
         """
         h, (f1, f2, f3, f4) = self._step, thrusts
         fixed = f1 + f2 + f3 + f4, [a * f1 + b * f2 + c * f3 + d * f4 for a, b, c, d in self._torques], held

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linprog
 
-from quadsim.sim.effects.body_drag import added_mass
+from quadsim.sim.airframe import added_mass
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.vehicle import Vehicle
 

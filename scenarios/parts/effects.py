@@ -11,18 +11,9 @@ from mpc.fallback.settings import FallbackSettings
 from quadsim.errors import ParameterError
 from quadsim.fields import filled
 from quadsim.sim.computation import Computation, ComputationTime, Stall
-from quadsim.sim.effects import (
-    Air,
-    Change,
-    LagChange,
-    MassChange,
-    PayloadChange,
-    PushChange,
-    RotorChange,
-    RotorDynamics,
-)
-from quadsim.sim.effects.gust import Gust
-from quadsim.sim.effects.wind import WindChange, WindField
+from quadsim.sim.effects import Change, LagChange, MassChange, PayloadChange, PushChange, RotorChange
+from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects.wind import Air, Gust, WindChange, WindField
 from quadsim.vehicle import Vehicle
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import actual_effects

@@ -17,8 +17,7 @@ from mpc.ocp import Unanswered
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.sim.computation import Computation, Stall
-from quadsim.sim.effects.gust import Gust
-from quadsim.sim.effects.wind import WindChange
+from quadsim.sim.effects.wind import Gust, WindChange
 from quadsim.sim.loop import ClosedLoop
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal, get_args
 
-from quadsim.sim.effects import Air, Load
-from quadsim.sim.effects.gust import Gust
-from quadsim.sim.effects.wind import WindChange
+from quadsim.sim.effects.load import Load
+from quadsim.sim.effects.wind import Air, Gust, WindChange
 from quadsim.vehicle import Vehicle
 from scenarios.parts.vehicle import actual_effects
 from scenarios.schema.events import (

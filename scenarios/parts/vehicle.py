@@ -12,7 +12,9 @@ import numpy as np
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError, ParameterError
 from quadsim.motion import Motion
-from quadsim.sim.effects import Air, Effects, RotorDynamics
+from quadsim.sim.effects import Effects
+from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects.wind import Air
 from quadsim.sim.physics import physics_to_state
 from quadsim.state import Array, make_state
 from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle

@@ -11,10 +11,9 @@ from pydantic import Field, model_validator
 
 from quadsim.fields import Fraction, Instant, NonNegative, Number, Positive
 from quadsim.sim.computation import Stall
-from quadsim.sim.effects.gust import Gust
+from quadsim.sim.effects import Push
 from quadsim.sim.effects.load import Factor, Payload
-from quadsim.sim.effects.push import Push
-from quadsim.sim.effects.wind import WindChange
+from quadsim.sim.effects.wind import Gust, WindChange
 from quadsim.state import REFERENCE_NAMES
 from scenarios.schema.base import Spec, Triple
 from scenarios.schema.plugin import is_plain

@@ -139,7 +139,7 @@ class LostSpec(Spec):
 
     @property
     def limits(self) -> dict[str, float]:
-        """The criteria that are on; see `quadsim.flight.lost`."""
+        """The criteria that are on; see `quadsim.sim.phase`."""
         return {name: limit for name, limit in self if limit is not False}
 
 

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Number, Vector
-from quadsim.sim.estimation.settings import EstimatorSettings
+from quadsim.sim.estimation.estimate import EstimatorSettings
 from quadsim.sim.sensing.sensor import Sampling, Sensor, SensorName
 from scenarios.schema.base import Spec
 

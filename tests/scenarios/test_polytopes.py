@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mpc.ocp import Problem
-from quadsim.flight import rundir
 from quadsim.flight.audit import SUM, TERMS, audit
+from quadsim.flight.summary import limit_from_json, limit_to_json
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_controller, build_problem
@@ -63,7 +63,7 @@ def test_the_audit_sees_the_same_rows_at_the_physics_rate() -> None:
         margin = np.minimum(values[:, row] - constraint.lower[row], constraint.upper[row] - values[:, row])
         assert finding.worst_margin == pytest.approx(margin.min(), abs=1e-9)
         assert finding.worst_time == log.plant.t[np.argmin(margin)]
-        assert rundir.limit_from_json(rundir.limit_to_json(finding)) == finding.limit
+        assert limit_from_json(limit_to_json(finding)) == finding.limit
 
 
 def test_every_term_has_both_rates() -> None:

@@ -249,11 +249,9 @@ def test_a_defect_of_our_own_is_not_taken_for_a_flight(tmp_path: Path, monkeypat
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("cores", [1, 2])
 def test_a_recording_that_was_asked_for_and_cannot_be_made_is_an_error_and_all_else_is_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("scenarios.flight.usable_cores", lambda: cores)
     monkeypatch.setenv("RERUN", "off")
     scenario, target = load_scenario("hover", [SHORT]), tmp_path / "new" / "run"
     with pytest.raises(OutputError, match=r"run/flight\.rrd: failed: .*rerun is switched off by .* RERUN; all else is"):
@@ -263,10 +261,7 @@ def test_a_recording_that_was_asked_for_and_cannot_be_made_is_an_error_and_all_e
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("cores", [1, 2])
-def test_outputs_are_made_as_requested(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: int) -> None:
-    """Where there are cores for it, the recording by a process of its own."""
-    monkeypatch.setattr("scenarios.flight.usable_cores", lambda: cores)
+def test_outputs_are_made_as_requested(tmp_path: Path) -> None:
     run_scenario(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import pickle
 import subprocess
 from collections.abc import Sequence
@@ -23,13 +24,7 @@ _FRAME: Final = 1.0 / 30.0  # how far rotors have turned from one picture to the
 
 
 class Camera:
-    """Follows the vehicle; close it, or use it as a context manager.
-
-    Args:
-        vehicle: what is drawn.
-        obstacles: likewise.
-        width: [pixels].
-        height: [pixels].
+    """Follows a vehicle among obstacles; pictures of width by height [pixels].  Close it, or use it in a `with` block.
 
     Raises:
         RenderingUnavailableError: this machine cannot render.
@@ -54,13 +49,9 @@ class Camera:
     def picture(
         self, state: Array, rotors: Array, reference: Array, time: float
     ) -> np.ndarray[Any, np.dtype[np.uint8]]:
-        """One picture (height, width, 3).
+        """One picture (height, width, 3) of a state (12,), rotor speeds (4,) [rad/s] and x, y, z [m] of a reference.
 
-        Args:
-            state: (12,).
-            rotors: (4,) speeds [rad/s].
-            reference: (3,) where to, or (4,) with yaw [m].
-            time: [s], for what moves.
+        Obstacles are where they are at `time` [s].
 
         Raises:
             RenderingUnavailableError: the renderer has ended.
@@ -72,7 +63,7 @@ class Camera:
         size = int(np.prod(self._shape))
         data = self._process.stdout.read(size)
         if len(data) < size:
-            raise self._ended()
+            raise RenderingUnavailableError({self._backend: "the renderer has ended"})
         return np.frombuffer(data, np.uint8).reshape(self._shape).copy()
 
     def close(self) -> None:
@@ -87,11 +78,6 @@ class Camera:
 
     def _send(self, request: bytes) -> None:
         assert self._process.stdin is not None
-        try:
+        with contextlib.suppress(BrokenPipeError):  # then no picture comes either
             self._process.stdin.write(request)
             self._process.stdin.flush()
-        except BrokenPipeError as error:
-            raise self._ended() from error
-
-    def _ended(self) -> RenderingUnavailableError:
-        return RenderingUnavailableError({self._backend: "the renderer has ended"})

@@ -14,28 +14,12 @@ from quadsim.controller import LAW, OPTIMAL, STOPPED, Phase, law_name
 from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import failure_sentences
+from quadsim.report.film import painter as ink
 from quadsim.report.film.frames import Footage, MarginTrack
-from quadsim.report.film.painter import (
-    AMBER,
-    BLUE,
-    CYAN,
-    FAINT,
-    GREEN,
-    GREY,
-    RED,
-    VIOLET,
-    WHITE,
-    Colour,
-    Painter,
-    Picture,
-    shade,
-    text_width,
-)
+from quadsim.report.film.painter import Colour, Painter, Picture, shade, text_width
 from quadsim.report.film.topview import TopView
 from quadsim.report.table import ABSENT
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
-
-_Panel = Callable[[Painter, float, float, int], None]
 
 _STRIP: Final = 150  # height of the bottom strip, in design pixels of a 1280 x 720 frame
 _COMPACT_SCALE: Final = 1.6
@@ -71,7 +55,8 @@ class Overlay:
     def draw(self, frame: Picture, i: int) -> Picture:
         """Frame `i` (height, width, 3) with its captions; `frame` itself is changed."""
         lines = self._headlines(i)
-        columns: list[tuple[float, _Panel]] = [(262, self._attitude), (188, self._speeds)]
+        columns: list[tuple[float, Callable[[Painter, float, float, int], None]]]
+        columns = [(262, self._attitude), (188, self._speeds)]
         if not self._compact:
             columns = [(262, self._position), *columns, (188, self._slews), (226, self._margins)]
         gap = max(0.0, (self._width - 48.0 - sum(width for width, _ in columns)) / (len(columns) - 1))
@@ -106,27 +91,27 @@ class Overlay:
         """Text, size and colour of the lines in the corner."""
         control, k = self._run.log.control, self._footage.period[i]
         time = self._footage.times[i]
-        lines: list[tuple[str, float, Colour]] = [(self._run.name, 21, WHITE)]
+        lines: list[tuple[str, float, Colour]] = [(self._run.name, 21, ink.WHITE)]
         if self._compact:
-            return [*lines, (f"t = {time:.1f} s", 17, GREY)]
-        lines += [(self._subtitle, 14, GREY), (f"t = {time:.2f} s", 20, WHITE), self._answer(k)]
+            return [*lines, (f"t = {time:.1f} s", 17, ink.GREY)]
+        lines += [(self._subtitle, 14, ink.GREY), (f"t = {time:.2f} s", 20, ink.WHITE), self._answer(k)]
         for vectors, what, unit, colour in (
-            (self._footage.wind, "wind", "m/s", CYAN),
-            (self._footage.force, "external force", "N", VIOLET),
+            (self._footage.wind, "wind", "m/s", ink.CYAN),
+            (self._footage.force, "external force", "N", ink.VIOLET),
         ):
             if vectors is not None:
                 lines.append((f"{what} {np.linalg.norm(vectors[i]):.2g} {unit}", 14, colour))
         happened = [event for event in self._run.summary.get("events", ()) if 0.0 <= time - event["time"] <= _SHOWN]
-        lines += [(event["text"][:_WIDEST], 15, AMBER) for event in happened[-_MOST_EVENTS:]]
+        lines += [(event["text"][:_WIDEST], 15, ink.AMBER) for event in happened[-_MOST_EVENTS:]]
         reason = self._run.log.reason
         if reason is not None and time >= control.t[-1]:
-            lines.append((f"aborted {reason}"[:130], 15, RED))
+            lines.append((f"aborted {reason}"[:130], 15, ink.RED))
         if time >= self._footage.times[-1] - _LAST:
             wrapped = [textwrap.wrap(sentence, _WIDEST) for sentence in failure_sentences(self._run.summary)]
             parts = [part for sentence in wrapped for part in sentence]
-            lines += [(part, 14, AMBER) for part in parts[:_MOST_LINES]]
+            lines += [(part, 14, ink.AMBER) for part in parts[:_MOST_LINES]]
             if len(parts) > _MOST_LINES:
-                lines.append(("... all of it is in summary.json", 14, AMBER))
+                lines.append(("... all of it is in summary.json", 14, ink.AMBER))
         return lines
 
     def _answer(self, k: int) -> tuple[str, float, Colour]:
@@ -140,27 +125,28 @@ class Overlay:
         if control.iterations[k]:
             phrases += [f"{control.iterations[k]} iterations", f"{control.active[k]} active"]
         good = fallback == 0 and status in OPTIMAL | {Phase.LANDED}
-        return "  ·  ".join(phrases), 14, GREEN if good else RED
+        return "  ·  ".join(phrases), 14, ink.GREEN if good else ink.RED
 
     def _position(self, painter: Painter, x: float, y: float, i: int) -> None:
-        painter.text(x + 118, y, "now", size=13, colour=GREY, anchor="ra")
-        painter.text(x + 192, y, "reference", size=13, colour=AMBER, anchor="ra")
-        painter.text(x + 262, y, "error", size=13, colour=GREY, anchor="ra")
+        painter.text(x + 118, y, "now", size=13, colour=ink.GREY, anchor="ra")
+        painter.text(x + 192, y, "reference", size=13, colour=ink.AMBER, anchor="ra")
+        painter.text(x + 262, y, "error", size=13, colour=ink.GREY, anchor="ra")
         reference = self._run.log.control.reference[self._footage.period[i]]
         values = (*self._footage.position[i], self._footage.euler[i, 2])
         for j, (name, state) in enumerate(zip(REFERENCE_NAMES, REFERENCE_STATES, strict=True)):
             angle = state == INDEX["yaw"]
             factor, digits = (math.degrees(1.0), 1) if angle else (1.0, 2)
             now, wanted, row = factor * values[j], factor * reference[j], y + 24 + 27 * j
-            painter.text(x, row, f"{name} [{'deg' if angle else 'm'}]", colour=GREY)
+            painter.text(x, row, f"{name} [{'deg' if angle else 'm'}]", colour=ink.GREY)
             unknown = angle and self._footage.tilt is not None and self._footage.tilt[i] > 0.5 * math.pi
-            for right, value, colour in ((118, now, WHITE), (192, wanted, AMBER), (262, now - wanted, GREY)):
+            columns = (118, now, ink.WHITE), (192, wanted, ink.AMBER), (262, now - wanted, ink.GREY)
+            for right, value, colour in columns:
                 shown = f"{round(value, digits) + 0.0:+.{digits}f}"  # no "-0.00"
-                text = ABSENT if unknown and colour is not AMBER else shown  # upside down there is no heading to hold
+                text = ABSENT if unknown and colour is not ink.AMBER else shown  # upside down none is to be held
                 painter.text(x + right, row, text, colour=colour, anchor="ra")
 
     def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:
-        painter.text(x, y, "attitude [deg]", size=13, colour=GREY)
+        painter.text(x, y, "attitude [deg]", size=13, colour=ink.GREY)
         signals, tilted = dict(zip(("roll", "pitch"), self._footage.euler[i], strict=False)), self._footage.tilt
         if tilted is not None:  # past the vertical roll jumps by 180 deg
             signals = {"tilt": tilted[i], "pitch": signals["pitch"]}
@@ -170,24 +156,24 @@ class Overlay:
             span = 2.0 * max(map(abs, _bounds(limit)), default=15.0) if tilted is None else whole[name]
             broken, shown = _breaks(limit, value), f"{round(value, 2) + 0.0:+.2f}"
             painter.text(x, row, name, size=17)
-            painter.text(x + 262, row, shown, size=17, colour=RED if broken else WHITE, anchor="ra")
-            painter.box(x, row + 25, 262, 9, FAINT)
+            painter.text(x + 262, row, shown, size=17, colour=ink.RED if broken else ink.WHITE, anchor="ra")
+            painter.box(x, row + 25, 262, 9, ink.FAINT)
             centre, unit = x + 131, 131 / span
-            painter.box(centre, row + 25, unit * float(np.clip(value, -span, span)), 9, RED if broken else BLUE)
-            painter.box(centre - 0.5, row + 23, 1, 13, GREY)
+            painter.box(centre, row + 25, unit * float(np.clip(value, -span, span)), 9, ink.RED if broken else ink.BLUE)
+            painter.box(centre - 0.5, row + 23, 1, 13, ink.GREY)
             for bound in _bounds(limit):
-                painter.box(centre + unit * bound - 1, row + 21, 2.5, 17, RED if broken else AMBER)
+                painter.box(centre + unit * bound - 1, row + 21, 2.5, 17, ink.RED if broken else ink.AMBER)
 
     def _speeds(self, painter: Painter, x: float, y: float, i: int) -> None:
         limit = self._limit("speed", i)
         top = 1.25 * (limit.upper if limit and math.isfinite(limit.upper) else self._run.vehicle.speed_max)
-        painter.text(x, y, "rotor speed [rad/s]", size=13, colour=GREY)
+        painter.text(x, y, "rotor speed [rad/s]", size=13, colour=ink.GREY)
         self._bars(painter, x, y, self._footage.speeds[i], limit, (0.0, top), "{:.0f}")
 
     def _slews(self, painter: Painter, x: float, y: float, i: int) -> None:
         limit = self._limit("slew", i)
         span = 1.6 * max(map(abs, _bounds(limit)), default=12.5)
-        painter.text(x, y, "step per period [rad/s]", size=13, colour=GREY)
+        painter.text(x, y, "step per period [rad/s]", size=13, colour=ink.GREY)
         self._bars(painter, x, y, self._run.log.control.slews[self._footage.period[i]], limit, (-span, span), "{:+.1f}")
 
     def _bars(
@@ -204,27 +190,27 @@ class Overlay:
         unit = height / (high - low)
         zero = top + height + unit * min(low, 0.0)
         for j, value in enumerate(values):
-            left, broken = x + 50 * j, _breaks(limit, value)
-            painter.box(left, top, 34, height, FAINT)
-            painter.box(left, zero, 34, -unit * float(np.clip(value, low, high)), RED if broken else BLUE)
-            shown = form.format(round(value, 1) + 0.0)
-            painter.text(left + 17, top + height + 5, shown, size=13, colour=RED if broken else WHITE, anchor="ma")
+            left, broken, shown = x + 50 * j, _breaks(limit, value), form.format(round(value, 1) + 0.0)
+            colour = ink.RED if broken else ink.WHITE
+            painter.box(left, top, 34, height, ink.FAINT)
+            painter.box(left, zero, 34, -unit * float(np.clip(value, low, high)), ink.RED if broken else ink.BLUE)
+            painter.text(left + 17, top + height + 5, shown, size=13, colour=colour, anchor="ma")
         for bound in _bounds(limit):
             if bound != 0.0:
-                painter.box(x - 4, zero - unit * bound - 1, 192, 2, AMBER)
+                painter.box(x - 4, zero - unit * bound - 1, 192, 2, ink.AMBER)
 
     def _margins(self, painter: Painter, x: float, y: float, i: int) -> None:
-        painter.text(x, y, "limit", size=13, colour=GREY)
-        painter.text(x + 226, y, "worst margin so far", size=13, colour=GREY, anchor="ra")
+        painter.text(x, y, "limit", size=13, colour=ink.GREY)
+        painter.text(x + 226, y, "worst margin so far", size=13, colour=ink.GREY, anchor="ra")
         shown, rest = margin_rows(self._ranked, i)
         pitch = 18.5 if len(self._ranked) <= _MOST_MARGINS else 16.0
         for j, track in enumerate(shown):
             worst, row = track.worst[i], y + 22 + pitch * j
             now_broken, once_broken = (margin < -track.limit.tolerance for margin in (track.now[i], worst))
-            painter.text(x, row, track.limit.name, size=14, colour=RED if now_broken else GREY)
+            painter.text(x, row, track.limit.name, size=14, colour=ink.RED if now_broken else ink.GREY)
             phrases = f"{round(worst, 2) + 0.0:+.2f} {track.limit.unit}"
-            painter.text(x + 226, row, phrases, size=14, colour=RED if once_broken else WHITE, anchor="ra")
-        colour = RED if "violated" in rest else GREY
+            painter.text(x + 226, row, phrases, size=14, colour=ink.RED if once_broken else ink.WHITE, anchor="ra")
+        colour = ink.RED if "violated" in rest else ink.GREY
         painter.text(x, y + 22 + pitch * len(shown), rest, size=14, colour=colour)
 
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from quadsim.errors import FileError, ParameterError
+from quadsim.errors import FileError
 from quadsim.flight.audit import Limit, margins_at, margins_sampled
 from quadsim.flight.rundir import Run
 from quadsim.rotation import euler_to_quaternion
@@ -27,26 +27,15 @@ class Shot:
     width: int = 1280  # [pixels], even
     height: int = 720  # [pixels], even
     fps: int = 30  # frames per second of film
-    start: float = 0.0  # simulated time of frame 0 [s]
     speed: float = 1.0  # simulated seconds per second of film
     first: int = 0  # first frame to film
     count: int  # how many
     compact: bool = False  # whether to leave out all but the largest captions, for small pictures
 
-    def __post_init__(self) -> None:
-        for name, smallest in (("width", 320), ("height", 180), ("fps", 1), ("count", 1)):
-            if getattr(self, name) < smallest:
-                raise ParameterError("film", name, getattr(self, name), f"at least {smallest}")
-        for name in ("width", "height"):
-            if getattr(self, name) % 2:
-                raise ParameterError("film", name, getattr(self, name), "even")
-        if not self.speed > 0.0:
-            raise ParameterError("film", "speed", self.speed, "positive")
-
     @property
     def times(self) -> Array:
         """(count,) simulated times of the frames [s]."""
-        return self.start + self.speed / self.fps * np.arange(self.first, self.first + self.count, dtype=float)
+        return self.speed / self.fps * np.arange(self.first, self.first + self.count, dtype=float)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,22 +79,21 @@ class Footage:
     force: Array | None  # (F, 3) external force, world [N]; None where there is none
 
 
-def film_span(run: Run) -> tuple[float, float]:
-    """First and last simulated time [s] there is something to film of.
+def film_end(run: Run) -> float:
+    """Last simulated time [s] there is something to film of.
 
     Raises:
         FileError: the flight ended before its first control period.
     """
-    log = run.log
-    if log.control.t.size == 0 or log.plant.t.size == 0:
+    if run.log.control.t.size == 0 or run.log.plant.t.size == 0:
         raise FileError(run.directory, "holds nothing to film: the flight ended before its first control period")
-    return float(log.plant.t[0]), float(log.plant.t[-1])
+    return run.end
 
 
 def make_footage(run: Run, times: Array) -> Footage:
     """Read a flight at frame times; times beyond the flight show its ends."""
     plant, control = run.log.plant, run.log.control
-    times = np.clip(times, *film_span(run))
+    times = np.clip(times, 0.0, film_end(run))
     row = np.clip(np.searchsorted(plant.t, times + 1e-9, side="right") - 1, 0, max(plant.t.size - 2, 0))
     after = np.minimum(row + 1, plant.t.size - 1)
     share = ((times - plant.t[row]) / np.where(after > row, plant.t[after] - plant.t[row], 1.0))[:, None]

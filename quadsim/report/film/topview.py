@@ -8,8 +8,9 @@ from typing import Final
 import numpy as np
 
 from quadsim.flight.rundir import Run
+from quadsim.report.film import painter as ink
 from quadsim.report.film.frames import Footage
-from quadsim.report.film.painter import AMBER, BLUE, BRICK, CYAN, FAINT, GREEN, GREY, VIOLET, WHITE, Painter
+from quadsim.report.film.painter import Painter
 from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.state import Array
 
@@ -56,27 +57,29 @@ class TopView:
 
         footage = self._footage
         flown = footage.path[: np.searchsorted(footage.path_times, footage.times[i], side="right")]
-        painter.text(x + 10, y + 6, "from above", size=13, colour=GREY)
+        painter.text(x + 10, y + 6, "from above", size=13, colour=ink.GREY)
         for obstacle in self._obstacles:
             for outline, meets in outlines(obstacle, footage.times[i], footage.position[i, 2], self._radius):
                 points = centre + (np.clip(outline, self._low[:2], self._high[:2]) - self._middle[:2]) * (unit, -unit)
-                painter.polygon(points, BRICK if meets else FAINT)
+                painter.polygon(points, ink.BRICK if meets else ink.FAINT)
         for region, edges in self._regions:
             for edge in edges if region.holds_at(footage.times[i : i + 1])[0] else ():
                 if not ((edge < self._low).all(axis=0) | (edge > self._high).all(axis=0))[:2].any():
-                    painter.line(place(edge), GREY, width=1.0)
-        painter.line(place(footage.course), AMBER, width=1.2)
-        painter.line(place(np.concatenate([flown, footage.position[i : i + 1]])), BLUE, width=2.2)
+                    painter.line(place(edge), ink.GREY, width=1.0)
+        painter.line(place(footage.course), ink.AMBER, width=1.2)
+        painter.line(place(np.concatenate([flown, footage.position[i : i + 1]])), ink.BLUE, width=2.2)
         spot = place(footage.position[i])
         yaw = footage.euler[i, 2]
-        painter.line(np.stack([spot, spot + 11.0 * np.array([math.cos(yaw), -math.sin(yaw)])]), WHITE, width=2.5)
-        painter.dot(spot, 4.0, WHITE)
+        painter.line(np.stack([spot, spot + 11.0 * np.array([math.cos(yaw), -math.sin(yaw)])]), ink.WHITE, width=2.5)
+        painter.dot(spot, 4.0, ink.WHITE)
         if self._acting:
-            painter.arrow(spot - 1.25 * self._wind[i], self._wind[i], CYAN)
-            painter.arrow(spot, self._force[i], VIOLET)
-        metres = _round_length(0.22 * width / unit)
-        painter.box(x + width - 60 - unit * metres, y + 18, unit * metres, 2, GREY)
-        painter.text(x + width - 60, y + 4, f"{metres:g} m", size=12, colour=GREY, anchor="ra")
+            painter.arrow(spot - 1.25 * self._wind[i], self._wind[i], ink.CYAN)
+            painter.arrow(spot, self._force[i], ink.VIOLET)
+        longest = 0.22 * width / unit  # of 1, 2, 5 times a power of ten
+        power = 10.0 ** math.floor(math.log10(longest))
+        metres = max(power * factor for factor in (1.0, 2.0, 5.0) if power * factor <= longest)
+        painter.box(x + width - 60 - unit * metres, y + 18, unit * metres, 2, ink.GREY)
+        painter.text(x + width - 60, y + 4, f"{metres:g} m", size=12, colour=ink.GREY, anchor="ra")
 
         rise = room[1] / extent[2]
         bar, bottom = x + width - 26, y + 32 + room[1]
@@ -84,10 +87,11 @@ class TopView:
         def level(z: float) -> float:
             return float(bottom - rise * (np.clip(z, self._low[2], self._high[2]) - self._low[2]))
 
-        painter.text(bar + 4, y + 6, "z", size=13, colour=GREY, anchor="ma")
-        painter.box(bar, bottom, 8, -room[1], FAINT)
-        painter.box(bar, bottom, 8, level(footage.position[i, 2]) - bottom, BLUE)
-        for right, label, colour in ((0.05, "reference", AMBER), (0.40, "flown", BLUE), (0.64, "predicted", GREEN)):
+        painter.text(bar + 4, y + 6, "z", size=13, colour=ink.GREY, anchor="ma")
+        painter.box(bar, bottom, 8, -room[1], ink.FAINT)
+        painter.box(bar, bottom, 8, level(footage.position[i, 2]) - bottom, ink.BLUE)
+        legend = (0.05, "reference", ink.AMBER), (0.40, "flown", ink.BLUE), (0.64, "predicted", ink.GREEN)
+        for right, label, colour in legend:
             painter.text(x + right * width, y + height - 20, label, size=0.056 * width, colour=colour)
 
 
@@ -96,9 +100,3 @@ def _arrows(vectors: Array, of_flight: Array) -> Array:
     longest = max(float(np.linalg.norm(of_flight[:, :2], axis=1).max()), 1e-9)
     arrows: Array = vectors[:, :2] * (1.0, -1.0) * (_LONGEST_ARROW / longest)
     return arrows
-
-
-def _round_length(length: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is no longer than a length."""
-    power = 10.0 ** math.floor(math.log10(length))
-    return max(power * factor for factor in (1.0, 2.0, 5.0) if power * factor <= length)

@@ -22,9 +22,9 @@ from typing import IO, Final
 
 from quadsim.assets import own_packages
 from quadsim.errors import OutputError, ParameterError, RenderingUnavailableError
-from quadsim.flight.rundir import Run, load_run
+from quadsim.flight.rundir import load_run
 from quadsim.outputs import writing_file
-from quadsim.report.film.frames import Shot, film_span
+from quadsim.report.film.frames import Shot, film_end
 from quadsim.vehicle import Vehicle
 
 BACKENDS: Final = ("egl", "osmesa")  # what can render without a screen, in the order tried
@@ -86,63 +86,41 @@ def render_video(
     width: int = 1280,
     height: int = 720,
     fps: int = 30,
-    start: float = 0.0,
-    stop: float | None = None,
-    speed: float = 1.0,
     overwrite: bool = False,
 ) -> None:
     """Film a run as an MP4 (H.264, 4:2:0), which appears at `path` complete or not at all.
 
-    Args:
-        run_directory: a run with its summary and Parquet files.
-        path: the MP4 to write.
-        workers: rendering processes, at most; the machine's cores when None.
-        progress: called with frames done and frames in all, in the caller's thread.
-        width: [pixels], even.
-        height: [pixels], even.
-        fps: frames per second.
-        start: first simulated time shown [s].
-        stop: last simulated time shown [s]; the flight's end when None.
-        speed: simulated seconds per second of film.
-        overwrite: whether to replace a file that is there.
+    Width and height are even [pixels].  `workers` is how many processes render, at most; the machine's cores when None.
+    `progress` is called with frames done and frames in all, in the caller's thread.
 
     Raises:
         FileError: the run cannot be read, or holds nothing to film.
         OutputError: the film cannot be written, or a renderer failed; nothing is left behind.
-        ParameterError: a size, rate or time that cannot be.
+        ParameterError: there are to be no workers.
         RenderingUnavailableError: this machine cannot render.
     """
-    shot = _plan(load_run(run_directory), start, stop, Shot(
-        run=str(run_directory), width=width, height=height, fps=fps, speed=speed, count=1
-    ))  # fmt: skip
+    end = film_end(load_run(run_directory))
+    shot = Shot(run=str(run_directory), width=width, height=height, fps=fps, count=max(1, round(end * fps)))
     with _making(path, overwrite) as new:
         _film(shot, new, workers, progress)
 
 
-def render_gif(
-    run_directory: Path,
-    path: Path,
-    *,
-    width: int = 480,
-    fps: int = 8,
-    start: float = 0.0,
-    stop: float | None = None,
-    speed: float = 6.0,
-    workers: int | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Film a run as a small looping GIF in 16:9, a time-lapse by default; arguments and errors as `render_video`.
+def render_gif(run_directory: Path, path: Path, *, workers: int | None = None, overwrite: bool = False) -> None:
+    """Film a run as a small looping GIF in 16:9, six times as fast as it was; arguments and errors as `render_video`.
 
     It is rendered at twice its size, with large captions, and scaled down, which smooths its edges.
     """
-    shot = _plan(load_run(run_directory), start, stop, Shot(
-        run=str(run_directory), width=2 * width, height=2 * round(width * 9 / 16), fps=fps, speed=speed, count=1,
-        compact=True,
-    ))  # fmt: skip
+    fps, speed = 8, 6.0
+    count = max(1, round(film_end(load_run(run_directory)) * fps / speed))
+    shot = Shot(run=str(run_directory), width=960, height=540, fps=fps, speed=speed, count=count, compact=True)
     with _making(path, overwrite) as new:
         film = new.with_suffix(".mp4")
         backend = _film(shot, film, workers, None)
-        _work([_to_gif(film, new, width)], backend, new.parent)
+        # small by few colours and little noise
+        scaled = "scale=480:-2:flags=area,hqdn3d=3:3:0:0,split[a][b]"
+        colours = "[a]palettegen=max_colors=96:stats_mode=diff[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
+        looping = ("-i", str(film), "-filter_complex", f"{scaled};{colours}", "-loop", "0", str(new))
+        _work([(*_ffmpeg(), *looping)], backend, new.parent)
 
 
 def render_portrait(
@@ -152,14 +130,6 @@ def render_portrait(
     with _making(path, overwrite) as new:
         command = (*_WORKER, "portrait", json.dumps(asdict(vehicle)), str(new), str(width), str(height))
         _work([command], rendering_backend(), new.parent)
-
-
-def _plan(run: Run, start: float, stop: float | None, shot: Shot) -> Shot:
-    first, last = film_span(run)
-    stop = last if stop is None else min(stop, last)
-    if not first <= start <= stop:
-        raise ParameterError("film", "start", start, f"between {first:g} s and its stop at {stop:g} s")
-    return replace(shot, start=start, count=max(1, round((stop - start) * shot.fps / shot.speed)))
 
 
 def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None) -> str:
@@ -175,21 +145,9 @@ def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None
     _work(commands, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
     listing = path.parent / "pieces.txt"
     listing.write_text("".join(f"file '{name}'\n" for name in names), encoding="utf-8")
-    _work([_join(listing, path)], backend, path.parent)
+    joined = ("-f", "concat", "-safe", "0", "-i", str(listing), "-c", "copy", "-movflags", "+faststart", str(path))
+    _work([(*_ffmpeg(), *joined)], backend, path.parent)
     return backend
-
-
-def _join(listing: Path, path: Path) -> tuple[str, ...]:
-    """The command that joins the MP4 files which an ffmpeg concat list names, without encoding again."""
-    copied = ("-f", "concat", "-safe", "0", "-i", str(listing), "-c", "copy", "-movflags", "+faststart")
-    return (*_ffmpeg(), *copied, str(path))
-
-
-def _to_gif(film: Path, path: Path, width: int) -> tuple[str, ...]:
-    """The command that makes a looping GIF of an MP4, `width` pixels wide, small by few colours and little noise."""
-    picture = f"scale={width}:-2:flags=area,hqdn3d=3:3:0:0,split[a][b];[a]palettegen=max_colors=96:stats_mode=diff[p]"
-    dither = "[b][p]paletteuse=dither=none:diff_mode=rectangle"
-    return (*_ffmpeg(), "-i", str(film), "-filter_complex", f"{picture};{dither}", "-loop", "0", str(path))
 
 
 def _ffmpeg() -> tuple[str, ...]:

@@ -17,28 +17,18 @@ Everything stands on one timeline, `sim_time`, the simulated time:
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
-import pickle
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from quadsim.assets import own_packages
 from quadsim.errors import FileError, OutputError, ViewerUnavailableError
 from quadsim.flight.rundir import Run
 from quadsim.outputs import writing_file
-from quadsim.report.palette import line_colour
-from quadsim.report.recording.layout import blueprint
-from quadsim.report.recording.signals import send_effects, send_limit, send_signals, send_solver
-from quadsim.report.recording.style import on_screen
-from quadsim.report.recording.texts import send_texts
-from quadsim.report.recording.world import send_airframe, send_scene, send_space
 
 _CALL: Final = "import sys; from rerun_cli.__main__ import main; sys.exit(main())"
 _VIEWER: Final = (sys.executable, "-P", "-c", _CALL, "--bind=127.0.0.1", "--port=auto")
@@ -59,8 +49,18 @@ def write_recording(run: Run, path: Path) -> None:
 def _encode(run: Run, path: Path) -> bytes:
     """The file's content, made in memory: rerun's own file writer hides from Python why it failed."""
     import rerun as rr
+    import rerun.blueprint as rrb
 
-    recording = rr.RecordingStream(f"quadsim {run.name}", recording_id=_identity(run), send_properties=False)
+    from quadsim.report.recording.plots import send_plots, send_texts
+    from quadsim.report.recording.style import TIMELINE
+    from quadsim.report.recording.world import scene_views, send_airframe, send_scene, send_space
+
+    digest = hashlib.sha256(repr((run.vehicle, run.limits)).encode())
+    for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    # the viewer merges recordings that share an identity
+    identity = f"{run.name}-{digest.hexdigest()[:16]}"
+    recording = rr.RecordingStream(f"quadsim {run.name}", recording_id=identity, send_properties=False)
     if not rr.is_enabled(recording):
         raise OutputError(path, "rerun is switched off by the environment variable RERUN")
     memory = recording.memory_recording()
@@ -68,58 +68,24 @@ def _encode(run: Run, path: Path) -> bytes:
     rr.set_strict_mode(True)  # otherwise what cannot be recorded is left out with a warning
     try:
         recording.send_recording_name(run.name)
-        recording.send_blueprint(blueprint(run), make_active=True, make_default=True)
         send_airframe(recording, run.vehicle)
         send_scene(recording, run)
         send_space(recording, run)
-        send_signals(recording, run.log)
-        for limit in run.limits:
-            peers = [peer.name for peer in run.limits if peer.unit == limit.unit]  # in one plot of margins
-            send_limit(recording, limit, run.log, on_screen(line_colour(peers.index(limit.name))))
-        send_solver(recording, run)
-        send_effects(recording, run.log)
         send_texts(recording, run)
+        views = rrb.Horizontal(scene_views(run), send_plots(recording, run), column_shares=[4, 5])
+        layout = rrb.Blueprint(  # nothing is left to be clicked or unfolded
+            views,
+            rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="playing", loop_mode="all"),
+            rrb.BlueprintPanel(state="collapsed"),
+            rrb.SelectionPanel(state="collapsed"),
+            auto_layout=False,
+            auto_views=False,
+        )
+        recording.send_blueprint(layout, make_active=True, make_default=True)
         return bytes(memory.drain_as_bytes())
     finally:
         rr.set_strict_mode(strict)
         recording.disconnect()
-
-
-def _identity(run: Run) -> str:
-    """The same for equal flights and different for others: the viewer merges recordings that share it."""
-    digest = hashlib.sha256(repr((run.vehicle, run.limits)).encode())
-    for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return f"{run.name}-{digest.hexdigest()[:16]}"
-
-
-@contextlib.contextmanager
-def recording_in_background(directory: Path, path: Path) -> Iterator[None]:
-    """Write the recording of a run directory to a file while the block runs; it is complete once the block is left.
-
-    A Ctrl-C does not reach the process, which has no terminal of its own: whatever ends the block early ends it too,
-    and what it wrote until then is not under the recording's name.
-
-    Raises:
-        OutputError: the file cannot be written, as from `write_recording`.
-    """
-    with subprocess.Popen(
-        [sys.executable, "-P", "-m", "quadsim.report.recording", str(directory), str(path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={**os.environ, **own_packages()},
-        process_group=0,
-    ) as process:
-        try:
-            yield
-            raised, output = process.communicate()
-        finally:
-            process.kill()  # of no consequence to one that is done
-    if raised:
-        raise pickle.loads(raised)
-    if process.returncode:
-        last = output.decode(errors="replace").strip().rpartition("\n")[2]
-        raise OutputError(path, last or f"its process ended with status {process.returncode}")
 
 
 def viewer_problem() -> str | None:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import rerun as rr
 
 from quadsim.flight.audit import SIGNALS
-from quadsim.report.palette import line_colour
+from quadsim.flight.log import FlightLog
+from quadsim.report.curves import line_colour
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
-
-if TYPE_CHECKING:
-    import rerun as rr
-
-    from quadsim.flight.log import FlightLog
 
 TIMELINE: Final = "sim_time"
 
@@ -60,10 +58,6 @@ WHOLE_PATH: Final = (70, 160, 255, 60)
 REFERENCE: Final = (165, 170, 178, 255)
 PREDICTED: Final = (255, 160, 40, 255)
 BOUND: Final = (255, 70, 70, 255)
-CARBON: Final = (75, 80, 90, 255)
-METAL: Final = (150, 155, 165, 255)
-SHELL: Final = (235, 238, 242, 255)
-FORWARD: Final = (245, 110, 30, 255)
 FORCE: Final = (225, 90, 200, 255)
 WIND: Final = (110, 220, 225, 255)
 OBSTACLE: Final = (184, 92, 72, 255)
@@ -80,6 +74,4 @@ VERDICTS: Final = {
 
 def time_column(t: Array) -> rr.TimeColumn:
     """Instants [s] on the recording's one timeline."""
-    import rerun as rr
-
     return rr.TimeColumn(TIMELINE, duration=t)

@@ -3,77 +3,68 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+import mujoco
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
 from quadsim.controller import Phase
 from quadsim.flight.rundir import Run
 from quadsim.report.recording import style
-from quadsim.report.recording.style import Colour, time_column
+from quadsim.report.recording.style import TIMELINE, Colour, time_column
 from quadsim.report.scene import obstacles_in, region_edges
 from quadsim.rotation import euler_to_quaternion
+from quadsim.sim.airframe import DISC_NAMES, DRAWN_ARM, FLOOR, compile_model
+from quadsim.space import Solid
 from quadsim.state import EULER, POSITION, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
 _WIND_LENGTH: Final = 1.5  # how long a flight's strongest wind is drawn, in arm lengths
-_DRAWN_ARM: Final = 0.3  # arm length [m] for which the airframe's parts are measured, as in `models/quadrotor.xml`
 
 
 def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
-    """The vehicle from primitives, in its body frame; what points forward is orange, rotors look as in the plots."""
-    import rerun as rr
+    """The vehicle as films show it, in its body frame, but for rotor discs in the colours of the plots."""
+    model = compile_model(vehicle, visuals=True)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    colours = dict(zip(DISC_NAMES, ((*colour[:3], 110) for colour in style.SERIES), strict=True))
+    for i in range(model.ngeom):
+        geom = model.geom(i)
+        if geom.name != FLOOR and not geom.name.startswith("blades"):
+            kind = mujoco.mjtGeom(int(geom.type[0])).name.removeprefix("mjGEOM_").lower()
+            solid = Solid(kind, tuple(geom.size), data.geom_xpos[i].copy(), data.geom_xmat[i].reshape(3, 3).copy())
+            lightened = 76 + 179 * model.mat_rgba[geom.matid[0]]  # the viewer's background may be black
+            colour = colours.get(geom.name) or tuple(int(shade) for shade in lightened)
+            recording.log(f"world/vehicle/body/{geom.name}", _part(solid, colour), static=True)
+    unit = vehicle.arm_length / DRAWN_ARM
+    origins = vehicle.rotor_positions + np.array([0.0, 0.0, 0.036 * unit])
+    arrows = rr.Arrows3D.from_fields(origins=origins, radii=0.01 * unit, colors=list(style.SERIES))
+    recording.log("world/vehicle/body/thrust", arrows, static=True)
 
-    unit, rotors, azimuths = _unit(vehicle), vehicle.rotor_positions, np.radians(vehicle.rotor_azimuths)
-    up = np.array([0.0, 0.0, unit])
-    gaps = np.linalg.norm(rotors[:, None] - rotors[None], axis=2)[~np.eye(N_ROTORS, dtype=bool)]
-    arm = [vehicle.arm_length / 2, 0.011 * unit, 0.011 * unit]
-    parts: dict[str, rr.AsComponents] = {
-        "arms": rr.Boxes3D(
-            centers=rotors / 2,
-            half_sizes=np.tile(arm, (N_ROTORS, 1)),
-            quaternions=_vector_first(euler_to_quaternion(azimuths[:, None] * [0.0, 0.0, 1.0])),
-            colors=[style.FORWARD if x > 0.1 * vehicle.arm_length else style.CARBON for x in rotors[:, 0]],
-            fill_mode="solid",
-        ),
-        "hub": rr.Ellipsoids3D(
-            centers=unit * np.array([[0.0, 0.0, 0.01], [0.065, 0.0, 0.0]]),
-            half_sizes=unit * np.array([[0.065, 0.052, 0.034], [0.022, 0.022, 0.022]]),
-            colors=[style.SHELL, style.FORWARD],
-            fill_mode="solid",
-        ),
-        "motors": rr.Cylinders3D(
-            centers=rotors + 0.006 * up,
-            lengths=[0.04 * unit] * N_ROTORS,
-            radii=[0.023 * unit] * N_ROTORS,
-            colors=style.METAL,
-            fill_mode="solid",
-        ),
-        "discs": rr.Cylinders3D(
-            centers=rotors + 0.034 * up,
-            lengths=[0.003 * unit] * N_ROTORS,
-            radii=[min(0.125 * unit, 0.48 * float(gaps.min()))] * N_ROTORS,
-            colors=[(*colour[:3], 110) for colour in style.SERIES],
-            fill_mode="solid",
-        ),
-        "legs": rr.LineStrips3D(
-            [[0.45 * rotor, 0.6 * rotor - 0.12 * up] for rotor in rotors], radii=0.007 * unit, colors=style.CARBON
-        ),
-        "thrust": rr.Arrows3D.from_fields(origins=rotors + 0.036 * up, radii=0.01 * unit, colors=list(style.SERIES)),
-    }
-    for name, part in parts.items():
-        recording.log(f"world/vehicle/body/{name}", part, static=True)
+
+def _part(solid: Solid, colour: Any) -> rr.AsComponents:
+    """A solid, or an ellipsoid of half axes `size`."""
+    a, b, _ = solid.size
+    turned = {"quaternions": _vector_first(solid.quaternion)[None], "colors": colour, "fill_mode": "solid"}
+    centres: Any = [solid.centre]
+    match solid.kind:
+        case "box":
+            return rr.Boxes3D(centers=centres, half_sizes=[solid.size], **turned)
+        case "cylinder":
+            return rr.Cylinders3D(centers=centres, lengths=[2.0 * b], radii=[a], **turned)
+        case "capsule":
+            begin = solid.centre - b * solid.turn[:, 2]
+            return rr.Capsules3D(translations=[begin], lengths=[2.0 * b], radii=[a], **turned)
+    half = (a, a, a) if solid.kind == "sphere" else solid.size
+    return rr.Ellipsoids3D(centers=centres, half_sizes=[half], **turned)
 
 
 def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     """Axes and paths, how the vehicle moves through them, and what the controller predicts."""
-    import rerun as rr
-
     control, plant = run.log.control, run.log.plant
     position = plant.state[:, POSITION]
     thickness = min(0.02, 0.06 * run.vehicle.arm_length)
@@ -95,9 +86,13 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     recording.send_columns("world/vehicle/body", [time_column(plant.t)], rr.Transform3D.columns(quaternion=attitude))
     recording.send_columns("world/vehicle/body/thrust", [time_column(plant.t)], arrows)
     if plant.wrench is not None and np.any(plant.wrench[:, :3]):
-        _send_force(recording, run.vehicle, plant.t, plant.wrench[:, :3])
+        vehicle = run.vehicle
+        scale = _FORCE_SCALE * vehicle.arm_length / (vehicle.mass * vehicle.gravity / N_ROTORS)
+        _send_arrows(recording, run, "external_force", scale * plant.wrench[:, :3], style.FORCE, behind=0.0)
     if plant.wind is not None and np.any(plant.wind):
-        _send_wind(recording, run.vehicle, plant.t, plant.wind)
+        strongest = float(np.linalg.norm(plant.wind, axis=1).max())
+        drawn = _WIND_LENGTH * run.vehicle.arm_length / strongest * plant.wind
+        _send_arrows(recording, run, "wind", drawn, style.WIND, behind=1.3)
 
     if control.t.size:
         starts = np.searchsorted(plant.t, control.t - 1e-9)
@@ -116,27 +111,10 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
 
 def send_space(recording: rr.RecordingStream, run: Run) -> None:
     """Obstacles, which move where they do, and regions, which are there while they hold."""
-    import rerun as rr
-
-    look: dict[str, Any] = {"colors": style.OBSTACLE, "fill_mode": "solid"}
     for obstacle in obstacles_in(run.limits):
         entity = f"world/obstacles/{obstacle.name}"
         for i, solid in enumerate(obstacle.solids):
-            a, b, _ = solid.size
-            turned = {"quaternions": _vector_first(solid.quaternion)[None], **look}
-            centres, radii = [solid.centre], [a]
-            part: rr.AsComponents
-            match solid.kind:
-                case "box":
-                    part = rr.Boxes3D(centers=centres, half_sizes=[solid.size], **turned)
-                case "sphere":
-                    part = rr.Ellipsoids3D(centers=centres, radii=radii, **look)
-                case "cylinder":
-                    part = rr.Cylinders3D(centers=centres, lengths=[2.0 * b], radii=radii, **turned)
-                case "capsule":
-                    begin = solid.centre - b * solid.turn[:, 2]
-                    part = rr.Capsules3D(translations=[begin], lengths=[2.0 * b], radii=radii, **turned)
-            recording.log(f"{entity}/{i}", part, static=True)
+            recording.log(f"{entity}/{i}", _part(solid, style.OBSTACLE), static=True)
         if obstacle.moves:
             t = run.log.plant.t
             moving = rr.Transform3D.columns(translation=obstacle.positions(t))
@@ -151,34 +129,54 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
         recording.send_columns(entity, [time_column(times[np.isfinite(times)])], strips)
 
 
-def _unit(vehicle: Vehicle) -> float:
-    """The scale of the drawing."""
-    return vehicle.arm_length / _DRAWN_ARM
+def scene_views(run: Run) -> rrb.Vertical:
+    """Course and vehicle in space, and the summary."""
+    behind = run.vehicle.arm_length * np.array([-3.0, -3.5, 2.2])
+    return rrb.Vertical(
+        _view("Course", "/world", *_overview(run)),
+        rrb.Horizontal(
+            _view("Vehicle", "/world/vehicle", behind, np.zeros(3)),
+            rrb.TextDocumentView(name="Summary", origin="/summary"),
+        ),
+        row_shares=[3, 2],
+    )
 
 
-def _send_force(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, force: Array) -> None:
-    """The external force (M, 3) [N] as an arrow in the world frame that moves with the vehicle."""
-    import rerun as rr
+def _overview(run: Run) -> tuple[Array, Array]:
+    """Where the eye is and where it looks [m] to see the whole course."""
+    path, course = run.log.plant.state[:, POSITION], run.log.control.reference[:, :3]
+    path = path[np.isfinite(path).all(axis=1)]  # a flight that diverged ends in anything
+    course = course if len(course) else path
+    low, high, least = course.min(axis=0), course.max(axis=0), 10 * run.vehicle.arm_length
+    slack = max(float((high - low).max()), least)
+    path = np.clip(path, low - slack, high + slack)  # a lost vehicle leaves the picture
+    low, high = np.minimum(low, path.min(axis=0)), np.maximum(high, path.max(axis=0))
+    centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), least)
+    return centre + size * np.array([0.35, -0.9, 0.3]), centre
 
-    entity, unit = "world/vehicle/external_force", _unit(vehicle)
-    above_the_discs = [0.0, 0.0, 0.08 * unit]
-    look = rr.Arrows3D.from_fields(origins=above_the_discs, radii=0.01 * unit, colors=style.FORCE)
-    scale = _FORCE_SCALE * vehicle.arm_length / (vehicle.mass * vehicle.gravity / N_ROTORS)
-    recording.log(entity, look, static=True)
-    recording.send_columns(entity, [time_column(t)], rr.Arrows3D.columns(vectors=scale * force))
+
+def _view(name: str, origin: str, eye: Array, target: Array) -> rrb.Spatial3DView:
+    """The scene seen from a point at rest in the frame of `origin`, and the ground, in the frame of the world."""
+    start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    return rrb.Spatial3DView(
+        name=name,
+        origin=origin,
+        contents="/world/**",
+        line_grid=rrb.LineGrid3D(visible=origin == "/world", spacing=1.0),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=target),
+        overrides={"/world/flown": rrb.VisibleTimeRanges(timeline=TIMELINE, start=start, end=now)},
+    )
 
 
-def _send_wind(recording: rr.RecordingStream, vehicle: Vehicle, t: Array, wind: Array) -> None:
-    """The wind (M, 3) [m/s] as an arrow in the world frame that meets the vehicle from upwind."""
-    import rerun as rr
-
-    entity, unit = "world/vehicle/wind", _unit(vehicle)
-    look = rr.Arrows3D.from_fields(radii=0.01 * unit, colors=style.WIND)
-    vectors = _WIND_LENGTH * vehicle.arm_length / float(np.linalg.norm(wind, axis=1).max()) * wind
-    above_the_discs = np.array([0.0, 0.0, 0.08 * unit])
-    recording.log(entity, look, static=True)
-    columns = rr.Arrows3D.columns(vectors=vectors, origins=above_the_discs - 1.3 * vectors)
-    recording.send_columns(entity, [time_column(t)], columns)
+def _send_arrows(
+    recording: rr.RecordingStream, run: Run, name: str, vectors: Array, colour: Colour, *, behind: float
+) -> None:
+    """Arrows (M, 3) above the rotor discs that move with the vehicle, begun by `behind` of their length before it."""
+    entity, unit = f"world/vehicle/{name}", run.vehicle.arm_length / DRAWN_ARM
+    recording.log(entity, rr.Arrows3D.from_fields(radii=0.01 * unit, colors=colour), static=True)
+    origins = np.array([0.0, 0.0, 0.08 * unit]) - behind * vectors
+    columns = rr.Arrows3D.columns(vectors=vectors, origins=origins)
+    recording.send_columns(entity, [time_column(run.log.plant.t)], columns)
 
 
 def _log_lines(
@@ -189,8 +187,6 @@ def _log_lines(
     strips: Sequence[Array] | None = None,
 ) -> None:
     """Lines that stay, or the look alone of lines to come; `width` in points on the screen."""
-    import rerun as rr
-
     look = rr.LineStrips3D.from_fields(strips=strips, radii=rr.Radius.ui_points(width), colors=colour)
     recording.log(entity, look, static=True)
 

@@ -10,33 +10,68 @@ import numpy as np
 from annotated_types import doc
 
 from quadsim.errors import ParameterError
-from quadsim.fields import NonNegative, Vector
-from quadsim.sim.effects.ground_effect import Ground
+from quadsim.fields import Instant, NonNegative, Positive, Vector, filled
 from quadsim.sim.effects.load import Factor, Load, Payload
-from quadsim.sim.effects.push import Push
 from quadsim.sim.effects.rotors import RotorDynamics
-from quadsim.sim.effects.thrust_noise import ThrustNoise
 from quadsim.sim.effects.wind import Air
 from quadsim.state import Array
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.vehicle import Vehicle
 
-__all__ = [
-    "Air",
-    "Change",
-    "Disturbance",
-    "Effects",
-    "Ground",
-    "LagChange",
-    "Load",
-    "MassChange",
-    "Payload",
-    "PayloadChange",
-    "Push",
-    "PushChange",
-    "RotorChange",
-    "RotorDynamics",
-    "ThrustNoise",
-]
+
+@dataclass(frozen=True, kw_only=True)
+class Push:
+    """A constant force in the world frame that acts at a point of the body, with the torque r x R' F that follows."""
+
+    at: Instant
+    duration: Annotated[Positive, doc("[s] how long")]
+    force: Annotated[Vector, doc("[N] world frame")]
+    point: Annotated[Vector, doc("[m] where it acts, body frame")] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ground:
+    """A floor at the height at which the vehicle at z = 0 stands on its feet."""
+
+    contact: Annotated[bool, doc("whether feet and hull meet the floor")] = True
+    effect: Annotated[bool, doc("whether thrust grows near the floor (Cheeseman and Bennett)")] = False
+    rotor_radius: Annotated[Positive | None, doc("[m] for the ground effect; absent: the vehicle's rotor_radius")] = (
+        None
+    )
+
+    def resolved(self, vehicle: Vehicle) -> Ground:
+        """With the radius that is left to the vehicle, where there is a ground effect.
+
+        Raises:
+            ParameterError: neither states it.
+        """
+        if not self.effect:
+            return self
+        found = filled(self, rotor_radius=vehicle.rotor_radius)
+        if found.rotor_radius is None:
+            rule = f"given for the ground effect, as the vehicle {vehicle.name!r} states none"
+            raise ParameterError("effects.ground", "rotor_radius", None, rule)
+        return found
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThrustNoise:
+    """Each rotor gives clip(u - n, 0, 1) of its largest thrust instead of u, n normal, independent.
+
+    The mean of n is `loss` u^2 and its standard deviation is `deviation` sqrt(u), as in the simplified simulation of
+    Torrente et al. 2021, "Data-Driven MPC for Quadrotors".  The reaction torque changes with the thrust.
+    """
+
+    loss: Annotated[NonNegative, doc("[-] mean of the share of thrust lost at full thrust; grows as u^2")] = 0.0
+    deviation: Annotated[
+        NonNegative, doc("[-] its standard deviation in each physics step at full thrust; as sqrt(u)")
+    ] = 0.0
+
+    def applied(self, thrusts: Array, largest: float, rng: np.random.Generator) -> Array:
+        """The thrusts (M, 4) [N] over M steps that result where these are commanded, of `largest` [N] at most."""
+        share = thrusts / largest
+        lost = self.loss * np.square(share) + self.deviation * np.sqrt(share) * rng.standard_normal(share.shape)
+        given: Array = largest * np.clip(share - lost, 0.0, 1.0)
+        return given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +105,6 @@ class RotorChange:
     time: float
     rotor: int
     efficiency: float
-
-    def __post_init__(self) -> None:
-        if self.rotor not in range(1, N_ROTORS + 1):
-            raise ParameterError("events", "rotor", self.rotor, f"1 to {N_ROTORS}")
-        if not 0.0 <= self.efficiency <= 1.0:
-            raise ParameterError("events", "efficiency", self.efficiency, "between 0 and 1")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -61,11 +61,7 @@ class StepForces:
         self._of_pose = self._always_of_pose or bool(self._pushes)
 
     def of_rotors(self, speeds: Array, accelerations: Array) -> Array:
-        """What the forces take from the rotors, whatever the motion.
-
-        Args:
-            speeds: (M, 4) rotor speeds [rad/s].
-            accelerations: (M, 4) of the rotors [rad/s^2].
+        """What the forces take from rotor speeds (M, 4) [rad/s] and their accelerations [rad/s^2], whatever the motion.
 
         Returns:
             (M, 6) drag coefficients D = sum_i k w_i [kg/s] and their moments sum_i x_i k w_i, sum_i y_i k w_i [kg m/s]

@@ -23,10 +23,6 @@ class Payload:
     mass: Annotated[Positive, doc("[kg]")]
     position: Annotated[Vector, doc("[m] in the body frame")] = (0.0, 0.0, 0.0)
 
-    def __post_init__(self) -> None:
-        if not 0.0 < self.mass < np.inf:
-            raise ParameterError("effects.load.payloads", "mass", self.mass, "positive and finite")
-
 
 Factor = Annotated[float, Ge(0.05), Le(20.0)]
 
@@ -41,13 +37,6 @@ class Load:
     ] = (1.0, 1.0, 1.0)
     centre_of_mass: Annotated[Vector, doc("[m] where it really is, body frame")] = (0.0, 0.0, 0.0)
     payloads: Annotated[tuple[Payload, ...], MaxLen(1000), doc("what it carries from the start")] = ()
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.mass_factor < np.inf:
-            raise ParameterError("effects.load", "mass_factor", self.mass_factor, "positive and finite")
-        if not all(0.0 < factor < np.inf for factor in self.inertia_factor):
-            rule = "three positive and finite numbers"
-            raise ParameterError("effects.load", "inertia_factor", self.inertia_factor, rule)
 
 
 @dataclass(frozen=True, kw_only=True)

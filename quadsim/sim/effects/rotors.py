@@ -45,15 +45,6 @@ class RotorDynamics:
         tuple[Fraction, ...], Len(N_ROTORS, N_ROTORS), doc("[-] share of its thrust and torque that each rotor gives")
     ] = (1.0, 1.0, 1.0, 1.0)
 
-    def __post_init__(self) -> None:
-        for name in ("rise", "fall", "inertia"):
-            if not 0.0 <= (getattr(self, name) or 0.0) < math.inf:
-                raise ParameterError("effects.rotors", name, getattr(self, name), "at least 0 and finite")
-        if self.acceleration is not None and not self.acceleration > 0.0:
-            raise ParameterError("effects.rotors", "acceleration", self.acceleration, "positive")
-        if len(self.efficiency) != N_ROTORS or not all(0.0 <= share <= 1.0 for share in self.efficiency):
-            raise ParameterError("effects.rotors", "efficiency", self.efficiency, "four numbers between 0 and 1")
-
     @property
     def at_once(self) -> bool:
         """Whether rotors have the commanded speed at once, and no inertia."""
@@ -86,15 +77,12 @@ class RotorDynamics:
             raise ParameterError("effects.rotors", "inertia", self.inertia, rule)
 
     def respond(self, speeds: Array, target: Array, elapsed: Array) -> tuple[Array, Array]:
-        """Speeds and accelerations some time after a command.
+        """Speeds (M, 4) [rad/s] and accelerations (M, 4) [rad/s^2] at times `elapsed` (M,) [s] after a command.
 
         Args:
             speeds: (4,) rotor speeds when the command came [rad/s].
             target: (4,) the command, within what the rotors can hold [rad/s].
             elapsed: (M,) times since then [s].
-
-        Returns:
-            (M, 4) speeds [rad/s] and (M, 4) accelerations [rad/s^2].
         """
         gap = target - speeds
         sign, distance = np.sign(gap), np.abs(gap)

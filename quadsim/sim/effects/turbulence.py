@@ -29,7 +29,6 @@ from typing import Annotated, Final
 import numpy as np
 from annotated_types import Ge, Le, doc
 
-from quadsim.errors import ParameterError
 from quadsim.state import Array
 
 LOWEST, HIGHEST = 3.048, 304.8
@@ -49,9 +48,6 @@ class Dryden:
 
     MIL-F-8785C, Sec. 3.7.3.4; the order of axes is u, v, w: along the mean wind, across it and horizontal, vertical.
     Turbulence is light, moderate and severe at a mean wind of 15, 30 and 45 knots (7.7, 15.4 and 23.2 m/s, Fig. 9).
-
-    Raises:
-        ParameterError: the altitude is outside the model, the wind speed negative, or the airspeed not positive.
     """
 
     altitude: Annotated[float, Ge(LOWEST), Le(HIGHEST), doc("[m] above the ground, for the scale lengths")] = 10.0
@@ -65,17 +61,6 @@ class Dryden:
         Annotated[float, Ge(SLOWEST_AIRSPEED), Le(FASTEST_AIRSPEED)] | None,
         doc("[m/s] at which the turbulence passes the vehicle; absent: the mean wind's speed"),
     ] = None
-
-    def __post_init__(self) -> None:
-        if not LOWEST <= self.altitude <= HIGHEST:
-            rule = f"between {LOWEST} and {HIGHEST} m (10 to 1000 ft), where the model of MIL-F-8785C holds"
-            raise ParameterError("effects.air.turbulence", "altitude", self.altitude, rule)
-        if not 0.0 <= self.wind_speed_20ft < math.inf:
-            raise ParameterError(
-                "effects.air.turbulence", "wind_speed_20ft", self.wind_speed_20ft, "a finite speed >= 0 m/s"
-            )
-        if self.airspeed is not None and not 0.0 < self.airspeed < math.inf:
-            raise ParameterError("effects.air.turbulence", "airspeed", self.airspeed, "a finite speed > 0 m/s")
 
     @property
     def lengths(self) -> Array:
@@ -98,10 +83,7 @@ class Dryden:
 class Turbulence:
     """The turbulence that passes a vehicle, an evolving state; stationary from its first sample on.
 
-    Args:
-        dryden: its strength and size.
-        timestep: time between samples [s].
-        rng: its randomness; a child of it is used, so that others may draw from it at any time.
+    It draws from a child of `rng`, so that others may draw from that at any time.
     """
 
     def __init__(self, dryden: Dryden, *, timestep: float, rng: np.random.Generator) -> None:

@@ -18,9 +18,8 @@ from typing import Final
 import numpy as np
 
 from quadsim.errors import ParameterError
-from quadsim.sim.estimation.estimate import N_ERRORS, Estimate, retract
+from quadsim.sim.estimation.estimate import N_ERRORS, Estimate, EstimatorSettings, retract
 from quadsim.sim.estimation.prediction import Drive, drive, lifts, motion_model, predict, stand
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.estimation.update import doubt, update
 from quadsim.sim.sensing.sampler import Sample
 from quadsim.sim.sensing.sensor import AXES, Sensor, SensorName
@@ -100,13 +99,10 @@ class ErrorStateFilter:
         self._stride = max(1, int(LONGEST_STEP / timestep + 1e-9))
 
     def reset(self, mean: Array, speeds: Array, rng: np.random.Generator) -> None:
-        """Start at step 0.
+        """Start at step 0, with rotor speeds (4,) in force [rad/s].
 
-        Args:
-            mean: (16,) the truth, gyro bias zero; the first estimate differs from it by a drawn error of the initial
-                covariance, the bias by what it is.
-            speeds: (4,) rotor speeds in force [rad/s].
-            rng: what the error is drawn from.
+        The first estimate differs from the truth, a mean (16,) whose gyro bias is zero, by a drawn error of the initial
+        covariance; the bias by what it is.
         """
         error = self._initial() * rng.standard_normal(N_ERRORS)
         error[12:] = 0.0
@@ -135,8 +131,8 @@ class ErrorStateFilter:
             commands: (M, 4) rotor speeds in force during each physics step [rad/s].
             samples: what has arrived meanwhile, in any order.
             first: number of the first of these physics steps.
-            standing: whether a land detector has seen the vehicle on the ground when the segment began; it has left
-                the ground once the modelled thrust exceeds its weight.
+            standing: whether a land detector has seen the vehicle on the ground when the segment began; it has left the
+                ground once the modelled thrust exceeds its weight.
         """
         changed = np.any(commands != np.vstack([self._speeds, commands[:-1]]), axis=1)
         changed[:1] |= standing is not self._standing

@@ -34,8 +34,8 @@ from quadsim.sim.estimation.estimate import (
     RATES,
     VELOCITY,
     Estimate,
+    EstimatorSettings,
 )
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
 
@@ -95,15 +95,9 @@ def drive(model: MotionModel, speeds: Array) -> Drive:
 
 
 def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: float) -> Estimate:
-    """The estimate some time later.
+    """The estimate a time h [s] later, short against the time in which the vehicle turns.
 
     The mean by the midpoint rule, the attitude on the sphere; the covariance as F P F' + Q(h), F to third order in h.
-
-    Args:
-        model: the modelled vehicle.
-        estimate: the estimate now.
-        driven: what the rotors do meanwhile.
-        duration: h [s]; short against the time in which the vehicle turns.
     """
     h, a = duration, driven.acceleration
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, p, q, r, *bias = estimate.mean.tolist()
@@ -164,16 +158,11 @@ def _gathered(density: Array) -> tuple[Array, Array, Array]:
     return read_only(density), read_only(0.5 * (N @ density + density @ N.T)), read_only(N @ density @ N.T / 3.0)
 
 
-def _blocks() -> tuple[Array, Array, Array]:
-    retained, variance, walk = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
-    retained[VELOCITY] = retained[RATES] = 0.0
-    variance[VELOCITY], variance[RATES] = STILL_VELOCITY**2, STILL_RATE**2
-    walk[POSITION], walk[ATTITUDE] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
-    return read_only(np.outer(retained, retained)), read_only(np.diag(variance)), read_only(np.diag(walk))
-
-
-_RETAINED, _VARIANCE, _WALK = _blocks()
-"""(15, 15) each: 1 where neither velocity nor rates have a part and else 0; their variance; the growth of the rest."""
+_RETAINED, _VARIANCE, _WALK = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
+"""1 where neither velocity nor rates have a part and else 0; their variance; the growth of the rest."""
+_RETAINED[VELOCITY] = _RETAINED[RATES] = 0.0
+_VARIANCE[VELOCITY], _VARIANCE[RATES] = STILL_VELOCITY**2, STILL_RATE**2
+_WALK[POSITION], _WALK[ATTITUDE] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
 
 
 def lifts(model: MotionModel, driven: Drive) -> bool:
@@ -182,15 +171,9 @@ def lifts(model: MotionModel, driven: Drive) -> bool:
 
 
 def stand(model: MotionModel, estimate: Estimate, duration: float) -> Estimate:
-    """The estimate some time later of a vehicle that stands.
-
-    Args:
-        model: the modelled vehicle.
-        estimate: the estimate now; its velocity and rates are not used.
-        duration: h [s].
-    """
+    """The estimate a time h [s] later of a vehicle that stands; its velocity and rates are not used."""
     mean = estimate.mean.copy()
     mean[VELOCITY] = mean[MEAN_RATES] = 0.0
-    covariance = _RETAINED * estimate.covariance + _VARIANCE + duration * _WALK
+    covariance = np.outer(_RETAINED, _RETAINED) * estimate.covariance + np.diag(_VARIANCE + duration * _WALK)
     covariance[GYRO_BIAS, GYRO_BIAS] += duration * model.noise[0][GYRO_BIAS, GYRO_BIAS]
     return Estimate(mean=mean, covariance=covariance)

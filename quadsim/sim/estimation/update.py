@@ -68,18 +68,11 @@ def innovation(name: SensorName, mean: Array, value: Array) -> Array:
 
 
 def update(estimate: Estimate, name: SensorName, value: Array, variance: Array, gate: float) -> tuple[Estimate, float]:
-    """The estimate after a sample, and the sample's normalised innovation squared.
+    """The estimate after a sample (3,), and the sample's normalised innovation squared.
 
     A sample whose normalised innovation squared is not within the gate, or not a number, changes nothing.  The error is
     reset to zero without G = I - [dtheta / 2]x of Solà 2017, Eq. (287), which would turn the covariance by half the
-    correction and is there neglected, too.
-
-    Args:
-        estimate: the estimate before.
-        name: which sensor.
-        value: (3,) the sample.
-        variance: (3, 3) R, of the sensor's noise.
-        gate: largest normalised innovation squared.
+    correction and is there neglected, too.  `variance` (3, 3) is R, of the sensor's noise.
     """
     H, P = OBSERVATION[name], estimate.covariance
     residual = innovation(name, estimate.mean, value)
@@ -94,16 +87,11 @@ def update(estimate: Estimate, name: SensorName, value: Array, variance: Array, 
 
 
 def doubt(estimate: Estimate, name: SensorName, value: Array, refused: float) -> Estimate:
-    """The estimate with its variance widened by as much as a sample disagrees with it, so that the sample passes.
+    """The estimate with its variance widened by as much as a sample (3,) disagrees with it, so that the sample passes.
 
     For the way back after divergence: the innovation squared is added to the variance of all that the sensor sees, and
-    (innovation / time)^2 to that of the rates of change which may have caused its error in the meantime.
-
-    Args:
-        estimate: the estimate.
-        name: which sensor.
-        value: (3,) its sample.
-        refused: for how long all its samples have been refused [s].
+    (innovation / time)^2 to that of the rates of change which may have caused its error in the meantime, in which all
+    its samples were refused [s].
     """
     covariance = estimate.covariance.copy()
     squares = np.diag(np.square(innovation(name, estimate.mean, value)))

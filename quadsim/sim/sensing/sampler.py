@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,6 @@ _COLUMNS = {
     SensorName.RATES: slice(11, 14),
 }
 """Where a sensor's quantity is in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
-
-_BLOCK: Final = 256  # samples whose errors are drawn at a time
 
 Flags = NDArray[np.bool_]
 Steps = NDArray[np.int64]
@@ -47,9 +45,6 @@ class Sampler:
     """Takes a sensor's samples; the same ones again after a reset, however the time is cut into calls.
 
     Noise, bias, dropouts and outliers each draw from a generator of their own, so none changes another's draws.
-
-    Attributes:
-        sensor: what it takes samples of.
     """
 
     def __init__(
@@ -80,50 +75,47 @@ class Sampler:
         self._of_noise, self._of_bias, self._of_dropout, self._of_outliers = copy.deepcopy(self._initial)
         self._walked: Array | None = None
         self._through: Array | None = None
-        self._errors, self._lost = np.empty((0, 3)), np.empty(0, dtype=bool)  # of the next samples, drawn ahead
 
     def sample(self, physics: Array, first: int) -> list[Sample]:
         """The samples taken during a segment of motion, those lost left out.
 
-        Args:
-            physics: (M, 14) MuJoCo's states at successive physics steps.
-            first: number of the first of these steps; segments follow one another from step 0.
+        Of MuJoCo's states (M, 14) at successive physics steps, the first of number `first`; segments follow one another
+        from step 0.
         """
         begin = -first % self._stride
         rows = physics[begin :: self._stride]
         count = len(rows)
         if not count:
             return []
-        taken = range(first + begin, first + len(physics), self._stride)
-        errors, lost = self._next_errors(count)
-        if self._faults:
-            return self._sample_with_faults(rows, errors, lost, np.array(taken, dtype=np.int64))
-        return self._samples(taken, self._measure(rows, errors), lost)
-
-    def _sample_with_faults(self, rows: Array, errors: Array, lost: Flags, taken: Steps) -> list[Sample]:
-        values = self._measure(rows, errors + self._offset(taken))
-        lost = lost | self._befallen(FaultKind.DROPOUT, taken)
-        self._freeze(values, lost, self._befallen(FaultKind.FREEZE, taken))
-        self._blank(values, taken)
-        return self._samples(taken.tolist(), values, lost)
-
-    def _samples(self, taken: Sequence[int], values: Array, lost: Flags) -> list[Sample]:
+        taken = np.arange(first + begin, first + len(physics), self._stride)
+        errors = self._walk(count) + self._draw_noise(count) + 0.0  # which leaves no -0
+        lost = self._of_dropout.random(count) < self.sensor.dropout
+        befallen = [(fault, _within(taken, window)) for fault, window in self._faults]
+        offset, frozen = np.zeros((count, 3)), np.zeros(count, dtype=bool)
+        for fault, held in befallen:
+            match fault.kind:
+                case FaultKind.BIAS:
+                    offset[held] += fault.offset
+                case FaultKind.DROPOUT:
+                    lost |= held
+                case FaultKind.FREEZE:
+                    frozen |= held
+        values = self._measure(rows, errors + offset)
+        if befallen:
+            for value, gone, stuck in zip(values, lost, frozen, strict=True):
+                if stuck and self._through is not None:
+                    value[:] = self._through
+                elif not gone:
+                    self._through = value.copy()
+        for fault, held in befallen:
+            if fault.kind is FaultKind.NAN:
+                values[np.ix_(np.flatnonzero(held), np.array(fault.axes))] = np.nan
         name, latency = self.sensor.name, self._latency
         return [
             Sample(name, step, step + latency, value)
-            for step, value, gone in zip(taken, values, lost.tolist(), strict=True)
+            for step, value, gone in zip(taken.tolist(), values, lost.tolist(), strict=True)
             if not gone
         ]
-
-    def _next_errors(self, count: int) -> tuple[Array, Flags]:
-        """(count, 3) bias and noise of the next samples, and (count,) which of them are lost; but for faults."""
-        while len(self._errors) < count:
-            errors = self._walk(_BLOCK) + self._draw_noise(_BLOCK) + 0.0  # which leaves no -0
-            lost = self._of_dropout.random(_BLOCK) < self.sensor.dropout
-            self._errors, self._lost = np.concatenate([self._errors, errors]), np.concatenate([self._lost, lost])
-        errors, self._errors = self._errors[:count], self._errors[count:]
-        lost, self._lost = self._lost[:count], self._lost[count:]
-        return errors, lost
 
     def _walk(self, count: int) -> Array:
         """(count, 3) bias at each sample: its constant at the first of all, then a random walk."""
@@ -152,33 +144,6 @@ class Sampler:
             for (w, x, y, z), (a, b, c) in zip(rows[:, _COLUMNS[name]].tolist(), errors.tolist(), strict=True)
         ]
         return quaternion_to_euler(np.array(turned))
-
-    def _befallen(self, kind: FaultKind, taken: Steps) -> Flags:
-        """(count,) whether a fault of a kind holds at these steps."""
-        held = np.zeros(len(taken), dtype=bool)
-        for fault, window in self._faults:
-            if fault.kind is kind:
-                held |= _within(taken, window)
-        return held
-
-    def _offset(self, taken: Steps) -> Array:
-        offset = np.zeros((len(taken), 3))
-        for fault, window in self._faults:
-            if fault.kind is FaultKind.BIAS:
-                offset[_within(taken, window)] += fault.offset
-        return offset
-
-    def _freeze(self, values: Array, lost: Flags, frozen: Flags) -> None:
-        for value, gone, held in zip(values, lost, frozen, strict=True):
-            if held and self._through is not None:
-                value[:] = self._through
-            elif not gone:
-                self._through = value.copy()
-
-    def _blank(self, values: Array, taken: Steps) -> None:
-        for fault, window in self._faults:
-            if fault.kind is FaultKind.NAN:
-                values[np.ix_(np.flatnonzero(_within(taken, window)), np.array(fault.axes))] = np.nan
 
 
 def _within(taken: Steps, window: tuple[int, int | None]) -> Flags:

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 import pyarrow as pa
 
+from quadsim.report.curves import BOUND, LINES, REFERENCE
 from quadsim.report.figure import Band, Bound, Figure, Panel, Series
-from quadsim.report.palette import BOUND, LINES, REFERENCE
 from quadsim.state import Array
 from scenarios.campaign.results.table import (
     DRAW,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from quadsim.report.palette import BOUND, LINES, REFERENCE
+from quadsim.report.curves import BOUND, LINES, REFERENCE
 from scenarios.many import DIED, ERROR, MEMORY, TIMEOUT
 
 HARMLESS: Final = "satisfied"

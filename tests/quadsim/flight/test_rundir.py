@@ -15,6 +15,7 @@ from quadsim.errors import FileError, OutputError
 from quadsim.flight import rundir
 from quadsim.flight.audit import audit
 from quadsim.flight.rundir import Run
+from quadsim.flight.summary import limit_from_json, limit_to_json
 from quadsim.outputs import adding, to_json
 
 
@@ -34,8 +35,8 @@ def test_a_run_is_read_back(short_run: Run) -> None:
 
 def test_limits_come_back_from_the_summary(short_run: Run) -> None:
     for finding, entry in zip(audit(short_run.log, short_run.limits), short_run.summary["constraints"], strict=True):
-        assert rundir.limit_from_json(rundir.limit_to_json(finding)) == finding.limit
-        assert rundir.limit_from_json(json.loads(json.dumps(entry))) == finding.limit
+        assert limit_from_json(limit_to_json(finding)) == finding.limit
+        assert limit_from_json(json.loads(json.dumps(entry))) == finding.limit
         if finding.limit.start > 6.0:  # a window not reached: null, not NaN
             assert entry["worst_margin"] is entry["peak_plant"] is entry["worst_time"] is None
             assert entry["satisfied"] is False

@@ -14,7 +14,10 @@ from support import draw_nothing
 from quadsim.errors import OutputError, ParameterError
 from quadsim.flight.rundir import Run
 from quadsim.report import comparison_page
-from quadsim.report.comparison_page import _plots, write_comparison
+from quadsim.report.comparison_page import write_comparison
+from quadsim.report.figure import Figure
+from quadsim.report.flight_figures import page_figures
+from quadsim.report.to_plotly import to_plot
 
 HOSTILE = "<script>alert(1)</script> & \"more\" 'quoted'"
 PROBE = """<script>
@@ -190,7 +193,7 @@ def test_plots_of_many_long_runs_stay_small(short_run: Run) -> None:
         short_run.log.plant, t=t, state=short_run.log.plant.state[rows], speeds=short_run.log.plant.speeds[rows]
     )
     long = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant))
-    assert sum(len(plot.json) for plot in _plots([long] * 10)) < 3e6
+    assert sum(len(to_plot(each).json) for each in page_figures([long] * 10) if isinstance(each, Figure)) < 3e6
 
 
 def test_different_courses_are_pointed_out(short_run: Run, tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ from quadsim.errors import OutputError
 from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
 from quadsim.flight.rundir import Run
 from quadsim.report import flight_figures
+from quadsim.report.curves import BOUND
 from quadsim.report.figure import Band, Bound, Figure, Panel, Scene, Series
 from quadsim.report.flight_figures import effects, inputs, overview, page_figures, states, times, write_figures
-from quadsim.report.palette import BOUND
 from quadsim.report.to_matplotlib import draw, to_png
 from quadsim.report.to_plotly import thin, to_plot
 from quadsim.space import Cylinder

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quadsim.errors import ParameterError
-from quadsim.sim.estimation.settings import EstimatorSettings
+from quadsim.sim.estimation.estimate import EstimatorSettings
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import physics_to_state
 from quadsim.sim.plant import Plant

@@ -13,7 +13,8 @@ from plausible_vehicles import HEAVIEST, LIGHTEST, QUICKEST, SLOWEST, STRONGEST,
 from mpc.model import continuous_model, discretise
 from quadsim.controller import Moment
 from quadsim.errors import ParameterError
-from quadsim.sim.effects import Air, Effects
+from quadsim.sim.effects import Effects
+from quadsim.sim.effects.wind import Air
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES, make_state
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle

@@ -10,17 +10,10 @@ import pytest
 
 from quadsim.controller import MISSED, Command, Controller, Moment
 from quadsim.sim.computation import Computation
-from quadsim.sim.effects import (
-    Air,
-    Disturbance,
-    Effects,
-    Ground,
-    Load,
-    Payload,
-    PayloadChange,
-    RotorChange,
-    RotorDynamics,
-)
+from quadsim.sim.effects import Disturbance, Effects, Ground, PayloadChange, RotorChange
+from quadsim.sim.effects.load import Load, Payload
+from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects.wind import Air
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller, build_plant

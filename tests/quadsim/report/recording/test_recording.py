@@ -19,7 +19,7 @@ from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.errors import OutputError
 from quadsim.flight.audit import SIGNALS, margins_sampled
 from quadsim.flight.rundir import Run
-from quadsim.report.recording import layout, open_viewer, world, write_recording
+from quadsim.report.recording import open_viewer, world, write_recording
 from quadsim.report.recording.style import PANELS, TIMELINE
 from quadsim.rotation import body_to_world
 from quadsim.state import EULER, POSITION
@@ -174,12 +174,6 @@ def test_forces_torques_wind_and_lagging_rotors_have_their_curves(
     vehicle = run.vehicle
     as_thrusts = vehicle.arm_length * 4.0 * wrench[:, :3] / (vehicle.mass * vehicle.gravity)
     np.testing.assert_allclose(arrows, world._FORCE_SCALE * as_thrusts, rtol=1e-5, atol=1e-9)
-    assert layout._effects(run) == {
-        "Rotor speeds, commanded and acting": ["effects/commanded", "signals/speed"],
-        "External force, world": ["effects/force"],
-        "External torque, body": ["effects/torque"],
-        "Wind, world": ["effects/wind"],
-    }
     assert "Effects" in "".join(
         str(column)
         for chunk in content.reader.stream(store=content.reader.blueprints()[0]).to_chunks()
@@ -267,7 +261,7 @@ def test_a_flight_without_predictions_or_finite_end_is_recorded(
     log = dataclasses.replace(short_run.log, predicted=None, plant=dataclasses.replace(plant, state=state))
     content = record(dataclasses.replace(short_run, log=log))
     assert "/world/horizon" not in content.entities
-    assert np.isfinite(layout._overview(dataclasses.replace(short_run, log=log))).all()
+    assert np.isfinite(world._overview(dataclasses.replace(short_run, log=log))).all()
 
 
 def test_the_layout_is_inside_and_shows_only_what_exists(content: Content, short_run: Run) -> None:

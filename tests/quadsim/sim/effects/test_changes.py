@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from quadsim.errors import ParameterError
-from quadsim.sim.effects import Effects, LagChange, Load, MassChange, Push, PushChange, RotorDynamics
+from quadsim.sim.effects import Effects, LagChange, MassChange, Push, PushChange
+from quadsim.sim.effects.load import Load
+from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.physics import Integrator
 from quadsim.sim.plant import Plant
 from quadsim.state import make_state
@@ -92,16 +94,3 @@ def test_rotors_with_inertia_are_never_at_once() -> None:
     assert rotors.lagging(0.1, 0.2).fall == 0.2
     with pytest.raises(ParameterError, match="change their speed at once"):
         rotors.lagging(0.0, 0.1)
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"duration": 0.0}, r"push.duration must be a finite time > 0 s; got 0.0"),
-        ({"at": -1.0}, r"push.at must be a finite time >= 0 s; got -1.0"),
-        ({"force": (1.0, math.nan, 0.0)}, r"push.force must be three finite numbers; got"),
-    ],
-)
-def test_a_push_that_is_none_is_refused(fields: dict[str, object], message: str) -> None:
-    with pytest.raises(ParameterError, match=message):
-        Push(**{"at": 0.0, "duration": 1.0, "force": (1.0, 0.0, 0.0), **fields})  # type: ignore[arg-type]

@@ -7,12 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from quadsim.sim.airframe import compile_model
-from quadsim.sim.effects import Air, Disturbance, Effects, Ground
-from quadsim.sim.effects.body_drag import added_mass, semi_axes
-from quadsim.sim.effects.gust import Gust
+from quadsim.sim.airframe import added_mass, compile_model, semi_axes
+from quadsim.sim.effects import Disturbance, Effects, Ground
 from quadsim.sim.effects.rotors import RotorDynamics
-from quadsim.sim.effects.wind import WindField
+from quadsim.sim.effects.wind import Air, Gust, WindField
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -61,20 +60,6 @@ def test_an_answer_in_two_parts_is_the_answer_in_one() -> None:
     second, _ = dynamics.respond(first[0], TARGET, np.array([0.04]))
     whole, _ = dynamics.respond(START, TARGET, np.array([0.07]))
     np.testing.assert_allclose(second, whole, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"rise": -0.01}, r"effects\.rotors\.rise must be at least 0 and finite; got -0\.01"),
-        ({"fall": math.nan}, r"effects\.rotors\.fall must be at least 0 and finite; got nan"),
-        ({"acceleration": 0.0}, r"effects\.rotors\.acceleration must be positive; got 0\.0"),
-        ({"efficiency": (1.0, 1.0)}, r"effects\.rotors\.efficiency must be four numbers between 0 and 1"),
-    ],
-)
-def test_impossible_rotors_are_refused(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(ParameterError, match=message):
-        RotorDynamics(**values)
 
 
 def test_inertia_of_rotors_that_change_their_speed_at_once_is_refused(vehicle: Vehicle) -> None:
@@ -175,15 +160,3 @@ def test_a_worn_rotor_gives_its_share(vehicle: Vehicle) -> None:
         plant.advance(speeds, 1)
         gone = (plant.physics - before)[11] * ixx / 1e-3
         assert gone == pytest.approx((0.2 - 1.0) * arm * share / 1e-3, rel=1e-2)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"rotor": 5, "efficiency": 0.5}, r"events\.rotor must be 1 to 4; got 5"),
-        ({"rotor": 1, "efficiency": 1.5}, r"events\.efficiency must be between 0 and 1; got 1\.5"),
-    ],
-)
-def test_impossible_changes_are_refused(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ParameterError, match=message):
-        RotorChange(time=0.0, **change)

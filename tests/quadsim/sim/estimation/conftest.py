@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quadsim.sim.estimation.estimate import difference
+from quadsim.sim.estimation.estimate import EstimatorSettings, difference
 from quadsim.sim.estimation.filter import ErrorStateFilter
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.sensing.sampler import Sampler
 from quadsim.sim.sensing.sensor import Sensor, SensorName
 from quadsim.state import Array

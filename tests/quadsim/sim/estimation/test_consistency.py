@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from quadsim.sim.estimation.settings import EstimatorSettings
+from quadsim.sim.estimation.estimate import EstimatorSettings
 from quadsim.sim.sensing.sensor import Sensor, SensorName
 from quadsim.vehicle import Vehicle
 

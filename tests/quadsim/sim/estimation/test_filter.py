@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from quadsim.errors import ParameterError
+from quadsim.sim.estimation.estimate import EstimatorSettings
 from quadsim.sim.estimation.filter import ErrorStateFilter
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.sensing.sampler import Sample
 from quadsim.sim.sensing.sensor import FaultKind, Outliers, Sensor, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
@@ -241,16 +241,3 @@ def test_it_never_fails_nor_answers_with_nan(vehicle: Vehicle) -> None:
 def test_sensors_it_cannot_work_with_are_refused(sensors: tuple[Sensor, ...], message: str, vehicle: Vehicle) -> None:
     with pytest.raises(ParameterError, match=f"^{message}"):
         ErrorStateFilter(vehicle, sensors, SETTINGS, timestep=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"acceleration_noise": -1.0}, r"estimator\.acceleration_noise must be a finite number >= 0; got -1\.0"),
-        ({"initial_rates": math.nan}, r"estimator\.initial_rates must be a finite number >= 0; got nan"),
-        ({"gate": 1.0}, r"estimator\.gate must be above 0 and below 1; got 1\.0"),
-    ],
-)
-def test_wrong_settings_are_refused(wrong: dict[str, float], message: str) -> None:
-    with pytest.raises(ParameterError, match=f"^{message}$"):
-        EstimatorSettings(**wrong)

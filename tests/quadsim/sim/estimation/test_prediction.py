@@ -9,9 +9,8 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from quadsim.sim.estimation.estimate import Estimate, difference, retract
+from quadsim.sim.estimation.estimate import Estimate, EstimatorSettings, difference, retract
 from quadsim.sim.estimation.prediction import MotionModel, drive, motion_model, predict
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle

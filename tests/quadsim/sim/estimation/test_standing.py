@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadsim.sim.estimation.estimate import Estimate
+from quadsim.sim.estimation.estimate import Estimate, EstimatorSettings
 from quadsim.sim.estimation.prediction import (
     STILL_RATE,
     STILL_TIME,
@@ -21,7 +21,6 @@ from quadsim.sim.estimation.prediction import (
     motion_model,
     stand,
 )
-from quadsim.sim.estimation.settings import EstimatorSettings
 from quadsim.sim.sensing.sensor import Sensor, SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle

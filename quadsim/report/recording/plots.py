@@ -1,0 +1,241 @@
+"""What is seen in the plots and what is read: sent to a recording, each with the view that shows it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from quadsim.controller import OPTIMAL, Phase
+from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
+from quadsim.flight.log import BODY_RATES, QUATERNION
+from quadsim.flight.metrics import unrecovered
+from quadsim.flight.rundir import Run
+from quadsim.report.comparison import comparison_rows, fallback_sentence
+from quadsim.report.curves import (
+    break_at_wraps,
+    commanded_speeds,
+    effect_curves,
+    least_range,
+    line_colour,
+    reference_curve,
+)
+from quadsim.report.recording.style import (
+    BOUND,
+    FRONT_PANELS,
+    REFERENCE,
+    SERIES,
+    VERDICTS,
+    Colour,
+    on_screen,
+    panels,
+    time_column,
+)
+from quadsim.report.table import to_markdown
+from quadsim.state import REFERENCE_NAMES, Array
+from quadsim.vehicle import N_ROTORS
+
+_ACTIVE: Final = 0.002  # A limit is active where its margin is below this fraction of the allowed band
+
+
+def send_plots(recording: rr.RecordingStream, run: Run) -> rrb.Tabs:
+    """All that is shown over time, at the log rate where it exists between the control samples; the views of it."""
+    signals, events = _send_signals(recording, run), rrb.TextLogView(name="Events", origin="/events")
+    margins, effects = _send_limits(recording, run), _send_effects(recording, run)
+    times, *solver = _send_solver(recording, run)
+    lanes = [f"verdicts/{limit.name}" for limit in run.limits if limit.start == 0.0]
+    verdicts = rrb.StateTimelineView(name="Constraints on the whole flight", contents=lanes)
+    return rrb.Tabs(
+        rrb.Grid(*signals[:FRONT_PANELS], verdicts, times, grid_columns=2, name="Flight"),
+        rrb.Grid(*signals[FRONT_PANELS:], grid_columns=2, name="More signals"),
+        rrb.Grid(*margins, *solver, events, grid_columns=2, name="Margins and solver"),
+        *([rrb.Grid(*effects, grid_columns=2, name="Effects")] if effects else []),
+    )
+
+
+def _send_signals(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
+    """Every signal there is, and the reference; of flights that may turn upside down quaternion and body rates too."""
+    log, views = run.log, []
+    for title, names in panels(log).items():
+        contents, values = [], []
+        for colour, name in zip(SERIES, names, strict=False):
+            unit = SIGNALS[name].unit
+            t, curve = SIGNALS[name].finest(log)
+            labels = {f"{name} [{unit}]": colour}
+            if curve.ndim == 2:
+                labels = {f"rotor {i} [{unit}]": shade for i, shade in enumerate(SERIES, start=1)}
+            else:
+                t, curve = break_at_wraps(t, curve, unit)
+            contents.append(f"signals/{name}")
+            values.append(curve)
+            _send_curves(recording, contents[-1], t, curve, labels, stepped=curve.ndim == 2)
+            if name in REFERENCE_NAMES:
+                contents.append(f"reference/{name}")
+                values.append(reference_curve(log.control, name))
+                _send_curves(recording, contents[-1], log.control.t, values[-1], {f"{name} ref [{unit}]": REFERENCE})
+        bounding = [limit for limit in run.limits if limit.signal in names]
+        values += [np.array([limit.lower, limit.upper]) for limit in bounding]
+        contents += [f"limits/{limit.name}" for limit in bounding]
+        views.append(_view(title, contents, run, ends=least_range(values, SIGNALS[names[0]].unit)))
+    for name, vectors, columns in (
+        ("quaternion", log.plant.attitude, QUATERNION),
+        ("body_rates", log.plant.body_rates, BODY_RATES),
+    ):
+        if vectors is not None:
+            labels = dict(zip((f"{column} [{unit}]" for column, unit in columns.items()), SERIES, strict=False))
+            _send_curves(recording, f"signals/{name}", log.plant.t, vectors, labels)
+            views.append(_view(name.replace("_", " ").capitalize(), [f"signals/{name}"], run))
+    return views
+
+
+def _send_limits(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
+    """Each limit's bounds over its time window, its margins, and what they say; margins of one unit in one plot."""
+    views = []
+    for unit in dict.fromkeys(limit.unit for limit in run.limits):
+        peers = [limit for limit in run.limits if limit.unit == unit]
+        for i, limit in enumerate(peers):
+            _send_limit(recording, limit, run, on_screen(line_colour(i)))
+        views.append(_view(f"Margins [{unit}]", [f"margins/{limit.name}" for limit in peers], run))
+    return views
+
+
+def _send_limit(recording: rr.RecordingStream, limit: Limit, run: Run, colour: Colour) -> None:
+    t, margins = run.log.control.t, margins_sampled(limit, run.log)
+    inside = np.isfinite(margins)
+    if not inside.any():
+        return
+    bounds = {sign: bound for sign, bound in (("≥", limit.lower), ("≤", limit.upper)) if math.isfinite(bound)}
+    window = np.array([t[inside][0], min(limit.stop, run.end)])
+    labels = {f"{limit.name} {sign} {bound:g} {limit.unit}": BOUND for sign, bound in bounds.items()}
+    _send_curves(recording, f"limits/{limit.name}", window, np.tile([*bounds.values()], (2, 1)), labels)
+    labels = {f"{limit.name} [{limit.unit}]": colour}
+    _send_curves(recording, f"margins/{limit.name}", t[inside], margins[inside], labels)
+
+    names, entity = list(VERDICTS), f"verdicts/{limit.name}"
+    band = limit.upper - limit.lower
+    near = max(limit.tolerance_sampled, _ACTIVE * band if math.isfinite(band) else 0.0)
+    verdicts = np.select([margins < -limit.tolerance_sampled, margins <= near, inside], [2, 1, 0], default=3)
+    changes = np.flatnonzero(np.diff(verdicts, prepend=-1))
+    style = rr.StateConfiguration(values=names, colors=list(VERDICTS.values()), visible=[True, True, True, False])
+    recording.log(entity, style, static=True)
+    states = rr.StateChange.columns(state=[names[verdicts[k]] for k in changes])
+    recording.send_columns(entity, [time_column(t[changes])], states)
+
+
+def _send_solver(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
+    """Clock times, and what is known of the answers."""
+    control, timing = run.log.control, run.log.timing
+    first, second = SERIES[:2]
+    for name, values, label, colour in (
+        ("solve_ms", timing.solve_ms, "optimum alone [ms]", first),
+        ("step_ms", timing.step_ms, "whole step [ms]", second),
+        ("iterations", control.iterations, "iterations", first),
+        ("active", control.active, "active constraints", second),
+        ("fallback", control.fallback, "fallback, 0 = none", first),
+        ("slack", np.degrees(control.slack), "slack [deg]", second),
+    ):
+        _send_curves(recording, f"solver/{name}", control.t, values, {label: colour})
+    deadline = run.summary["controller"].get("deadline_ms")
+    if deadline is not None:
+        ends = run.log.plant.t[[0, -1]]
+        _send_curves(recording, "solver/deadline_ms", ends, np.full(2, deadline), {"deadline [ms]": BOUND})
+    return [
+        _view("Computation", ["solver/solve_ms", "solver/step_ms", "solver/deadline_ms"], run),
+        _view("Solver", ["solver/iterations", "solver/active"], run),
+        _view("Fallback and slack", ["solver/fallback", "solver/slack"], run),
+    ]
+
+
+def _send_effects(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
+    """Commands that rotors do not follow at once, external force and torque, wind: what there is of it."""
+    t, views = run.log.plant.t, []
+    commanded = commanded_speeds(run.log)
+    if commanded is not None:
+        labels = {f"rotor {i}, commanded [rad/s]": REFERENCE for i in range(1, N_ROTORS + 1)}
+        _send_curves(recording, "effects/commanded", t, commanded, labels, stepped=True)
+        views.append(_view("Rotor speeds, commanded and acting", ["effects/commanded", "signals/speed"], run))
+    for entry in effect_curves(run.log):
+        labels = {f"{axis} [{entry.unit}]": colour for axis, colour in zip("xyz", SERIES, strict=False)}
+        _send_curves(recording, f"effects/{entry.key}", t, entry.values, labels)
+        views.append(_view(f"{entry.title[0].upper()}{entry.title[1:]}", [f"effects/{entry.key}"], run))
+    return views
+
+
+def send_texts(recording: rr.RecordingStream, run: Run) -> None:
+    """The summary, and what happened when.
+
+    Changes of the status, of who answers and of the phase; why the first QP without an answer had none; when permanent
+    fallback begins; the flight's events and its end.
+    """
+    log, summary = run.log.control, run.summary
+    found, periods = summary.get("diagnosis") or {}, unrecovered(log)
+    answers = list(zip(log.status, log.answered_by, log.fallback.tolist(), strict=True))
+    events = [
+        (
+            t,
+            f"{status}{'' if fallback else f' by {by}'}, fallback {fallback}",
+            "INFO" if status in OPTIMAL | {Phase.LANDED} and not fallback else "WARN",
+        )
+        for t, (status, by, fallback) in _changes(log.t, answers)
+    ]
+    if any(phase != Phase.FLYING for phase in log.phase):
+        for t, phase in _changes(log.t, log.phase):
+            events.append((t, f"phase: {phase}", "WARN" if phase == Phase.CRASHED else "INFO"))
+    events += [(found["time"], found[name], "ERROR") for name in ("sentence", "advice") if found.get(name)]
+    if periods:
+        events.append((float(log.t[-periods]), fallback_sentence(periods), "ERROR"))
+    events += [(event["time"], event["text"], "WARN") for event in summary.get("events", ())]
+    reason = run.log.reason
+    events.append((run.end, "completed", "INFO") if reason is None else (run.end, f"aborted: {reason}", "ERROR"))
+    times, texts, levels = zip(*sorted(events, key=lambda event: event[0]), strict=True)
+    recording.send_columns("events", [time_column(np.array(times))], rr.TextLog.columns(text=texts, level=levels))
+    rows = [row for row in comparison_rows([run]) if row.group in ("Flight", "Tracking") or row.headline]
+    document = rr.TextDocument(to_markdown(rows, [run.name]), media_type=rr.MediaType.MARKDOWN)
+    recording.log("summary", document, static=True)
+
+
+def _changes(t: Array, values: Sequence[Any]) -> list[tuple[float, Any]]:
+    """The first value and those that differ from the one before, each with its time [s]."""
+    pairs = zip(t.tolist(), [None, *values], values, strict=False)
+    return [(time, value) for time, before, value in pairs if value != before]
+
+
+def _send_curves(
+    recording: rr.RecordingStream,
+    entity: str,
+    t: Array,
+    values: np.ndarray[Any, np.dtype[Any]],
+    labels: Mapping[str, Colour],
+    *,
+    stepped: bool = False,
+) -> None:
+    """One curve per column of `values` (len(t),) or (len(t), j), at times `t` [s]; nothing where there is no row."""
+    if not t.size:
+        return
+    style = rr.SeriesLines(
+        names=list(labels),
+        colors=list(labels.values()),
+        widths=[1.5] * len(labels),
+        interpolation_mode="StepAfter" if stepped else "Linear",
+        aggregation_policy="MinMax",  # zoomed out, the viewer would show averages: lower peaks than were flown
+    )
+    recording.log(entity, style, static=True)
+    recording.send_columns(entity, [time_column(t)], rr.Scalars.columns(scalars=np.asarray(values, float)))
+
+
+def _view(
+    title: str, contents: Sequence[str], run: Run, *, ends: tuple[float, float] | None = None
+) -> rrb.TimeSeriesView:
+    """Curves over the whole flight, and the legend to their right; `ends` of the vertical axis."""
+    first, last = (rr.TimeRangeBoundary.absolute(seconds=seconds) for seconds in (0.0, 1.4 * max(run.end, 1e-3)))
+    return rrb.TimeSeriesView(
+        name=title,
+        contents=list(contents),
+        plot_legend=rrb.PlotLegend("RightTop"),
+        axis_y=None if ends is None else rrb.ScalarAxis(range=ends),
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last)),
+    )
