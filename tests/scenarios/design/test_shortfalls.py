@@ -93,12 +93,10 @@ def test_from_a_template_to_a_scenario_by_the_command_line(
 def test_the_speed_at_which_a_course_fits_is_reported_before_the_flight(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    output: list[str] = []
-    monkeypatch.setattr(console, "is_watched", lambda: True)
-    monkeypatch.setattr(console, "print_notice", output.append)
+    monkeypatch.setattr(console.PlainConsole, "is_terminal", True)
     settings = ["reference.period=6.0", "reference.start=0.0", "duration=4.0"]
     main(["check", "hummingbird-figure-eight", *(part for setting in settings for part in ("--set", setting))])
-    assert len(output) == 1
-    assert "It cannot be followed exactly: roll up to" in output[0]
-    assert output[0].endswith(" % of its size.")
-    assert " It would fit at " in output[0]
+    notice = capsys.readouterr().err.partition("\n")[0]
+    assert "It cannot be followed exactly: roll up to" in notice
+    assert notice.endswith(" % of its size.")
+    assert " It would fit at " in notice
