@@ -374,13 +374,7 @@ def write_run(
 ) -> None:
     """Write a run directory: scenario, Parquet tables and summary at once, then its products, one by one.
 
-    Args:
-        flight: as it was flown.
-        directory: its absolute path.
-        outputs: which products.
-        progress: called with (what, done, total).
-        overwrite: whether to replace an earlier output there.
-        since: clock reading at which the flight's work began [s], for the summary's total.
+    `since` is the clock's reading when the flight's work began [s], for the summary's total.
 
     Raises:
         OutputError: the directory cannot be written, or a product that was asked for by name failed.
@@ -414,6 +408,8 @@ def summarise(flight: Flight) -> dict[str, Any]:
     course = build_course_steps(scenario)
     ground = scenario.effects.ground
     flown = log.control.t.size > 0
+    samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
+    estimation = {} if log.control.measured_perfectly else {**metrics.estimation(log.control), "samples": samples}
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=course)
     return {
         "scenario": scenario.name,
@@ -443,7 +439,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
             **numbers["controller"],
         },
         **({"computation": metrics.computation(log.control)} if flown and build_computation(scenario) else {}),
-        **({} if log.control.measured_perfectly else {"estimation": _estimation(flight)}),
+        **({"estimation": estimation} if estimation else {}),
         **({"ground": metrics.ground(log, outline(flight.actual))} if flown and ground and ground.contact else {}),
         "vehicle": asdict(flight.vehicle),
         **({"actual": asdict(flight.actual)} if flight.actual != flight.vehicle else {}),
@@ -453,11 +449,6 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "products": {},
         "files": {},
     }
-
-
-def _estimation(flight: Flight) -> dict[str, Any]:
-    samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
-    return {**metrics.estimation(flight.log.control), "samples": samples}
 
 
 def _add_products(flight: Flight, directory: Path, outputs: Outputs, progress: Progress) -> dict[str, str]:
