@@ -33,7 +33,7 @@ from scenarios.courses.make import build_course_steps
 from scenarios.limits import audit_notes
 from scenarios.machine import machine, usable_cores, versions
 from scenarios.parts.effects import build_computation
-from scenarios.parts.story import story
+from scenarios.parts.events import story
 from scenarios.parts.vehicle import build_actual
 from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario, Verdict

@@ -29,9 +29,9 @@ from scenarios.courses.make import build_motion, follow_course
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.limits import build_limits
 from scenarios.parts.effects import build_computation
+from scenarios.parts.events import prepared
 from scenarios.parts.live import FlightEvents, Successor
 from scenarios.parts.navigation import build_navigation
-from scenarios.parts.neutral import prepared
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_actual, build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent

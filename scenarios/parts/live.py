@@ -25,8 +25,8 @@ from quadsim.sim.plant import Plant
 from quadsim.sim.sensing.sensor import SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.parts.effects import build_changes, build_computation, check_changes, moving_air, winds_of
+from scenarios.parts.events import neutral
 from scenarios.parts.navigation import build_faults
-from scenarios.parts.neutral import neutral
 from scenarios.schema.base import Spec
 from scenarios.schema.controller import ControllerSpec, changed
 from scenarios.schema.events import (
