@@ -37,6 +37,7 @@ from scenarios.parts.events import story
 from scenarios.parts.vehicle import build_actual
 from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario, Verdict
+from scenarios.schema.settings import leaves
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -224,8 +225,8 @@ class Flight:
     @cached_property
     def metrics(self) -> dict[str, float]:
         """The flight's numbers by name, e.g. `rmse.x`, `speed_max`, `step_ms.p99`; units as in `summary`."""
-        tables = (self.summary[name] for name in ("tracking", "control", "controller"))
-        return {name: value for table in tables for name, value in _numbers(table)}
+        found = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self.summary[name]))
+        return {name: value for name, value in found if isinstance(value, int | float) and not isinstance(value, bool)}
 
     @property
     def run(self) -> rundir.Run:
@@ -352,15 +353,6 @@ def to_pandas(table: pa.Table) -> Any:
     if find_spec("pandas") is None:
         raise MissingPackageError("a DataFrame", "pandas", extra="pandas")
     return table.to_pandas()
-
-
-def _numbers(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
-    """The numbers of nested tables, by their paths."""
-    for name, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _numbers(value, f"{prefix}{name}.")
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            yield prefix + name, value
 
 
 def write_run(
