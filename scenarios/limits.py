@@ -16,7 +16,7 @@ from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
 from quadsim.report.table import format_number
 from scenarios.courses.windows import timed_regions
 from scenarios.parts.vehicle import build_actual, build_vehicle
-from scenarios.schema.nonlinear import NonlinearPartsSpec
+from scenarios.schema.nonlinear import NonlinearSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
 if TYPE_CHECKING:
@@ -50,9 +50,9 @@ def with_bounds_stated(scenario: Scenario) -> Scenario:
 def controller_bounds(spec: ControllerSpec, vehicle: Vehicle) -> dict[str, Range]:
     """The bounds that a controller has on signals of the audit, hard or soft, in their units."""
     found: dict[str, Range] = {name: (pair[0], pair[1]) for name, pair in getattr(spec, "output_bounds", {}).items()}
-    if isinstance(spec, NonlinearPartsSpec) and spec.tilt is not None:
+    if isinstance(spec, NonlinearSpec) and spec.tilt is not None:
         found["tilt"] = (-math.inf, spec.tilt)
-    if isinstance(spec, NonlinearPartsSpec) and spec.body_rate is not None:
+    if isinstance(spec, NonlinearSpec) and spec.body_rate is not None:
         largest = spec.body_rate if isinstance(spec.body_rate, list) else [spec.body_rate] * 3
         found |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", largest, strict=True)}
     inputs = getattr(spec, "input_bounds", None)
@@ -172,4 +172,4 @@ def _sum_limits(scenario: Scenario) -> tuple[Limit, ...]:
 
 def _polytopes(scenario: Scenario) -> list[PolytopeSpec]:
     controller = scenario.controller
-    return controller.polytopes if isinstance(controller, BoundedSpec | NonlinearPartsSpec) else []
+    return controller.polytopes if isinstance(controller, BoundedSpec | NonlinearSpec) else []

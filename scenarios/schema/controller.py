@@ -10,12 +10,11 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError
 from pydantic_core import PydanticCustomError
 
 from mpc.fallback.settings import FallbackSettings
-from mpc.solvers import SOLVERS, find_solver
-from quadsim.errors import UnknownNameError
+from mpc.solvers import SOLVERS
 from scenarios.schema.base import Spec
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
-from scenarios.schema.nonlinear import NonlinearPartsSpec
-from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
+from scenarios.schema.nonlinear import NonlinearSpec as NonlinearSpec
+from scenarios.schema.optimisation import BoundedSpec, WeightedSpec, require_solver
 from scenarios.schema.plugin import FORM, LAWS, PluginSpec, is_plugin
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.robust import RobustSpec
@@ -44,42 +43,11 @@ class ConstrainedSpec(BoundedSpec):
 
     @model_validator(mode="after")
     def _check(self) -> ConstrainedSpec:
-        _require_solver(self.solver)
-        return self
-
-
-class NonlinearSpec(NonlinearPartsSpec):
-    """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period."""
-
-    type: Literal["nonlinear"] = Field(description="the control law, by its name in `quadsim list`")
-    solver: str | None = Field(
-        default=None,
-        description="QP solver, by its name in `quadsim list`; absent: the fastest for the size",
-        json_schema_extra={"examples": [*SOLVERS]},
-    )
-
-    @model_validator(mode="after")
-    def _check_solver(self) -> NonlinearSpec:
-        if self.solver is not None:
-            _require_solver(self.solver)
+        require_solver(self.solver)
         return self
 
 
 COMPILED: Final = ("unconstrained", "constrained", "robust")
-
-
-def _require_solver(name: str) -> None:
-    try:
-        find_solver(name)
-    except UnknownNameError as error:
-        raise ValueError(f"solver: {error}") from error
-
-
-def shared_tilt_bound(spec: ConstrainedSpec) -> float | None:
-    """The one number that bounds roll and pitch alike [deg], or None."""
-    bounds = {abs(bound) for name in ("roll", "pitch") for bound in spec.output_bounds.get(name, [])}
-    both = {"roll", "pitch"} <= spec.output_bounds.keys()
-    return bounds.pop() if both and len(bounds) == 1 else None
 
 
 def _law(controller: object) -> str | None:

@@ -14,9 +14,17 @@ from mpc.nonlinear.settings import Weights
 from mpc.observer import ObserverSettings
 from mpc.qp import KKT_EVERY
 from mpc.robust.tightening import SHORTEST_LAG
+from mpc.solvers import SOLVERS
 from quadsim.fields import NonNegative, Positive
 from scenarios.schema.base import MOST_ENTRIES, Horizon, Lag, Pair, Spec, require_ordered
-from scenarios.schema.optimisation import AvoidanceSpec, KktEvery, PolytopeSpec, SoftSpec
+from scenarios.schema.optimisation import (
+    AvoidanceSpec,
+    KktEvery,
+    PolytopeSpec,
+    RotorBoundsSpec,
+    SoftSpec,
+    require_solver,
+)
 
 LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states that are so of the quaternion model too
 Terminal = NonNegative | Literal["none", "lqr"]
@@ -24,28 +32,10 @@ NonNegativeTriple = Annotated[list[NonNegative], Len(3, 3)]
 PositiveTriple = Annotated[list[Positive], Len(3, 3)]
 
 
-class RotorBoundsSpec(Spec):
-    """Hard bounds on the rotor speeds and their steps, for every rotor."""
+class NonlinearSpec(Spec):
+    """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period."""
 
-    speed: Pair | None = Field(default=None, description="[rad/s] absent: what the vehicle's rotors hold")
-    slew: Pair | None = Field(
-        default=None, description='[rad/s per period] only where inputs = "speed"; absent: no bound'
-    )
-
-    @model_validator(mode="after")
-    def _check(self) -> RotorBoundsSpec:
-        if self.speed is not None:
-            require_ordered("speed", self.speed)
-            if self.speed[0] < 0.0:
-                raise ValueError(f"speed must have a lower bound >= 0 rad/s; got {self.speed}")
-        if self.slew is not None and not self.slew[0] <= 0.0 <= self.slew[1]:
-            raise ValueError(f"slew must allow a speed to be held, so contain 0; got {self.slew}")
-        return self
-
-
-class NonlinearPartsSpec(Spec):
-    """All of a nonlinear MPC but its QP solver."""
-
+    type: Literal["nonlinear"] = Field(description="the control law, by its name in `quadsim list`")
     horizon: Horizon = Field(default=20, description="[periods] how far it looks ahead, a whole number of nodes")
     node: Positive | None = Field(
         default=None, description="[s] from one node to the next, whole periods; absent: one period"
@@ -106,9 +96,16 @@ class NonlinearPartsSpec(Spec):
         default=KKT_EVERY,
         description="[periods] from one whose KKT residuals are computed and logged to the next; 1: all",
     )
+    solver: str | None = Field(
+        default=None,
+        description="QP solver, by its name in `quadsim list`; absent: the fastest for the size",
+        json_schema_extra={"examples": [*SOLVERS]},
+    )
 
     @model_validator(mode="after")
-    def _check(self) -> NonlinearPartsSpec:
+    def _check(self) -> NonlinearSpec:
+        if self.solver is not None:
+            require_solver(self.solver)
         if self.rotor_lag != "vehicle" and 0.0 < self.rotor_lag < SHORTEST_LAG:
             raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {self.rotor_lag:g}")
         if self.attitude_error == "difference" and not isinstance(self.weights.attitude, float):

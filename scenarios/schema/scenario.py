@@ -26,7 +26,7 @@ from scenarios.schema import events as kinds
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec, changed
 from scenarios.schema.course import ReferenceSpec
-from scenarios.schema.nonlinear import NonlinearPartsSpec
+from scenarios.schema.nonlinear import NonlinearSpec
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
@@ -267,7 +267,7 @@ class Scenario(Spec):
     @property
     def audited_names(self) -> list[str]:
         """The names of constraints, rows of polytopes, obstacles and regions."""
-        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearPartsSpec) else []
+        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearSpec) else []
         names = [constraint.name for constraint in self.constraints]
         names += [name for polytope in polytopes for name in polytope.row_names]
         return names + [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
