@@ -12,7 +12,7 @@ from quadsim.sim.effects import Force
 from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
 from quadsim.vehicle import Vehicle
-from scenarios.courses.windows import timed_regions
+from scenarios.courses.make import timed_regions
 from scenarios.parts.controllers import make_controller, make_problem
 from scenarios.parts.effects import build_changes, build_wind
 from scenarios.parts.plugin import import_plugin, make_force

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final
 
 from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
 from quadsim.report.table import format_number
-from scenarios.courses.windows import timed_regions
+from scenarios.courses.make import timed_regions
 from scenarios.parts.vehicle import build_actual, build_vehicle
-from scenarios.schema.nonlinear import NonlinearSpec
+from scenarios.schema.controller import NonlinearSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
 if TYPE_CHECKING:

@@ -11,10 +11,8 @@ from quadsim.errors import InputError, OutputError, ParameterError, printable
 from quadsim.flight import rundir
 from quadsim.outputs import reserving
 from scenarios import api
-from scenarios.campaign.manifest import is_campaign
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
 from scenarios.commands.console import print_result, shown
-from scenarios.comparison import Comparison
 from scenarios.flight import Flight
 from scenarios.junit import junit_file, write_junit
 from scenarios.reaudit import Reaudit
@@ -57,6 +55,8 @@ def run(options: Namespace) -> int:
 
 def check(options: Namespace) -> int:
     """`quadsim check`; `incomplete` is a failure here: not every constraint was shown to hold."""
+    from scenarios.campaign.manifest import is_campaign
+
     if options.junit is not None:
         options.junit = junit_file(options.junit)
     found: Flight | Reaudit
@@ -97,6 +97,8 @@ def _announce(scenario: Scenario, options: Namespace) -> None:
 
 def compare(options: Namespace) -> int:
     """`quadsim compare`: of runs and of campaigns."""
+    from scenarios.comparison import Comparison
+
     found = api.compare(*options.targets, out=options.out, overwrite=options.overwrite)
     if isinstance(found, Comparison):
         for note in found.notes:

@@ -14,6 +14,7 @@ from mpc.flatness import motion_along
 from quadsim.errors import FileError, ParameterError
 from quadsim.flight.metrics import CourseStep
 from quadsim.motion import Motion
+from quadsim.space import Corridor, Fence
 from quadsim.state import REFERENCE_NAMES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course, Path, begin
@@ -23,7 +24,6 @@ from scenarios.courses.legs import Turn, Waypoint, waypoints, yaw_turns
 from scenarios.courses.loops import circle, figure_eight, fly_round
 from scenarios.courses.minimum_snap import minimum_snap
 from scenarios.courses.ramped import circle_curve, fly_ramped, lemniscate_curve, ramped_phase, upright_circle_curve
-from scenarios.courses.smoothing import smooth
 from scenarios.courses.steps import Window, steps, switches
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema import course as specs
@@ -77,14 +77,26 @@ def follow_course(scenario: Scenario) -> FollowedCourse:
 
 
 def filtered(course: Course, scenario: Scenario, samples: int) -> Array:
-    """(samples, 4) of the scenario's course at t_k = k tau_s, through its filter.  Eq. (31)."""
-    response_time, period = scenario.reference.response_time, scenario.control_period
-    t = np.arange(samples, dtype=np.float64) * period
-    channels = [
-        smooth(values, initial=initial, response_time=response_time, period=period)
-        for values, initial in zip(course.sample(t).T, course.initial.tolist(), strict=True)
-    ]
-    return np.stack(channels, axis=1)
+    """(samples, 4) of a course at t_k = k tau_s, through the scenario's filter.  Eq. (31)."""
+    followed = FollowedCourse(course, response_time=scenario.reference.response_time, period=scenario.control_period)
+    return followed.first(samples)
+
+
+def timed_regions(scenario: Scenario) -> tuple[Corridor | Fence, ...]:
+    """The corridors, each with a window of time, then the fence.
+
+    The reference is known before the flight, and where it is along its path never falls: a window of the one is a
+    window of the other.
+
+    Raises:
+        InputError: the reference's path is over before a window begins, or cannot be built.
+    """
+    regions = scenario.regions
+    if all(isinstance(region, Fence) or region.path is None for region in regions):
+        return regions
+    reference = build_reference(scenario, scenario.periods + 1)[:, :3]
+    t = scenario.control_period * np.arange(len(reference), dtype=np.float64)
+    return tuple(region if isinstance(region, Fence) else region.timed(t, reference) for region in regions)
 
 
 def build_motion(scenario: Scenario, vehicle: Vehicle) -> Motion | None:

@@ -11,7 +11,6 @@ from annotated_types import Len, MaxLen, doc
 from pydantic import Field, model_validator
 
 from mpc.qp import KKT_EVERY
-from mpc.solvers import find_solver
 from mpc.space.settings import AvoidanceSettings
 from quadsim.errors import UnknownNameError
 from quadsim.fields import NonNegative, Number, Weight
@@ -195,11 +194,3 @@ def require_states(values: Mapping[str, object], name: str) -> None:
             near = difflib.get_close_matches(key, STATE_NAMES, n=1)
             guess = f"; did you mean {near[0]!r}?" if near else ""
             raise ValueError(f"{name}.{key} is not a state{guess} (there are: {', '.join(STATE_NAMES)})")
-
-
-def require_solver(name: str) -> None:
-    """Refuse a QP solver that is not there."""
-    try:
-        find_solver(name)
-    except UnknownNameError as error:
-        raise ValueError(f"solver: {error}") from error

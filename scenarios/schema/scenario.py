@@ -24,9 +24,8 @@ from quadsim.state import STATE_NAMES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.schema import events as kinds
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
-from scenarios.schema.controller import ControllerSpec, changed
+from scenarios.schema.controller import ControllerSpec, NonlinearSpec, changed
 from scenarios.schema.course import ReferenceSpec
-from scenarios.schema.nonlinear import NonlinearSpec
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
