@@ -28,12 +28,7 @@ def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
 
 
 def build_plant(scenario: Scenario, vehicle: Vehicle, forces: Sequence[Force] | None = None) -> Plant:
-    """The simulated vehicle as it really is, and what acts on it.
-
-    Args:
-        scenario: what is flown.
-        vehicle: the modelled vehicle.
-        forces: of one's own, instead of those that the scenario names.
+    """The simulated vehicle as it really is, and what acts on it; `forces` instead of those that the scenario names.
 
     Raises:
         InputError: a combination of effects is not possible, or a force cannot be imported.

@@ -81,9 +81,7 @@ def _check_start(scenario: Scenario, vehicle: Vehicle) -> None:
 def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
     """Read and check a scenario, merged over its `base` where it has one, with the vehicle and the course it names.
 
-    Args:
-        name: a library name, or a path ending in `.toml`.
-        settings: `dotted.path=value` texts that replace or add fields, values as in TOML.
+    Settings are `dotted.path=value` texts that replace or add fields, values as in TOML.
 
     Raises:
         InputError: the file is missing or malformed, a field is not allowed, or what it names cannot be flown so.

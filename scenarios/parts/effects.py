@@ -87,12 +87,7 @@ def build_computation(scenario: Scenario) -> Computation | None:
 
 
 def build_changes(scenario: Scenario, events: Sequence[kinds.Event] | None = None) -> tuple[Change, ...]:
-    """What happens to rotors, mass and payload in flight, and what pushes the vehicle, in any order.
-
-    Args:
-        scenario: what is flown.
-        events: those that count, instead of all that the scenario has.
-    """
+    """What these events, or else all of the scenario, do to rotors, mass and payload, and what pushes, in any order."""
     events = scenario.events if events is None else events
     pushes = _in_force([event for event in events if isinstance(event, kinds.PushEvent)])
     found: list[Change] = [*_losses(scenario, events)]

@@ -221,11 +221,7 @@ class _Holder(Spec):
 
 
 def changed(spec: ControllerSpec, fields: Mapping[str, Any]) -> ControllerSpec:
-    """A controller of which some fields have other values.
-
-    Args:
-        spec: the one before; of another, or of its own, `type` it is replaced whole.
-        fields: values by dotted path; a table within changes what it names of the one there.
+    """A controller of which some fields, by dotted path, have other values; with a `type` it is replaced whole.
 
     Raises:
         ScenarioError: a field is not there, or its value is not allowed.
