@@ -17,7 +17,6 @@ from quadsim.report.table import format_number
 from scenarios.courses.make import timed_regions
 from scenarios.parts.vehicle import build_actual, build_vehicle
 from scenarios.schema.controller import NonlinearSpec
-from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 
 if TYPE_CHECKING:
     from quadsim.vehicle import Vehicle
@@ -165,11 +164,6 @@ def _sum_limits(scenario: Scenario) -> tuple[Limit, ...]:
             tolerance_sampled=polytope.tolerance_sampled,
             required=polytope.required,
         )
-        for polytope in _polytopes(scenario)
+        for polytope in scenario.polytopes
         for i, (name, row) in enumerate(zip(polytope.row_names, polytope.rows, strict=True))
     )
-
-
-def _polytopes(scenario: Scenario) -> list[PolytopeSpec]:
-    controller = scenario.controller
-    return controller.polytopes if isinstance(controller, BoundedSpec | NonlinearSpec) else []

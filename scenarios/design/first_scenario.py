@@ -15,7 +15,6 @@ from mpc.baselines.bandwidths import lag_to_allow_for
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.errors import UnknownNameError, printable
 from quadsim.vehicle import Vehicle
-from scenarios.design.loop import delay_margin
 from scenarios.design.tuning import (
     HEADING_RATIO,
     HEADING_STEP,
@@ -27,6 +26,7 @@ from scenarios.design.tuning import (
     PERIOD_SHARE,
     THRUST_SHARE,
     Tuning,
+    delay_margin,
     tune,
 )
 

@@ -59,7 +59,8 @@ def compiled(files: Mapping[str, str], room: int | None = None, changes: int | N
     sizes = {"ROOM": room, "CHANGES": changes}
     flags = (*FLAGS, *(f"-DQUADSIM_{name}={size}" for name, size in sizes.items() if size is not None))
     digest = hashlib.sha256()
-    for text in (_version(compiler), *flags, *(f"{name}\0{sources[name]}" for name in sorted(sources))):
+    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    for text in (version, *flags, *(f"{name}\0{sources[name]}" for name in sorted(sources))):
         digest.update(text.encode() + b"\0")
     library = _cache() / f"{digest.hexdigest()}.so"
     if not library.exists():
@@ -82,10 +83,6 @@ def _compiler() -> str:
             f"no C compiler found ({looked}); install one, e.g. apt-get install gcc, or leave out controller.compiled"
         )
     return found
-
-
-def _version(compiler: str) -> str:
-    return subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
 
 
 def _compile(compiler: str, flags: Sequence[str], sources: Mapping[str, str]) -> bytes:

@@ -26,7 +26,7 @@ from scenarios.schema import events as kinds
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec, NonlinearSpec, changed
 from scenarios.schema.course import ReferenceSpec
-from scenarios.schema.optimisation import BoundedSpec
+from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
@@ -101,10 +101,6 @@ class PlantSpec(Spec):
 _STEEPEST: Final = 180.0
 
 
-def _tilt_or_false(value: Any) -> Any:
-    return _number_or_false(value, _STEEPEST)
-
-
 def _number_or_false(value: Any, most: float = 1e6) -> Any:
     """Refuse all but numbers in range and false, in one sentence; 0, which Python takes for false, is refused too."""
     if value is False or (isinstance(value, int | float) and value is not True and 0.0 < value <= most):
@@ -118,12 +114,13 @@ LimitOrOff = Annotated[Positive | Literal[False], BeforeValidator(_number_or_fal
 class LostSpec(Spec):
     """When the flight is lost and ends, by the true state at each control sample; false switches a criterion off."""
 
-    tilt: Annotated[Annotated[float, Field(gt=0.0, le=_STEEPEST)] | Literal[False], BeforeValidator(_tilt_or_false)] = (
-        Field(
-            default=120.0,
-            description="[deg] between the thrust axis and the vertical; at 120, half the thrust pulls down; false for "
-            "loops and flips",
-        )
+    tilt: Annotated[
+        Annotated[float, Field(gt=0.0, le=_STEEPEST)] | Literal[False],
+        BeforeValidator(lambda value: _number_or_false(value, _STEEPEST)),
+    ] = Field(
+        default=120.0,
+        description="[deg] between the thrust axis and the vertical; at 120, half the thrust pulls down; false for "
+        "loops and flips",
     )
     distance: LimitOrOff = Field(default=100.0, description="[m] from the reference at the same time")
     depth: LimitOrOff = Field(default=50.0, description="[m] below the lowest of the start and the reference so far")
@@ -264,11 +261,15 @@ class Scenario(Spec):
             raise ValueError(f"constraints must have distinct names; got {names}")
 
     @property
+    def polytopes(self) -> list[PolytopeSpec]:
+        """Those of its controller."""
+        return self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearSpec) else []
+
+    @property
     def audited_names(self) -> list[str]:
         """The names of constraints, rows of polytopes, obstacles and regions."""
-        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearSpec) else []
         names = [constraint.name for constraint in self.constraints]
-        names += [name for polytope in polytopes for name in polytope.row_names]
+        names += [name for polytope in self.polytopes for name in polytope.row_names]
         return names + [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
 
     def _check_events(self) -> None:
