@@ -295,14 +295,9 @@ def start(
     live: bool = False,
     recorded: bool = True,
 ) -> StartedFlight:
-    """Build everything that a scenario's flight needs, and fly nothing yet.
+    """Build everything that a scenario's flight needs, and fly nothing yet; see `scenarios.api.start`.
 
-    Args:
-        scenario: what is flown.
-        law: flies it, instead of what is built from the scenario's `controller`.
-        forces: what acts on it, instead of what is built from the scenario's `forces`.
-        live: whether anything may happen in it that can happen to its vehicle; else what its scenario's events are of.
-        recorded: whether all periods are recorded, for `StartedFlight.flight`: some 10 kB each.
+    `law` and `forces` take the place of what is built from the scenario's `controller` and `forces`.
 
     Raises:
         InputError: something cannot be built.
