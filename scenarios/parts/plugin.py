@@ -107,7 +107,8 @@ def make_law(law: Any, spec: PluginSpec, vehicle: Vehicle, period: float) -> Plu
             try:
                 inspect.signature(code).bind(None, None, None, **spec.settings)
             except TypeError as error:
-                given = f"{code.__qualname__}{inspect.signature(code)}"
+                what = "bound method" if inspect.ismethod(code) else "function"
+                given = f"the {what} {code.__qualname__}{inspect.signature(code)}"
                 raise InputError(f"controller must be {_STEP}; got {given}: {error}") from error
             law = SimpleNamespace(step=functools.partial(code, **spec.settings), name=code.__name__)
     if not callable(getattr(law, "step", None)):
