@@ -72,6 +72,11 @@ class FirstScenario:
     size: float  # of the course [m]: the step, or the figure's length; for hover a step's
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What it was made from: the comments above it."""
+        return tuple(line.removeprefix("#").strip() for line in self.text.partition("\n\n")[0].splitlines())
+
+    @property
     def scenario(self) -> Scenario:
         """To be flown."""
         from scenarios.loading import parse_scenario
