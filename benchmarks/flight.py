@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 from timing import Record, Stopwatch, options, run, undisturbed
 
+from quadsim.sim.loop import complete
 from scenarios.api import load
 from scenarios.build import build_controller, build_plant
 from scenarios.courses.make import build_reference
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import fly_once
+from scenarios.run import closed_loop
 
 
 def measure(name: str, quick: bool) -> list[Record]:
@@ -30,7 +31,9 @@ def measure(name: str, quick: bool) -> list[Record]:
                 for laps in pieces.laps.values():
                     laps.clear()
                 navigation, watch = build_navigation(scenario, vehicle), Stopwatch()
-                log = fly_once(scenario, vehicle, plant, controller, reference, navigation=navigation)
+                loop = closed_loop(scenario, vehicle, plant, controller, reference, navigation=navigation)
+                complete(loop, periods=scenario.periods)
+                log = loop.log()
                 wall = watch.elapsed
                 if plant is plain:
                     walls.append(wall)

@@ -35,11 +35,10 @@ def absolute(path: Path | str) -> Path:
     """
     try:
         real = Path(os.path.realpath(Path(path).expanduser()))
-        circular = real.is_symlink()
-    except (ValueError, RuntimeError, OSError) as error:  # a null byte; a user without a home; too long a name
+        if real.is_symlink():
+            raise ValueError("a symbolic link leads back to itself")
+    except (ValueError, RuntimeError, OSError) as error:  # also a null byte; a user without a home; too long a name
         raise OutputError(ascii(str(path))[1:-1], getattr(error, "strerror", None) or str(error)) from error
-    if circular:
-        raise OutputError(path, "a symbolic link leads back to itself")
     return real
 
 

@@ -12,7 +12,7 @@ from quadsim.sim.effects import Force
 from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
 from quadsim.vehicle import Vehicle
-from scenarios.courses.windows import timed_regions
+from scenarios.courses.make import timed_regions
 from scenarios.parts.controllers import make_controller, make_problem
 from scenarios.parts.effects import build_changes, build_wind
 from scenarios.parts.plugin import import_plugin, make_force
@@ -28,12 +28,7 @@ def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
 
 
 def build_plant(scenario: Scenario, vehicle: Vehicle, forces: Sequence[Force] | None = None) -> Plant:
-    """The simulated vehicle as it really is, and what acts on it.
-
-    Args:
-        scenario: what is flown.
-        vehicle: the modelled vehicle.
-        forces: of one's own, instead of those that the scenario names.
+    """The simulated vehicle as it really is, and what acts on it; `forces` instead of those that the scenario names.
 
     Raises:
         InputError: a combination of effects is not possible, or a force cannot be imported.

@@ -57,13 +57,7 @@ def compare_flights(
     *,
     overwrite: bool = False,
 ) -> Comparison:
-    """Compare flights, and write the page where a directory is given.
-
-    Args:
-        targets: one or more.
-        out: the directory of the page; what has to be flown is saved beside it, in `OUT-runs`.
-        progress: called with (what, done, total).
-        overwrite: whether to replace an earlier output in the page's place.
+    """Compare flights, and write the page to `out`; what has to be flown is saved beside it, in `OUT-runs`.
 
     Raises:
         InputError: something is no flight and no scenario; nothing was flown.

@@ -61,11 +61,6 @@ def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> di
 
     Where the controller is one's own, its bounds are not a scenario file's: they are named by the problem, and the
     advice is by how much one of them alone would have to be wider.
-
-    Args:
-        unanswered: the first period without an answer.
-        scenario: what was flown.
-        vehicle: the modelled vehicle.
     """
     if unanswered.converges is not None:
         return _unconverged(unanswered, unanswered.converges, getattr(scenario.controller, "iterations", 1))

@@ -34,10 +34,11 @@ from scenarios.courses.make import build_course_steps
 from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
 from scenarios.parts.effects import build_computation
-from scenarios.parts.story import story
+from scenarios.parts.events import story
 from scenarios.parts.vehicle import build_actual
 from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario, Verdict
+from scenarios.schema.settings import leaves
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -225,8 +226,8 @@ class Flight:
     @cached_property
     def metrics(self) -> dict[str, float]:
         """The flight's numbers by name, e.g. `rmse.x`, `speed_max`, `step_ms.p99`; units as in `summary`."""
-        tables = (self.summary[name] for name in ("tracking", "control", "controller"))
-        return {name: value for table in tables for name, value in _numbers(table)}
+        found = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self.summary[name]))
+        return {name: value for name, value in found if isinstance(value, int | float) and not isinstance(value, bool)}
 
     @property
     def run(self) -> rundir.Run:
@@ -355,15 +356,6 @@ def to_pandas(table: pa.Table) -> Any:
     return table.to_pandas()
 
 
-def _numbers(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
-    """The numbers of nested tables, by their paths."""
-    for name, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _numbers(value, f"{prefix}{name}.")
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            yield prefix + name, value
-
-
 def write_run(
     flight: Flight,
     directory: Path,
@@ -375,13 +367,7 @@ def write_run(
 ) -> None:
     """Write a run directory: scenario, Parquet tables and summary at once, then its products, one by one.
 
-    Args:
-        flight: as it was flown.
-        directory: its absolute path.
-        outputs: which products.
-        progress: called with (what, done, total).
-        overwrite: whether to replace an earlier output there.
-        since: clock reading at which the flight's work began [s], for the summary's total.
+    `since` is the clock's reading when the flight's work began [s], for the summary's total.
 
     Raises:
         OutputError: the directory cannot be written, or a product that was asked for by name failed.
@@ -415,6 +401,8 @@ def summarise(flight: Flight) -> dict[str, Any]:
     course = build_course_steps(scenario)
     ground = scenario.effects.ground
     flown = log.control.t.size > 0
+    samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
+    estimation = {} if log.control.measured_perfectly else {**metrics.estimation(log.control), "samples": samples}
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=course)
     return {
         "scenario": scenario.name,
@@ -444,7 +432,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
             **numbers["controller"],
         },
         **({"computation": metrics.computation(log.control)} if flown and build_computation(scenario) else {}),
-        **({} if log.control.measured_perfectly else {"estimation": _estimation(flight)}),
+        **({"estimation": estimation} if estimation else {}),
         **({"ground": metrics.ground(log, outline(flight.actual))} if flown and ground and ground.contact else {}),
         "vehicle": asdict(flight.vehicle),
         **({"actual": asdict(flight.actual)} if flight.actual != flight.vehicle else {}),
@@ -454,11 +442,6 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "products": {},
         "files": {},
     }
-
-
-def _estimation(flight: Flight) -> dict[str, Any]:
-    samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
-    return {**metrics.estimation(flight.log.control), "samples": samples}
 
 
 def _add_products(flight: Flight, directory: Path, outputs: Outputs, progress: Progress) -> dict[str, str]:

@@ -73,8 +73,7 @@ def write_junit(result: Flight | Reaudit | Result | Sequence[Reproduction], path
         return write_cases(summary["campaign"], held, Path(path))
     text = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
     whole = summary["status"] == "completed" and not summary["controller"].get("unrecovered")
-    cases: list[tuple[str, bool | None, str]] = [("flight", whole, text)]
-    cases += [(entry["name"], _passed(entry), _sentence(entry)) for entry in summary["constraints"]]
+    cases = [("flight", whole, text), *map(_case, summary["constraints"])]
     return write_cases(summary["scenario"], cases, Path(path))
 
 
@@ -97,18 +96,14 @@ def write_cases(suite: str, cases: Sequence[tuple[str, bool | None, str]], path:
     return path
 
 
-def _passed(entry: Mapping[str, Any]) -> bool | None:
-    """Whether a constraint's case passes; None where it was required and not reached."""
-    if entry["required"] and constraint_verdict(entry) == "incomplete":
-        return None
-    return bool(entry["satisfied"]) or not entry["required"]
-
-
-def _sentence(entry: Mapping[str, Any]) -> str:
+def _case(entry: Mapping[str, Any]) -> tuple[str, bool | None, str]:
+    """A constraint's name, whether its case passes (None where it was required and not reached), and its numbers."""
     if constraint_verdict(entry) == "incomplete":
-        return "not reached: the flight has no value in the constraint's time window"
-    return (
+        text = "not reached: the flight has no value in the constraint's time window"
+        return entry["name"], None if entry["required"] else True, text
+    text = (
         f"worst margin {format_number(entry['worst_margin'])} {entry['unit']} at t = {entry['worst_time']:.3f} s "
         f"(tolerance {entry['tolerance']:g}), {format_number(entry['worst_margin_sampled'])} at the samples "
         f"(tolerance {entry['tolerance_sampled']:g}); violated for {entry['time_violated']:.3f} s"
     )
+    return entry["name"], bool(entry["satisfied"]) or not entry["required"], text

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Final
 
 from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
 from quadsim.report.table import format_number
-from scenarios.courses.windows import timed_regions
+from scenarios.courses.make import timed_regions
 from scenarios.parts.vehicle import build_actual, build_vehicle
-from scenarios.schema.nonlinear import NonlinearPartsSpec
-from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
+from scenarios.schema.controller import NonlinearSpec
 
 if TYPE_CHECKING:
     from quadsim.vehicle import Vehicle
@@ -50,9 +49,9 @@ def with_bounds_stated(scenario: Scenario) -> Scenario:
 def controller_bounds(spec: ControllerSpec, vehicle: Vehicle) -> dict[str, Range]:
     """The bounds that a controller has on signals of the audit, hard or soft, in their units."""
     found: dict[str, Range] = {name: (pair[0], pair[1]) for name, pair in getattr(spec, "output_bounds", {}).items()}
-    if isinstance(spec, NonlinearPartsSpec) and spec.tilt is not None:
+    if isinstance(spec, NonlinearSpec) and spec.tilt is not None:
         found["tilt"] = (-math.inf, spec.tilt)
-    if isinstance(spec, NonlinearPartsSpec) and spec.body_rate is not None:
+    if isinstance(spec, NonlinearSpec) and spec.body_rate is not None:
         largest = spec.body_rate if isinstance(spec.body_rate, list) else [spec.body_rate] * 3
         found |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", largest, strict=True)}
     inputs = getattr(spec, "input_bounds", None)
@@ -165,11 +164,6 @@ def _sum_limits(scenario: Scenario) -> tuple[Limit, ...]:
             tolerance_sampled=polytope.tolerance_sampled,
             required=polytope.required,
         )
-        for polytope in _polytopes(scenario)
+        for polytope in scenario.polytopes
         for i, (name, row) in enumerate(zip(polytope.row_names, polytope.rows, strict=True))
     )
-
-
-def _polytopes(scenario: Scenario) -> list[PolytopeSpec]:
-    controller = scenario.controller
-    return controller.polytopes if isinstance(controller, BoundedSpec | NonlinearPartsSpec) else []

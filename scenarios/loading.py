@@ -21,9 +21,8 @@ from scenarios.courses.make import build_course, build_motion, located
 from scenarios.limits import space_limits
 from scenarios.parts.effects import build_changes, check_changes, moving_air
 from scenarios.parts.vehicle import actual_effects, build_actual, build_initial_state, build_vehicle
-from scenarios.schema.bases import read_scenario, replaced_tables, retyped
+from scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
 from scenarios.schema.course import CsvSpec
-from scenarios.schema.plugin import located as located_controller
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting
@@ -82,9 +81,7 @@ def _check_start(scenario: Scenario, vehicle: Vehicle) -> None:
 def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
     """Read and check a scenario, merged over its `base` where it has one, with the vehicle and the course it names.
 
-    Args:
-        name: a library name, or a path ending in `.toml`.
-        settings: `dotted.path=value` texts that replace or add fields, values as in TOML.
+    Settings are `dotted.path=value` texts that replace or add fields, values as in TOML.
 
     Raises:
         InputError: the file is missing or malformed, a field is not allowed, or what it names cannot be flown so.
@@ -122,30 +119,18 @@ def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data
 
 
 def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directory: Path | None = None) -> Scenario:
-    """Check a scenario given as nested tables.
+    """Check a scenario given as nested tables, called `source` in messages.
 
-    Args:
-        data: the parsed TOML.
-        source: what to call it in messages.
-        directory: where relative paths of vehicles and courses are looked up, besides the working directory, and the
-            module of a plug-in controller.
+    Relative paths of vehicles and courses, and modules of plug-ins, are looked up in `directory` too.
 
     Raises:
         ScenarioError: naming every field that is wrong.
         FileError: the course's table is wrong.
     """
-    if directory is not None and "controller" in data:
-        data = {**data, "controller": located_controller(data["controller"], directory)}
-    if directory is not None and isinstance(data.get("forces"), list):
-        forces = [
-            located_controller(force, directory) if isinstance(force, dict) else force for force in data["forces"]
-        ]
-        data = {**data, "forces": forces}
+    if directory is not None:
+        data = {name: {**value} if isinstance(value, dict) else value for name, value in data.items()}
+        locate_files(data, directory)
     scenario = Scenario.parse(data, source=source)
-    file = scenario.vehicle.file
-    if directory is not None and file.endswith(".toml") and (directory / file).is_file():
-        absolute = str((directory / file).resolve())
-        scenario = scenario.model_copy(update={"vehicle": scenario.vehicle.model_copy(update={"file": absolute})})
     if directory is not None and isinstance(scenario.reference, CsvSpec):
         scenario = scenario.model_copy(update={"reference": located(scenario.reference, directory)})
     return scenario

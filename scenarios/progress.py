@@ -22,5 +22,5 @@ def reporting(progress: Progress | bool) -> Iterator[Progress]:
     else:
         from scenarios.commands.console import progress_bars
 
-        with progress_bars(enabled=True) as bars:
+        with progress_bars() as bars:
             yield bars

@@ -33,6 +33,7 @@ from scenarios.schema.bases import read_whole
 from scenarios.schema.events import RotorLagEvent
 from scenarios.schema.plugin import LAWS, is_plugin
 from scenarios.schema.scenario import Scenario
+from scenarios.schema.settings import leaves
 
 TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
 OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
@@ -66,9 +67,7 @@ class Reaudit:
 def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
     """Audit a finished run again from its tables, and hold its summary against that.
 
-    Args:
-        directory: of the run.
-        products: whether film, recording and figures have to be there too; they can be made again.
+    Film, recording and figures have to be there where `products` is true; they can be made again.
 
     Raises:
         FileError: a file is missing, changed or damaged, or the summary contradicts the tables; the message names
@@ -114,34 +113,30 @@ def stored_scenario(directory: Path) -> Scenario:
     if not path.is_file():
         raise FileError(path, "is missing or no file")
     data = read_whole(path)
-    controller = data.get("controller")
-    controller = controller if isinstance(controller, dict) else {}
-    name = controller.get("type")
-    if isinstance(name, str) and name not in LAWS and not is_plugin(name):
-        data["controller"] = {**controller, "type": "elsewhere:Controller"}
+    match data.get("controller"):
+        case {"type": str(name), **fields} if name not in LAWS and not is_plugin(name):
+            data["controller"] = {**fields, "type": "elsewhere:Controller"}
     return parse_scenario(data, source=str(path))
 
 
 def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> Iterator[str]:
     """Files that are not as they were written."""
+    needed = (*TABLES, rundir.SCENARIO_FILE)
     for name in rundir.damaged_files(directory, summary):
         if (directory / name).is_file():
             yield f"{name} is not the file that was written"
-        elif products or name in (*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE):
+        elif products or name in (*needed, HORIZON_FILE):
             yield f"{name} is missing"
-    for name in (*TABLES, rundir.SCENARIO_FILE):
-        if name not in summary["files"]:
-            yield f"{rundir.SUMMARY_FILE} has no hash of {name}"
+    yield from (f"{rundir.SUMMARY_FILE} has no hash of {name}" for name in needed if name not in summary["files"])
     for name in _unlisted(directory, summary):
-        if name in OURS and name not in (*TABLES, rundir.SCENARIO_FILE):
+        if name in OURS and name not in needed:
             yield f"{name} is there, and {rundir.SUMMARY_FILE} does not list it"
 
 
 def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
-    """Files in a run's directory that its summary does not list, but for our own bookkeeping, sorted."""
-    listed = {rundir.SUMMARY_FILE, *summary["files"]}
-    found = (path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir())
-    return sorted(name for name in found if name not in listed)
+    """Files in a run's directory that its summary does not list, sorted."""
+    found = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
+    return sorted(found - {rundir.SUMMARY_FILE, *summary["files"]})
 
 
 def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
@@ -198,28 +193,20 @@ def _differences(
     summary: Mapping[str, Any], scenario: Scenario, log: FlightLog, findings: Sequence[Finding]
 ) -> Iterator[str]:
     """Where a summary differs from the run's scenario and tables."""
-    whole = log.control.t.size == scenario.periods
-    stated = {
-        "scenario": scenario.name,
-        "seed": scenario.seed,
-        "expected": scenario.expect,
-        "duration": round(log.control.t.size * scenario.control_period, 9),
-    }
-    for key, value in stated.items():
-        if key in summary and summary[key] != value:
-            yield f"{key} is recorded as {summary[key]!r:.80}, and the run's files give {value!r:.80}"
-    if summary["status"] == "completed" and not whole:
-        yield f"status is recorded as 'completed', and {log.control.t.size} of {scenario.periods} periods were flown"
-    if (summary["status"] == "completed") != (summary["reason"] is None):
-        yield f"status is recorded as {summary['status']!r:.40}, and reason as {summary['reason']!r:.80}"
+    flown, completed, reason = log.control.t.size, summary["status"] == "completed", summary["reason"]
+    duration = round(flown * scenario.control_period, 9)
+    stated = {"scenario": scenario.name, "seed": scenario.seed, "expected": scenario.expect, "duration": duration}
+    for key, again in stated.items():
+        yield from _recorded(key, summary.get(key, again), again, "the run's files give")
+    if completed and flown != scenario.periods:
+        yield f"status is recorded as 'completed', and {flown} of {scenario.periods} periods were flown"
+    if completed != (reason is None):
+        yield f"status is recorded as {summary['status']!r:.40}, and reason as {reason!r:.80}"
     deadline_ms = 1e3 * scenario.control_period
     numbers = metrics.flight_numbers(log, deadline_ms=deadline_ms, course=build_course_steps(scenario))
-    recorded = dict(_leaves({key: summary[key] for key in numbers}))
-    for key, value in _leaves(numbers):
-        before = recorded.get(key, value)
-        alike = before == value or (isinstance(before, int | float) and _is_close(before, value, ROUNDING))
-        if not alike:
-            yield f"{key} is recorded as {before!r:.80}, and the tables give {value!r:.80}"
+    before = dict(leaves({key: summary[key] for key in numbers}))
+    for key, again in leaves(numbers):
+        yield from _recorded(key, before.get(key, again), again, "the tables give", ROUNDING)
     entries = summary["constraints"]
     names, wanted = [entry["name"] for entry in entries], [finding.limit.name for finding in findings]
     if names != wanted:
@@ -227,29 +214,23 @@ def _differences(
         return
     for entry, finding in zip(entries, findings, strict=True):
         yield from (f"{finding.limit.name}: {what}" for what in _constraint_differences(entry, finding, scenario, log))
-    for entry in entries:
-        found = constraint_verdict(entry)
-        if entry["satisfied"] != (found == "satisfied") or entry.get("verdict", found) != found:
-            yield f"{entry['name']}: satisfied is {entry['satisfied']}, and its worst margins say {found}"
+        held = constraint_verdict(entry)
+        if entry["satisfied"] != (held == "satisfied") or entry.get("verdict", held) != held:
+            yield f"{entry['name']}: satisfied is {entry['satisfied']}, and its worst margins say {held}"
     required = all(entry["satisfied"] for entry in entries if entry["required"])
-    unrecovered = metrics.unrecovered(log.control)
-    satisfied = summary["reason"] is None and not log.control.crashed and not unrecovered and required
-    if summary["satisfied"] != satisfied:
-        yield f"satisfied is recorded as {summary['satisfied']}, and its audit and outcome make it {satisfied}"
+    satisfied = reason is None and required and not (log.control.crashed or metrics.unrecovered(log.control))
+    yield from _recorded("satisfied", summary["satisfied"], satisfied, "its audit and outcome make it")
     outcome = verdict(summary)
-    if summary.get("verdict", outcome) != outcome:
-        yield f"verdict is recorded as {summary['verdict']!r:.40}, and its audit and outcome make it {outcome}"
+    yield from _recorded("verdict", summary.get("verdict", outcome), outcome, "its audit and outcome make it")
     if summary.get("as_expected") and outcome != scenario.expect:
         yield f"as_expected is recorded as True, and the flight is {outcome} where {scenario.expect} is expected"
 
 
-def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """What nested tables hold, by dotted path."""
-    if not isinstance(value, Mapping):
-        yield path, value
-        return
-    for key, inner in value.items():
-        yield from _leaves(inner, f"{path}.{key}" if path else key)
+def _recorded(key: str, before: Any, again: Any, source: str, rounding: float = 0.0) -> Iterator[str]:
+    """That a value is recorded otherwise, where numbers differ by more than the rounding."""
+    numbers = isinstance(before, int | float) and isinstance(again, int | float)
+    if before != again and not (numbers and math.isclose(before, again, rel_tol=rounding, abs_tol=rounding)):
+        yield f"{key} is recorded as {before!r:.80}, and {source} {again!r:.80}"
 
 
 _DEMANDS: Final = (
@@ -263,26 +244,25 @@ def _constraint_differences(
     entry: Mapping[str, Any], finding: Finding, scenario: Scenario, log: FlightLog
 ) -> Iterator[str]:
     """Where a summary differs from the tables in one constraint."""
-    again = limit_to_json(finding)
-    recorded = {"terms": None, "shape": None, "radius": None, **entry}
+    again, limit = limit_to_json(finding), finding.limit
     for key in _DEMANDS:
-        if recorded[key] != again.get(key):
-            yield f"{key} is recorded as {recorded[key]!r:.80}, and is {again.get(key)!r:.80} in the scenario"
-    rounding = ROUNDING_TILT if finding.limit.signal == "tilt" else ROUNDING
-    alike = ["peak_sampled", "worst_margin_sampled"]
-    if finding.limit.source.plant is None or scenario.plant_stride == 1 or not log.control.t.size:
-        alike += ["peak_plant", "worst_margin", "worst_time"]
+        if entry.get(key) != again.get(key):
+            yield f"{key} is recorded as {entry.get(key)!r:.80}, and is {again.get(key)!r:.80} in the scenario"
+    rounding = ROUNDING_TILT if limit.signal == "tilt" else ROUNDING
+    sampled = limit.source.plant is None
+    whole = sampled or scenario.plant_stride == 1 or not log.control.t.size  # the tables have all that the audit saw
+    alike = ("peak_sampled", "worst_margin_sampled", *(("peak_plant", "worst_margin", "worst_time") if whole else ()))
     for key in alike:
-        if not _is_close(entry[key], again[key], rounding):
-            yield f"{key} is recorded as {entry[key]}, and the tables give {again[key]}"
-    recorded, there = entry["worst_margin"], again["worst_margin"]
-    milder = there is not None and (recorded is None or recorded > there + rounding * max(1.0, abs(there)))
-    if "worst_margin" not in alike and milder:
-        yield f"worst_margin is recorded as {recorded}, and the tables go down to {there:.6g}"
-    peak = "peak_sampled" if finding.limit.source.plant is None else "peak_plant"
-    if recorded is not None and not _is_close(_margin(finding, entry[peak]), recorded, rounding):
-        yield f"worst_margin is recorded as {recorded}, and {peak} as {entry[peak]}"
-    beyond = recorded is not None and recorded < -entry["tolerance"]
+        yield from _recorded(key, entry[key], again[key], "the tables give", rounding)
+    margin, there = entry["worst_margin"], again["worst_margin"]
+    milder = there is not None and (margin is None or margin > there + rounding * max(1.0, abs(there)))
+    if not whole and milder:
+        yield f"worst_margin is recorded as {margin}, and the tables go down to {there:.6g}"
+    peak = "peak_sampled" if sampled else "peak_plant"
+    if margin is not None:
+        at_peak = None if entry[peak] is None else float(limit.margin(np.array([entry[peak]]))[0])
+        yield from _recorded("worst_margin", margin, at_peak, f"by its {peak}", rounding)
+    beyond = margin is not None and margin < -entry["tolerance"]
     least, most = _time_beyond(finding, scenario, log)
     if (entry["time_violated"] > 0.0 and not beyond) or not least <= entry["time_violated"] <= most:
         yield f"time_violated is recorded as {entry['time_violated']}, and the tables give {again['time_violated']:.6g}"
@@ -300,16 +280,6 @@ def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[
     t = log.plant.t[:-1]  # the last row ends the flight, and lasts no time
     beyond = limit.margin(signal.plant(log.plant))[:-1] < -limit.tolerance - ROUNDING_TILT
     return max(0.0, (np.count_nonzero(limit.holds_at(t) & beyond) - 1) * scenario.plant.timestep), math.inf
-
-
-def _margin(finding: Finding, peak: float | None) -> float | None:
-    return None if peak is None else float(finding.limit.margin(np.array([peak]))[0])
-
-
-def _is_close(recorded: float | None, again: float | None, rounding: float) -> bool:
-    if recorded is None or again is None:
-        return recorded is again
-    return math.isclose(recorded, again, rel_tol=rounding, abs_tol=rounding)
 
 
 def _contradiction(directory: Path, differing: Sequence[str]) -> FileError:

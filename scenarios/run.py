@@ -6,7 +6,7 @@ import contextlib
 import math
 import os
 import time as clock
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from threadpoolctl import threadpool_limits
 from quadsim.controller import Command, Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import audit, smallest_margins
-from quadsim.flight.log import FlightLog
 from quadsim.outputs import reserving
 from quadsim.sim.effects import Force
 from quadsim.sim.loop import ClosedLoop, Observation, Reference, Sample, complete, one_period
@@ -30,14 +29,14 @@ from scenarios.courses.make import build_motion, follow_course
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.limits import build_limits
 from scenarios.parts.effects import build_computation
+from scenarios.parts.events import prepared
 from scenarios.parts.live import FlightEvents, Successor
 from scenarios.parts.navigation import build_navigation
-from scenarios.parts.neutral import prepared
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_actual, build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.schema.controller import ControllerSpec, NonlinearSpec
-from scenarios.schema.events import ControllerEvent, Event, SetpointEvent
+from scenarios.schema.events import ControllerEvent, Event
 from scenarios.schema.scenario import LONGEST_FLIGHT, MOST_STEPS, Scenario
 
 
@@ -51,17 +50,7 @@ def closed_loop(
     navigation: Navigation | None,
     recorded: bool = True,
 ) -> ClosedLoop:
-    """The loop of a scenario, at t = 0.
-
-    Args:
-        scenario: what is flown.
-        vehicle: the modelled vehicle.
-        plant: see `scenarios.build.build_plant`.
-        controller: see `scenarios.build.build_controller`.
-        reference: (K + N, 4), or an object; see `scenarios.courses.make`.
-        navigation: see `scenarios.parts.navigation.build_navigation`.
-        recorded: whether all periods are recorded.
-    """
+    """The loop of a scenario, at t = 0; the reference is (K + N, 4), or an object (see `scenarios.courses.make`)."""
     motion = build_motion(scenario, vehicle)
     return ClosedLoop(
         plant,
@@ -85,35 +74,6 @@ def needs_quaternions(scenario: Scenario) -> bool:
     """Whether one of its controllers flies at any attitude."""
     specs = (scenario.controller, *(spec for _, spec in scenario.controller_changes))
     return any(isinstance(spec, NonlinearSpec) for spec in specs)
-
-
-def fly_once(
-    scenario: Scenario,
-    vehicle: Vehicle,
-    plant: Plant,
-    controller: Controller,
-    reference: Array,
-    *,
-    navigation: Navigation | None,
-    progress: Callable[[int], None] | None = None,
-) -> FlightLog:
-    """Fly a scenario with a plant and a controller that were built for it.
-
-    Args:
-        scenario: what is flown; without events `setpoint` and `controller`, which are not of these parts.
-        vehicle: the modelled vehicle.
-        plant: see `closed_loop`, as the others.
-        controller: what flies it.
-        reference: (K + N, 4).
-        navigation: gives the controller the state.
-        progress: called with the number of periods flown, after each.
-    """
-    for event in scenario.events:
-        if isinstance(event, SetpointEvent | ControllerEvent):
-            raise ParameterError("events", "type", event.type, "another one where the parts were built before")
-    loop = closed_loop(scenario, vehicle, plant, controller, reference, navigation=navigation)
-    complete(loop, periods=scenario.periods, progress=progress)
-    return loop.log()
 
 
 class StartedFlight:
@@ -335,14 +295,9 @@ def start(
     live: bool = False,
     recorded: bool = True,
 ) -> StartedFlight:
-    """Build everything that a scenario's flight needs, and fly nothing yet.
+    """Build everything that a scenario's flight needs, and fly nothing yet; see `scenarios.api.start`.
 
-    Args:
-        scenario: what is flown.
-        law: flies it, instead of what is built from the scenario's `controller`.
-        forces: what acts on it, instead of what is built from the scenario's `forces`.
-        live: whether anything may happen in it that can happen to its vehicle; else what its scenario's events are of.
-        recorded: whether all periods are recorded, for `StartedFlight.flight`: some 10 kB each.
+    `law` and `forces` take the place of what is built from the scenario's `controller` and `forces`.
 
     Raises:
         InputError: something cannot be built.
@@ -359,13 +314,7 @@ def fly_scenario(
 ) -> Flight:
     """Fly a scenario and audit it, writing nothing.
 
-    A controller that changes the working directory changes it for the flight alone.
-
-    Args:
-        scenario: what is flown.
-        progress: called with (what, done, total).
-        law: flies it, instead of what is built from the scenario's `controller`.
-        forces: what acts on it, instead of what is built from the scenario's `forces`.
+    A controller that changes the working directory changes it for the flight alone.  `law` and `forces` as of `start`.
     """
     with _staying(), start(scenario, law, forces) as started:
         started.complete(progress)
@@ -395,19 +344,7 @@ def run_scenario(
 ) -> Flight:
     """Fly a scenario and write its run directory: tables and summary first, then its products.
 
-    A flight that its pilot interrupted is written without its video.
-
-    Args:
-        scenario: what is flown.
-        target: the run directory.
-        outputs: which products.
-        progress: called with (what, done, total).
-        law: see `fly_scenario`.
-        forces: see `fly_scenario`.
-        overwrite: whether to replace an earlier output in its place.
-
-    Returns:
-        The flight, with its directory.
+    A flight that its pilot interrupted is written without its video.  Arguments as of `fly_scenario` and `write_run`.
 
     Raises:
         RenderingUnavailableError: a video is asked for by name and cannot be made; nothing was flown.

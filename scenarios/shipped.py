@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Final, Literal
 
 from quadsim.errors import FileError, UnknownNameError
 
-LIBRARY: Final = Path(__file__).resolve().parent / "library"
-CAMPAIGNS: Final = Path(__file__).resolve().parent / "campaigns"
-TUNINGS: Final = Path(__file__).resolve().parent / "tunings"
-PAPERS: Final = Path(__file__).resolve().parent / "papers"
+_HERE: Final = Path(__file__).resolve().parent
+LIBRARY, CAMPAIGNS, TUNINGS, PAPERS = (_HERE / name for name in ("library", "campaigns", "tunings", "papers"))
 
 Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
 
@@ -25,55 +24,13 @@ CONTROLLERS: Final = {
 }
 
 
-def scenario_names() -> list[str]:
-    """Names of the scenarios that ship, sorted."""
-    return _names(LIBRARY)
-
-
-def scenario_path(name: str) -> Path:
-    """The file of a library name, or the path itself when it ends in `.toml`.
-
-    Raises:
-        FileError, UnknownNameError: there is none.
-    """
-    return _path("scenario", name, LIBRARY)
-
-
-def campaign_names() -> list[str]:
-    """Names of the campaigns that ship, sorted."""
-    return _names(CAMPAIGNS)
-
-
-def campaign_path(name: str) -> Path:
-    """The file of a campaign that ships; as `scenario_path`."""
-    return _path("campaign", name, CAMPAIGNS)
-
-
-def tuning_names() -> list[str]:
-    """Names of the tunings that ship, sorted."""
-    return _names(TUNINGS)
-
-
-def tuning_path(name: str) -> Path:
-    """The file of a tuning that ships; as `scenario_path`."""
-    return _path("tuning", name, TUNINGS)
-
-
-def paper_names() -> list[str]:
-    """Names of the papers whose numbers ship, sorted."""
-    return _names(PAPERS)
-
-
-def paper_path(name: str) -> Path:
-    """The file of a paper that ships; as `scenario_path`."""
-    return _path("paper", name, PAPERS)
-
-
 def _names(folder: Path) -> list[str]:
+    """Names of what ships in a folder, sorted."""
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
-def _path(kind: str, name: str, folder: Path) -> Path:
+def _path(kind: str, folder: Path, name: str) -> Path:
+    """The file of a name that ships, or the path itself where it ends in `.toml`; refused where there is none."""
     if name.endswith(".toml"):
         if not Path(name).is_file():
             raise FileError(name, f"no such {kind} file")
@@ -81,3 +38,9 @@ def _path(kind: str, name: str, folder: Path) -> Path:
     if name not in _names(folder):
         raise UnknownNameError(kind, name, _names(folder), hint="or give a path ending in .toml")
     return folder / f"{name}.toml"
+
+
+scenario_names, scenario_path = partial(_names, LIBRARY), partial(_path, "scenario", LIBRARY)
+campaign_names, campaign_path = partial(_names, CAMPAIGNS), partial(_path, "campaign", CAMPAIGNS)
+tuning_names, tuning_path = partial(_names, TUNINGS), partial(_path, "tuning", TUNINGS)
+paper_names, paper_path = partial(_names, PAPERS), partial(_path, "paper", PAPERS)

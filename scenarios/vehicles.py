@@ -86,9 +86,7 @@ def vehicle_template() -> str:
         >>> "[mass]" in text, "kg" in text
         (True, True)
     """
-    from scenarios.design.vehicle_template import vehicle_template as template
-
-    return template()
+    return (Path(__file__).parent / "design" / "vehicle_template.toml").read_text(encoding="utf-8")
 
 
 def draw_vehicle(name: str | Path, out: str | Path, *, overwrite: bool = False) -> Path:

@@ -15,9 +15,13 @@ from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.model import LinearModel
 from mpc.nonlinear.model import NonlinearModel, advance
 from mpc.ocp import Objective, Problem, Query, Rest
+from quadsim.controller import Controller
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.sim.loop import complete
+from quadsim.sim.navigation import Navigation
+from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES, Array
-from quadsim.vehicle import N_ROTORS
+from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios import many
 from scenarios.build import build_problem
 from scenarios.campaign.results.table import Row
@@ -25,6 +29,8 @@ from scenarios.courses.make import build_reference
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.run import closed_loop
+from scenarios.schema.scenario import Scenario
 
 
 def fly_here(patch: pytest.MonkeyPatch) -> None:
@@ -283,3 +289,18 @@ def logged(state_name: str, *, samples: Sequence[float], plant: Sequence[float])
     control.state[:, INDEX[state_name]] = samples
     flown.state[:, INDEX[state_name]] = plant
     return replace(log, control=control, plant=flown)
+
+
+def fly_once(
+    scenario: Scenario,
+    vehicle: Vehicle,
+    plant: Plant,
+    controller: Controller,
+    reference: Array,
+    *,
+    navigation: Navigation | None,
+) -> FlightLog:
+    """Fly a scenario with a plant and a controller that were built for it; no set-points, no other controllers."""
+    loop = closed_loop(scenario, vehicle, plant, controller, reference, navigation=navigation)
+    complete(loop, periods=scenario.periods)
+    return loop.log()

@@ -8,7 +8,7 @@ from argparse import Namespace
 from quadsim.errors import ParameterError
 from quadsim.flight import rundir
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
-from scenarios.commands.common import print_summary, shown
+from scenarios.commands.console import print_result, shown
 from scenarios.junit import junit_file, write_junit
 from scenarios.many_flights import campaign as fly_campaign
 from scenarios.many_flights import replay as fly_again
@@ -68,7 +68,7 @@ def replay(options: Namespace) -> int:
         figures=options.figures,
         progress=not options.json,
     )
-    print_summary(rundir.read_summary(found.directory), options, where=shown(found.directory))
+    print_result(rundir.read_summary(found.directory), options, where=shown(found.directory))
     if not options.json:
         print_replay(found.recorded.number, found.recorded.row, found.differing)
     return EXIT_FAILED if found.differing else EXIT_DONE

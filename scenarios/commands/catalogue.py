@@ -1,4 +1,4 @@
-"""`quadsim list` and `scenario`: what there is, and its text."""
+"""`quadsim list`, `scenario` and `doctor`: what there is, its text, and what this machine can do with it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,19 @@ def scenario(options: Namespace) -> int:
             f"scenario needs a name or a TOML file, or --schema (there are: {', '.join(scenario_names())})"
         )
     from scenarios.api import resolve
-    from scenarios.commands.common import load
+    from scenarios.commands.flights import load
 
     print(resolve(load(options.scenario, options)).to_toml(), end="")
+    return EXIT_DONE
+
+
+def doctor(options: Namespace) -> int:
+    """`quadsim doctor`."""
+    from scenarios.self_check import doctor as check_machine
+
+    findings = check_machine()
+    if options.json:
+        print(json.dumps(findings, indent=2))
+    else:
+        console.print_listing(findings)
     return EXIT_DONE

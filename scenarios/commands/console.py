@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
+from argparse import Namespace
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 from rich.box import SIMPLE_HEAD
@@ -115,16 +118,19 @@ def say(text: str) -> None:
     stderr().print(f"quadsim: {text}", soft_wrap=True)
 
 
-def is_watched() -> bool:
-    """Whether a person at a terminal sees notices."""
-    return stderr().is_terminal
+def print_result(summary: Mapping[str, Any], options: Namespace, where: str | None = None) -> None:
+    """A flight's summary, for a person or as JSON."""
+    if options.json:
+        print(json.dumps(summary, indent=2))
+    else:
+        print_summary(summary, where)
 
 
-def print_notice(text: str) -> None:
-    """Print a notice before the work, on a terminal only."""
-    console = stderr()
-    if console.is_terminal:
-        console.print(text, soft_wrap=True)
+def shown(path: Path) -> str:
+    """A path for a person: relative to the current directory where it is in there."""
+    with contextlib.suppress(ValueError, OSError):  # it is not in there; the current directory is gone
+        return str(path.relative_to(Path.cwd()))
+    return str(path)
 
 
 def outcome(summary: Mapping[str, Any]) -> Text:
@@ -304,10 +310,10 @@ def _table(
 
 
 @contextlib.contextmanager
-def progress_bars(*, enabled: bool) -> Iterator[Progress]:
-    """Progress bars on stderr, one per stage; nothing when not enabled or not on a terminal."""
+def progress_bars() -> Iterator[Progress]:
+    """Progress bars on stderr, one per stage; nothing when not on a terminal."""
     console = stderr()
-    if not enabled or not console.is_terminal:
+    if not console.is_terminal:
         yield silent
         return
     columns = (TextColumn("{task.description:<10}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))

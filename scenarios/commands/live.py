@@ -12,7 +12,7 @@ from quadsim.errors import ParameterError
 from quadsim.outputs import reserving
 from scenarios.api import load as load_scenario
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
-from scenarios.commands.common import load, shown
+from scenarios.commands.console import shown
 from scenarios.live.guard import LOOPBACK
 from scenarios.live.pacing import Pace
 from scenarios.live.session import Session, read_script
@@ -24,6 +24,8 @@ from scenarios.shipped import scenario_names
 
 def live(options: Namespace) -> int:
     """`quadsim live`."""
+    from scenarios.commands.flights import load
+
     run = Path(options.scenario)
     finished = run.is_dir()
     if finished and (options.settings or options.seed is not None):

@@ -6,7 +6,7 @@ import json
 from argparse import Namespace
 
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, console
-from scenarios.commands.common import shown
+from scenarios.commands.console import shown
 from scenarios.many_flights import tune as carry_out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -19,11 +20,13 @@ from scenarios.courses.course import Course
 from scenarios.courses.make import build_course, filtered, initial_pose
 from scenarios.courses.smoothing import within_rounding
 from scenarios.schema.events import SetpointEvent
-from scenarios.schema.optimisation import ANGLES, BoundedSpec
+from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.robust import RobustSpec
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
+
+Range = tuple[float, float]
 
 
 def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
@@ -120,7 +123,8 @@ def _required(course: Course, scenario: Scenario, vehicle: Vehicle, *, duration:
     channels = zip(poses.T, course.resolution, strict=True)
     smooth = np.column_stack([within_rounding(values, unit, jumped | kinked) for values, unit in channels])
     needed = demand(smooth, period, vehicle, jumps=jumped, kinks=kinked)
-    return assess(needed, vehicle, bounds=_bounds(scenario), tightened=_tightened(scenario, vehicle), jumps=jumps)
+    bounds, tightened = _bounds(scenario, vehicle)
+    return assess(needed, vehicle, bounds=bounds, tightened=tightened, jumps=jumps)
 
 
 def _touched(t: Array, instants: ArrayLike) -> Mask:
@@ -138,33 +142,21 @@ def _isolated(kinks: Sequence[float], period: float) -> Array:
     return at[np.maximum(gaps[1:], gaps[:-1])[: at.size] > period * (1.0 + 1e-6)]
 
 
-def _bounds(scenario: Scenario) -> dict[str, tuple[float, float]]:
-    """The controller's bounds, SI."""
-    spec = scenario.controller
-    if not isinstance(spec, BoundedSpec):
-        return {}
-    scales = {name: math.radians(1.0) if name in ANGLES else 1.0 for name in spec.output_bounds}
-    bounds = {name: (scales[name] * lower, scales[name] * upper) for name, (lower, upper) in spec.output_bounds.items()}
-    return bounds | {
-        "speed": (spec.input_bounds.speed[0], spec.input_bounds.speed[1]),
-        "slew": (spec.input_bounds.slew[0], spec.input_bounds.slew[1]),
-    }
-
-
-def _tightened(scenario: Scenario, vehicle: Vehicle) -> dict[str, tuple[float, float]]:
-    """What tightening leaves of the output bounds at the end of the horizon, SI; none without it."""
+def _bounds(scenario: Scenario, vehicle: Vehicle) -> tuple[dict[str, Range], dict[str, Range]]:
+    """The controller's bounds, and what tightening leaves of those on outputs at the end of the horizon; SI."""
     from scenarios.parts.controllers import make_bounds, tightening_margins
 
     spec = scenario.controller
-    if not isinstance(spec, RobustSpec):
-        return {}
-    bounds = make_bounds(spec)
-    try:
-        margins = tightening_margins(spec, vehicle, scenario.control_period)
-    except ParameterError:  # which is reported where the controller is made
-        return {}
+    if not isinstance(spec, BoundedSpec):
+        return {}, {}
+    bounds, names = make_bounds(spec), [name for name in STATE_NAMES if name in spec.output_bounds]
+    (u_min, u_max), (delta_min, delta_max) = spec.input_bounds.speed, spec.input_bounds.slew
+    whole = dict(zip(names, zip(bounds.y_min.tolist(), bounds.y_max.tolist(), strict=True), strict=True))
+    inputs = {"speed": (u_min, u_max), "slew": (delta_min, delta_max)}
+    margins = None
+    with contextlib.suppress(ParameterError):  # which is reported where the controller is made
+        margins = tightening_margins(spec, vehicle, scenario.control_period) if isinstance(spec, RobustSpec) else None
     if margins is None:
-        return {}
-    ends = zip(bounds.y_min + margins[-1], bounds.y_max - margins[-1], strict=True)
-    names = [name for name in STATE_NAMES if name in spec.output_bounds]
-    return {name: (float(lower), float(upper)) for name, (lower, upper) in zip(names, ends, strict=True)}
+        return whole | inputs, {}
+    last = dict(zip(names, margins[-1].tolist(), strict=True))
+    return whole | inputs, {name: (low + last[name], high - last[name]) for name, (low, high) in whole.items()}

@@ -22,16 +22,16 @@ class FollowedCourse:
     """
 
     def __init__(self, course: Course, *, response_time: float, period: float) -> None:
-        """Set up at t = 0.
-
-        Args:
-            course: before its filter.
-            response_time: tau_r [s]; 0 for no filter.
-            period: tau_s [s].
-        """
+        """Set up at t = 0, with tau_r [s], 0 for no filter, and tau_s [s]."""
         self._course, self._response_time, self._period = course, response_time, period
         self._samples = self._rows = np.empty((0, len(REFERENCE_NAMES)))
         self._setpoint: dict[int, float] = {}
+
+    def first(self, count: int) -> Array:
+        """(count, 4) x, y, z [m], yaw [rad] at t_0 and later."""
+        self._extend(count)
+        rows: Array = self._rows[:count]
+        return rows
 
     def row(self, k: int) -> Array:
         """(4,) x, y, z [m], yaw [rad] at t_k."""

@@ -76,15 +76,9 @@ def ramped(t: Array, *, rate: float, total: float, ramp: float) -> Array:
 
 
 def fly_round(loop: Loop, *, turn_time: float, turns: float, ramp: float, yaw: float, along: bool) -> Path:
-    """A loop flown from and to rest.
+    """A loop flown from and to rest, one turn at full speed in `turn_time` [s], gained and lost over `ramp` [s].
 
-    Args:
-        loop: the curve.
-        turn_time: of one turn at full speed [s].
-        turns: how many, positive.
-        ramp: over which the speed is gained, and lost at the end [s].
-        yaw: held, or if `along` near which turn yaw starts [rad].
-        along: whether yaw follows the direction of travel.
+    Yaw [rad] is held, or where it goes `along` the direction of travel, it starts near that.
     """
     rate, total = math.tau / turn_time, math.tau * turns
     whole_turns = math.tau * round((yaw - loop.heading(np.zeros(1))[0]) / math.tau)

@@ -101,14 +101,7 @@ def lemniscate_curve(radius: float) -> Curve:
 
 
 def fly_ramped(curve: Curve, phase: Phase, *, initial: Array, gravity: float, free_heading: bool) -> Path:
-    """A curve flown from and to rest.
-
-    Args:
-        curve: where it leads, from the origin on.
-        phase: how far it is at each sample.
-        initial: (4,) x, y, z [m], yaw [rad] where it begins.
-        gravity: g [m/s^2]; with the acceleration it makes the attitude, and so the yaw.
-        free_heading: whether the heading is what leaves no rate about body z; else the initial one.
+    """A curve flown from and to rest, from the initial pose (4,) on; of a free heading see `Path`.
 
     The yaw is that of the attitude; of a curve that turns the vehicle upside down, where Euler's yaw turns by 180 deg,
     the initial one.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator
+import tomllib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from mpc.baselines.bandwidths import lag_to_allow_for
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.errors import UnknownNameError, printable
 from quadsim.vehicle import Vehicle
-from scenarios.design.loop import delay_margin
 from scenarios.design.tuning import (
     HEADING_RATIO,
     HEADING_STEP,
@@ -27,6 +26,7 @@ from scenarios.design.tuning import (
     PERIOD_SHARE,
     THRUST_SHARE,
     Tuning,
+    delay_margin,
     tune,
 )
 
@@ -64,22 +64,17 @@ _EIGHT_PEAK: Final = float(np.hypot(np.sin(angle := np.linspace(0.0, math.pi, 72
 """Largest |d2p/dt2| of the figure eight (a sin wt, a/2 sin 2wt), over a w^2."""
 
 
-class Entry(NamedTuple):
-    """A line of the file."""
-
-    table: str  # its header, without brackets; empty for the top
-    key: str  # of the field; empty for an empty table, which switches a part on
-    value: Any  # of TOML
-    why: str = ""  # what it is, in its unit, and where it comes from
-
-
 @dataclass(frozen=True, kw_only=True)
 class FirstScenario:
-    """A scenario for a vehicle, line by line."""
+    """A scenario for a vehicle."""
 
-    notes: tuple[str, ...]  # what it was made from, the comments above it
-    entries: tuple[Entry, ...]  # its lines, those of a table together
+    text: str  # its commented file
     size: float  # of the course [m]: the step, or the figure's length; for hover a step's
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What it was made from: the comments above it."""
+        return tuple(line.removeprefix("#").strip() for line in self.text.partition("\n\n")[0].splitlines())
 
     @property
     def scenario(self) -> Scenario:
@@ -89,35 +84,12 @@ class FirstScenario:
         return parse_scenario(self.to_data())
 
     def to_data(self) -> dict[str, Any]:
-        """As nested tables, what parsing `to_toml` gives."""
-        data: dict[str, Any] = {}
-        for entry in self.entries:
-            holder = data
-            if entry.table == "[constraints]":
-                rows = data.setdefault("constraints", [])
-                if entry.key == "name":
-                    rows.append({})
-                holder = rows[-1]
-            else:
-                for name in entry.table.split("."):
-                    holder = holder.setdefault(name, {}) if name else holder
-            if entry.key:
-                holder[entry.key] = entry.value
-        return data
+        """As nested tables."""
+        return tomllib.loads(self.text)
 
     def to_toml(self) -> str:
         """As a commented file."""
-        lines = [f"# {printable(text)}".rstrip() for text in self.notes]
-        table = ""
-        for entry in self.entries:
-            if entry.table != table or (entry.table == "[constraints]" and entry.key == "name"):
-                table = entry.table
-                lines += ["", f"[{table}]" + (f"  # {entry.why}" if not entry.key else "")]
-            elif not lines[-1].strip() or lines[-1].startswith("#"):
-                lines.append("")
-            if entry.key:
-                lines.append(f"{entry.key} = {_text(entry.value)}" + (f"  # {entry.why}" if entry.why else ""))
-        return "\n".join(lines) + "\n"
+        return self.text
 
 
 def first_scenario(vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust") -> FirstScenario:
@@ -136,64 +108,68 @@ def first_scenario(vehicle: Vehicle, file: str, *, course: str = "hover", law: s
         if name not in known:
             raise UnknownNameError(kind, name, known)
     tuning = tune(vehicle)
-    flown, duration, size = _course(course, vehicle, tuning)
+    reference, duration, size = _course(course, vehicle, tuning)
     name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course}".lower())[:80]
-    why = f"s, tau: the longest of the usual ones with tau w <= {PERIOD_SHARE:g}"
-    entries = (
-        Entry("", "name", name),
-        Entry("", "description", _description(course, vehicle, tuning)),
-        *([] if duration is None else [Entry("", "duration", duration, "s")]),
-        Entry("", "control_period", tuning.period, why),
-        Entry("vehicle", "file", file, "made for its numbers: remake this file when they change"),
-        Entry("initial", "position", [0.0, 0.0, _height(vehicle, size)], "m, world; at rest"),
-        Entry("plant", "limit_speeds", True, "rotors saturate at their lowest and highest speed"),
-        *flown,
-        *(_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning)),
-        *_rotors(vehicle),
-        Entry("effects.air", "", None, "drag of the vehicle file"),
-        *_constraints(vehicle, tuning, size),
-    )
-    return FirstScenario(notes=_notes(vehicle, tuning, course, law), entries=entries, size=size)
+    for_duration = "" if duration is None else f"duration = {duration}  # s\n"
+    text = f"""{_notes(vehicle, tuning, course, law)}
+name = {_text(name)}
+description = {_text(_description(course, vehicle, tuning))}
+{for_duration}control_period = {tuning.period}  # s, tau: the longest of the usual ones with tau w <= {PERIOD_SHARE:g}
+
+[vehicle]
+file = {_text(file)}  # made for its numbers: remake this file when they change
+
+[initial]
+position = [0.0, 0.0, {_height(vehicle, size)}]  # m, world; at rest
+
+[plant]
+limit_speeds = true  # rotors saturate at their lowest and highest speed
+
+{reference}
+{_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning)}
+[controller.input_bounds]
+speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {vehicle.hover_speed:.4g}
+slew = {[*_slew(tuning)]}  # rad/s per period: what a rotor's own speed makes in one, from hover towards its limits
+
+{_rotors(vehicle)}
+[effects.air]  # drag of the vehicle file
+{_constraints(vehicle, tuning, size)}"""
+    return FirstScenario(text=text, size=size)
 
 
-def _rotors(vehicle: Vehicle) -> Iterator[Entry]:
-    """The lines of `[effects.rotors]`; rotors that change their speed at once can have no inertia."""
+def _rotors(vehicle: Vehicle) -> str:
+    """`[effects.rotors]`; rotors that change their speed at once can have no inertia."""
     if vehicle.rotor_inertia and not (vehicle.rotor_rise and vehicle.rotor_fall):
-        yield Entry("effects.rotors", "inertia", 0.0, "kg m^2; that of the vehicle file needs its rotor_rise and fall")
-    else:
-        yield Entry("effects.rotors", "", None, "lag and inertia of the vehicle file")
+        return "[effects.rotors]\ninertia = 0.0  # kg m^2; that of the vehicle file needs its rotor_rise and fall\n"
+    return "[effects.rotors]  # lag and inertia of the vehicle file\n"
 
 
-def _notes(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> tuple[str, ...]:
+def _notes(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> str:
+    """The comments above the file: what it was made from."""
     can = tuning.authority
     limits = {
         "lag": f"the rotors' lag: 1 / ({LAG_RATIO:g} (T + tau / 2)), T = {1e3 * can.lag:.3g} ms",
         "torque": "torque: 0.5 sqrt(alpha / tilt bound), alpha the smaller of roll's and pitch's",
         "period": "what a period of 10 ms or more can serve",
     }
-    bandwidths = f"{tuning.height:.3g} rad/s for z, {tuning.heading:.3g} rad/s for yaw"
-    if law == "robust":
-        what, margin = "The loop's bandwidth for x and y", delay_margin(vehicle, tuning)
-        then = [
-            f"{bandwidths}. Without bounds it tolerates {1e3 * margin:.3g} ms more delay than it knows of.",
-            "Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: "
-            "scenarios/design/tuning.py.",
-        ]
-    else:
-        what = "The course is made for a robust MPC, whose bandwidth for x and y"
-        then = [f"{bandwidths}. The controller's own rules: docs/own-vehicle.md."]
-    return (
-        f"A first flight of {_description(course, vehicle, tuning)}.",
-        f"Made by: quadsim scenario --for VEHICLE --course {course}"
-        + ("" if law == "robust" else f" --controller {law}"),
-        "",
-        f"Thrust to weight {can.thrust_to_weight:.3g}: at most {math.degrees(can.steady_tilt):.3g} deg of steady tilt; "
-        "angular acceleration in reserve at hover",
-        f"{can.turning[0]:.3g}, {can.turning[1]:.3g}, {can.turning[2]:.3g} rad/s^2 about x, y, z.",
-        f"{what} is w = {tuning.bandwidth:.3g} rad/s,",
-        f"limited by {limits[tuning.limited_by]};",
-        *then,
+    option, what = "", "The loop's bandwidth for x and y"
+    then = (
+        f"Without bounds it tolerates {1e3 * delay_margin(vehicle, tuning):.3g} ms more delay than it knows of.\n"
+        "# Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: scenarios/design/tuning.py."
     )
+    if law != "robust":
+        option, what = f" --controller {law}", "The course is made for a robust MPC, whose bandwidth for x and y"
+        then = "The controller's own rules: docs/own-vehicle.md."
+    return f"""# A first flight of {printable(_description(course, vehicle, tuning))}.
+# Made by: quadsim scenario --for VEHICLE --course {course}{option}
+#
+# Thrust to weight {can.thrust_to_weight:.3g}: at most {math.degrees(can.steady_tilt):.3g} deg of steady tilt; \
+angular acceleration in reserve at hover
+# {can.turning[0]:.3g}, {can.turning[1]:.3g}, {can.turning[2]:.3g} rad/s^2 about x, y, z.
+# {what} is w = {tuning.bandwidth:.3g} rad/s,
+# limited by {limits[tuning.limited_by]};
+# {tuning.height:.3g} rad/s for z, {tuning.heading:.3g} rad/s for yaw. {then}
+"""
 
 
 def _description(course: str, vehicle: Vehicle, tuning: Tuning) -> str:
@@ -219,134 +195,120 @@ def _eight_limit(vehicle: Vehicle, tuning: Tuning) -> str:
     return "the largest acceleration within the tilt bound"
 
 
-def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[list[Entry], float | None, float]:
-    """The lines of `[reference]`, the flight's duration [s], None to the end of the course, and its size [m]."""
+def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[str, float | None, float]:
+    """The table `[reference]`, the flight's duration [s], None to the end of the course, and its size [m]."""
     if course == "hover":
-        why = "no windows: every axis stays at its initial position, yaw at 0"
-        return [Entry("reference", "", None, why)], 4.0, STEP
+        return "[reference]  # no windows: every axis stays at its initial position, yaw at 0\n", 4.0, STEP
     if course == "step":
         slowest = min(tuning.bandwidth, tuning.height)
         response = round(3.0 / (STEP_RATIO * slowest), 2)
         start = _later(max(1.0, 3.0 / tuning.bandwidth))
         hold = _later(max(1.5, 1.2 * response))
-        why = f"s, 95 % of a step: 3 / ({STEP_RATIO:g} times {slowest:.3g} rad/s, the slower of w and that of z)"
-        found = [Entry("reference", "response_time", response, why)]
         above = round(_height(vehicle, STEP) + STEP, 9)
-        for axis, begin, until, value in (("x", 0, 2, STEP), ("y", 1, 3, STEP), ("z", 0, 2, above)):
-            window = {"start": round(start + begin * hold, 9), "stop": round(start + until * hold, 9), "value": value}
-            found.append(Entry("reference", axis, [window], "s, s, m"))
-        return found, round(start + 4.0 * hold, 9), STEP
+        first, second, third, last = (round(start + i * hold, 9) for i in range(4))
+        text = f"""[reference]
+response_time = {response}  # s, 95 % of a step: 3 / ({STEP_RATIO:g} times {slowest:.3g} rad/s, \
+the slower of w and that of z)
+x = [{{ start = {first}, stop = {third}, value = {STEP} }}]  # s, s, m
+y = [{{ start = {second}, stop = {last}, value = {STEP} }}]  # s, s, m
+z = [{{ start = {first}, stop = {third}, value = {above} }}]  # s, s, m
+"""
+        return text, round(start + 4.0 * hold, 9), STEP
     acceleration = SHARE * largest_eight(vehicle, tuning)[0]
     length = _rounded(2.0 * acceleration / (_EIGHT_PEAK * (EIGHT_RATIO * tuning.bandwidth) ** 2), 3)
     turn = round(math.tau * math.sqrt(0.5 * length * _EIGHT_PEAK / acceleration), 3)
-    ramp = round(0.5 * turn, 3)
-    to_end = f"m, end to end: such that it turns with {EIGHT_RATIO:g} w; width half of it"
-    why = f"s: at most {acceleration:.3g} m/s^2, at {100.0 * SHARE:g} % of {_eight_limit(vehicle, tuning)}"
-    found = [
-        Entry("reference", "type", "figure_eight"),
-        Entry("reference", "start", 1.0, "s"),
-        Entry("reference", "length", length, to_end),
-        Entry("reference", "period", turn, why),
-        Entry("reference", "ramp", ramp, "s, half a turn to gain its speed, and to lose it"),
-    ]
-    return found, None, length
+    text = f"""[reference]
+type = "figure_eight"
+start = 1.0  # s
+length = {length}  # m, end to end: such that it turns with {EIGHT_RATIO:g} w; width half of it
+period = {turn}  # s: at most {acceleration:.3g} m/s^2, at {100.0 * SHARE:g} % of {_eight_limit(vehicle, tuning)}
+ramp = {round(0.5 * turn, 3)}  # s, half a turn to gain its speed, and to lose it
+"""
+    return text, None, length
 
 
-def _robust(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
+def _robust(vehicle: Vehicle, tuning: Tuning) -> str:
     place, height, heading = (_rounded(weight) for weight in tuning.weights)
-    speed = _rounded(tuning.speed_weight)
-    lag = vehicle.rotor_rise is not None and vehicle.rotor_rise >= SHORTEST_LAG
-
-    def line(key: str, value: Any, why: str, table: str = "") -> Entry:
-        return Entry(f"controller{table}", key, value, why)
-
-    yield line("type", "robust", "")
-    yield line(
-        "horizon", tuning.horizon, f"N, periods: {HORIZON_TIMES:g} / w = {HORIZON_TIMES / tuning.bandwidth:.3g} s"
-    )
-    known = "the vehicle's rotor_rise is predicted" if lag else "the vehicle gives no lag"
-    yield line("rotor_lag", "vehicle" if lag else 0.0, known)
-    yield line("heading", True, "the hover model is turned by the present yaw")
-    why = f"of changes: as much as speed costs at {MOVE_RATIO:g} w, speed / ({MOVE_RATIO:g} w tau)^2"
-    yield line("move_weight", _rounded(tuning.move_weight), why)
-    yield line("", None, "force and torque that the model does not know are estimated and compensated", ".offset_free")
-    yield line("linear", _rounded(SOFT[0] * place), f"l1: {SOFT[0]:g} times the weight of x", ".soft")
-    yield line("quadratic", _rounded(SOFT[1] * place), f"l2: {SOFT[1]:g} times the weight of x", ".soft")
-    where = ".output_weights"
-    why = f"1 / (g tan(tilt bound) / w^2)^2: {tuning.deviation:.3g} m is what the tilt bound answers"
-    yield line("x", place, why, where)
-    yield line("y", place, "as x", where)
-    why = f"for {tuning.height:.3g} rad/s, at most {HEIGHT_RATIO:g} w; all thrust in reserve answers {HEIGHT_STEP:g} m"
-    yield line("z", height, f"{why} or more", where)
-    turned = math.degrees(HEADING_STEP)
-    why = f"for {tuning.heading:.3g} rad/s, at most {HEADING_RATIO:g} w; all torque in reserve answers {turned:.3g} deg"
-    yield line("yaw", heading, f"{why} or more", where)
-    why = f"1 / ({speed**-0.5:.3g} rad/s)^2: with it four integrators have the bandwidth w, (g beta)^2 x / w^8"
-    yield line("speed", speed, why, ".input_weights")
-    tilt = _tilt(tuning)
+    speed, w, tilt = _rounded(tuning.speed_weight), tuning.bandwidth, _tilt(tuning)
+    lag, known = "0.0", "the vehicle gives no lag"
+    if vehicle.rotor_rise is not None and vehicle.rotor_rise >= SHORTEST_LAG:
+        lag, known = '"vehicle"', "the vehicle's rotor_rise is predicted"
     limit = math.degrees(math.acos(min(1.0, 1.0 / (THRUST_SHARE * tuning.authority.thrust_to_weight))))
-    why = f"deg: what the hover model stands, or {limit:.3g} deg, what {100 * THRUST_SHARE:g} % of the thrust holds"
-    yield line("roll", [-tilt, tilt], why, ".output_bounds")
-    yield line("pitch", [-tilt, tilt], "as roll", ".output_bounds")
-    yield from _inputs(vehicle, tuning)
+    return f"""[controller]
+type = "robust"
+horizon = {tuning.horizon}  # N, periods: {HORIZON_TIMES:g} / w = {HORIZON_TIMES / w:.3g} s
+rotor_lag = {lag}  # {known}
+heading = true  # the hover model is turned by the present yaw
+move_weight = {_rounded(tuning.move_weight)}  # of changes: as much as speed costs at {MOVE_RATIO:g} w, \
+speed / ({MOVE_RATIO:g} w tau)^2
+
+[controller.offset_free]  # force and torque that the model does not know are estimated and compensated
+
+[controller.soft]
+linear = {_rounded(SOFT[0] * place)}  # l1: {SOFT[0]:g} times the weight of x
+quadratic = {_rounded(SOFT[1] * place)}  # l2: {SOFT[1]:g} times the weight of x
+
+[controller.output_weights]
+x = {place}  # 1 / (g tan(tilt bound) / w^2)^2: {tuning.deviation:.3g} m is what the tilt bound answers
+y = {place}  # as x
+z = {height}  # for {tuning.height:.3g} rad/s, at most {HEIGHT_RATIO:g} w; \
+all thrust in reserve answers {HEIGHT_STEP:g} m or more
+yaw = {heading}  # for {tuning.heading:.3g} rad/s, at most {HEADING_RATIO:g} w; \
+all torque in reserve answers {math.degrees(HEADING_STEP):.3g} deg or more
+
+[controller.input_weights]
+speed = {speed}  # 1 / ({speed**-0.5:.3g} rad/s)^2: with it four integrators have the bandwidth w, (g beta)^2 x / w^8
+
+[controller.output_bounds]
+roll = {[-tilt, tilt]}  # deg: what the hover model stands, or {limit:.3g} deg, \
+what {100 * THRUST_SHARE:g} % of the thrust holds
+pitch = {[-tilt, tilt]}  # as roll
+"""
 
 
-def _baseline(law: str, vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
-    known = {"lqr": "weights by Bryson's rule, its defaults; it tracks pose and velocity, not acceleration"}
-    yield Entry("controller", "type", law, known.get(law, ""))
-    steepest = BASELINE_SHARE * _tilt(tuning)
-    why = "deg, largest that it commands; below the audit's, which it overshoots"
-    yield Entry("controller", "tilt", round(min(LQR_TILT, steepest) if law == "lqr" else steepest, 3), why)
-    ahead = math.ceil(PREVIEW / (tuning.bandwidth * tuning.period))
-    why = f"periods of preview for the reference's velocity: {PREVIEW:g} / w = {PREVIEW / tuning.bandwidth:.3g} s"
-    yield Entry("controller", "horizon", ahead, why)
+def _baseline(law: str, vehicle: Vehicle, tuning: Tuning) -> str:
+    rules = "  # weights by Bryson's rule, its defaults; it tracks pose and velocity, not acceleration"
+    steepest, w = BASELINE_SHARE * _tilt(tuning), tuning.bandwidth
+    tilt = round(min(LQR_TILT, steepest) if law == "lqr" else steepest, 3)
+    text = f"""[controller]
+type = {_text(law)}{rules if law == "lqr" else ""}
+tilt = {tilt}  # deg, largest that it commands; below the audit's, which it overshoots
+horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for the reference's velocity: \
+{PREVIEW:g} / w = {PREVIEW / w:.3g} s
+"""
     if law != "lqr":
         lag = lag_to_allow_for(vehicle, tuning.period)
-        why = f"s that its gains allow for: {LAG_SHARE:g} times {1e3 * lag:.3g} ms, the rotors' lag or half a period"
-        yield Entry("controller", "lag", _rounded(LAG_SHARE * lag), why)
+        text += f"lag = {_rounded(LAG_SHARE * lag)}  # s that its gains allow for: {LAG_SHARE:g} times "
+        text += f"{1e3 * lag:.3g} ms, the rotors' lag or half a period\n"
     if law == "geometric":
-        yield Entry("controller", "integral", True, "against drag and what else is not modelled")
-    yield from _inputs(vehicle, tuning)
+        text += "integral = true  # against drag and what else is not modelled\n"
+    return text
 
 
-def _inputs(vehicle: Vehicle, tuning: Tuning) -> Iterator[Entry]:
-    down, up = _slew(tuning)
-    table = "controller.input_bounds"
-    why = f"rad/s, what the rotors hold; hover is {vehicle.hover_speed:.4g}"
-    yield Entry(table, "speed", [vehicle.speed_min, vehicle.speed_max], why)
-    why = "rad/s per period: what a rotor's own speed makes in one, from hover towards its limits"
-    yield Entry(table, "slew", [down, up], why)
-
-
-def _constraints(vehicle: Vehicle, tuning: Tuning, size: float) -> Iterator[Entry]:
+def _constraints(vehicle: Vehicle, tuning: Tuning, size: float) -> str:
     """What the flight is audited against, whatever its controller; `size` of the course [m]."""
-    tilt, (down, up) = _tilt(tuning), _slew(tuning)
+    tilt, off = _tilt(tuning), _rounded(ROOM * size)
     rounding = _rounded(1e-9 * vehicle.speed_max)
 
-    def entry(
-        name: str, signal: str, bounds: tuple[float, float | None], tolerance: float, why: str
-    ) -> Iterator[Entry]:
-        pairs = {"name": name, "signal": signal, "lower": bounds[0]}
-        if bounds[1] is not None:
-            pairs["upper"] = bounds[1]
-        if tolerance:
-            pairs |= {"tolerance": tolerance, "tolerance_sampled": tolerance}
-        for key, value in pairs.items():
-            comment = {"lower": why, "tolerance": "rounding"}.get(key, "")
-            yield Entry("[constraints]", key, value, comment)
+    def entry(name: str, signal: str, lower: float, upper: float | None, why: str, tolerance: float = 0.0) -> str:
+        text = f'\n[[constraints]]\nname = "{name}"\nsignal = "{signal}"\nlower = {lower}  # {why}\n'
+        text += "" if upper is None else f"upper = {upper}\n"
+        return text + (f"tolerance = {tolerance}  # rounding\ntolerance_sampled = {tolerance}\n" if tolerance else "")
 
-    for name in ("roll", "pitch"):
-        yield from entry(name, name, (-tilt, tilt), 0.0, "deg, the tilt bound, at every instant")
-    yield from entry("speed", "speed", (vehicle.speed_min, vehicle.speed_max), rounding, "rad/s, what the rotors hold")
-    yield from entry("slew", "slew", (down, up), rounding, "rad/s per period, the controller's bound")
-    why = (
+    reached = "rad/s, what the rotors hold"
+    hull = (
         "m, radius of the ball about the hull: the lowest centre that keeps all of the vehicle above the ground, z = 0"
     )
-    yield from entry("floor", "z", (_floor(vehicle), None), 0.0, why)
-    off = _rounded(ROOM * size)
-    for axis in "xyz":
-        why = f"m, {100 * ROOM:g} % of the course's size, {size:g} m: the same for every controller"
-        yield from entry(f"hold_{axis}", f"{axis}_error", (-off, off), 0.0, why)
+    room = f"m, {100 * ROOM:g} % of the course's size, {size:g} m: the same for every controller"
+    return "".join(
+        [
+            *(entry(name, name, -tilt, tilt, "deg, the tilt bound, at every instant") for name in ("roll", "pitch")),
+            entry("speed", "speed", vehicle.speed_min, vehicle.speed_max, reached, rounding),
+            entry("slew", "slew", *_slew(tuning), "rad/s per period, the controller's bound", rounding),
+            entry("floor", "z", _floor(vehicle), None, hull),
+            *(entry(f"hold_{axis}", f"{axis}_error", -off, off, room) for axis in "xyz"),
+        ]
+    )
 
 
 def _floor(vehicle: Vehicle) -> float:
@@ -378,10 +340,6 @@ def _rounded(number: float, digits: int = 3) -> float:
     return float(f"{number:.{digits}g}")
 
 
-def _text(value: Any) -> str:
-    """A value as TOML."""
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_text(entry)}" for key, entry in value.items()) + " }"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_text, value)) + "]"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, bool | str) else repr(value)
+def _text(text: str) -> str:
+    """A text as TOML."""
+    return json.dumps(text, ensure_ascii=False)

@@ -18,12 +18,7 @@ SLOWEST_ANSWER: Final = 1.0
 
 
 def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
-    """A line for each bound that the vehicle cannot meet; none for a scenario that suits it.
-
-    Args:
-        scenario: whatever vehicle it has itself.
-        vehicle: that it is to be flown with.
-    """
+    """A line for each bound of a scenario, whatever its own vehicle, that the vehicle cannot meet."""
     spec, can = scenario.controller, authority(vehicle)
     found: list[str] = []
     if isinstance(spec, BoundedSpec | LQRSpec | PIDSpec | GeometricSpec) and spec.input_bounds is not None:

@@ -5,7 +5,7 @@
    w^8 = (g beta)^2 q / r and beta the angular acceleration per rotor speed; of two integrators, w^4 = beta^2 q / r.
    w is the smallest of
    - 1 / (`LAG_RATIO` (T + tau / 2)), T the rotors' time constant and tau the period: the loop then stands about
-     0.8 (T + tau / 2) more delay than it knows of (`scenarios.design.loop.delay_margin`; the tests measure it);
+     0.8 (T + tau / 2) more delay than it knows of (`delay_margin`; the tests measure it);
    - 0.5 sqrt(alpha / tilt), alpha the angular acceleration in reserve: the largest tilt is reached and left within
      2 sqrt(tilt / alpha) = 1 / w;
    - `FASTEST`, so that a period of 10 ms or more is enough.
@@ -29,11 +29,12 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+import scipy.linalg
 
-from mpc.model import continuous_model
+from mpc.model import continuous_model, discretise
 from quadsim.errors import ParameterError
-from quadsim.state import INDEX
-from quadsim.vehicle import Vehicle
+from quadsim.state import INDEX, Array
+from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.design.authority import Authority, authority
 
 PERIODS: Final = (0.05, 0.04, 0.025, 0.02, 0.01)
@@ -51,6 +52,8 @@ HEADING_RATIO: Final = 0.7  # bandwidth of the heading over that of the place
 HEADING_STEP: Final = 0.5  # deviation of the heading that the whole torque in reserve answers [rad]
 LEAST_RESERVE: Final = 1e-6
 """Acceleration [m/s^2] and angular acceleration [rad/s^2] in reserve below which there is nothing to design."""
+LONGEST: Final = 2.0  # delays beyond are not looked for [s]
+_HALVINGS: Final = 14
 MOVE_RATIO: Final = 4.0  # frequency at which changes of rotor speeds cost as much as these, over w
 
 
@@ -141,3 +144,58 @@ def _bandwidth(can: Authority, tilt: float) -> tuple[float, Literal["lag", "torq
 def _reached(period: float, lag: float | None) -> float:
     """Share of a step that a rotor's speed makes in a period."""
     return 1.0 if lag is None else 1.0 - math.exp(-period / lag)
+
+
+def gain(vehicle: Vehicle, tuning: Tuning) -> Array:
+    """K (4, n + 4) of u = -K [x; u(k-1)], deviations from hover: the weights' optimum over an infinite horizon.
+
+    Changes of inputs are part of the cost, so the last input is a state; n is 12, or 16 with rotors that lag.
+    """
+    A, B = discretise(*continuous_model(vehicle, vehicle.rotor_rise or 0.0), tuning.period)
+    n = len(A)
+    Q = np.zeros((n, n))
+    place, height, heading = tuning.weights
+    for name, weight in (("x", place), ("y", place), ("z", height), ("yaw", heading)):
+        Q[INDEX[name], INDEX[name]] = weight
+    D, R = tuning.move_weight * np.eye(N_ROTORS), tuning.speed_weight * np.eye(N_ROTORS)
+    A = scipy.linalg.block_diag(A, np.zeros((N_ROTORS, N_ROTORS)))
+    B = np.vstack([B, np.eye(N_ROTORS)])
+    cross = np.vstack([np.zeros((n, N_ROTORS)), -D])
+    P = scipy.linalg.solve_discrete_are(A, B, scipy.linalg.block_diag(Q, D), R + D, s=cross)
+    return np.asarray(np.linalg.solve(R + D + B.T @ P @ B, B.T @ P @ A + cross.T))
+
+
+def is_stable(vehicle: Vehicle, tuning: Tuning, K: Array, delay: float) -> bool:
+    """Whether the loop of a gain is stable where commands act some time [s] later than it knows of."""
+    A_c, B_c = continuous_model(vehicle, vehicle.rotor_rise or 0.0)
+    n, period = len(A_c), tuning.period
+    whole = int(delay / period + 1e-9)
+    late = max(delay - whole * period, 0.0)
+    A, _ = discretise(A_c, B_c, period)
+    rest, newer = discretise(A_c, B_c, period - late)
+    older = rest @ discretise(A_c, B_c, late)[1]
+    # States: x, u(k-1) .. u(k-whole-1); u(k-whole-1) acts until `late`, then u(k-whole).
+    size = n + N_ROTORS * (whole + 1)
+    closed, entry = np.zeros((size, size)), np.zeros((size, N_ROTORS))
+    closed[:n, :n] = A
+    closed[:n, size - N_ROTORS :] = older
+    if whole == 0:
+        entry[:n] = newer
+    else:
+        closed[:n, size - 2 * N_ROTORS : size - N_ROTORS] += newer
+    entry[n : n + N_ROTORS] = np.eye(N_ROTORS)
+    closed[n + N_ROTORS :, n : size - N_ROTORS] = np.eye(N_ROTORS * whole)
+    closed[:, : n + N_ROTORS] -= entry @ K
+    return float(np.abs(np.linalg.eigvals(closed)).max()) < 1.0
+
+
+def delay_margin(vehicle: Vehicle, tuning: Tuning) -> float:
+    """Shortest delay [s] beyond what the model knows of at which the loop is no longer stable, to a thousandth."""
+    K = gain(vehicle, tuning)
+    low, high = 0.0, 1e-3
+    while high < LONGEST and is_stable(vehicle, tuning, K, high):
+        low, high = high, 1.5 * high
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if is_stable(vehicle, tuning, K, middle) else (low, middle)
+    return low

@@ -15,8 +15,7 @@ from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import TorqueRange, authority, torque_ranges
-from scenarios.design.loop import delay_margin
-from scenarios.design.tuning import tune
+from scenarios.design.tuning import delay_margin, tune
 
 SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
 _RPM: Final = 60.0 / (2.0 * math.pi)

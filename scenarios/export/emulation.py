@@ -31,12 +31,7 @@ def require_programs(target: Target, what: str) -> None:
 
 
 def build(directory: Path, program: str, *settings: str) -> Path:
-    """Make a program of an export in its directory.
-
-    Args:
-        directory: of the export.
-        program: a target of its Makefile, e.g. `serial.elf`.
-        settings: variables of its Makefile, e.g. `CC=clang`.
+    """Make a program of an export, a target of its Makefile, with settings of its variables, e.g. `CC=clang`.
 
     Raises:
         QuadsimError: it cannot be built; with the compiler's first words.
@@ -49,12 +44,7 @@ def build(directory: Path, program: str, *settings: str) -> Path:
 
 
 class Program:
-    """A program that runs, and the serial line to it; see `scenarios.export.serial_line.Line`.
-
-    Args:
-        target: what it was built for.
-        image: its file.
-    """
+    """A program that runs, and the serial line to it; see `scenarios.export.serial_line.Line`."""
 
     def __init__(self, target: Target, image: Path) -> None:
         command = [*target.emulation, "-serial", "stdio", "-kernel", str(image)] if target.board else [str(image)]

@@ -74,13 +74,7 @@ class Frames:
 
 
 class SerialMPC:
-    """An exported controller at the other end of a serial line.
-
-    Args:
-        line: to it.
-        precision: of its numbers, `double` or `float`.
-        horizon: N.
-    """
+    """An exported controller of `double` or `float` numbers at the other end of a serial line."""
 
     def __init__(self, line: Line, precision: str, horizon: int) -> None:
         self._line, self._frames, self._horizon = line, Frames(precision), horizon

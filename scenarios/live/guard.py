@@ -20,26 +20,13 @@ LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
 class Guard:
-    """Checks requests.
-
-    Args:
-        host: what the server listens on.
-
-    Attributes:
-        token: what the address has to have.
-    """
+    """Checks requests to a server that listens on a host; the address has to have its `token`."""
 
     def __init__(self, host: str) -> None:
         self._host, self.token = host, secrets.token_urlsafe(24)
 
     def refusal(self, headers: Any, path: str, port: int) -> str | None:
-        """Why a request is refused; None where it is let in.
-
-        Args:
-            headers: of the request.
-            path: of the request, with its query.
-            port: that it came in by.
-        """
+        """Why a request with these headers, this path and query, to this port, is refused; None where it is let in."""
         try:
             host, origin = headers.get("Host", ""), headers.get("Origin")
         except LookupError:  # of the library's headers, where one is there twice

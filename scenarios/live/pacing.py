@@ -6,27 +6,17 @@ import threading
 import time as clock
 from collections import deque
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 from quadsim.errors import QuadsimError
 from scenarios.live.session import Frame, Session
 
+if TYPE_CHECKING:
+    from scenarios.live.page import Page
+
 LATE: Final = 0.25  # [s] beyond which lost time is given up: no period is dropped, the flight is behind real time
 POSES: Final = 2  # drawn in each period
 _IDLE: Final = 0.02  # [s] between looks for orders while nothing is flown
-
-
-class View(Protocol):
-    """What shows a flight to people."""
-
-    def show(self, frame: Frame, factor: float) -> None:
-        """Show a period that has been flown; `factor` is simulated over real time."""
-
-    def pose(self, frame: Frame, share: float) -> None:
-        """Draw the vehicle at a share of the period, 0 to 1."""
-
-    def ended(self, reason: str | None) -> None:
-        """The flight has ended, with its reason, or has begun anew (None)."""
 
 
 class Pace:
@@ -54,7 +44,7 @@ class Pace:
         """Have something done between two periods, in the thread that flies."""
         self._orders.append(what)
 
-    def drive(self, session: Session, view: View, until: Callable[[Frame], bool] = lambda frame: False) -> None:
+    def drive(self, session: Session, view: Page, until: Callable[[Frame], bool] = lambda frame: False) -> None:
         """Fly until `stop`, or until a frame is the last one; a flight that has ended waits for a reset."""
         due, flown = self._now(), deque[float](maxlen=round(2.0 / session.period) + 1)  # two seconds
         while not self._stop.is_set():

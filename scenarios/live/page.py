@@ -75,10 +75,8 @@ def require_server(host: str, port: int) -> None:
     if not 0 <= port <= 65535:
         raise ParameterError("", "--port", port, "from 1 to 65535, or 0 for any that is free")
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host or "?", port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host or "?", port), family=family).close()
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES):
             raise ParameterError("", "--port", port, "a port that is free") from error
@@ -96,19 +94,11 @@ def _reachable(host: str) -> str:
 
 
 class Page:
-    """A session's page.
+    """A session's page, which `pace` drives; see `require_server`.
 
     Args:
-        session: what is shown.
-        pace: what drives it.
         save: writes the run directory of what has been flown and reports where; in the simulation thread.
-        host: to listen on.
-        port: likewise; 0 for any free one.
         others: controllers by name that may take over.
-
-    Raises:
-        MissingPackageError: viser is not installed.
-        ParameterError: the port is in use.
 
     Attributes:
         address: to open.
@@ -124,7 +114,6 @@ class Page:
         port: int = 0,
         others: Mapping[str, ControllerSpec],
     ) -> None:
-        require_server(host, port)
         import viser
         from viser import _messages
 
@@ -160,7 +149,7 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
-    # What the thread that flies calls; see `scenarios.live.pacing.View`
+    # What the thread that flies calls
 
     def show(self, frame: Frame, factor: float) -> None:
         """Show a period that has been flown."""
@@ -264,9 +253,7 @@ class Page:
         self._submits(lag, lambda value: {"type": "rotor_lag", "rise": float(value) / 1e3})
         for rotor in range(1, N_ROTORS + 1):
             wear = gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0)
-            self._submits(
-                wear, partial(lambda rotor, value: {"type": "wear", "rotor": rotor, "loss": float(value)}, rotor)
-            )
+            self._submits(wear, partial(_wear, rotor))
         sensor = gui.add_dropdown("Sensor", ("position", "velocity", "attitude", "rates"))
         fault = gui.add_dropdown("Fault", ("dropout", "freeze", "nan"))
         failed = {"type": "sensor_fault", "duration": 1.0}
@@ -303,7 +290,7 @@ class Page:
         self._steered = gui.add_text("Set-point velocity [m/s]", "0, 0, 0", disabled=True)
         for key, direction in _STEER.items():
             command = gui.add_command(f"Fly {'-+'[sum(direction) > 0]}{'xyz'[np.abs(direction).argmax()]}", hotkey=key)
-            self._on(command.on_trigger, partial(self._fly_on, direction))
+            self._on(command.on_trigger, partial(self._fly_on, _STEER_STEP * np.array(direction)))
         self._on(gui.add_command("Stop the set-point", hotkey="X").on_trigger, lambda event: self._fly(np.zeros(3)))
         self._button("Stop set-point", lambda event: self._fly(np.zeros(3)))
 
@@ -313,8 +300,8 @@ class Page:
         self._handle.position, self._place.value = np.array([x, y, z]), (x, y, z)
         self._session.submit({"type": "setpoint", "x": x, "y": y, "z": z}, subject="setpoint")
 
-    def _fly_on(self, direction: tuple[int, int, int], event: Any) -> None:
-        self._fly(self._steer + _STEER_STEP * np.array(direction))
+    def _fly_on(self, change: Any, event: Any) -> None:
+        self._fly(self._steer + change)
 
     def _fly(self, velocity: Any) -> None:
         self._show_velocity(np.clip(velocity, -_STEER_MOST, _STEER_MOST))
@@ -496,22 +483,18 @@ class Page:
         if sample is None:
             return str(self._status.content)
         command, deadline = sample.command, 1e3 * self._session.period
-        step = 1e3 * sample.step_s
         worst = self._history[-1] if self._history else (0.0,) * 11
         mark = "" if command.status in OPTIMAL else ' class="bad"'
         back = "" if command.fallback == 0 else f' <span class="bad">fallback {command.fallback}</span>'
+        missed = ' <span class="bad">missed</span>' if sample.missed else ""
+        others = [flight.loop for flight in self._session.flights[1:]]
+        lost = [f"{other.controller.name} was lost: {other.reason}" for other in others if other.reason is not None]
+        phase = "paused" if self._pace.paused else escape(sample.phase.value)
         rows = [
-            f"<b>{frame.time:.2f} s</b> &times; {factor:.2f} of real time, "
-            f"{'paused' if self._pace.paused else escape(sample.phase.value)}",
+            f"<b>{frame.time:.2f} s</b> &times; {factor:.2f} of real time, {phase}",
             f"<span{mark}>{escape(command.status)}</span> by {escape(command.answered_by)}{back}, "
-            f"{command.active} active, "
-            f"step <b>{step:.2f}</b> of {deadline:g} ms"
-            + (' <span class="bad">missed</span>' if sample.missed else ""),
-            *(
-                f'<span class="bad">{escape(other.controller.name)} was lost: {escape(other.reason)}</span>'
-                for other in (flight.loop for flight in self._session.flights[1:])
-                if other.reason is not None
-            ),
+            f"{command.active} active, step <b>{1e3 * sample.step_s:.2f}</b> of {deadline:g} ms{missed}",
+            *(f'<span class="bad">{escape(text)}</span>' for text in lost),
             f"tilt <b>{worst[4]:.1f}</b> deg, error <b>{np.linalg.norm(worst[1:4]):.2f}</b> m, pull "
             f"<b>{np.linalg.norm(frame.pull):.1f}</b> N",
         ]

@@ -95,17 +95,9 @@ class _Hand:
 
 
 class Session:
-    """A flight, or two of the same vehicle by different controllers, and the users' inputs.
-
-    Args:
-        scenario: what is flown.
-        against: a controller that flies a second vehicle, through the same events; absent for none.
-
-    Raises:
-        InputError: it cannot be flown.
+    """A flight, and another one of the same vehicle by the controller `against` where that is given, and users' inputs.
 
     Attributes:
-        scenario: as given.
         flights: the one that inputs are about, then the other.
         reason: why the first has ended; None while it has not.
     """
@@ -150,12 +142,9 @@ class Session:
     def submit(
         self, table: Mapping[str, Any], *, subject: str | None = None, successor: Successor | None = None
     ) -> None:
-        """Let something happen from the next period on; from any thread.
+        """Let a `Pull`, `Wear`, `Steer`, or an event without its time, happen from the next period on; from any thread.
 
-        Args:
-            table: a `Pull`, `Wear` or `Steer`, or an event of a scenario file without its time.
-            subject: an earlier input of the same subject that has not acted yet is dropped.
-            successor: of an event `controller`, the controller that was built for it.
+        An earlier input of the same subject that has not acted yet is dropped.
         """
         self._queue.append((dict(table), subject, successor))
 

@@ -28,11 +28,7 @@ _FLAT: Final = {"cast_shadow": False, "receive_shadow": False}
 
 
 class Stage:
-    """The scene of a session.
-
-    Args:
-        scene: viser's.
-        session: what is shown.
+    """A session in viser's scene.
 
     Attributes:
         unit: the vehicle's arm length [m].

@@ -31,11 +31,7 @@ _READY: dict[Hashable, tuple[Path, Exportable]] = {}
 
 
 def compiled_controller(key: Hashable, make: Callable[[], Exportable]) -> CompiledMPC:
-    """A controller as compiled C.
-
-    Args:
-        key: the same for the same controller.
-        make: called where that is new to this process.
+    """A controller as compiled C; `make` is called where its key is new to this process.
 
     Raises:
         ExportError: this controller cannot be exported.
@@ -52,10 +48,7 @@ def compiled_controller(key: Hashable, make: Callable[[], Exportable]) -> Compil
 def compiled(files: Mapping[str, str], room: int | None = None, changes: int | None = None) -> Path:
     """The shared library of a controller's files and of `shim.c`, from the cache where it is there.
 
-    Args:
-        files: see `mpc.export.source.sources`.
-        room: active rows that there is room for; None for the export's own.
-        changes: of the active set after which a search is given up; likewise.
+    `room` for active rows, and the most `changes` of the active set in a search, are the export's own where None.
 
     Raises:
         CompilerError: there is no compiler, or it fails.
@@ -66,7 +59,8 @@ def compiled(files: Mapping[str, str], room: int | None = None, changes: int | N
     sizes = {"ROOM": room, "CHANGES": changes}
     flags = (*FLAGS, *(f"-DQUADSIM_{name}={size}" for name, size in sizes.items() if size is not None))
     digest = hashlib.sha256()
-    for text in (_version(compiler), *flags, *(f"{name}\0{sources[name]}" for name in sorted(sources))):
+    version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
+    for text in (version, *flags, *(f"{name}\0{sources[name]}" for name in sorted(sources))):
         digest.update(text.encode() + b"\0")
     library = _cache() / f"{digest.hexdigest()}.so"
     if not library.exists():
@@ -89,10 +83,6 @@ def _compiler() -> str:
             f"no C compiler found ({looked}); install one, e.g. apt-get install gcc, or leave out controller.compiled"
         )
     return found
-
-
-def _version(compiler: str) -> str:
-    return subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
 
 
 def _compile(compiler: str, flags: Sequence[str], sources: Mapping[str, str]) -> bytes:

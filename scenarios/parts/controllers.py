@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from mpc.export.source import Exportable
     from mpc.robust.controller import RobustMPC
     from mpc.robust.filter import SafetyFilter
-    from mpc.robust.settings import RobustSettings
     from mpc.space.halfspaces import Shape, Space
 
 FALLBACK_SHARE: Final = 0.8
@@ -69,18 +68,11 @@ def make_bounds(spec: BoundedSpec) -> Bounds:
     """The bounds in SI units."""
     constrained = [name for name in STATE_NAMES if name in spec.output_bounds]
     scale = np.array([math.radians(1.0) if name in ANGLES else 1.0 for name in constrained])
-    pairs = np.array([spec.output_bounds[name] for name in constrained], float).reshape(-1, 2)
-    lower_speed, upper_speed = spec.input_bounds.speed
-    lower_slew, upper_slew = spec.input_bounds.slew
-    return Bounds(
-        C_c=_selection(constrained),
-        y_min=scale * pairs[:, 0],
-        y_max=scale * pairs[:, 1],
-        delta_min=np.full(N_ROTORS, lower_slew),
-        delta_max=np.full(N_ROTORS, upper_slew),
-        u_min=np.full(N_ROTORS, lower_speed),
-        u_max=np.full(N_ROTORS, upper_speed),
-    )
+    lower, upper = scale * np.array([spec.output_bounds[name] for name in constrained], float).reshape(-1, 2).T
+    u_min, u_max = (np.full(N_ROTORS, bound) for bound in spec.input_bounds.speed)
+    delta_min, delta_max = (np.full(N_ROTORS, bound) for bound in spec.input_bounds.slew)
+    C_c = _selection(constrained)
+    return Bounds(C_c=C_c, y_min=lower, y_max=upper, delta_min=delta_min, delta_max=delta_max, u_min=u_min, u_max=u_max)
 
 
 def _three(numbers: float | Sequence[float]) -> tuple[float, float, float]:
@@ -174,9 +166,11 @@ def posed_problem(spec: BoundedSpec, vehicle: Vehicle, period: float) -> Problem
     Raises:
         InputError: it cannot be made from these numbers.
     """
-    if isinstance(spec, RobustSpec):
-        return _robust_problem(spec, vehicle, period)
-    return make_problem(spec, vehicle, period)
+    if not isinstance(spec, RobustSpec):
+        return make_problem(spec, vehicle, period)
+    from mpc.robust.controller import robust_problem
+
+    return robust_problem(**_robust_parts(spec, vehicle, period))
 
 
 def exportable(spec: ControllerSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
@@ -332,10 +326,11 @@ def _unconstrained(problem: Problem) -> Controller:
         ) from error
 
 
-def _robust_settings(spec: RobustSpec, vehicle: Vehicle, period: float) -> RobustSettings:
+def _robust_parts(spec: RobustSpec, vehicle: Vehicle, period: float) -> dict[str, Any]:
+    """What the robust MPC and its problem are made of."""
     from mpc.robust.settings import RobustSettings
 
-    return RobustSettings(
+    settings = RobustSettings(
         penalty=None if spec.soft is None else make_penalty(spec.soft, len(spec.output_bounds)),
         rotor_lag=_rotor_lag(spec, vehicle),
         delay=spec.delay,
@@ -347,24 +342,15 @@ def _robust_settings(spec: RobustSpec, vehicle: Vehicle, period: float) -> Robus
         margins=tightening_margins(spec, vehicle, period),
     )
 
-
-def _robust_parts(spec: RobustSpec, vehicle: Vehicle, period: float) -> dict[str, Any]:
-    """What the robust MPC and its problem are made of."""
     return {
         "vehicle": vehicle,
         "period": period,
         "horizon": spec.horizon,
         "objective": make_objective(spec.output_weights, spec.input_weights),
         "bounds": make_bounds(spec),
-        "settings": _robust_settings(spec, vehicle, period),
+        "settings": settings,
         "constraints": make_polytopes(spec),
     }
-
-
-def _robust_problem(spec: RobustSpec, vehicle: Vehicle, period: float) -> Problem:
-    from mpc.robust.controller import robust_problem
-
-    return robust_problem(**_robust_parts(spec, vehicle, period))
 
 
 def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
@@ -374,8 +360,7 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[
     margins = None  # by which half-spaces are tightened along x, y, z at each predicted state, (N, 3) [m]
     if spec.tightening is not None and spec.avoidance is not None:
         margins = position_margins(**_tightened(spec, vehicle, period))
-    space = make_space(spec, vehicle, period, shapes, margins)
-    parts = _robust_parts(spec, vehicle, period)
+    space, parts = make_space(spec, vehicle, period, shapes, margins), _robust_parts(spec, vehicle, period)
     return RobustMPC(**parts, shortcut=spec.shortcut, space=space, kkt_every=spec.kkt_every)
 
 
@@ -413,41 +398,24 @@ def _baseline(spec: LQRSpec | PIDSpec | GeometricSpec, vehicle: Vehicle, period:
 
     held = spec.input_bounds
     bounds = None if held is None else ActuatorBounds.alike(_pair(held.speed), _pair(held.slew))
+    shared: dict[str, Any] = {"period": period, "horizon": spec.horizon, "tilt_max": spec.tilt, "bounds": bounds}
     if isinstance(spec, LQRSpec):
-        objective = (
-            make_objective(spec.output_weights, spec.input_weights)
-            if spec.output_weights is not None and spec.input_weights is not None
-            else bryson_objective(vehicle, period)
-        )
-        lqr = LQRSettings(
-            period=period,
-            objective=objective,
-            horizon=spec.horizon,
-            heading_frame=spec.heading,
-            tilt_max=spec.tilt,
-            bounds=bounds,
-        )
-        return LQR(vehicle, lqr)
-    shared: dict[str, Any] = {
-        "period": period,
-        "lag": spec.lag,
-        "horizon": spec.horizon,
-        "tilt_max": spec.tilt,
-        "bounds": bounds,
-    }
+        objective = bryson_objective(vehicle, period)
+        if spec.output_weights is not None and spec.input_weights is not None:
+            objective = make_objective(spec.output_weights, spec.input_weights)
+        return LQR(vehicle, LQRSettings(objective=objective, heading_frame=spec.heading, **shared))
+    shared["lag"] = spec.lag
     if isinstance(spec, PIDSpec):
         return CascadedPID(vehicle, pid_settings(vehicle, velocity_max=spec.velocity, **shared))
-    geometric = GeometricController(
+    settings = geometric_settings(
         vehicle,
-        geometric_settings(
-            vehicle,
-            integral=spec.integral,
-            feedforward=spec.feedforward,
-            drag=tuple(spec.drag),
-            disturbance=spec.disturbance,
-            **shared,
-        ),
+        integral=spec.integral,
+        feedforward=spec.feedforward,
+        drag=tuple(spec.drag),
+        disturbance=spec.disturbance,
+        **shared,
     )
+    geometric = GeometricController(vehicle, settings)
     return geometric if spec.indi is None else Incremental(geometric, vehicle, spec.indi, geometric.bounds)
 
 

@@ -17,15 +17,7 @@ from quadsim.sim.effects.wind import Air, Gust, WindChange, WindField
 from quadsim.vehicle import Vehicle
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import actual_effects
-from scenarios.schema.events import (
-    Event,
-    MassEvent,
-    PayloadDropEvent,
-    PayloadPickupEvent,
-    PushEvent,
-    RotorLagEvent,
-    RotorLossEvent,
-)
+from scenarios.schema import events as kinds
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
@@ -85,25 +77,20 @@ def build_computation(scenario: Scenario) -> Computation | None:
     return Computation(**vars(filled(spec or ComputationTime(), plan=guarded)), stalls=stalls)
 
 
-def build_changes(scenario: Scenario, events: Sequence[Event] | None = None) -> tuple[Change, ...]:
-    """What happens to rotors, mass and payload in flight, and what pushes the vehicle, in any order.
-
-    Args:
-        scenario: what is flown.
-        events: those that count, instead of all that the scenario has.
-    """
+def build_changes(scenario: Scenario, events: Sequence[kinds.Event] | None = None) -> tuple[Change, ...]:
+    """What these events, or else all of the scenario, do to rotors, mass and payload, and what pushes, in any order."""
     events = scenario.events if events is None else events
-    pushes = _in_force([event for event in events if isinstance(event, PushEvent)])
+    pushes = _in_force([event for event in events if isinstance(event, kinds.PushEvent)])
     found: list[Change] = [*_losses(scenario, events)]
     found += [PushChange(time=time, pushes=tuple(in_force)) for time, in_force in pushes]
     for event in events:
-        if isinstance(event, PayloadPickupEvent):
+        if isinstance(event, kinds.PayloadPickupEvent):
             found.append(PayloadChange(time=event.at, payload=event))
-        elif isinstance(event, PayloadDropEvent):
+        elif isinstance(event, kinds.PayloadDropEvent):
             found.append(PayloadChange(time=event.at, payload=None))
-        elif isinstance(event, MassEvent):
+        elif isinstance(event, kinds.MassEvent):
             found.append(MassChange(time=event.at, factor=event.factor))
-        elif isinstance(event, RotorLagEvent):
+        elif isinstance(event, kinds.RotorLagEvent):
             fall = event.rise if event.fall is None else event.fall
             found.append(LagChange(time=event.at, rise=event.rise, fall=fall))
     return tuple(found)
@@ -121,9 +108,9 @@ def check_changes(scenario: Scenario, vehicle: Vehicle, changes: Iterable[Change
             rotors.lagging(change.rise, change.fall)
 
 
-def _losses(scenario: Scenario, events: Sequence[Event]) -> Iterator[RotorChange]:
+def _losses(scenario: Scenario, events: Sequence[kinds.Event]) -> Iterator[RotorChange]:
     """Each rotor's share whenever one of its losses begins or ends: the product of what all losses in force leave."""
-    losses = [event for event in events if isinstance(event, RotorLossEvent)]
+    losses = [event for event in events if isinstance(event, kinds.RotorLossEvent)]
     rotors = scenario.effects.rotors or RotorDynamics()
     for rotor, worn in enumerate(rotors.efficiency, start=1):
         for time, in_force in _in_force([loss for loss in losses if loss.rotor == rotor]):
@@ -131,7 +118,7 @@ def _losses(scenario: Scenario, events: Sequence[Event]) -> Iterator[RotorChange
             yield RotorChange(time=time, rotor=rotor, efficiency=worn * left)
 
 
-_Lasting = TypeVar("_Lasting", RotorLossEvent, PushEvent)
+_Lasting = TypeVar("_Lasting", kinds.RotorLossEvent, kinds.PushEvent)
 
 
 def _in_force(events: Sequence[_Lasting]) -> Iterator[tuple[float, list[_Lasting]]]:

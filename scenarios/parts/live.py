@@ -24,8 +24,8 @@ from quadsim.sim.plant import Plant
 from quadsim.sim.sensing.sensor import SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.parts.effects import build_changes, build_computation, check_changes, moving_air, winds_of
+from scenarios.parts.events import neutral
 from scenarios.parts.navigation import build_faults
-from scenarios.parts.neutral import neutral
 from scenarios.schema.base import Spec
 from scenarios.schema.controller import ControllerSpec, changed
 from scenarios.schema.events import (
@@ -95,17 +95,7 @@ class FlightEvents:
         loop: ClosedLoop,
         build: Callable[[ControllerSpec], Controller] | None,
     ) -> None:
-        """Set up, before the first period.
-
-        Args:
-            scenario: what is flown.
-            vehicle: the modelled vehicle.
-            plant: what is flown.
-            navigation: gives the controller the state.
-            reference: what is followed.
-            loop: the closed loop; what happens at a period's begin does from then on.
-            build: makes a controller; None where the one that flies is one's own, and stays.
-        """
+        """Set up, before the first period; `build` makes a controller, None where the user's own one flies."""
         self.scenario, self._vehicle, self._spec = scenario, vehicle, scenario.controller
         self._plant, self._navigation, self._reference, self._loop = plant, navigation, reference, loop
         self._build = build

@@ -28,10 +28,6 @@ _UNITS: Final = {
 def build_navigation(scenario: Scenario, vehicle: Vehicle) -> Navigation | None:
     """The source of the controller's state; None where that is the true one.
 
-    Args:
-        scenario: what is flown.
-        vehicle: the vehicle of the estimator's model.
-
     Raises:
         ParameterError: a fault of a sensor that the estimator does not have.
     """
@@ -74,16 +70,7 @@ def build_fault(
     axes: Sequence[str] | None = None,
     offset: Sequence[float] | None = None,
 ) -> SensorFault:
-    """A sensor's fault from its names in a scenario file.
-
-    Args:
-        sensor: `position`, `velocity`, `attitude` or `rates`.
-        kind: `dropout`, `freeze`, `nan` or `bias`.
-        start: [s].
-        duration: [s]; infinite: permanent.
-        axes: of nan, which of `x`, `y`, `z`; all where absent.
-        offset: of a bias, by axis: [m], [m/s], [deg] or [deg/s].
-    """
+    """A sensor's fault in the words and units of a scenario file; see `scenarios.schema.events.SensorFaultEvent`."""
     name = SensorName(sensor)
     added = _three(0.0 if offset is None else offset, _UNITS[name])
     affected = AXES if axes is None else tuple(sorted({"xyz".index(axis) for axis in axes}))

@@ -207,12 +207,6 @@ def _table(spec: PluginSpec | ForceSpec) -> str:
 
 def _reason(error: BaseException) -> str:
     """An exception in one line, with the user's line that raised it."""
-    last = traceback.extract_tb(error.__traceback__)[-1]
-    hidden = (
-        isinstance(error, SyntaxError)
-        or last.filename in (__file__, inspect.__file__, importlib.__file__)
-        or "<frozen" in last.filename
-    )
-    return " ".join(f"{type(error).__name__}: {error}".split()) + (
-        "" if hidden else f" ({last.filename}, line {last.lineno})"
-    )
+    last, text = traceback.extract_tb(error.__traceback__)[-1], " ".join(f"{type(error).__name__}: {error}".split())
+    ours = last.filename in (__file__, inspect.__file__, importlib.__file__) or "<frozen" in last.filename
+    return text if ours or isinstance(error, SyntaxError) else f"{text} ({last.filename}, line {last.lineno})"

@@ -8,10 +8,5 @@ import numpy as np
 
 
 def generator(seed: int, purpose: str) -> np.random.Generator:
-    """Random numbers for one purpose, the same whatever else draws any.
-
-    Args:
-        seed: of the scenario.
-        purpose: a name, e.g. `wind`.
-    """
+    """Random numbers for one purpose, e.g. `wind`, the same whatever else draws any."""
     return np.random.default_rng(np.random.SeedSequence([seed, zlib.crc32(purpose.encode())]))

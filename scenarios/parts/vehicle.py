@@ -70,10 +70,6 @@ def actual_effects(scenario: Scenario, vehicle: Vehicle) -> Effects:
 
     Lag, rotor inertia and drag that `[actual]` states act, whether or not `[effects]` has their table.
 
-    Args:
-        scenario: what is flown.
-        vehicle: the modelled vehicle.
-
     Raises:
         ParameterError: `[effects]` states another size than `[actual]`, or lacks one, or a combination is not possible.
     """

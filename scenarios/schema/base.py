@@ -22,13 +22,8 @@ Pair = Annotated[list[Number], Len(2, 2)]
 LARGEST_HORIZON: Final = 1000
 Horizon = Annotated[int, Field(ge=1, le=LARGEST_HORIZON)]
 LARGEST_SEED: Final = 2**63 - 1  # the largest whole number that every reader of TOML takes
-
-
 Seconds = Annotated[float, Field(ge=0.0, le=10.0)]
-
-
 Lag = Seconds | Literal["vehicle"]  # A time constant, or that of the vehicle file
-
 
 _FIRST: Final = {"at": 0, "type": 1}
 """Fields that stand first in a table, which may have been added to those of a dataclass."""

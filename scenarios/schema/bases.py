@@ -18,10 +18,10 @@ LARGEST_FILE: Final = 8_000_000
 
 def locate_files(data: dict[str, Any], directory: Path) -> None:
     """Make paths that are relative to a file's folder independent of it, in place."""
-    for table, field in (("vehicle", "file"), ("reference", "file")):
-        file = data.get(table, {}).get(field) if isinstance(data.get(table), dict) else None
-        if isinstance(file, str) and (directory / file).is_file():
-            data[table][field] = str((directory / file).resolve())
+    for name, ending in (("vehicle", ".toml"), ("reference", "")):
+        file = data[name].get("file") if isinstance(data.get(name), dict) else None
+        if isinstance(file, str) and file.endswith(ending) and (directory / file).is_file():
+            data[name]["file"] = str((directory / file).resolve())
     if "controller" in data:
         data["controller"] = located(data["controller"], directory)
     if isinstance(data.get("forces"), list):
@@ -37,11 +37,8 @@ def read_scenario(
 ) -> dict[str, Any]:
     """A scenario file's tables, merged over those of its base, and that one's base, and so on.
 
-    Args:
-        path: the file.
-        find: from a name to the file it means; see `scenarios.loading.scenario_path`.
-        locate: makes the paths in a base independent of its folder, in place.
-        above: the files that led here.
+    `find` gives the file that a name means; `locate` makes the paths in a base independent of its folder, in place;
+    `above` are the files that led here.
 
     Raises:
         FileError: a file is missing, too large, is not TOML, or is its own base in the end.
@@ -77,12 +74,7 @@ def _find_base(path: Path, name: str, find: Callable[[str], Path]) -> Path:
 
 
 def replaced_tables(path: Path, find: Callable[[str], Path]) -> dict[str, str]:
-    """Tables that stand instead of their base's, being of another `type`: what that was, and where, by their names.
-
-    Args:
-        path: a file that `read_scenario` can read.
-        find: as there.
-    """
+    """Tables that stand instead of their base's, being of another `type`: what that was, and where, by their names."""
     data = _read(path)
     if "base" not in data:
         return {}

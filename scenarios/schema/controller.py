@@ -6,21 +6,41 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Final, Literal
 
+from annotated_types import Len, MaxLen
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
+from mpc.disturbance import RampSettings
 from mpc.fallback.settings import FallbackSettings
+from mpc.indi import INDISettings
+from mpc.nonlinear.settings import Weights
+from mpc.observer import ObserverSettings
+from mpc.qp import KKT_EVERY
+from mpc.robust.tightening import SHORTEST_LAG
 from mpc.solvers import SOLVERS, find_solver
 from quadsim.errors import UnknownNameError
-from scenarios.schema.base import Spec
+from quadsim.fields import NonNegative, Positive
+from scenarios.schema.base import MOST_ENTRIES, Horizon, Lag, Pair, Spec, require_ordered
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
-from scenarios.schema.nonlinear import NonlinearPartsSpec
-from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
+from scenarios.schema.optimisation import (
+    AvoidanceSpec,
+    BoundedSpec,
+    KktEvery,
+    PolytopeSpec,
+    RotorBoundsSpec,
+    SoftSpec,
+    WeightedSpec,
+)
 from scenarios.schema.plugin import FORM, LAWS, PluginSpec, is_plugin
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.robust import RobustSpec
 from scenarios.schema.settings import set_field
 from scenarios.schema.writing import is_absent
+
+LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states that are so of the quaternion model too
+Terminal = NonNegative | Literal["none", "lqr"]
+NonNegativeTriple = Annotated[list[NonNegative], Len(3, 3)]
+PositiveTriple = Annotated[list[Positive], Len(3, 3)]
 
 
 class UnconstrainedSpec(WeightedSpec):
@@ -44,14 +64,74 @@ class ConstrainedSpec(BoundedSpec):
 
     @model_validator(mode="after")
     def _check(self) -> ConstrainedSpec:
-        _require_solver(self.solver)
+        require_solver(self.solver)
         return self
 
 
-class NonlinearSpec(NonlinearPartsSpec):
+class NonlinearSpec(Spec):
     """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period."""
 
     type: Literal["nonlinear"] = Field(description="the control law, by its name in `quadsim list`")
+    horizon: Horizon = Field(default=20, description="[periods] how far it looks ahead, a whole number of nodes")
+    node: Positive | None = Field(
+        default=None, description="[s] from one node to the next, whole periods; absent: one period"
+    )
+    iterations: Annotated[int, Field(ge=1, le=100)] = Field(
+        default=1, description="most steps of sequential quadratic programming in a period; 1: the real-time iteration"
+    )
+    shift: bool | None = Field(
+        default=None, description="whether the last plan is shifted by a node; absent: where a node is one period"
+    )
+    substeps: Annotated[int, Field(ge=1, le=100)] = Field(default=1, description="Runge-Kutta steps per node")
+    inputs: Literal["thrust", "speed"] = Field(
+        default="thrust", description="what the inputs are, as shares of the rotors' largest"
+    )
+    weights: Weights = Weights()
+    attitude_error: Literal["error-state", "difference"] = Field(
+        default="error-state",
+        description="error-state: twice the vector part of q_r* q, the angle to first order; difference: the four "
+        "components of q - q_r",
+    )
+    terminal: Terminal = Field(
+        default="none", description="weight of the last node: none, lqr, or a factor on that of the others"
+    )
+    rotor_lag: Lag = Field(
+        default=0.0,
+        description='[s] time constant by which rotors follow that is predicted, 0 for none; "vehicle": its rotor_rise',
+    )
+    drag: NonNegativeTriple = Field(
+        default=[0.0, 0.0, 0.0], description="[N s/m] linear drag that is predicted, along body x, y, z"
+    )
+    quadratic_drag: NonNegativeTriple = Field(
+        default=[0.0, 0.0, 0.0], description="[N s^2/m^2] the same, of each component's square"
+    )
+    output_bounds: dict[str, Pair] = Field(
+        default={}, description="[m, m/s] lower and upper bound, of positions and velocities by their states' names"
+    )
+    tilt: Annotated[float, Field(gt=0.0, lt=90.0)] | None = Field(
+        default=None, description="[deg] largest angle between thrust axis and vertical; absent: no bound"
+    )
+    body_rate: Positive | PositiveTriple | None = Field(
+        default=None, description="[deg/s] largest magnitude, one or about body x, y, z; absent: no bound"
+    )
+    soft: SoftSpec | None = Field(default=None, description="of the three above; absent: hard")
+    avoidance: AvoidanceSpec | None = Field(
+        default=None, description="absent: it knows of no obstacles, corridors or fence, which are audited all the same"
+    )
+    polytopes: Annotated[list[PolytopeSpec], MaxLen(MOST_ENTRIES)] = Field(
+        default=[], description="bounds on sums of positions, velocities and, as inputs, rotor speeds; audited as well"
+    )
+    offset_free: ObserverSettings | None = None
+    disturbance: RampSettings | None = Field(
+        default=None, description="absent: no drag is fitted, no changing force followed; not beside offset_free"
+    )
+    indi: INDISettings | None = Field(default=None, description="absent: rotors hold the commands for a period")
+    input_bounds: RotorBoundsSpec = RotorBoundsSpec()
+    fallback: FallbackSettings = FallbackSettings()
+    kkt_every: KktEvery = Field(
+        default=KKT_EVERY,
+        description="[periods] from one whose KKT residuals are computed and logged to the next; 1: all",
+    )
     solver: str | None = Field(
         default=None,
         description="QP solver, by its name in `quadsim list`; absent: the fastest for the size",
@@ -59,27 +139,40 @@ class NonlinearSpec(NonlinearPartsSpec):
     )
 
     @model_validator(mode="after")
-    def _check_solver(self) -> NonlinearSpec:
+    def _check(self) -> NonlinearSpec:
         if self.solver is not None:
-            _require_solver(self.solver)
+            require_solver(self.solver)
+        if self.rotor_lag != "vehicle" and 0.0 < self.rotor_lag < SHORTEST_LAG:
+            raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {self.rotor_lag:g}")
+        if self.attitude_error == "difference" and not isinstance(self.weights.attitude, float):
+            raise ValueError(
+                f'weights.attitude must be one number where attitude_error = "difference"; got {self.weights.attitude}'
+            )
+        if self.offset_free is not None and self.disturbance is not None:
+            raise ValueError("disturbance must be absent where offset_free is given: both estimate the same force")
+        for name, pair in self.output_bounds.items():
+            if name not in LINEAR:
+                raise ValueError(
+                    f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
+                )
+            require_ordered(f"output_bounds.{name}", pair)
+        if self.inputs == "thrust" and self.input_bounds.slew is not None:
+            raise ValueError(
+                'input_bounds.slew must be absent where inputs = "thrust", in which steps of speeds are not linear: '
+                f'inputs = "speed"; got {self.input_bounds.slew}'
+            )
         return self
 
 
-COMPILED: Final = ("unconstrained", "constrained", "robust")
-
-
-def _require_solver(name: str) -> None:
+def require_solver(name: str) -> None:
+    """Refuse a QP solver that is not there."""
     try:
         find_solver(name)
     except UnknownNameError as error:
         raise ValueError(f"solver: {error}") from error
 
 
-def shared_tilt_bound(spec: ConstrainedSpec) -> float | None:
-    """The one number that bounds roll and pitch alike [deg], or None."""
-    bounds = {abs(bound) for name in ("roll", "pitch") for bound in spec.output_bounds.get(name, [])}
-    both = {"roll", "pitch"} <= spec.output_bounds.keys()
-    return bounds.pop() if both and len(bounds) == 1 else None
+COMPILED: Final = ("unconstrained", "constrained", "robust")
 
 
 def _law(controller: object) -> str | None:
@@ -128,11 +221,7 @@ class _Holder(Spec):
 
 
 def changed(spec: ControllerSpec, fields: Mapping[str, Any]) -> ControllerSpec:
-    """A controller of which some fields have other values.
-
-    Args:
-        spec: the one before; of another, or of its own, `type` it is replaced whole.
-        fields: values by dotted path; a table within changes what it names of the one there.
+    """A controller of which some fields, by dotted path, have other values; with a `type` it is replaced whole.
 
     Raises:
         ScenarioError: a field is not there, or its value is not allowed.

@@ -150,37 +150,31 @@ class _LoopSpec(_StartedSpec):
         return self
 
 
-class CircleSpec(_LoopSpec):
+class _RoundSpec(_LoopSpec):
+    radius: Positive = Field(description="[m] seen from above")
+    centre: Pair | None = Field(
+        default=None, description="[m] x, y, world; if absent, such that the course begins at the initial position"
+    )
+    angle: Number = Field(default=0.0, description="[deg] where on the circle it begins, seen from the centre; 0 is +x")
+
+    @property
+    def turn_time(self) -> float:
+        """Of one turn at full speed [s]."""
+        climb: float = getattr(self, "climb", 0.0)
+        return self.period or math.hypot(2.0 * math.pi * self.radius, climb) / (self.speed or math.inf)
+
+
+class CircleSpec(_RoundSpec):
     """A level circle, counter-clockwise seen from above."""
 
     type: Literal["circle"] = Field(description="kind of course: a level circle")
-    radius: Positive = Field(description="[m] seen from above")
-    centre: Pair | None = Field(
-        default=None, description="[m] x, y, world; if absent, such that the circle begins at the initial position"
-    )
-    angle: Number = Field(default=0.0, description="[deg] where on the circle it begins, seen from the centre; 0 is +x")
-
-    @property
-    def turn_time(self) -> float:
-        """Of one turn at full speed [s]."""
-        return self.period or 2.0 * math.pi * self.radius / (self.speed or math.inf)
 
 
-class HelixSpec(_LoopSpec):
+class HelixSpec(_RoundSpec):
     """A circle that climbs in proportion to the angle flown."""
 
     type: Literal["helix"] = Field(description="kind of course: a circle that climbs")
-    radius: Positive = Field(description="[m] seen from above")
     climb: Number = Field(description="[m] gained per turn; negative: lost")
-    centre: Pair | None = Field(
-        default=None, description="[m] x, y, world; if absent, such that the helix begins at the initial position"
-    )
-    angle: Number = Field(default=0.0, description="[deg] where on the circle it begins, seen from the centre; 0 is +x")
-
-    @property
-    def turn_time(self) -> float:
-        """Of one turn at full speed [s]."""
-        return self.period or math.hypot(2.0 * math.pi * self.radius, self.climb) / (self.speed or math.inf)
 
 
 class FigureEightSpec(_LoopSpec):

@@ -33,21 +33,32 @@ class InputWeightsSpec(Spec):
     speed: Weights = Field(description="[1/(rad/s)^2] diagonal of Q_u: one weight for all rotors, or a list of four")
 
 
-class InputBoundsSpec(Spec):
+class RotorBoundsSpec(Spec):
+    """Hard bounds on the rotor speeds and their steps, for every rotor."""
+
+    speed: Pair | None = Field(default=None, description="[rad/s] absent: what the vehicle's rotors hold")
+    slew: Pair | None = Field(
+        default=None, description='[rad/s per period] only where inputs = "speed"; absent: no bound'
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> RotorBoundsSpec:
+        if self.speed is not None:
+            require_ordered("speed", self.speed)
+            if self.speed[0] < 0.0:
+                raise ValueError(f"speed must have a lower bound >= 0 rad/s; got {self.speed}")
+        if self.slew is not None:
+            require_ordered("slew", self.slew)
+            if not self.slew[0] <= 0.0 <= self.slew[1]:
+                raise ValueError(f"slew must allow a speed to be held, so contain 0; got {self.slew}")
+        return self
+
+
+class InputBoundsSpec(RotorBoundsSpec):
     """Hard bounds on the rotor speeds and their steps, for every rotor."""
 
     speed: Pair = Field(description="[rad/s] u_min, u_max of every rotor.  Eq. (20)")
     slew: Pair = Field(description="[rad/s per period] delta_min, delta_max of every rotor.  Eq. (15)")
-
-    @model_validator(mode="after")
-    def _check(self) -> InputBoundsSpec:
-        require_ordered("speed", self.speed)
-        require_ordered("slew", self.slew)
-        if self.speed[0] < 0.0:
-            raise ValueError(f"speed must have a lower bound >= 0 rad/s; got {self.speed}")
-        if not self.slew[0] <= 0.0 <= self.slew[1]:
-            raise ValueError(f"slew must allow a speed to be held, so contain 0; got {self.slew}")
-        return self
 
 
 class WeightedSpec(Spec):

@@ -22,7 +22,16 @@ LAWS: Final = ("unconstrained", "constrained", "robust", "nonlinear", "lqr", "pi
 _NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 
 
-class PluginSpec(Spec):
+class _CodeSpec(Spec):
+    type: str = Field(description="its code, as package.module:name")
+    folder: str | None = Field(
+        default=None,
+        description="where its module is looked for first, from the scenario file; absent: beside that",
+    )
+    settings: dict[str, Any] = Field(default={}, description="what else it is called with, by the arguments' names")
+
+
+class PluginSpec(_CodeSpec):
     """A controller of one's own, called as MyController(vehicle, period=..., horizon=..., **settings)."""
 
     type: str = Field(
@@ -30,11 +39,6 @@ class PluginSpec(Spec):
         json_schema_extra={"not": {"enum": [*LAWS]}},
     )
     horizon: Horizon = Field(default=50, description="[periods] N, samples of the reference that a step is given")
-    folder: str | None = Field(
-        default=None,
-        description="where its module is looked for first, from the scenario file; absent: beside that",
-    )
-    settings: dict[str, Any] = Field(default={}, description="what else it is called with, by the arguments' names")
 
     @model_validator(mode="after")
     def _check(self) -> PluginSpec:
@@ -42,18 +46,11 @@ class PluginSpec(Spec):
         return self
 
 
-class ForceSpec(Spec):
+class ForceSpec(_CodeSpec):
     """A force of one's own, called once per physics step; see `quadsim.sim.effects.Force`.
 
     A function force(time, state, **settings), or a class called as MyForce(vehicle, rng=..., **settings).
     """
-
-    type: str = Field(description="its code, as package.module:name")
-    folder: str | None = Field(
-        default=None,
-        description="where its module is looked for first, from the scenario file; absent: beside that",
-    )
-    settings: dict[str, Any] = Field(default={}, description="what else it is called with, by the arguments' names")
 
     @model_validator(mode="after")
     def _check(self) -> ForceSpec:

@@ -200,14 +200,7 @@ def _of_given_types(found: list[ErrorDetails], data: Mapping[str, Any], root: ty
 
 
 def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel], *, file: str = "scenario") -> str:
-    """One line about one field: its name, what is allowed, what was given.
-
-    Args:
-        details: what pydantic found.
-        data: the file.
-        root: what the file is to be.
-        file: what such a file is called.
-    """
+    """One line about one field of a file that is to be a `root`: its name, what is allowed, what was given."""
     place = find(details["loc"], data, root)
     field, kind, context = ".".join(place.names), details["type"], {**details.get("ctx", {})}
     given = details["input"] if details["loc"][-1:] == ("[key]",) else place.given

@@ -22,19 +22,11 @@ from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from scenarios.schema import events as kinds
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
-from scenarios.schema.controller import ControllerSpec, changed
+from scenarios.schema.controller import ControllerSpec, NonlinearSpec, changed
 from scenarios.schema.course import ReferenceSpec
-from scenarios.schema.events import (
-    MOST_EVENTS,
-    ControllerEvent,
-    Event,
-    PayloadDropEvent,
-    PayloadPickupEvent,
-    SensorFaultEvent,
-)
-from scenarios.schema.nonlinear import NonlinearPartsSpec
-from scenarios.schema.optimisation import BoundedSpec
+from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
@@ -109,10 +101,6 @@ class PlantSpec(Spec):
 _STEEPEST: Final = 180.0
 
 
-def _tilt_or_false(value: Any) -> Any:
-    return _number_or_false(value, _STEEPEST)
-
-
 def _number_or_false(value: Any, most: float = 1e6) -> Any:
     """Refuse all but numbers in range and false, in one sentence; 0, which Python takes for false, is refused too."""
     if value is False or (isinstance(value, int | float) and value is not True and 0.0 < value <= most):
@@ -126,12 +114,13 @@ LimitOrOff = Annotated[Positive | Literal[False], BeforeValidator(_number_or_fal
 class LostSpec(Spec):
     """When the flight is lost and ends, by the true state at each control sample; false switches a criterion off."""
 
-    tilt: Annotated[Annotated[float, Field(gt=0.0, le=_STEEPEST)] | Literal[False], BeforeValidator(_tilt_or_false)] = (
-        Field(
-            default=120.0,
-            description="[deg] between the thrust axis and the vertical; at 120, half the thrust pulls down; false for "
-            "loops and flips",
-        )
+    tilt: Annotated[
+        Annotated[float, Field(gt=0.0, le=_STEEPEST)] | Literal[False],
+        BeforeValidator(lambda value: _number_or_false(value, _STEEPEST)),
+    ] = Field(
+        default=120.0,
+        description="[deg] between the thrust axis and the vertical; at 120, half the thrust pulls down; false for "
+        "loops and flips",
     )
     distance: LimitOrOff = Field(default=100.0, description="[m] from the reference at the same time")
     depth: LimitOrOff = Field(default=50.0, description="[m] below the lowest of the start and the reference so far")
@@ -195,7 +184,9 @@ class Scenario(Spec):
     estimator: EstimatorSpec | None = Field(
         default=None, description="absent: the controller receives the sensors' samples as they arrive"
     )
-    events: Annotated[list[Event], MaxLen(MOST_EVENTS)] = Field(default=[], description="what happens in flight")
+    events: Annotated[list[kinds.Event], MaxLen(kinds.MOST_EVENTS)] = Field(
+        default=[], description="what happens in flight"
+    )
     lost: LostSpec = LostSpec()
     obstacles: Annotated[list[Annotated[AnyObstacle, Field(discriminator="type")]], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="what the vehicle, a ball of its extent, must not touch: a touch is a crash"
@@ -270,11 +261,15 @@ class Scenario(Spec):
             raise ValueError(f"constraints must have distinct names; got {names}")
 
     @property
+    def polytopes(self) -> list[PolytopeSpec]:
+        """Those of its controller."""
+        return self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearSpec) else []
+
+    @property
     def audited_names(self) -> list[str]:
         """The names of constraints, rows of polytopes, obstacles and regions."""
-        polytopes = self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearPartsSpec) else []
         names = [constraint.name for constraint in self.constraints]
-        names += [name for polytope in polytopes for name in polytope.row_names]
+        names += [name for polytope in self.polytopes for name in polytope.row_names]
         return names + [obstacle.name for obstacle in self.obstacles] + [region.name for region in self.regions]
 
     def _check_events(self) -> None:
@@ -282,18 +277,18 @@ class Scenario(Spec):
         for i, event in sorted(enumerate(self.events), key=lambda entry: entry[1].at):
             if event.at >= self.duration:
                 raise ValueError(f"events.{i}.at must be before the flight's end, {self.duration} s; got {event.at}")
-            if isinstance(event, PayloadPickupEvent):
+            if isinstance(event, kinds.PayloadPickupEvent):
                 carried += 1
-            elif isinstance(event, PayloadDropEvent):
+            elif isinstance(event, kinds.PayloadDropEvent):
                 if not carried:
                     raise ValueError(f"events.{i}.type must not be payload_drop at {event.at} s: nothing is carried")
                 carried = 0
-            elif isinstance(event, SensorFaultEvent) and self.estimator is not None:
+            elif isinstance(event, kinds.SensorFaultEvent) and self.estimator is not None:
                 present = [] if self.sensors is None else [str(name) for name in self.sensors.present()]
                 if event.sensor not in present:
                     rule = f"one that the estimator has, of {', '.join(present)}"
                     raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
-            elif isinstance(event, ControllerEvent):
+            elif isinstance(event, kinds.ControllerEvent):
                 try:
                     controller = changed(controller, event.fields)
                 except InputError as error:
@@ -320,7 +315,7 @@ class Scenario(Spec):
     def controller_changes(self) -> list[tuple[float, ControllerSpec]]:
         """Each controller that takes over from the one before it, and when [s], in order of time."""
         found: list[tuple[float, ControllerSpec]] = []
-        events = (event for event in self.events if isinstance(event, ControllerEvent))
+        events = (event for event in self.events if isinstance(event, kinds.ControllerEvent))
         for event in sorted(events, key=lambda event: event.at):
             found.append((event.at, changed(found[-1][1] if found else self.controller, event.fields)))
         return found

@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import numpy as np
 from annotated_types import Len, doc
 from pydantic import Field
 
@@ -104,15 +105,11 @@ def check_sensing(sensors: SensorsSpec | None, estimator: EstimatorSpec | None, 
             probe.latency(timestep)
         except ParameterError as error:
             raise ValueError(str(error)) from error
-        if estimator is not None and not _all_positive(spec.noise):
-            noise = [*spec.noise] if isinstance(spec.noise, tuple) else spec.noise
+        noise = [*spec.noise] if isinstance(spec.noise, tuple) else spec.noise
+        if estimator is not None and not np.all(np.array(noise) > 0.0):
             raise ValueError(
                 f"sensors.{name}.noise must be positive, for the estimator to weigh its samples; got {noise}"
             )
     missing = [name for name in (SensorName.POSITION, SensorName.ATTITUDE) if name not in present]
     if estimator is not None and missing:
         raise ValueError(f"estimator must have sensors.{missing[0]} to work with; got {[str(n) for n in present]}")
-
-
-def _all_positive(noise: float | tuple[float, ...]) -> bool:
-    return min(noise) > 0.0 if isinstance(noise, tuple) else noise > 0.0

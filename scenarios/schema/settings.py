@@ -42,13 +42,7 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
 
     An entry of a list of tables is addressed by its name, as in `constraints.roll.upper`, or, where it has none, by its
     index, as in `events.0.at`; a number of a list by its index, as in `initial.euler.2`.
-
-    Args:
-        data: the tables, changed in place.
-        path: dotted.
-        value: of TOML; None for a field that is to be absent.
-        source: of the request, for the message.
-        given: what was given, for the message; the path where absent.
+    None is a field that is to be absent.  `source` of the request, and what was `given`, are for the message.
 
     Raises:
         ParameterError: the path goes through something that is no table.
@@ -69,12 +63,7 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
 
 
 def state_bounds(data: dict[str, Any], controller: Any) -> None:
-    """Write a controller's bounds into the constraints that take them, where another law without these replaces it.
-
-    Args:
-        data: the scenario's tables, changed in place.
-        controller: the table of the other law, or its name.
-    """
+    """Write a controller's bounds into the constraints that take them, where another law without these replaces it."""
     before, after = data.get("controller"), {"type": controller} if isinstance(controller, str) else controller
     if not (isinstance(before, dict) and isinstance(after, dict)) or after.get("type") in (None, before.get("type")):
         return
@@ -93,13 +82,7 @@ def _table(data: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 
 def note_change(data: dict[str, Any], path: str, value: Any) -> None:
-    """Say in a scenario's description, where it has one, that a field was changed, and to what; the last change counts.
-
-    Args:
-        data: the scenario's tables, changed in place.
-        path: dotted.
-        value: None for a field that was made absent.
-    """
+    """Say in a scenario's description, where it has one, that a field was changed, and to what; the last one counts."""
     description = data.get("description")
     if not isinstance(description, str) or path in NOT_DESCRIBED:
         return

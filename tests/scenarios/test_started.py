@@ -14,7 +14,7 @@ from quadsim.errors import CommandError, FlightError, InputError
 from quadsim.sim.loop import ClosedLoop
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.parts.neutral import prepared
+from scenarios.parts.events import prepared
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario, start
 from scenarios.schema.scenario import Scenario

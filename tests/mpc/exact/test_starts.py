@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support import flight_queries, paper_problem
+from support import flight_queries, fly_once, paper_problem
 
 from mpc.constraints import Constraint, Penalty
 from mpc.exact.shortcut import Shortcut
@@ -21,7 +21,6 @@ from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import fly_once
 
 
 class Recording:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.linalg
-from support import paper_problem, paper_reference
+from support import fly_once, paper_problem, paper_reference
 
 from mpc.constraints import Bounds, Penalty
 from mpc.model import discretise
@@ -37,7 +37,6 @@ from quadsim.vehicle import Vehicle
 from scenarios.build import build_plant
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
-from scenarios.run import fly_once
 
 ROOT = Path(__file__).resolve().parents[3]
 TILTS = [INDEX["roll"], INDEX["pitch"]]

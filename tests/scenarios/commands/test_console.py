@@ -51,7 +51,6 @@ def test_a_foreign_summary_is_shown_as_text(nasty: str, short_run: Any, capsys: 
     for entry in summary["constraints"]:
         entry |= {"name": nasty, "unit": nasty}
     console.print_summary(summary, where=nasty)
-    console.print_notice(nasty)
     console.say(nasty)
     console.print_listing({nasty: {nasty: nasty}})
     cells = tuple(Cell(text=nasty, mark=mark) for mark in (Mark.NONE, Mark.BAD))

@@ -16,10 +16,10 @@ from mpc.baselines.lqr import bryson_objective
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import Vehicle, load_vehicle
 from scenarios.design.first_scenario import BASELINE_SHARE, CLEARANCE, COURSES, LAWS, ROOM, first_scenario
-from scenarios.design.vehicle_template import vehicle_template
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.course import FigureEightSpec
 from scenarios.schema.robust import RobustSpec
+from scenarios.vehicles import vehicle_template
 
 ALL = {vehicle.name: vehicle for vehicle in vehicles()}
 HARDEST = ("random-08", "random-17")

@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 
 from quadsim.assets import vehicle_path
-from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, load_vehicle
+from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, console
 from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
 from scenarios.design.shortfalls import shortfalls
-from scenarios.design.vehicle_template import ADVICE, parameter_meanings, vehicle_template
 from scenarios.loading import load_scenario, parse_scenario
+from scenarios.schema.base import fields_of
+from scenarios.vehicles import vehicle_template
 
 HUMMINGBIRD, LOPES = (load_vehicle(vehicle_path(name)) for name in ("hummingbird", "lopes2011"))
 
@@ -59,11 +60,11 @@ def test_a_first_scenario_suits_its_vehicle(course: str, law: str) -> None:
 def test_the_template_documents_every_parameter() -> None:
     tables = tomllib.loads(vehicle_template())
     assert [*tables] == ["name", "description", *VEHICLE_UNITS]
-    text, meanings = " ".join(vehicle_template().replace("# ", "").split()), parameter_meanings()
-    for name in VEHICLE_UNITS:
-        assert len(meanings[name]) > 4
-        assert f"{name}: {meanings[name]}" in text
-        assert ADVICE[name].how in text
+    text = " ".join(vehicle_template().replace("# ", "").split())
+    for name, unit in VEHICLE_UNITS.items():
+        assert tables[name]["unit"] == unit
+        meaning = (fields_of(Vehicle)[name].description or "").partition("] ")[2]
+        assert f"{name}: {meaning} Find it: " in text
     assert text.count("May be left out:") == len(OPTIONAL_PARAMETERS)
 
 
@@ -92,12 +93,10 @@ def test_from_a_template_to_a_scenario_by_the_command_line(
 def test_the_speed_at_which_a_course_fits_is_reported_before_the_flight(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    output: list[str] = []
-    monkeypatch.setattr(console, "is_watched", lambda: True)
-    monkeypatch.setattr(console, "print_notice", output.append)
+    monkeypatch.setattr(console.PlainConsole, "is_terminal", True)
     settings = ["reference.period=6.0", "reference.start=0.0", "duration=4.0"]
     main(["check", "hummingbird-figure-eight", *(part for setting in settings for part in ("--set", setting))])
-    assert len(output) == 1
-    assert "It cannot be followed exactly: roll up to" in output[0]
-    assert output[0].endswith(" % of its size.")
-    assert " It would fit at " in output[0]
+    notice = capsys.readouterr().err.partition("\n")[0]
+    assert "It cannot be followed exactly: roll up to" in notice
+    assert notice.endswith(" % of its size.")
+    assert " It would fit at " in notice

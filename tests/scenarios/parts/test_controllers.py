@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
+from support import fly_once
 
 from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import GeometricController
@@ -34,7 +35,7 @@ from scenarios.courses.feasibility_check import report
 from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import fly_once, fly_scenario
+from scenarios.run import fly_scenario
 from scenarios.schema.json_schema import scenario_schema
 from scenarios.schema.scenario import Scenario
 

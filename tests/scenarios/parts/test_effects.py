@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import fly_once
 
 from quadsim.controller import MISSED, Command, Controller, Moment
 from quadsim.sim.computation import Computation
@@ -21,7 +22,6 @@ from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
 from scenarios.parts.effects import build_changes, build_computation, build_wind
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import fly_once
 from scenarios.schema.scenario import Scenario
 
 

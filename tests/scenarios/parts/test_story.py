@@ -7,8 +7,7 @@ from typing import Any, get_args
 import pytest
 
 from scenarios.loading import load_scenario
-from scenarios.parts.neutral import prepared
-from scenarios.parts.story import story
+from scenarios.parts.events import prepared, story
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.base import fields_of
 from scenarios.schema.events import Event
