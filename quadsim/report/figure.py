@@ -98,7 +98,6 @@ class Panel:
     areas: tuple[Area, ...] = ()
     x_label: str = ""
     y_label: str = ""
-    x_log: bool = False
     y_log: bool = False
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None

@@ -143,7 +143,7 @@ def _is_headed(panel: Panel) -> bool:
 
 def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
     """Draw a panel; the legend's entries."""
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+    from matplotlib.ticker import MaxNLocator
 
     shown: dict[str, Artist] = {}
     for area in panel.areas:
@@ -156,11 +156,6 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
         shown.setdefault(series.label, _draw_series(axes, series))
     for bound in panel.bounds:
         shown["bound"] = _draw_bound(axes, bound)
-    if panel.x_log:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
     if panel.y_log:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")

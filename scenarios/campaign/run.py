@@ -235,7 +235,6 @@ def _conclude(plan: Plan, files: Growing, progress: _Progress, manifest: dict[st
         campaign=directory,
         table=table,
         summary=summary,
-        manifest=manifest,
         name=plan.spec.name,
         description=plan.spec.description,
         failure=plan.spec.failure,

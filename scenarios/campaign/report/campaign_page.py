@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
-from urllib.parse import quote
+from typing import Final
 
 import pyarrow as pa
 
@@ -51,7 +50,6 @@ def write_report(
     *,
     table: pa.Table,
     summary: Summary,
-    manifest: Mapping[str, Any],
     name: str,
     description: str = "",
     failure: Sequence[str] = (),
@@ -64,16 +62,12 @@ def write_report(
     Raises:
         OutputError: the directory cannot be written.
     """
-    campaign = directory if campaign is None else campaign
+    campaign = campaign or directory
     sentence = verdict_sentence(summary)
     write_pngs([campaign_figures.overview(table, summary, f"{name}: {sentence}")], directory)
     tables = campaign_tables
     sections = [
-        Section(
-            title="How often",
-            plots=_plots("convergence", "How the estimate settles", campaign_figures.convergence(summary)),
-            tables=(tables.event_table(summary, failure), tables.constraint_table(summary)),
-        ),
+        Section(title="How often", tables=(tables.event_table(summary, failure), tables.constraint_table(summary))),
         Section(
             title="Distributions",
             plots=_plots("metrics", "Flights by verdict", campaign_figures.histograms(table), _MARGINS),
@@ -92,14 +86,11 @@ def write_report(
             title="Worst flights",
             tables=(tables.worst_table(summary, str(campaign)), tables.worst_draws_table(summary)),
         ),
-        Section(title="How it was made", tables=(tables.manifest_table(manifest),)),
     ]
-    files = {
-        label: quote(file)
-        for file, label in _FILES.items()
-        if (directory / file).is_file() or (campaign / file).is_file()
-    }
-    verdict = Cell(text=sentence, mark=_mark(summary))
+    there = [file for file in _FILES if (directory / file).is_file() or (campaign / file).is_file()]
+    files = {_FILES[file]: file for file in there}
+    mark = Mark.NONE if not summary["flights"] else Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
+    verdict = Cell(text=sentence, mark=mark)
     page = render_page("campaign", name, sections, description=description, verdict=verdict, files=files)
     (directory / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
@@ -110,22 +101,13 @@ def _plots(key: str, title: str, panels: Sequence[Panel], note: str = "", *, col
     return (to_plot(figure, note=note),) if panels else ()
 
 
-def _mark(summary: Summary) -> Mark:
-    if not summary["flights"]:
-        return Mark.NONE
-    return Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
-
-
 def write_comparison_report(comparison: Comparison, directory: Path, *, overwrite: bool = False) -> Path:
     """Write `index.html`, `comparison.json` and `comparison.md`, which appear together or not at all; the page.
 
     Raises:
         OutputError: the directory cannot be written, or holds something else.
     """
-    note = (
-        f"Above the dashed line, {comparison.names[1]} has the larger margin. Triangles at the edges are pairs beyond "
-        "the axes."
-    )
+    note = f"Above the dashed line, {comparison.names[1]} has the larger margin. Triangles are pairs beyond the axes."
     plots = tuple(to_plot(figure, note=note) for figure in campaign_figures.paired_margins(comparison))
     sections = [
         Section(title="What is compared", text=(pairing(comparison),), tables=tuple(difference_table(comparison))),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
 from scenarios.campaign.statistics.comparison import Comparison, EventComparison, MetricComparison
 from scenarios.campaign.statistics.inference import ALPHA, CONFIDENCE
-from scenarios.campaign.statistics.wording import label, p_value, percent, signed_interval, signed_points
+from scenarios.campaign.statistics.wording import label, p_value, percent
 from scenarios.schema.settings import shown
 
 _SURE = f"{100.0 * CONFIDENCE:g} %"
@@ -50,12 +50,12 @@ def _events(comparison: Comparison) -> Grid:
         title="Events",
         head=(
             *("event", a, b, f"{a} alone", f"{b} alone", "both"),
-            *("p", "after Holm", "difference [points]", f"{_SURE} interval"),
+            *("p", "after Holm"),
         ),
         lines=tuple(_event(event) for event in comparison.events if any(event.counts)),
         note="p: McNemar's exact test, two-sided, of each event by itself; the verdict is by that of failure. After "
         "Holm: corrected for all events that one flight of a pair alone had; bold: beyond chance at "
-        f"{100.0 * ALPHA:g} %. Difference: {b} less {a}, with Tango's score interval for pairs.",
+        f"{100.0 * ALPHA:g} %.",
     )
 
 
@@ -63,8 +63,7 @@ def _event(event: EventComparison) -> tuple[Cell, ...]:
     counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
     pairs = map(str, (event.only_a, event.only_b, event.both))
     corrected = Cell(text=p_value(event.p_holm), mark=Mark.BEST if event.p_holm < ALPHA else Mark.NONE)
-    difference = signed_points(event.difference), signed_interval(event.lower, event.upper)
-    return line(event.event, *counts, *pairs, p_value(event.p), corrected, *difference)
+    return line(event.event, *counts, *pairs, p_value(event.p), corrected)
 
 
 def _metrics(comparison: Comparison) -> Grid:

@@ -14,23 +14,48 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from scenarios.campaign.results.verdicts import VERDICT_EVENTS
+from quadsim.report.palette import BOUND, LINES, REFERENCE
+from scenarios.many import DIED, ERROR, MEMORY, TIMEOUT
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 Flags = np.ndarray[Any, np.dtype[np.bool_]]
+HARMLESS: Final = "satisfied"
+INCOMPLETE: Final = "incomplete"  # of a flight that ended before it reached a required constraint: neither good nor bad
+
+
+class Verdict(NamedTuple):
+    """What is to be known of a verdict."""
+
+    badness: int  # its place among the worst flights: the larger, the worse
+    colour: str  # of its flights
+    symbol: str  # of its flights
+
+
+VERDICTS: Final = {
+    HARMLESS: Verdict(0, LINES[0], "circle"),
+    INCOMPLETE: Verdict(1, LINES[2], "cross"),
+    "violated": Verdict(2, LINES[1], "diamond"),
+    "lost": Verdict(6, BOUND, "x"),
+    ERROR: Verdict(5, REFERENCE, "square"),
+    DIED: Verdict(5, LINES[3], "pentagon"),
+    TIMEOUT: Verdict(4, LINES[4], "triangle-up"),
+    MEMORY: Verdict(3, LINES[5], "triangle-down"),
+}
+"""In the order in which they are drawn and counted."""
+
 
 _NAMED: Final[dict[str, tuple[str, bool | str]]] = {
     "failure": ("failed", True),
     "violation": ("violated", True),
     "lost": ("verdict", "lost"),
     "crash": ("crashed", True),
-    **{verdict: ("verdict", verdict) for verdict in VERDICT_EVENTS},
+    **{verdict: ("verdict", verdict) for verdict in VERDICTS if verdict not in (HARMLESS, "violated")},
 }
 """Column of each event that has a name, and its value there where the event holds."""
 _SPELLINGS: Final = {"failed": "failure", "violated": "violation", "crashed": "crash"}
-_OPERATIONS: Final = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
+OPERATIONS: Final = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 _NEVER_COMPARED: Final = ("flight", "seed", "failed")
 """Columns that identify flights, or are covered by other events."""
 _COMPARISON: Final = re.compile(r"(?P<column>[^<>=]*?)\s*(?P<operation><=|>=|<|>)\s*(?P<number>[^<>=]*)")
@@ -62,7 +87,7 @@ class Event(NamedTuple):
             return bool(value == self.value)
         if isinstance(value, str):
             raise _no_number(self.text, self.column_name)
-        return math.isnan(value) or bool(_OPERATIONS[self.operation](value, self.value))
+        return math.isnan(value) or bool(OPERATIONS[self.operation](value, self.value))
 
     def column(self, table: pa.Table) -> Flags:
         """(K,) whether it happened, flight by flight; the same as `holds` of every row.

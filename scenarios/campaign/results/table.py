@@ -21,8 +21,7 @@ from quadsim.flight.audit import Finding, Limit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
-from scenarios.campaign.results.events import Event, Flags
-from scenarios.campaign.results.verdicts import HARMLESS, INCOMPLETE, VERDICTS
+from scenarios.campaign.results.events import HARMLESS, INCOMPLETE, VERDICTS, Event, Flags
 from scenarios.many import ERROR
 
 Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None

@@ -17,12 +17,11 @@ from scenarios.campaign.report.campaign_figures import histograms, overview, sca
 from scenarios.campaign.report.campaign_page import write_report
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.statistics.estimates import estimate
-from scenarios.campaign.statistics.wording import interval, percent, signed_points
+from scenarios.campaign.statistics.wording import interval, percent
 
 MakeCampaign = Callable[..., pa.Table]
 
 HOSTILE = "<script>alert(1)</script> & more"
-MANIFEST = {"engine": "local", "versions": {"numpy": "2"}, "failure": ["lost", "violated"], "note": HOSTILE, "no": None}
 PROBE = """<script>
 (async () => {
   while (!("drawn" in document.documentElement.dataset)) await new Promise((done) => setTimeout(done, 50));
@@ -46,7 +45,6 @@ def write(directory: Path, table: pa.Table, name: str = NAME, summary: Summary |
         directory,
         table=table,
         summary=json.loads(json.dumps(summary or estimate(table))),
-        manifest=MANIFEST,
         name=name,
         description="What is flown.",
         failure=["violated", "rmse.z > 0.5"],
@@ -85,7 +83,6 @@ def test_the_page_shows_what_the_flights_show(estimated: Summary, reported: Path
         assert f"<h2>{heading}</h2>" in text
     for table in ("Constraints", "Failures over each varied parameter", "Their parameters"):
         assert f"<h3>{table}</h3>" in text
-    assert "versions.numpy" in text
     assert {path.name for path in directory.iterdir()} == {"index.html", "campaign.png", "flights.parquet"}
     for url in re.findall(r'(?:href|src)="([^"#]+)"', text):
         assert url == "data:," or (directory / url).is_file(), url
@@ -163,7 +160,7 @@ def test_many_flights_are_thinned_evenly_and_by_verdict(make_campaign: MakeCampa
     table = make_campaign(5000)
     shown = {series.label: series.x.size for series in over(table, "solver").series if series.marker[:8] != "triangle"}
     verdicts = table["verdict"].to_pylist()
-    assert shown["satisfied"] == 500
+    assert shown["satisfied"] == 1000
     assert shown["violated"] == verdicts.count("violated")
     assert over(table, "solver").x_names == ("daqp", "gain", "piqp")
 
@@ -171,12 +168,9 @@ def test_many_flights_are_thinned_evenly_and_by_verdict(make_campaign: MakeCampa
 def test_the_figure_shows_the_parameters_that_matter_most(thousand: pa.Table, estimated: Summary) -> None:
     figure = overview(thousand, estimated, NAME)
     assert [panel.x_label for panel in figure.panels] == [
-        *("flights", "worst_margin", "rank correlation, or xi", "wind [m/s]", "mass", "yaw")
+        *("worst_margin", "rank correlation, or xi", "wind [m/s]", "mass", "yaw")
     ]
-    share, drivers = figure.panels[0], figure.panels[2]
-    assert share.series[0].y[-1] == pytest.approx(3.0), "30 of 1000 flights, in percent"
-    np.testing.assert_array_less(share.bands[0].low[-1], 3.0)
-    strong = next(series for series in drivers.series if series.style == "points")
+    strong = next(series for series in figure.panels[1].series if series.style == "points")
     assert strong.x[0] == pytest.approx(estimated["parameters"]["wind"]["worst_margin"]["rho"])
     assert to_png(figure, dpi=40) == to_png(figure, dpi=40)
 
@@ -187,8 +181,7 @@ def test_shares_are_reported_with_the_digits_they_need() -> None:
     ]
     assert interval(0.0262, 0.0506) == "2.6 to 5.1 %"
     assert interval(0.0, 0.00368) == "0 to 0.37 %"
-    assert interval(0.9106, 0.999578) == "91.1 to 99.96 %"
-    assert [signed_points(value) for value in (-0.025, 0.0, 0.0004)] == ["-2.5", "0", "+0.040"]
+    assert interval(0.9106, 0.999578) == "91.1 to 99.958 %"
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -199,7 +192,7 @@ def test_a_browser_draws_the_page_and_has_no_complaint(make_campaign: MakeCampai
     dom, console = open_page(page, tmp_path / "profile")
     assert console == []
     report = dict(one.split(" ", 1) for one in re.findall(r"<output>(.*?)</output>", dom)[-1].split("; "))
-    assert report["drawn"] == "4"
+    assert report["drawn"] == "3"
     assert int(report["points"]) == 9 * 300, "every flight over every parameter"
     assert int(report["bars"]) > 100
     assert "Chart Studio" not in report["buttons"]
@@ -208,4 +201,4 @@ def test_a_browser_draws_the_page_and_has_no_complaint(make_campaign: MakeCampai
 def test_a_place_that_cannot_be_is_reported(thousand: pa.Table, estimated: Summary, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="Not a directory"):
-        write_report(tmp_path / "file" / "gone", table=thousand, summary=estimated, manifest={}, name="a")
+        write_report(tmp_path / "file" / "gone", table=thousand, summary=estimated, name="a")

@@ -38,7 +38,7 @@ def test_a_better_controller_is_found_to_be(thousand: pa.Table, better: pa.Table
     assert failure.counts == (failed[0].sum(), failed[1].sum())
     assert (failure.only_a, failure.only_b) == ((failed[0] & ~failed[1]).sum(), (failed[1] & ~failed[0]).sum())
     assert failure.pairs == found.flights == 1000
-    assert failure.lower < failure.difference < failure.upper < 0.0
+    assert failure.difference == (failure.only_b - failure.only_a) / 1000 < 0.0
     assert found.sentence.startswith("robust is better than paper: of 1000 paired flights, ")
     assert compare(better, thousand, NAMES).verdict == "worse"
 
@@ -86,7 +86,6 @@ def test_a_campaign_and_itself_are_not_distinguishable(thousand: pa.Table) -> No
     assert found.verdict == "not distinguishable"
     assert found.sentence.startswith("b and a are not distinguishable by their failures: of 1000")
     assert found.events[0].p == 1.0
-    assert found.events[0].lower < 0.0 < found.events[0].upper
     assert all(metric.difference.mean == 0.0 for metric in found.metrics)
 
 
