@@ -82,8 +82,8 @@ class Panel:
     Attributes:
         title: what y is; beside the axis, or above the panel where `x_label` names its own horizontal axis.
         unit: of y; an axis of a known unit has a least span, below which there is only rounding.
-        x_range, y_range: ends of the axes; None fits them to what is drawn.
-        x_names, y_names: names of 0, 1, ... on an axis, in place of numbers.
+        y_range: ends of the axis; None fits it to what is drawn.
+        x_names: names of 0, 1, ... on the axis, in place of numbers.
         equal: whether both axes have one scale.
         whole: whether y counts things.
         legend: whether the labels are explained in the panel, not in the legend of all panels.
@@ -99,10 +99,8 @@ class Panel:
     x_label: str = ""
     y_label: str = ""
     y_log: bool = False
-    x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
     x_names: tuple[str, ...] = ()
-    y_names: tuple[str, ...] = ()
     equal: bool = False
     whole: bool = False
     legend: bool = False

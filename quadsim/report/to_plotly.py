@@ -169,12 +169,9 @@ def _draw_panel(canvas: Canvas, panel: Panel, place: dict[str, int], points: int
     if panel.whole:
         highest = max((float(np.max(s.y if s.base is None else s.y + s.base)) for s in panel.series), default=0.0)
         canvas.update_yaxes(rangemode="tozero", **({"dtick": 1 if highest < 4 else 2} if highest < 6 else {}), **place)
-    for update, names in ((canvas.update_xaxes, panel.x_names), (canvas.update_yaxes, panel.y_names)):
-        if names:
-            text = [html.escape(name).replace("\n", "<br>") for name in names]
-            update(tickvals=list(range(len(names))), ticktext=text, automargin=True, **place)
-    if panel.x_range:
-        canvas.update_xaxes(range=list(panel.x_range), **place)
+    if panel.x_names:
+        text = list(map(html.escape, panel.x_names))
+        canvas.update_xaxes(tickvals=list(range(len(text))), ticktext=text, automargin=True, **place)
     if panel.y_range:
         canvas.update_yaxes(range=list(panel.y_range), **place)
     elif panel.least_range:

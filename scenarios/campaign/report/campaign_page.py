@@ -14,8 +14,17 @@ from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import Cell, Mark
 from quadsim.report.to_matplotlib import write_pngs
 from quadsim.report.to_plotly import Plot, to_plot
-from scenarios.campaign.report import campaign_figures, campaign_tables
-from scenarios.campaign.report.campaign_tables import verdict_sentence
+from scenarios.campaign.report import campaign_figures
+from scenarios.campaign.report.campaign_tables import (
+    constraint_table,
+    driver_table,
+    event_table,
+    group_table,
+    metric_table,
+    verdict_sentence,
+    worst_draws_table,
+    worst_table,
+)
 from scenarios.campaign.report.comparison_tables import (
     comparison_markdown,
     comparison_tables,
@@ -23,6 +32,7 @@ from scenarios.campaign.report.comparison_tables import (
     pairing,
 )
 from scenarios.campaign.results.table import Summary
+from scenarios.campaign.spec import CampaignSpec
 from scenarios.campaign.statistics.comparison import Comparison
 
 _FILES: Final = {
@@ -46,14 +56,7 @@ _POINTS: Final = "Triangles at the edges are flights beyond the axes; at the foo
 
 
 def write_report(
-    directory: Path,
-    *,
-    table: pa.Table,
-    summary: Summary,
-    name: str,
-    description: str = "",
-    failure: Sequence[str] = (),
-    campaign: Path | None = None,
+    directory: Path, table: pa.Table, summary: Summary, spec: CampaignSpec, *, campaign: Path | None = None
 ) -> Path:
     """Write `index.html` and `campaign.png` into a directory that is being made; the page.
 
@@ -64,41 +67,29 @@ def write_report(
     """
     campaign = campaign or directory
     sentence = verdict_sentence(summary)
-    write_pngs([campaign_figures.overview(table, summary, f"{name}: {sentence}")], directory)
-    tables = campaign_tables
+    figure = campaign_figures.overview(table, summary, f"{spec.name}: {sentence}")
+    write_pngs([figure] if figure.panels else [], directory)
+    often = (event_table(summary, spec.failure), constraint_table(summary))
+    shapes = _plots("metrics", "Flights by verdict", campaign_figures.histograms(table), _MARGINS)
+    clouds = _plots("scatter", "Worst margin over each parameter", campaign_figures.scatters(table), _POINTS)
+    worst = (worst_table(summary, str(campaign)), worst_draws_table(summary))
     sections = [
-        Section(title="How often", tables=(tables.event_table(summary, failure), tables.constraint_table(summary))),
-        Section(
-            title="Distributions",
-            plots=_plots("metrics", "Flights by verdict", campaign_figures.histograms(table), _MARGINS),
-            folded=(tables.metric_table(summary),),
-        ),
-        Section(
-            title="What drives failure",
-            plots=(
-                *_plots("drivers", "Which parameters matter", campaign_figures.dependence(summary), columns=1),
-                *_plots("scatter", "Worst margin over each parameter", campaign_figures.scatters(table), _POINTS),
-            ),
-            tables=(tables.group_table(summary),),
-            folded=(tables.driver_table(summary),),
-        ),
-        Section(
-            title="Worst flights",
-            tables=(tables.worst_table(summary, str(campaign)), tables.worst_draws_table(summary)),
-        ),
+        Section(title="How often", tables=often),
+        Section(title="Distributions", plots=shapes, folded=(metric_table(summary),)),
+        Section(title="What drives failure", plots=clouds, tables=(driver_table(summary), group_table(summary))),
+        Section(title="Worst flights", tables=worst),
     ]
     there = [file for file in _FILES if (directory / file).is_file() or (campaign / file).is_file()]
     files = {_FILES[file]: file for file in there}
     mark = Mark.NONE if not summary["flights"] else Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
     verdict = Cell(text=sentence, mark=mark)
-    page = render_page("campaign", name, sections, description=description, verdict=verdict, files=files)
+    page = render_page("campaign", spec.name, sections, description=spec.description, verdict=verdict, files=files)
     (directory / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
 
 
-def _plots(key: str, title: str, panels: Sequence[Panel], note: str = "", *, columns: int = 2) -> tuple[Plot, ...]:
-    figure = Figure(key=key, title=title, panels=tuple(panels), columns=columns)
-    return (to_plot(figure, note=note),) if panels else ()
+def _plots(key: str, title: str, panels: Sequence[Panel], note: str) -> tuple[Plot, ...]:
+    return (to_plot(Figure(key=key, title=title, panels=tuple(panels)), note=note),) if panels else ()
 
 
 def write_comparison_report(comparison: Comparison, directory: Path, *, overwrite: bool = False) -> Path:
@@ -107,12 +98,9 @@ def write_comparison_report(comparison: Comparison, directory: Path, *, overwrit
     Raises:
         OutputError: the directory cannot be written, or holds something else.
     """
-    note = f"Above the dashed line, {comparison.names[1]} has the larger margin. Triangles are pairs beyond the axes."
-    plots = tuple(to_plot(figure, note=note) for figure in campaign_figures.paired_margins(comparison))
     sections = [
         Section(title="What is compared", text=(pairing(comparison),), tables=tuple(difference_table(comparison))),
         Section(title="Which is better", text=(comparison.sentence,), tables=tuple(comparison_tables(comparison))),
-        Section(title="Margins", plots=plots),
     ]
     title = f"{comparison.names[1]} against {comparison.names[0]}"
     files = {file: file for file in (COMPARISON_FILE, TABLE_FILE)}

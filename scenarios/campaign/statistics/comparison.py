@@ -7,14 +7,13 @@ far smaller differences than two campaigns side by side would.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError
-from quadsim.state import Array
 from scenarios.campaign.results.events import EVENT_NAMES, Flags, parse_event
 from scenarios.campaign.results.table import (
     DRAW,
@@ -89,9 +88,6 @@ class Comparison:
     differences: Differences | None  # fields in which their scenarios and draws differ; None where not known
     events: tuple[EventComparison, ...]  # failure, then every other event with a name, then each constraint not held
     metrics: tuple[MetricComparison, ...]
-    numbers: Array = field(repr=False, compare=False)  # (flights,) of the pairs
-    margins: Array = field(repr=False, compare=False)  # (flights, 2) worst margins; NaN where a flight has none
-    failed: Flags = field(repr=False, compare=False)  # (flights, 2)
 
     @property
     def verdict(self) -> str:
@@ -188,11 +184,8 @@ def compare(
         metrics=tuple(
             _compare_metric(a, b, name, completed)
             for name in COMPARED
-            if name in a.column_names and name in b.column_names
+            if {name} <= {*a.column_names} & {*b.column_names}
         ),
-        numbers=numbers(a, "flight"),
-        margins=np.stack([numbers(table, "worst_margin") for table in (a, b)], axis=1),
-        failed=np.stack([FAILURE.column(table) for table in (a, b)], axis=1),
     )
 
 

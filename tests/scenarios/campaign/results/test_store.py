@@ -6,14 +6,16 @@ import contextlib
 import errno
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from quadsim.errors import FileError, OutputError
 from quadsim.outputs import Growing, growing
-from scenarios.campaign.results.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store
-from scenarios.campaign.results.table import Row, failed_row, make_schema, read_table
+from scenarios.campaign.results.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store, read_flights
+from scenarios.campaign.results.table import Row, failed_row, make_schema, make_table, read_table
 
 SCHEMA = make_schema({"mass": (pa.float64(), "kg")}, [])
 
@@ -126,3 +128,19 @@ def test_a_part_of_another_campaign_is_refused(tmp_path: Path) -> None:
         store.append([row(0)])
     with store_in(tmp_path) as store, pytest.raises(FileError, match="has other columns than this campaign"):
         store.table()
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("flight", [3, 3], "has flights that are not numbered upwards from 0"),
+        ("flight", [-1, 3], "has flights that are not numbered upwards from 0"),
+        ("failed", ["no", "yes"], "has other columns than this campaign"),
+    ],
+)
+def test_a_table_that_others_changed_is_refused(tmp_path: Path, name: str, values: list[Any], message: str) -> None:
+    table = make_table([row(1), row(2)], SCHEMA)
+    table = table.set_column(table.column_names.index(name), name, pa.array(values))
+    pq.write_table(table, tmp_path / "t.parquet")
+    with pytest.raises(FileError, match=message):
+        read_flights(tmp_path / "t.parquet", SCHEMA)

@@ -172,9 +172,3 @@ def test_the_page_stands_with_its_files(thousand: pa.Table, better: pa.Table, tm
     (theirs / "index.html").write_text("mine")
     with pytest.raises(OutputError, match="it is not empty"):
         write_comparison_report(compare(thousand, better, NAMES), theirs)
-
-
-def test_campaigns_without_margins_have_no_plot(thousand: pa.Table, tmp_path: Path) -> None:
-    free = changed(thousand, "worst_margin", [None] * 1000).slice(0, 3)
-    page = write_comparison_report(compare(free, free, NAMES), tmp_path / "out")
-    assert 'class="plot"' not in page.read_text()
