@@ -12,8 +12,7 @@ from browser import open_page
 
 from quadsim.report.figure import Panel
 from quadsim.report.to_matplotlib import to_png
-from scenarios.campaign.report.campaign_figures import histograms, overview, scatters
-from scenarios.campaign.report.campaign_page import write_report
+from scenarios.campaign.report.campaign_page import histograms, overview, scatters, write_report
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.spec import CampaignSpec
 from scenarios.campaign.statistics.estimates import estimate
