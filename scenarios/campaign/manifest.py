@@ -24,11 +24,7 @@ MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
 SCENARIO_FILE: Final = "scenario.toml"
 FORMAT: Final = "quadsim campaign"
-_FORM: Final = {
-    **dict.fromkeys(("format", "name", "status"), str),
-    **dict.fromkeys(("flights", "flown"), int),
-    "sessions": list,
-}
+_FORM: Final = {"format": str, "name": str, "status": str, "flights": int, "flown": int, "sessions": list}
 _ROOT: Final = Path(__file__).resolve().parents[2]
 
 

@@ -38,6 +38,7 @@ class Plan:
 
     spec: CampaignSpec  # the file
     scenario: Scenario  # with the file's changes, and every number of its vehicle, in it
+    one_seed: bool = False  # whether all flights have the scenario's own
 
     @cached_property
     def draws(self) -> Draws:
@@ -84,7 +85,7 @@ class Plan:
         values = self.draws.values(flight)
         changes = [(entry, values[entry.name]) for entry in self.spec.vary]
         name = f"{self.spec.name[:70]}-{flight}"
-        return self._varied(changes, name=name, seed=self.draws.seed(flight))
+        return self._varied(changes, name=name, seed=self.scenario.seed if self.one_seed else self.draws.seed(flight))
 
     def identity(self, flight: int) -> Row:
         """The columns that identify a flight."""

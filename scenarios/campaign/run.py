@@ -97,6 +97,7 @@ def fly_campaign(
     session = {"engine": engine, "workers": count_workers(workers, cluster), "flights": 0, "wall_s": None}
     if records.is_campaign(directory) and not (resume or overwrite):
         raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
+    records.code_digest()  # kept: a process that dies before its manifest is there could not be resumed
     with growing(directory, records.MANIFEST_FILE, overwrite=overwrite) as files:
         if records.is_campaign(directory):
             records.require_same(plan, directory)

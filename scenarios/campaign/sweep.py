@@ -21,26 +21,11 @@ from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario
 
 
-class SweepPlan(Plan):
-    """A plan whose flights differ in what is swept alone: each has the scenario's own seed."""
-
-    def of(self, flight: int) -> Scenario:
-        """The scenario of one flight; see `Plan.of`."""
-        values = self.draws.values(flight)
-        changes = [(entry, values[entry.name]) for entry in self.spec.vary]
-        return self._varied(changes, name=f"{self.scenario.name[:70]}-{flight}", seed=self.scenario.seed)
-
-
 @dataclass(frozen=True)
 class Sweep:
-    """The flights of a sweep, a row each.
+    """The flights of a sweep, a row each, with the units in the columns' metadata."""
 
-    Attributes:
-        table: what was swept, by dotted path; verdict; tracking errors; commands; margins of each constraint; step
-            times.  Units are in the columns' metadata.
-    """
-
-    table: pa.Table
+    table: pa.Table  # what was swept, by dotted path; verdict; tracking errors; commands; margins; step times
 
     def __getitem__(self, column: str) -> np.ndarray[Any, Any]:
         """(flights,) of a column by its name.
@@ -87,7 +72,8 @@ def fly_sweep(
     ]
     count = math.prod(map(len, lists))
     data = {"name": scenario.name, "scenario": scenario.name, "flights": count, "vary": entries}
-    plan = SweepPlan(parse_campaign(data, source="sweep"), resolve_vehicle(scenario, build_vehicle(scenario)))
+    spec = parse_campaign(data, source="sweep")
+    plan = Plan(spec, resolve_vehicle(scenario, build_vehicle(scenario)), one_seed=True)
     plan.check()
     progress("sweep", 0, count)
     rows = []

@@ -115,16 +115,13 @@ def _constraint(table: pa.Table, name: str) -> dict[str, Any]:
     held = flags(table, SATISFIED + name, absent=False)
     unknown = [value is None for value in table[SATISFIED + name].to_pylist()]
     reached = ~(np.array(unknown, bool) & np.isin(texts(table, "verdict").astype(str), (INCOMPLETE, "violated")))
-    found: dict[str, Any] = {
+    worst = int(np.nanargmin(margin)) if np.isfinite(margin).any() else None
+    return {
         "unit": unit_of(table, MARGIN + name),
         "not_satisfied": share_of(~held[reached]),
-        "worst_margin": None,
-        "worst_flight": None,
+        "worst_margin": None if worst is None else float(margin[worst]),
+        "worst_flight": None if worst is None else table["flight"][worst].as_py(),
     }
-    if np.isfinite(margin).any():
-        row = int(np.nanargmin(margin))
-        found |= {"worst_margin": float(margin[row]), "worst_flight": table["flight"][row].as_py()}
-    return found
 
 
 def _flight(table: pa.Table, row: int) -> dict[str, Any]:

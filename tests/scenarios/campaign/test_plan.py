@@ -145,20 +145,18 @@ def test_the_nominal_campaign_is_of_small_errors_at_the_papers_own_tolerance() -
 # --- what is refused -----------------------------------------------------------------------------------------------
 
 
-def test_a_missing_or_unknown_campaign_is_named(tmp_path: Path) -> None:
+def test_what_cannot_be_is_refused(tmp_path: Path) -> None:
+    path = str(write(tmp_path, BASE))
+    for setting, rule in (
+        ("effects.load.mass_factor=1.2", "mass draws effects.load.mass_factor"),
+        ("seed=7", "--seed"),
+    ):
+        with pytest.raises(InputError, match=rule):
+            load_plan(path, [setting])
     with pytest.raises(FileError, match="no such campaign file"):
         load_plan(str(tmp_path / "gone.toml"))
     with pytest.raises(UnknownNameError, match="no campaign named 'paper-robustnes'; did you mean 'paper-robustness'"):
         campaign_path("paper-robustnes")
-
-
-@pytest.mark.parametrize(
-    ("setting", "rule"),
-    [("effects.load.mass_factor=1.2", "mass draws effects.load.mass_factor"), ("seed=7", "give --seed")],
-)
-def test_a_setting_that_flights_have_each_of_their_own_is_refused(tmp_path: Path, setting: str, rule: str) -> None:
-    with pytest.raises(InputError, match=rule):
-        load_plan(str(write(tmp_path, BASE)), [setting])
 
 
 def test_a_base_in_another_folder_brings_its_scenario(tmp_path: Path) -> None:

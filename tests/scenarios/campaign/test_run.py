@@ -267,20 +267,6 @@ def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
 # --- what is refused -----------------------------------------------------------------------------------------------
 
 
-def test_a_campaign_is_not_overwritten_without_a_request(plan: Plan, flown: Path) -> None:
-    with pytest.raises(OutputError, match="a campaign is already there; continue it with --resume"):
-        fly_campaign(plan, flown, Alone())
-
-
-def test_a_directory_of_something_else_is_left_alone(plan: Plan, tmp_path: Path) -> None:
-    (tmp_path / "c").mkdir()
-    (tmp_path / "c" / "thesis.tex").write_text("years of work")
-    for resume in (False, True):
-        with pytest.raises(OutputError, match="it is not empty"):
-            fly_campaign(plan, tmp_path / "c", Alone(), resume=resume)
-    assert [path.name for path in (tmp_path / "c").iterdir()] == ["thesis.tex"]
-
-
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
@@ -296,6 +282,8 @@ def test_another_campaign_does_not_go_on_with_it(
 ) -> None:
     with pytest.raises(InputError, match=rf"its {named} differs from the one there"):
         fly_campaign(make_plan(tmp_path, **changes), flown, Alone(), resume=True)
+    with pytest.raises(OutputError, match="a campaign is already there; continue it with --resume"):
+        fly_campaign(make_plan(tmp_path, **changes), flown, Alone())
 
 
 def test_a_latin_hypercube_does_not_grow(tmp_path: Path) -> None:

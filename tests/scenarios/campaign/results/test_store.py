@@ -38,17 +38,11 @@ def flights(store: Store) -> list[int]:
 def test_rows_come_back_sorted_from_whatever_parts(tmp_path: Path) -> None:
     with store_in(tmp_path) as store:
         store.append([row(3), row(1)])
-        store.append([row(2)])
+        store.append([row(2), row(3)])
         store.append([])
     with store_in(tmp_path) as store:
-        assert flights(store) == [1, 2, 3]
-
-
-def test_a_row_that_is_there_twice_counts_once(tmp_path: Path) -> None:
-    with store_in(tmp_path) as store:
-        store.append([row(1), row(2)])
-        store.append([row(2), row(3)])
-        assert flights(store) == [1, 2, 3]
+        assert flights(store) == [1, 2, 3], "one that is there twice counts once"
+        assert store.close(flights=3)["flight"].to_pylist() == [1, 2], "those beyond the first three do not"
 
 
 def test_the_end_is_the_same_however_it_was_appended(tmp_path: Path) -> None:
@@ -71,12 +65,6 @@ def test_more_may_follow_on_what_was_closed(tmp_path: Path) -> None:
         assert flights(store) == [0, 1, 2]
         store.close(flights=3)
     assert read_table(tmp_path / TIMES_FILE)["wall_s"].to_pylist() == [1.0, 1.0, 1.0]
-
-
-def test_flights_beyond_those_that_count_are_left_out(tmp_path: Path) -> None:
-    with store_in(tmp_path) as store:
-        store.append([row(flight) for flight in range(5)])
-        assert store.close(flights=3)["flight"].to_pylist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize("dies_before", [TIMES_FILE, FLIGHTS_FILE, "parts go"])
