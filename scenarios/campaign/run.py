@@ -57,7 +57,6 @@ class Result:
     manifest: dict[str, Any]  # what was flown, with what
     table: pa.Table  # `flights.parquet`
     summary: dict[str, Any]  # `summary.json`
-    failure: tuple[str, ...]  # the events of which any one makes a flight fail
     judgements: tuple[Judgement, ...] = ()  # of the requirements that were stated
 
     def to_pandas(self) -> Any:
@@ -127,7 +126,7 @@ def fly_campaign(
         manifest["status"] = "complete" if progress.wanted == spec.flights else "stopped"
         records.write(manifest, files)
         files.finish(summary)
-    return Result(directory=directory, manifest=manifest, table=table, summary=summary, failure=tuple(spec.failure))
+    return Result(directory=directory, manifest=manifest, table=table, summary=summary)
 
 
 class _Progress:

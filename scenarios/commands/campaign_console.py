@@ -73,7 +73,7 @@ def print_campaign(result: Result, where: str) -> None:
     out.print(styled((summary["campaign"], "bold"), f": {verdict_sentence(summary)}"), soft_wrap=True)
     if summary["parameters"]:
         out.print(driver_sentence(summary), soft_wrap=True)
-    tables = [event_table(summary, result.failure), constraint_table(summary), worst_table(summary, where)]
+    tables = [event_table(summary), constraint_table(summary), worst_table(summary, where)]
     console.print_grids([_brief(grid) for grid in tables if grid.lines], None, prose=("constraint", "reason"))
     if summary["worst"]:
         command = replay_command(where, summary["worst"][0]["flight"])

@@ -14,6 +14,7 @@ from scenarios.campaign.statistics.inference import ALPHA
 from scenarios.campaign.statistics.wording import count_of, interval, label, p_value, percent
 
 _MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN}
+_ENDS: Final = ("lower", "upper")
 _ALWAYS: Final = ("failure", "violation", "lost")  # events that are listed even where they never happened
 
 
@@ -50,10 +51,7 @@ def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
         title="How often",
         head=("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}"),
         lines=tuple(
-            line(
-                *(name, str(found["count"]), *_shares(found)),
-                *(percent(found["lower_one_sided"]), percent(found["upper_one_sided"])),
-            )
+            line(name, str(found["count"]), *_shares(found), *(percent(found[f"{end}_one_sided"]) for end in _ENDS))
             for name, found in summary["events"].items()
             if found["count"] or name in _ALWAYS
         ),
@@ -68,12 +66,11 @@ def constraint_table(summary: Summary) -> Grid:
     """How often each constraint did not hold, and by how much at worst."""
     lines = []
     for name, found in summary["constraints"].items():
-        failed = found["not_satisfied"]
-        mark = Mark.BAD if failed["count"] else Mark.NONE
-        margin = ABSENT if found["worst_margin"] is None else f"{format_number(found['worst_margin'])} {found['unit']}"
-        flight = ABSENT if found["worst_flight"] is None else str(found["worst_flight"])
-        count = Cell(text=str(failed["count"]), mark=mark)
-        lines.append(line(name, count, *_shares(failed), margin, flight))
+        failed, worst = found["not_satisfied"], (ABSENT, ABSENT)
+        if found["worst_margin"] is not None:
+            worst = f"{format_number(found['worst_margin'])} {found['unit']}", str(found["worst_flight"])
+        count = Cell(text=str(failed["count"]), mark=Mark.BAD if failed["count"] else Mark.NONE)
+        lines.append(line(name, count, *_shares(failed), *worst))
     return Grid(
         key="constraints",
         title="Constraints",
