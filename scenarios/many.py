@@ -34,17 +34,12 @@ Fly = Callable[[Any], Row]
 ERROR, TIMEOUT, MEMORY, DIED = "error", "timeout", "memory", "died"
 """Verdicts of flights that gave no row: it raised, took too long or too much memory, or its process died."""
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_PRELOAD: Final = (
-    *("scenarios.many", "scenarios.campaign.pilot"),
-    *("mpc.constrained", "mpc.robust.controller", "mpc.unconstrained"),
-)
+_PRELOAD: Final = ("scenarios.campaign.pilot", "mpc.constrained", "mpc.robust.controller", "mpc.unconstrained")
 """Loaded once, by the server that workers are forked from."""
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
-_DECIDE_NUMBERS: Final = ("mujoco", "numpy", "scipy", "piqp")
-_START_S: Final = 60.0  # at most, for a worker to start; no part of a flight's time
+_START_S: Final = 60.0  # at most, for a worker, or the first one of a cluster, to start; no part of a flight's time
 _CONNECT_S: Final = 10.0
-_PATIENCE_S: Final = 60.0  # for the first worker of a cluster
 
 
 class ClusterError(QuadsimError):
@@ -80,45 +75,13 @@ def fly_many(
         ClusterError: the scheduler does not answer, or its workers cannot fly.
     """
     _require(workers, cluster)
-    pickled = pickle.dumps(fly)
     if cluster is not None:
-        return _on_cluster(cluster, flights, pickled, timeout, memory)
-    return _here(flights, pickled, workers or usable_cores(), timeout, memory, isolate)
-
-
-def answers(
-    function: Callable[[Any], Any],
-    questions: Sequence[Any],
-    *,
-    workers: int | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Any]:
-    """What a function of a module answers to each question, in their order, by processes.
-
-    Raises:
-        ParameterError: no worker is wanted.
-        QuadsimError: one has no answer.
-    """
-    found: dict[int, Any] = {}
-    with closing(fly_many(questions, functools.partial(_answer, function), workers=workers)) as rows:
-        for place, row in rows:
-            if "answer" not in row:
-                raise QuadsimError(f"{questions[place]}: {row['verdict']} ({row['reason']})")
-            found[place] = row["answer"]
-            progress(len(found), len(questions))
-    return [found[place] for place in range(len(questions))]
-
-
-def _answer(function: Callable[[Any], Any], question: Any) -> Row:
-    return {"answer": function(question)}
+        return _on_cluster(cluster, flights, pickle.dumps(fly), timeout, memory)
+    return _here(flights, pickle.dumps(fly), workers or usable_cores(), timeout, memory, isolate)
 
 
 def count_workers(workers: int | None, cluster: str | None) -> int:
-    """How many flights `fly_many` flies at the same time; what it refuses is refused here.
-
-    Raises:
-        See `fly_many`.
-    """
+    """How many flights `fly_many` flies at the same time; what it refuses is refused here."""
     _require(workers, cluster)
     if cluster is None:
         return workers or usable_cores()
@@ -151,7 +114,8 @@ def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory
                 workers.append(_Worker(fly, timeout, memory))
                 workers[-1].hand(*flight)
                 flight = next(todo, None)
-            ready, rows = _wait(workers), []
+            left, rows = min(worker.deadline for worker in workers) - clock.monotonic(), []
+            ready = connection.wait([end for each in workers for end in each.ends], max(left, 0.0))
             for worker in workers[:]:
                 if (row := worker.row(ready)) is None:
                     continue
@@ -168,12 +132,6 @@ def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory
             worker.end()
 
 
-def _wait(workers: Sequence[_Worker]) -> Sequence[object]:
-    """What has something to say, or has ended, before the next deadline."""
-    left = min(worker.deadline for worker in workers) - clock.monotonic()
-    return connection.wait([end for each in workers for end in (each.pipe, each.process.sentinel)], max(left, 0.0))
-
-
 class _Worker:
     """A process that flies one flight at a time."""
 
@@ -187,6 +145,7 @@ class _Worker:
         self.process = context.Process(target=_serve, args=(theirs, fly, memory), daemon=True)
         with closing(theirs), _starting():
             self.process.start()
+        self.ends = (self.pipe, self.process.sentinel)  # either is ready when there is something to know
 
     def hand(self, place: int, flight: Any) -> None:
         self.place, self.deadline = place, clock.monotonic() + self._timeout + self._start_s
@@ -248,10 +207,11 @@ def _serve(pipe: connection.Connection, fly: bytes, memory: float) -> None:
     _die_with_caller()
     os.dup2(2, 1)  # what controllers print is no part of the caller's output
     _limit_memory(memory)
+    load = functools.cache(pickle.loads)
     with suppress(EOFError, OSError):
         pipe.send(None)
         while True:
-            pipe.send_bytes(_row(lambda flight: _loaded(fly)(flight), pipe.recv(), memory))
+            pipe.send_bytes(_row(lambda flight: load(fly)(flight), pipe.recv(), memory))
             gc.collect()  # a flight may leave a dozen megabytes in cycles
 
 
@@ -274,12 +234,6 @@ def _row(fly: Fly, flight: Any, memory: float) -> bytes:
         return pickle.dumps({"verdict": MEMORY, "reason": f"{describe(error)} (it may take {memory:g} MB)"})
     except BaseException as error:  # a user's controller may exit, too
         return pickle.dumps({"verdict": ERROR, "reason": describe(error)})
-
-
-@functools.lru_cache(maxsize=1)
-def _loaded(fly: bytes) -> Fly:
-    loaded: Fly = pickle.loads(fly)
-    return loaded
 
 
 def _limit_memory(megabytes: float) -> None:
@@ -335,6 +289,14 @@ def _beside(fly: bytes, flight: Any, timeout: float, memory: float, code: Mappin
         return next(rows)[1]
 
 
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ModuleNotFoundError as error:
+        raise MissingPackageError("a cluster", "distributed", extra="cluster") from error
+    return distributed
+
+
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
     """A client of a scheduler that has a worker."""
@@ -345,7 +307,7 @@ def _client(address: str) -> Iterator[Any]:
         raise ClusterError(f"the scheduler at {address} does not answer ({describe(error)})") from error
     with client:
         try:
-            client.wait_for_workers(1, timeout=_PATIENCE_S)
+            client.wait_for_workers(1, timeout=_START_S)
         except TimeoutError as error:
             raise ClusterError(f"the scheduler at {address} has no worker; start one: dask worker {address}") from error
         yield client
@@ -360,12 +322,4 @@ def _code() -> dict[str, str]:
     """Versions of the packages that decide a flight's numbers, our own by the digest of its code."""
     from scenarios.campaign.manifest import code_digest
 
-    return {**{name: versions()[name] for name in _DECIDE_NUMBERS}, "quadsim": code_digest()[:19]}
-
-
-def _distributed() -> Any:
-    try:
-        import distributed
-    except ModuleNotFoundError as error:
-        raise MissingPackageError("a cluster", "distributed", extra="cluster") from error
-    return distributed
+    return {name: versions()[name] for name in ("mujoco", "numpy", "scipy", "piqp")} | {"quadsim": code_digest()[:19]}

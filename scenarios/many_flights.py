@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -94,7 +95,7 @@ def campaign(
         seed: of all draws, instead of the file's.
         changes: of a file: texts `dotted.path=value` that change fields of its scenario.
         controller: of a scenario, as of `sweep`.
-        forces: of a scenario: what acts on it, as of `sweep`.
+        forces: of a scenario, as of `sweep`.
         require: requirements as texts, e.g. `P(failure) < 0.02`, that `judgements` judges.
         workers: processes that fly; one per usable core where absent.
         cluster: the address of a Dask scheduler whose workers fly instead, as of `--cluster`.
@@ -126,10 +127,7 @@ def campaign(
     from scenarios.campaign.results.events import parse_event
     from scenarios.campaign.run import fly_campaign
     from scenarios.campaign.statistics.requirement import judge, parse_requirement
-    from scenarios.commands.campaign_console import progress as bar
 
-    if resume and overwrite:
-        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
     requirements = [parse_requirement(text) for text in require]
     if isinstance(campaign, Scenario):
         requested = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **fields}
@@ -142,21 +140,9 @@ def campaign(
     for requirement in requirements:
         parse_event(requirement.event.text, plan.columns)
     target = absolute(Path("runs") / "campaigns" / plan.spec.name if out is None else out)
-    try:
-        with bar(enabled=bool(progress), lines=progress == "lines") as watch:
-            result = fly_campaign(
-                plan,
-                target,
-                workers=workers,
-                cluster=cluster,
-                resume=resume,
-                overwrite=overwrite,
-                until_width=until_width,
-                report=report,
-                watch=watch,
-            )
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"{target} has what was flown") from None
+    options: dict[str, Any] = {"workers": workers, "cluster": cluster, "report": report, "until_width": until_width}
+    with _watching(target, progress, resume=resume, overwrite=overwrite) as shared:
+        result = fly_campaign(plan, target, **options, **shared)
     return replace(result, judgements=tuple(judge(result.table, requirement) for requirement in requirements))
 
 
@@ -175,17 +161,8 @@ def tune(
 ) -> TuningResult:
     """Search fields of a scenario, and hold the answer against the start on fresh draws.
 
-    Args:
-        tuning: one that ships, or a tuning file.
-        out: its directory, `runs/tunings/NAME` where absent.
-        trials: candidates, instead of the file's.
-        seed: of the search and its draws, instead of the file's.
-        workers: processes that fly; one per usable core where absent.
-        cluster: the address of a Dask scheduler whose workers fly instead, as of `--cluster`.
-        resume: whether to continue what the directory holds.
-        overwrite: whether to replace an earlier output there.
-        report: whether to write the pages and their figures.
-        progress: whether to show a bar on a terminal; "lines" for a line now and then where stderr is none.
+    The tuning is one that ships, or a file; `trials` (candidates) and `seed` (of the search and its draws) replace the
+    file's.  Its directory is `runs/tunings/NAME` where `out` is absent.  All other options are those of `campaign`.
 
     Returns:
         `best` (the scenario that was found), `summary` (the search and the fresh flights),
@@ -222,28 +199,29 @@ def tune(
         >>> len(found.summary["candidates"]), found.holds
         (3, True)
     """
-    from scenarios.commands.campaign_console import progress as bar
     from scenarios.tuning.plan import load_tuning
     from scenarios.tuning.run import tune as carry_out
     from scenarios.tuning.search import require_optuna
 
-    if resume and overwrite:
-        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
     require_optuna()
     plan = load_tuning(str(tuning), trials=trials, seed=seed)
     target = absolute(Path("runs") / "tunings" / plan.spec.name if out is None else out)
+    with _watching(target, progress, resume=resume, overwrite=overwrite) as shared:
+        return carry_out(plan, target, workers=workers, cluster=cluster, report=report, **shared)
+
+
+@contextmanager
+def _watching(
+    target: Path, progress: bool | Literal["lines"], *, resume: bool, overwrite: bool
+) -> Iterator[dict[str, Any]]:
+    """The options that say whether to go on in a directory, and that show a bar; Ctrl-C says what is there."""
+    from scenarios.commands.campaign_console import progress as bar
+
+    if resume and overwrite:
+        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
     try:
         with bar(enabled=bool(progress), lines=progress == "lines") as watch:
-            return carry_out(
-                plan,
-                target,
-                workers=workers,
-                cluster=cluster,
-                resume=resume,
-                overwrite=overwrite,
-                report=report,
-                watch=watch,
-            )
+            yield {"resume": resume, "overwrite": overwrite, "watch": watch}
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{target} has what was flown") from None
 
@@ -261,15 +239,8 @@ def replay(
 ) -> Replay:
     """Fly one flight of a finished campaign again, with everything that a run directory has.
 
-    Args:
-        campaign: its directory.
-        flight: which; the worst where absent.
-        out: the run directory; `runs/CAMPAIGN-N`, or the next free name, where absent.
-        overwrite: whether to replace an earlier output there.
-        video: as of `fly`.
-        recording: as of `fly`.
-        figures: as of `fly`.
-        progress: as of `fly`.
+    `campaign` is its directory, and `flight` the worst where absent.  The run directory is `runs/CAMPAIGN-N`, or the
+    next free name, where `out` is absent.  All other options are those of `fly`.
 
     Returns:
         The flight, and the columns of the campaign's table that it does not agree with, bit for bit.

@@ -79,12 +79,9 @@ class Panel:
     areas: tuple[Area, ...] = ()
     x_label: str = ""
     y_label: str = ""
-    x_log: bool = False
     y_log: bool = False
-    x_range: tuple[float, float] | None = None  # ends of the axis; None fits it to what is drawn
-    y_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None  # ends of the axis; None fits it to what is drawn
     x_names: tuple[str, ...] = ()  # names of 0, 1, ... on the axis, in place of numbers
-    y_names: tuple[str, ...] = ()
     equal: bool = False  # whether both axes have one scale
     whole: bool = False  # whether y counts things
     legend: bool = False  # whether the labels are explained in the panel, not in the legend of all panels

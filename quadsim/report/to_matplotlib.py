@@ -45,7 +45,7 @@ _WIDTH, _ROW, _HEAD = 9.6, 1.95, 0.7  # of a figure, of a row of panels and of w
 _LABEL: Final = 26  # characters beside a vertical axis
 _DASHES: Final = (0, (5, 2))
 _MARKERS: Final = {
-    **{"circle": "o", "diamond": "D", "diamond-open": "D", "circle-open": "o", "square": "s", "x": "x", "cross": "P"},
+    **{"circle": "o", "diamond": "D", "square": "s", "x": "x", "cross": "P"},
     **{"pentagon": "p", "triangle-up": "^", "triangle-down": "v", "triangle-left": "<", "triangle-right": ">"},
 }
 
@@ -104,8 +104,8 @@ def _draw(figure: Figure, *, interactive: bool) -> Canvas:
     for axes, panel in zip(grid.flat, figure.panels, strict=False):
         entries = _draw_panel(axes, panel)
         if panel.legend and entries:
-            beside = {} if _is_headed(panel) else {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
-            axes.legend(entries.values(), entries, loc="lower right", ncols=1 if _is_headed(panel) else 4,
+            beside = {} if panel.y_label else {"bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.1}
+            axes.legend(entries.values(), entries, loc="lower right", ncols=1 if panel.y_label else 4,
                         fontsize=8.0, columnspacing=1.0, handletextpad=0.4, **beside)  # fmt: skip
         else:
             shown |= entries
@@ -114,8 +114,7 @@ def _draw(figure: Figure, *, interactive: bool) -> Canvas:
     for axes in grid.flat[len(figure.panels) :]:
         axes.set_axis_off()
     _share_time(timed, figure)
-    if not any(panel.y_names for panel in figure.panels):
-        canvas.align_ylabels()
+    canvas.align_ylabels()
     if figure.title:
         canvas.suptitle(figure.title, x=0.01, ha="left", fontsize=11.0, fontweight="bold")
     if shown:
@@ -136,14 +135,9 @@ def _share_time(panels: list[Axes], figure: Figure) -> None:
         panels[0].set_xlim(-0.008 * figure.end, figure.end or 1.0)
 
 
-def _is_headed(panel: Panel) -> bool:
-    """Whether its title stands above the panel, not beside its vertical axis."""
-    return bool(panel.y_label or panel.y_names)
-
-
 def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
     """Draw a panel; the legend's entries."""
-    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+    from matplotlib.ticker import MaxNLocator
 
     shown: dict[str, Artist] = {}
     for area in panel.areas:
@@ -156,11 +150,6 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
         shown.setdefault(series.label, _draw_series(axes, series))
     for bound in panel.bounds:
         shown["bound"] = _draw_bound(axes, bound)
-    if panel.x_log:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter(NullFormatter())
     if panel.y_log:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
@@ -169,19 +158,13 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
         axes.set_ylim(bottom=0.0, top=max(1.0, axes.get_ylim()[1]))
     if panel.x_names:
         axes.set_xticks(range(len(panel.x_names)), panel.x_names)
-    if panel.y_names:
-        axes.set_yticks(range(len(panel.y_names)), panel.y_names)
     if panel.equal:
         axes.set_aspect("equal", adjustable="datalim")
-    if panel.x_range:
-        axes.set_xlim(*panel.x_range)
     if ends := panel.y_range or panel.least_range:
         axes.set_ylim(*ends)
-    if _is_headed(panel):
+    if panel.y_label:
         axes.set_title(panel.heading)
-    axes.set(
-        xlabel=panel.x_label, ylabel=panel.y_label or ("" if panel.y_names else textwrap.fill(panel.heading, _LABEL))
-    )
+    axes.set(xlabel=panel.x_label, ylabel=panel.y_label or textwrap.fill(panel.heading, _LABEL))
     shown.pop("", None)
     return shown
 
@@ -195,8 +178,7 @@ def _draw_series(axes: Axes, series: Series) -> Artist:
         return bars
     if series.style == "points":
         looks |= {"marker": _MARKERS[series.marker], "markersize": series.width, "linestyle": "none"}
-        looks["markeredgewidth"] = 0.9 if series.marker == "x" or series.marker.endswith("-open") else 0.0
-        looks |= {"markerfacecolor": "none"} if series.marker.endswith("-open") else {}
+        looks["markeredgewidth"] = 0.9 if series.marker == "x" else 0.0
     else:
         looks |= {"linewidth": series.width, "linestyle": _DASHES if series.dashed else "-"}
         looks |= {"drawstyle": "steps-post"} if series.style == "steps" else {}

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 _ROW, _TOP, _BOTTOM = 210, 34, 46  # of a row of panels, and above and below them all [px]
 _GAP, _LABELLED_GAP = 56, 76  # between rows of panels, and where each has a label [px]
 _SCENE: Final = 560  # [px]
-_LOG_TICKS: Final = [float(digit * 10**power) for power in range(7) for digit in (1, 2, 5)]
 _MOST_POINTS: Final = 3000
 _POINTS_OF_ALL_RUNS: Final = 12_000
 """Points that one quantity may have over all runs: keeps a page of two runs near 6 MB, and of ten below 8 MB."""
@@ -163,20 +162,14 @@ def _draw_panel(canvas: Canvas, panel: Panel, place: dict[str, int], points: int
         canvas.update_xaxes(title={"text": html.escape(panel.x_label), "standoff": 6}, **place)
     if panel.y_label:
         canvas.update_yaxes(title={"text": html.escape(panel.y_label)}, **place)
-    if panel.x_log:
-        canvas.update_xaxes(type="log", tickvals=_LOG_TICKS, tickformat="~g", **place)
     if panel.y_log:
         canvas.update_yaxes(type="log", dtick=1, **place)
     if panel.whole:
         highest = max((float(np.max(s.y if s.base is None else s.y + s.base)) for s in panel.series), default=0.0)
         canvas.update_yaxes(rangemode="tozero", **({"dtick": 1 if highest < 4 else 2} if highest < 6 else {}), **place)
-    for update, names in ((canvas.update_xaxes, panel.x_names), (canvas.update_yaxes, panel.y_names)):
-        if names:
-            text = [html.escape(name).replace("\n", "<br>") for name in names]
-            update(tickvals=list(range(len(names))), ticktext=text, automargin=True, **place)
-    if panel.x_range:
-        ends = np.log10(panel.x_range) if panel.x_log else panel.x_range
-        canvas.update_xaxes(range=[float(value) for value in ends], **place)
+    if panel.x_names:
+        text = list(map(html.escape, panel.x_names))
+        canvas.update_xaxes(tickvals=list(range(len(text))), ticktext=text, automargin=True, **place)
     if panel.y_range:
         canvas.update_yaxes(range=list(panel.y_range), **place)
     elif panel.least_range:

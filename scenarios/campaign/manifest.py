@@ -17,31 +17,25 @@ from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
 from scenarios.campaign.spec import CampaignSpec
 from scenarios.machine import machine, versions
-from scenarios.parts.controllers import make_controller
 from scenarios.parts.plugin import import_plugin
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.plugin import ForceSpec, PluginSpec
-from scenarios.schema.scenario import Scenario
 
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
 SCENARIO_FILE: Final = "scenario.toml"
 FORMAT: Final = "quadsim campaign"
-_FORM: Final = {
-    **dict.fromkeys(("format", "name", "status"), str),
-    **dict.fromkeys(("flights", "flown"), int),
-    "sessions": list,
-}
+_FORM: Final = {"format": str, "name": str, "status": str, "flights": int, "flown": int, "sessions": list}
 _ROOT: Final = Path(__file__).resolve().parents[2]
 
 
-def begin(plan: Plan, files: Growing) -> dict[str, Any]:
-    """Write the files that define a campaign, its manifest last, and return that.
+def start(plan: Plan, files: Growing, session: Mapping[str, Any], *, flying: bool) -> dict[str, Any]:
+    """The manifest of a campaign that begins, or is resumed, with the files that define it, itself the last of them.
 
     Raises:
-        OutputError: they cannot be written, or files of these names that we did not write are there.
+        FileError: it is damaged.
+        InputError: something has to be flown, and other code would fly it.
+        OutputError: they cannot be written.
     """
-    files.write(_texts(plan))
     manifest: dict[str, Any] = {
         "format": FORMAT,
         "name": plan.spec.name,
@@ -53,40 +47,25 @@ def begin(plan: Plan, files: Growing) -> dict[str, Any]:
         **flown_by(plan),
         "sessions": [],
     }
-    write(manifest, files)
-    return manifest
-
-
-def go_on(plan: Plan, files: Growing, *, flying: bool) -> dict[str, Any]:
-    """The manifest of a campaign that is resumed, perhaps with more flights; see `require_same`.
-
-    Raises:
-        FileError: there is none, or it is damaged.
-        InputError: something has to be flown, and other code would fly it.
-        OutputError: it cannot be written.
-    """
-    manifest = read_manifest(files.path)
-    if flying:
-        differing = [name for name in other_than_flew(manifest, plan) if name != "machine"]
-        if differing:
+    if is_campaign(files.path):
+        known = read_manifest(files.path)
+        differing = [name for name in other_than_flew(known, plan) if name != "machine"]
+        if flying and differing:
             raise InputError(
-                f"{files.path}: --resume needs the same code, and this one differs from what flew the "
-                f"first flights ({', '.join(differing)}): half of the numbers would be another program's; choose "
-                "another --out"
+                f"{files.path}: --resume needs the same code, and this one differs from what flew the first flights "
+                f"({', '.join(differing)}): half of the numbers would be another program's; choose another --out"
             )
-    manifest |= {"status": "running", "flights": plan.spec.flights}
-    files.remove([SUMMARY_FILE])  # which is there, with the hashes of all others, while nothing is being flown
-    files.write(_texts(plan))
+        manifest = {**known, "status": "running", "flights": plan.spec.flights}
+        files.remove([SUMMARY_FILE])  # which is there, with the hashes of all others, while nothing is being flown
+    manifest["sessions"].append(session)
+    own = {CAMPAIGN_FILE: _own(plan).to_toml(), SCENARIO_FILE: plan.scenario.to_toml()}  # files that need no others
+    files.write({name: text.encode() for name, text in own.items()})
     write(manifest, files)
     return manifest
 
 
 def write(manifest: Mapping[str, Any], files: Growing) -> None:
-    """Write or replace the manifest in one step.
-
-    Raises:
-        OutputError: it cannot be written, or is not as we wrote it.
-    """
+    """Write or replace the manifest in one step."""
     files.write({MANIFEST_FILE: to_json(manifest).encode()})
 
 
@@ -113,18 +92,16 @@ def require_same(plan: Plan, directory: Path) -> None:
 
 
 def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
-    """Of `code`, `controller`, `forces`, `versions` and `machine`, those that are not as when a campaign was begun.
-
-    Imports a plug-in controller.
-    """
+    """Of what `flown_by` states, that which is not as when a campaign was begun."""
     return [name for name, value in flown_by(plan).items() if manifest.get(name) != value]
 
 
 def flown_by(plan: Plan) -> dict[str, Any]:
-    """What numbers come from besides the campaign's own files."""
+    """What numbers come from besides the campaign's own files; imports code of the user."""
+    controller = plan.scenario.controller
     return {
         "code": code_digest(),
-        "controller": controller_digest(plan.scenario),
+        "controller": _user_code(controller) if isinstance(controller, PluginSpec) else None,
         "forces": [_user_code(force) for force in plan.scenario.forces] or None,
         "versions": versions(),
         "machine": machine(),
@@ -135,18 +112,6 @@ def flown_by(plan: Plan) -> dict[str, Any]:
 def code_digest() -> str:
     """SHA-256 of everything of ours that numbers come from: code, models, scenarios."""
     return _digest([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
-
-
-def controller_digest(scenario: Scenario) -> str | None:
-    """SHA-256 of the code of a plug-in controller: its module, or the whole package that it is in.
-
-    Raises:
-        InputError: the controller cannot be made.
-    """
-    if not isinstance(scenario.controller, PluginSpec):
-        return None
-    make_controller(scenario.controller, build_vehicle(scenario), scenario.control_period)
-    return _user_code(scenario.controller)
 
 
 def _user_code(spec: PluginSpec | ForceSpec) -> str | None:
@@ -200,29 +165,13 @@ def stored_plan(directory: Path) -> Plan:
         FileError: it is none, or a file is missing or not the one that was flown.
     """
     read_manifest(directory)
-    known = _listed(directory)
-    for name in (CAMPAIGN_FILE, SCENARIO_FILE, *known):
+    path = directory / SUMMARY_FILE  # of a finished campaign
+    listed = read_json(path, {}, "a campaign's summary").get("files", {}) if path.exists() else {}
+    for name in (CAMPAIGN_FILE, SCENARIO_FILE, *(name for name in (FLIGHTS_FILE, TIMES_FILE) if name in listed)):
         path = directory / name
-        if not path.is_file() or (name in known and digest_of(path) != known[name]):
+        if not path.is_file() or (name in listed and digest_of(path) != listed[name]):
             raise FileError(path, "is missing or not the file that was written")
     return load_plan(str(directory / CAMPAIGN_FILE))
-
-
-def _listed(directory: Path) -> dict[str, str]:
-    """The digests of what a finished campaign was and found; none of one that is being flown.
-
-    Raises:
-        FileError: its summary is damaged.
-    """
-    path = directory / SUMMARY_FILE
-    summary = read_json(path, {}, "a campaign's summary") if path.exists() else {}
-    ours = (CAMPAIGN_FILE, SCENARIO_FILE, FLIGHTS_FILE, TIMES_FILE)
-    return {name: digest for name, digest in summary.get("files", {}).items() if name in ours}
-
-
-def _texts(plan: Plan) -> Mapping[str, bytes]:
-    """The campaign as files that need no others."""
-    return {CAMPAIGN_FILE: _own(plan).to_toml().encode(), SCENARIO_FILE: plan.scenario.to_toml().encode()}
 
 
 def _own(plan: Plan) -> CampaignSpec:

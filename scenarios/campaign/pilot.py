@@ -5,7 +5,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Generator, Sequence
 from contextlib import closing
-from typing import Protocol
+from typing import Any, Protocol
 
 from quadsim.errors import QuadsimError
 from scenarios.campaign.plan import Plan
@@ -33,29 +33,11 @@ class Pilot(Protocol):
 def fly_flights(
     pilot: Pilot, flights: Sequence[int], *, workers: int | None = None, cluster: str | None = None
 ) -> Generator[Row]:
-    """The rows of a pilot's flights, each once, in whatever order they come; closing the iterator stops all work.
-
-    Args:
-        pilot: flies them.
-        flights: their numbers.
-        workers: see `scenarios.many.fly_many`.
-        cluster: the same.
-
-    Raises:
-        QuadsimError: see `scenarios.many.fly_many`.
-    """
-    limits = pilot.plan.spec.limits
-    answers = fly_many(
-        flights,
-        pilot.fly,
-        workers=workers,
-        timeout=limits.flight,
-        memory=limits.memory,
-        isolate=pilot.plan.flies_user_code,
-        cluster=cluster,
-    )
-    with closing(answers):
-        for place, row in answers:
+    """The rows of a pilot's flights, each once, in whatever order they come; see `scenarios.many.fly_many`."""
+    limits, isolate = pilot.plan.spec.limits, pilot.plan.flies_user_code
+    options: dict[str, Any] = {"timeout": limits.flight, "memory": limits.memory, "isolate": isolate}
+    with closing(fly_many(flights, pilot.fly, workers=workers, cluster=cluster, **options)) as rows:
+        for place, row in rows:
             yield row if "flight" in row else pilot.failed(flights[place], row["reason"], row["verdict"])
 
 
@@ -73,15 +55,16 @@ class CampaignPilot:
         except QuadsimError as error:
             return self._row(flight, failed_row(str(error)))
         if raised := flown.log.traceback:  # no more of such a flight is kept than that it raised
-            reason = str(flown.log.reason)
+            reason, limit = str(flown.log.reason), f"(it may take {self.plan.spec.limits.memory:g} MB)"
             short = raised[-1].startswith(MemoryError.__name__)
-            memory = f"{reason} (it may take {self.plan.spec.limits.memory:g} MB)"
-            return self._row(flight, failed_row(memory, MEMORY) if short else failed_row(reason))
-        return self._row(flight, _recorded(flown, clock.perf_counter() - started))
+            return self._row(flight, failed_row(f"{reason} {limit}", MEMORY) if short else failed_row(reason))
+        return self.row_of(flight, flown, clock.perf_counter() - started)
 
-    def row_of(self, flight: int, flown: Flight) -> Row:
-        """The row of a flight that was flown elsewhere; it has no clock times of its own."""
-        return self._row(flight, _recorded(flown, 0.0))
+    def row_of(self, flight: int, flown: Flight, wall_s: float = 0.0) -> Row:
+        """The row of a flight that was flown, in that time [s]."""
+        machine = processor_name()
+        row = flown_row(flown.log, flown.findings, verdict=flown.outcome, wall_s=wall_s, machine=machine)
+        return self._row(flight, row)
 
     def failed(self, flight: int, reason: str, verdict: str) -> Row:
         """See `Pilot`."""
@@ -90,8 +73,3 @@ class CampaignPilot:
     def _row(self, flight: int, came_of_it: Row) -> Row:
         row = dict.fromkeys(self.plan.schema.names) | self.plan.identity(flight) | came_of_it
         return row | {"failed": any(event.holds(row) for event in self.plan.failure)}
-
-
-def _recorded(flight: Flight, wall_s: float) -> Row:
-    """What a campaign keeps of a flight."""
-    return flown_row(flight.log, flight.findings, verdict=flight.outcome, wall_s=wall_s, machine=processor_name())

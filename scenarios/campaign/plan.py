@@ -13,9 +13,9 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from quadsim.errors import FileError, InputError, ParameterError
-from scenarios.campaign.draws import Draws, extremes
+from scenarios.campaign.draws import Draws
 from scenarios.campaign.results.events import Event, parse_event
-from scenarios.campaign.results.table import DRAW, TIMING, Row, make_schema
+from scenarios.campaign.results.table import DRAW, TIMES, Row, make_schema
 from scenarios.campaign.spec import CampaignSpec, Value, VaryBase
 from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
@@ -38,6 +38,7 @@ class Plan:
 
     spec: CampaignSpec  # the file
     scenario: Scenario  # with the file's changes, and every number of its vehicle, in it
+    one_seed: bool = False  # whether all flights have the scenario's own
 
     @cached_property
     def draws(self) -> Draws:
@@ -60,7 +61,7 @@ class Plan:
     @property
     def columns(self) -> dict[str, pa.DataType]:
         """The columns that events may be about, with their types: all but clock times and what only counts flights."""
-        others = {*(name for name, *_ in TIMING), "flight", "seed", "failed"}
+        others = {*TIMES, "flight", "seed", "failed"}
         return {field.name: field.type for field in self.schema if field.name not in others}
 
     @cached_property
@@ -84,7 +85,7 @@ class Plan:
         values = self.draws.values(flight)
         changes = [(entry, values[entry.name]) for entry in self.spec.vary]
         name = f"{self.spec.name[:70]}-{flight}"
-        return self._varied(changes, name=name, seed=self.draws.seed(flight))
+        return self._varied(changes, name=name, seed=self.scenario.seed if self.one_seed else self.draws.seed(flight))
 
     def identity(self, flight: int) -> Row:
         """The columns that identify a flight."""
@@ -104,17 +105,13 @@ class Plan:
             lambda entry, value: check_parts(self._varied([(entry, value)], name=self.scenario.name, seed=0)),
             table="vary",
         )
-        refusals = [self._refusal(flight) for flight in range(min(FIRST, self.spec.flights))]
-        if all(refusals):
-            raise InputError(f"none of the first {len(refusals)} flights can be flown, the first since {refusals[0]}")
-
-    def _refusal(self, flight: int) -> InputError | None:
-        """Why a flight cannot be flown; None where it can."""
-        try:
-            check_parts(self.of(flight))
-        except InputError as error:
-            return error
-        return None
+        refusals = []
+        for flight in range(min(FIRST, self.spec.flights)):
+            try:
+                return check_parts(self.of(flight))
+            except InputError as error:
+                refusals.append(error)
+        raise InputError(f"none of the first {len(refusals)} flights can be flown, the first since {refusals[0]}")
 
     def _varied(self, changes: Sequence[Change], *, name: str, seed: int) -> Scenario:
         def parse(data: dict[str, Any]) -> Scenario:
@@ -139,13 +136,7 @@ def read_campaign(name: str) -> dict[str, Any]:
 
 
 def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = None, seed: int | None = None) -> Plan:
-    """Read and check a campaign, with the scenario it names.
-
-    Args:
-        name: of one that ships, or a path ending in `.toml`.
-        settings: `dotted.path=value` texts that change fields of the scenario, after the file's own.
-        flights: instead of the file's.
-        seed: instead of the file's.
+    """Read and check a campaign that ships, or a file, with the scenario it names; the other arguments change it.
 
     Raises:
         InputError: the file is missing or malformed, a field is not allowed, or what it varies cannot be flown.
@@ -153,7 +144,7 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
     path, data = campaign_path(name), read_campaign(name)
     data |= {key: value for key, value in (("flights", flights), ("seed", seed)) if value is not None}
     spec = parse_campaign(data, source=path.name)
-    plan = Plan(spec=spec, scenario=flown_scenario(spec, path, settings))
+    plan = Plan(spec, flown_scenario(spec, path, settings))
     plan.check()
     return plan
 
@@ -165,7 +156,7 @@ def make_plan(scenario: Scenario, data: Mapping[str, Any]) -> Plan:
         InputError: a field is not allowed, or what varies cannot be flown.
     """
     spec = parse_campaign({"name": scenario.name, **data, "scenario": scenario.name}, source="campaign")
-    plan = Plan(spec=spec, scenario=resolve_vehicle(scenario, build_vehicle(scenario)))
+    plan = Plan(spec, resolve_vehicle(scenario, build_vehicle(scenario)))
     plan.check()
     return plan
 
@@ -192,13 +183,13 @@ def flown_scenario(spec: CampaignSpec, path: Path, settings: Sequence[str] = ())
     file = scenario_path(spec.scenario)
     data = merge(read_scenario(file, scenario_path), spec.set)
     note_changes(data, spec.set)
-    drawn = {field: entry.name for entry in spec.vary if not entry.relative for field in entry.fields}
+    owners = {"seed": "give --seed"}
+    owners |= {
+        field: f"{entry.name} draws {field}" for entry in spec.vary if not entry.relative for field in entry.fields
+    }
     for setting in settings:
-        field = setting.partition("=")[0].strip()
-        if field in drawn or field == "seed":
-            rule = "of a field that flights do not have each of their own; " + (
-                "give --seed" if field == "seed" else f"{drawn[field]} draws {field}"
-            )
+        if (field := setting.partition("=")[0].strip()) in owners:
+            rule = f"of a field that flights do not have each of their own; {owners[field]}"
             raise ParameterError("", "--set", setting, rule)
         apply_setting(data, setting)
     try:
@@ -214,22 +205,15 @@ def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], .
 
     Fields of the scenario that both draw are left out: their draws are compared.
     """
-    drawn = _replaced(first) & _replaced(second)
-    found = differences(_compared(first), _compared(second))
-    return tuple(entry for entry in found if entry[0] not in drawn)
-
-
-def _compared(plan: Plan) -> dict[str, Any]:
-    """A campaign's tables, less what only names it."""
-    scenario = tomllib.loads(plan.scenario.to_toml())
-    vary = [entry.model_dump() for entry in plan.spec.vary]
-    own = plan.spec.model_dump(include={"sampling", "seed", "limits"})
-    return {**{key: value for key, value in scenario.items() if key not in NOT_DESCRIBED}, **own, "vary": vary}
-
-
-def _replaced(plan: Plan) -> set[str]:
-    """The fields of the scenario whose values each flight draws."""
-    return {field for entry in plan.spec.vary if not entry.relative for field in entry.fields}
+    tables, drawn = [], []
+    for plan in (first, second):
+        scenario = {
+            key: value for key, value in tomllib.loads(plan.scenario.to_toml()).items() if key not in NOT_DESCRIBED
+        }
+        own = plan.spec.model_dump(include={"sampling", "seed", "limits"})
+        tables.append({**scenario, **own, "vary": [entry.model_dump() for entry in plan.spec.vary]})
+        drawn.append({field for entry in plan.spec.vary if not entry.relative for field in entry.fields})
+    return tuple(entry for entry in differences(*tables) if entry[0] not in drawn[0] & drawn[1])
 
 
 def locate(data: dict[str, Any], directory: Path) -> None:
@@ -243,7 +227,7 @@ def locate(data: dict[str, Any], directory: Path) -> None:
 
 def column_type(entry: VaryBase) -> pa.DataType:
     """The type of the column that holds an entry's values."""
-    first = extremes(entry)[0]
+    first = entry.extremes()[0]
     if isinstance(first, bool):
         return pa.bool_()
     return pa.float64() if isinstance(first, int | float) else pa.string()
@@ -257,19 +241,17 @@ def cell(value: Value) -> Value | str:
 
 
 def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *, table: str) -> Scenario:
-    """A scenario with the fields of some entries replaced.
-
-    Args:
-        data: the scenario's tables.
-        changes: entries with the value of each.
-        parse: makes a scenario of tables, or raises InputError.
-        table: of the file that has the entries, e.g. `vary`, for messages.
+    """A scenario's tables with the fields of some entries replaced, parsed; `table` of the file has the entries.
 
     Raises:
         InputError: what comes of it is no scenario.
     """
-    data = _with_actual(data, [field for entry, _ in changes for field in entry.fields])
-    after: dict[str, Any] = merge(data, {})
+    given, data = data, merge(data, {})
+    for entry, _ in changes:  # a field of `[actual]` is as modelled until it is drawn
+        for above, name, *_rest in (field.split(".") for field in entry.fields if "." in field):
+            if above == "actual" and name in given["vehicle"]:
+                data.setdefault("actual", {}).setdefault(name, given["vehicle"][name])
+    after = merge(data, {})
     for entry, value in changes:
         for field in entry.fields:
             new = _scaled(data, entry, field, value, parse, table) if entry.relative else value
@@ -277,47 +259,29 @@ def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *,
     return parse(after)
 
 
-def _with_actual(data: Mapping[str, Any], fields: Iterable[str]) -> dict[str, Any]:
-    """The scenario's tables with the fields of `[actual]` that are drawn, which are as modelled where none is given."""
-    found = merge(data, {})
-    for field in fields:
-        table, _, rest = field.partition(".")
-        name = rest.partition(".")[0]
-        if table == "actual" and name in data["vehicle"]:
-            found.setdefault("actual", {}).setdefault(name, data["vehicle"][name])
-    return found
+def _scaled(data: dict[str, Any], entry: VaryBase, field: str, value: Value, parse: Parse, table: str) -> Value:
+    given = get_field(data, field)
+    if given is None:  # refused with its own message where there is no such field
+        changed(data, [(entry.model_copy(update={"relative": False}), value)], parse, table=table)
+    for what, number in ((f"the scenario has no number at {field}", given), ("what is drawn is no number", value)):
+        if isinstance(number, bool) or not isinstance(number, int | float):
+            raise ParameterError(f"{table}.{entry.name}", "relative", True, f"false where {what}")
+    return value * given
 
 
 def check_ends(entries: Iterable[VaryBase], check: Callable[[VaryBase, Value], object], *, table: str) -> None:
-    """Refuse entries that cannot be flown at an end of their range.
-
-    Args:
-        entries: of the file.
-        check: raises where an entry cannot have a value.
-        table: of the file that has the entries, for messages.
+    """Refuse entries that cannot be flown at an end of their range; `check` raises where one cannot have a value.
 
     Raises:
         InputError: naming the entry and the value.
     """
     for entry in entries:
-        for value in extremes(entry):
+        for value in entry.extremes():
+            where = f"{table}.{entry.name} at {value!r}"
             try:
                 check(entry, value)
             except ScenarioError as error:
-                raise ScenarioError(f"{table}.{entry.name} at {value!r}", error.problems) from error
+                raise ScenarioError(where, error.problems) from error
             except InputError as error:
-                message = str(error)
-                where = "" if message.startswith(f"{table}.") else f"{table}.{entry.name} at {value!r}: "
-                raise InputError(where + message) from error
-
-
-def _scaled(data: Mapping[str, Any], entry: VaryBase, field: str, value: Value, parse: Parse, table: str) -> Value:
-    given = get_field(merge(data, {}), field)
-    if isinstance(given, bool) or not isinstance(given, int | float):
-        if given is None:  # refused with its own message where there is no such field
-            changed(data, [(entry.model_copy(update={"relative": False}), value)], parse, table=table)
-        rule = f"false where the scenario has no number at {field}"
-        raise ParameterError(f"{table}.{entry.name}", "relative", True, rule)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ParameterError(f"{table}.{entry.name}", "relative", True, "false where what is drawn is no number")
-    return value * given
+                named = str(error).startswith(f"{table}.")
+                raise InputError(str(error) if named else f"{where}: {error}") from error

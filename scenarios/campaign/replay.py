@@ -25,13 +25,11 @@ from scenarios.schema.scenario import Scenario
 class Recorded:
     """A flight of a finished campaign."""
 
-    number: int  # which
-    row: Mapping[str, Any]  # its row of `flights.parquet`
-    plan: Plan  # the campaign
-    scenario: Scenario  # what was flown
-    # of `code`, `controller`, `versions` and `machine`, those that are not as when it was flown, so that numbers may
-    # differ
-    otherwise: Sequence[str]
+    number: int
+    row: Mapping[str, Any]  # of `flights.parquet`
+    plan: Plan
+    scenario: Scenario
+    otherwise: Sequence[str]  # see `manifest.other_than_flew`
 
     @property
     def notes(self) -> list[str]:
@@ -65,34 +63,18 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """A flight of a campaign, flown again.
+    """A flight of a campaign, flown again."""
 
-    Attributes:
-        recorded: as the campaign has it.
-        flight: as it was flown now.
-        directory: its run directory.
-        differing: the columns of the campaign's table that it does not agree with, bit for bit; none, on the same
-            machine with the same code.
-    """
-
-    recorded: Recorded
-    flight: Flight
-    directory: Path
-    differing: Sequence[str]
+    recorded: Recorded  # as the campaign has it
+    flight: Flight  # as it was flown now
+    directory: Path  # its run directory
+    differing: Sequence[str]  # columns of the campaign's table that are not the same bit for bit
 
 
 def replay_flight(
     recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent, *, overwrite: bool = False
 ) -> Replay:
-    """Fly it again and write its run directory.
-
-    Args:
-        recorded: the flight.
-        target: the run directory.
-        outputs: see `scenarios.run.run_scenario`.
-        progress: see `scenarios.run.run_scenario`.
-        overwrite: see `scenarios.run.run_scenario`.
-    """
+    """Fly it again and write its run directory; see `scenarios.run.run_scenario`."""
     flight = run_scenario(recorded.scenario, target, outputs, progress, overwrite=overwrite)
     row = CampaignPilot(recorded.plan).row_of(recorded.number, flight)
     (again,) = make_table([row], recorded.plan.schema).to_pylist()

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,7 +24,7 @@ from scenarios.campaign.pilot import CampaignPilot, fly_flights
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.report.campaign_page import write_report
 from scenarios.campaign.results.store import TIMES_FILE, Store
-from scenarios.campaign.results.table import Row, read_table
+from scenarios.campaign.results.table import read_table
 from scenarios.campaign.statistics.estimates import estimate
 from scenarios.campaign.statistics.inference import proportion
 from scenarios.campaign.statistics.requirement import Judgement
@@ -44,7 +43,7 @@ class Standing:
     flown: int  # flights that are there
     flights: int  # that there are to be
     failed: int  # of those flown
-    rate: float  # flights per second of this session; 0 before the first
+    rate: float  # flights per second of this session
 
 
 Watch = Callable[[Standing], None]
@@ -52,23 +51,13 @@ Watch = Callable[[Standing], None]
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What came of a campaign.
+    """What came of a campaign."""
 
-    Attributes:
-        directory: where everything is.
-        manifest: what was flown, with what.
-        table: `flights.parquet`.
-        summary: `summary.json`.
-        failure: the events of which any one makes a flight fail.
-        judgements: of the requirements that were stated.
-    """
-
-    directory: Path
-    manifest: dict[str, Any]
-    table: pa.Table
-    summary: dict[str, Any]
-    failure: tuple[str, ...]
-    judgements: tuple[Judgement, ...] = ()
+    directory: Path  # where everything is
+    manifest: dict[str, Any]  # what was flown, with what
+    table: pa.Table  # `flights.parquet`
+    summary: dict[str, Any]  # `summary.json`
+    judgements: tuple[Judgement, ...] = ()  # of the requirements that were stated
 
     def to_pandas(self) -> Any:
         """The table as a pandas DataFrame.
@@ -91,21 +80,10 @@ def fly_campaign(
     report: bool = True,
     watch: Watch = lambda standing: None,
 ) -> Result:
-    """Fly a campaign, or what is missing of it.
+    """Fly a campaign, or what is missing of it; the arguments are those of `quadsim.campaign`.
 
     Each flight's row is the same with any worker and order; so is the table of all.  Whatever ends this
     early, what was flown stays, and `resume` continues it.
-
-    Args:
-        plan: the campaign.
-        directory: where its results go.
-        workers: see `scenarios.many.fly_many`.
-        cluster: the same.
-        resume: whether to continue what the directory holds; without it there must be nothing there.
-        overwrite: whether to replace an earlier output there.
-        until_width: width of the 95 % interval of the failure probability, from 0 to 1, at which to stop.
-        report: whether to write the page and its figure.
-        watch: called with the progress, as answers come.
 
     Raises:
         InputError: another campaign is there, or `until_width` would leave out flights that are there.
@@ -114,17 +92,16 @@ def fly_campaign(
     """
     if until_width is not None and not 0.0 < until_width < 1.0:
         raise ParameterError("", "--until-width", until_width, "between 0 and 1")
-    session = new_session(workers, cluster)
+    engine = "local" if cluster is None else "dask"
+    session = {"engine": engine, "workers": count_workers(workers, cluster), "flights": 0, "wall_s": None}
     if records.is_campaign(directory) and not (resume or overwrite):
         raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
+    records.code_digest()  # kept: a process that dies before its manifest is there could not be resumed
     with growing(directory, records.MANIFEST_FILE, overwrite=overwrite) as files:
-        going_on = records.is_campaign(directory)
-        if going_on:
+        if records.is_campaign(directory):
             records.require_same(plan, directory)
         progress = _Progress(plan, files, until_width=until_width, watch=watch)
-        manifest = records.go_on(plan, files, flying=progress.missing) if going_on else records.begin(plan, files)
-        manifest["sessions"].append(session)
-        records.write(manifest, files)
+        manifest = records.start(plan, files, session, flying=bool(progress.missing))
         try:
             progress.fly(workers, cluster)
         except BaseException:
@@ -132,44 +109,43 @@ def fly_campaign(
             raise
         finally:
             session |= {"flights": progress.flown, "wall_s": clock.perf_counter() - progress.started}
-            manifest["flown"] = progress.done
+            manifest["flown"] = int(np.count_nonzero(progress.outcomes[: progress.wanted] >= 0))
             records.write(manifest, files)
-        return _conclude(plan, files, progress, manifest, report=report)
 
+        table = progress.store.close(progress.wanted)
+        spec, directory = plan.spec, files.path
+        summary = {"campaign": spec.name, "scenario": plan.scenario.name, **estimate(table)}
 
-def new_session(workers: int | None, cluster: str | None) -> dict[str, Any]:
-    """What a manifest has of a session, before its first flight.
+        def write(place: Path) -> None:
+            write_report(place, table, summary, spec, campaign=directory)
 
-    Raises:
-        QuadsimError: nobody can fly so; see `scenarios.many.fly_many`.
-    """
-    engine = "local" if cluster is None else "dask"
-    return {"engine": engine, "workers": count_workers(workers, cluster), "flights": 0, "wall_s": None}
+        put_report(files, REPORT_FILES, write if report else None)
+        # flights by the processor that flew them; those that raised, or that no process came back from, have none
+        processors = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
+        manifest["machines"] = dict(sorted(Counter(processors).items()))
+        manifest["status"] = "complete" if progress.wanted == spec.flights else "stopped"
+        records.write(manifest, files)
+        files.finish(summary)
+    return Result(directory=directory, manifest=manifest, table=table, summary=summary)
 
 
 class _Progress:
     """A session: what is there, what is still to be flown, and what is waiting to be written."""
 
     def __init__(self, plan: Plan, files: Growing, *, until_width: float | None, watch: Watch) -> None:
-        self.store = Store(files, plan.schema)
-        self.wanted = plan.spec.flights
-        self.flown = 0
-        self.started = clock.perf_counter()
         self._plan, self._width, self._watch = plan, until_width, watch
-        self._outcomes = np.full(plan.spec.flights, -1, np.int8)  # not flown, passed, failed
-        self._checked = 0
-        there = self.store.table().select(["flight", "failed"])
-        self._counted = self.store.counted()
-        within = there.filter(pc.less(there["flight"], plan.spec.flights))
-        self._note(within["flight"].to_numpy(), within["failed"].to_numpy(zero_copy_only=False))
+        self.store = Store(files, plan.schema)
+        self.wanted, self.flown, self._checked = plan.spec.flights, 0, 0
+        self.started = clock.perf_counter()
+        self.outcomes = np.full(plan.spec.flights, -1, np.int8)  # not flown, passed, failed
+        there = self.store.table()
+        there = there.filter(pc.less(there["flight"], plan.spec.flights))
+        self.outcomes[there["flight"].to_numpy()] = there["failed"].to_numpy(zero_copy_only=False)
 
     @property
-    def missing(self) -> bool:
-        return bool((self._outcomes < 0).any()) and not self._is_sure()
-
-    @property
-    def done(self) -> int:
-        return int(np.count_nonzero(self._outcomes[: self.wanted] >= 0))
+    def missing(self) -> list[int]:
+        """The flights to be flown."""
+        return [] if self._is_sure() else list(np.flatnonzero(self.outcomes < 0).tolist())
 
     def fly(self, workers: int | None, cluster: str | None) -> None:
         """Fly what is missing, until nothing is, or the interval is narrow enough.
@@ -177,79 +153,40 @@ class _Progress:
         Raises:
             InputError: it is so before flights that a finished campaign has.
         """
-        if self._is_sure() and self.wanted < self._counted:
-            given = f"the interval is as narrow after {self.wanted} of the {self._counted} flights that are there"
+        missing, counted = self.missing, self.store.counted()
+        if self._is_sure() and self.wanted < counted:
+            given = f"the interval is as narrow after {self.wanted} of the {counted} flights that are there"
             raise InputError(f"--until-width would leave out flights: {given}; go on without it")
-        if not self.missing:
-            return
-        missing = np.flatnonzero(self._outcomes < 0).tolist()
         try:
             with closing(fly_flights(CampaignPilot(self._plan), missing, workers=workers, cluster=cluster)) as rows:
                 for row in rows:
-                    self._keep(row)
+                    self.store.add(row)
+                    self.flown += 1
+                    self.outcomes[row["flight"]] = row["failed"]
+                    there, failed = (int(np.count_nonzero(self.outcomes >= least)) for least in (0, 1))
+                    rate = self.flown / (clock.perf_counter() - self.started)
+                    self._watch(Standing(flown=there, flights=self.wanted, failed=failed, rate=rate))
                     if self._is_sure():
                         return
         finally:
             self.store.flush()
-
-    def _keep(self, row: Row) -> None:
-        self.store.add(row)
-        self.flown += 1
-        self._note(row["flight"], row["failed"])
-        elapsed = clock.perf_counter() - self.started
-        failed = int(np.count_nonzero(self._outcomes == 1))
-        there = int(np.count_nonzero(self._outcomes >= 0))
-        self._watch(Standing(flown=there, flights=self.wanted, failed=failed, rate=self.flown / elapsed))
-
-    def _note(self, flights: Any, failed: Any) -> None:
-        self._outcomes[np.asarray(flights, int)] = np.asarray(failed, np.int8)
 
     def _is_sure(self) -> bool:
         """Whether the interval is narrow enough after the first n flights, for the smallest such n.
 
         Only flights without a gap before them count, so that the answer does not depend on which came back first.
         """
-        if self._width is None:
-            return False
-        if self.wanted < self._outcomes.size:
-            return True
-        gaps = np.flatnonzero(self._outcomes < 0)
-        whole = int(gaps[0]) if gaps.size else self._outcomes.size
+        if self._width is None or self.wanted < self.outcomes.size:
+            return self._width is not None
+        whole = int(np.argmax(np.append(self.outcomes, -1) < 0))
         every = math.lcm(CHECK_EVERY, self._plan.spec.cells)  # whole turns of the grids
         for count in range(self._checked + every, whole + 1, every):
             self._checked = count
-            share = proportion(int(np.count_nonzero(self._outcomes[:count] == 1)), count)
+            share = proportion(int(np.count_nonzero(self.outcomes[:count] == 1)), count)
             if share.upper - share.lower <= self._width:
                 self.wanted = count
                 return True
         return False
-
-
-def _conclude(plan: Plan, files: Growing, progress: _Progress, manifest: dict[str, Any], *, report: bool) -> Result:
-    """Final tables, estimates and report."""
-    directory = files.path
-    table = progress.store.close(progress.wanted)
-    summary = {"campaign": plan.spec.name, "scenario": plan.scenario.name, **estimate(table)}
-    write = partial(
-        write_report,
-        campaign=directory,
-        table=table,
-        summary=summary,
-        manifest=manifest,
-        name=plan.spec.name,
-        description=plan.spec.description,
-        failure=plan.spec.failure,
-    )
-    put_report(files, REPORT_FILES, write if report else None)
-    # flights by the processor that flew them; those that raised, or that no process came back from, have none
-    processors = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
-    manifest["machines"] = dict(sorted(Counter(processors).items()))
-    manifest["status"] = "complete" if progress.wanted == plan.spec.flights else "stopped"
-    records.write(manifest, files)
-    files.finish(summary)
-    return Result(
-        directory=directory, manifest=manifest, table=table, summary=summary, failure=tuple(plan.spec.failure)
-    )
 
 
 def put_report(files: Growing, names: Sequence[str], write: Callable[[Path], object] | None) -> None:
@@ -258,9 +195,9 @@ def put_report(files: Growing, names: Sequence[str], write: Callable[[Path], obj
     Raises:
         OutputError: they cannot be written.
     """
-    if write is None:
-        files.remove(names)
-        return
     with tempfile.TemporaryDirectory() as scratch:
-        write(Path(scratch))
-        files.write({name: (Path(scratch) / name).read_bytes() for name in names})
+        if write is not None:
+            write(Path(scratch))
+        made = {path.name: path.read_bytes() for path in Path(scratch).iterdir()}
+    files.remove([name for name in names if name not in made])
+    files.write(made)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
+import numpy as np
+import scipy  # whose `stats` takes half a second to load, where it is first used
 from annotated_types import MaxLen, MinLen
 from pydantic import Field, model_validator
 
@@ -20,6 +22,7 @@ Value = bool | Whole | Number | str | list[Number]
 """What can be drawn from a list: whatever a field of a scenario may be, but for tables."""
 Values = Annotated[list[Value], MinLen(1), MaxLen(MOST_ENTRIES)]
 MOST_FLIGHTS: Final = 1_000_000
+_TAIL: Final = 1e-3  # share of a distribution beyond the values taken as its ends
 Sampling = Literal["random", "latin_hypercube", "sobol", "halton"]
 
 
@@ -35,32 +38,65 @@ class VaryBase(Spec):
     )
     unit: Annotated[str, Field(max_length=20)] = Field(default="-", description="of the values, for tables and plots")
     relative: bool = Field(default=False, description="whether the sampled value multiplies the scenario's own")
+    distribution: str
+
+    def quantile(self, share: float) -> Value:
+        """The value below which a share, from 0 to less than 1, of the distribution lies; of a list, in its order."""
+        raise NotImplementedError
+
+    def extremes(self) -> list[Value]:
+        """The values at the ends, or all of a list: if these can be flown, the others can."""
+        raise NotImplementedError
 
 
-class UniformSpec(VaryBase):
-    """Every value between two bounds is equally likely."""
+class _Ranged(VaryBase):
+    """Numbers between two bounds."""
 
-    distribution: Literal["uniform"]
     low: Number
     high: Number
 
     @model_validator(mode="after")
-    def _check(self) -> UniformSpec:
+    def _check(self) -> Self:
         require_range(self.low, self.high)
         return self
 
+    def extremes(self) -> list[Value]:
+        """See `VaryBase`."""
+        return [self.low, self.high]
 
-class LogUniformSpec(VaryBase):
+
+class UniformSpec(_Ranged):
+    """Every value between two bounds is equally likely."""
+
+    distribution: Literal["uniform"]
+
+    def quantile(self, share: float) -> Value:
+        """See `VaryBase`."""
+        return self.low + (self.high - self.low) * share
+
+
+class LogUniformSpec(_Ranged):
     """The logarithm is uniform: every factor is equally likely."""
 
     distribution: Literal["log_uniform"]
     low: Positive
     high: Positive
 
-    @model_validator(mode="after")
-    def _check(self) -> LogUniformSpec:
-        require_range(self.low, self.high)
-        return self
+    def quantile(self, share: float) -> Value:
+        """See `VaryBase`."""
+        return float(self.low * (self.high / self.low) ** share)
+
+
+class IntegerSpec(_Ranged):
+    """Every whole number between two bounds, both included, is equally likely."""
+
+    distribution: Literal["integer"]
+    low: Whole
+    high: Whole
+
+    def quantile(self, share: float) -> Value:
+        """See `VaryBase`."""
+        return self.low + int((self.high - self.low + 1) * share)
 
 
 class NormalSpec(VaryBase):
@@ -73,8 +109,8 @@ class NormalSpec(VaryBase):
     high: Number | None = Field(default=None, description="absent: no upper end")
 
     @model_validator(mode="after")
-    def _check(self) -> NormalSpec:
-        low, high = self.ends
+    def _check(self) -> Self:
+        low, high = self._ends
         require_range(low, high)
         if low > self.mean + 8.0 * self.deviation or high < self.mean - 8.0 * self.deviation:
             raise ValueError(
@@ -84,53 +120,68 @@ class NormalSpec(VaryBase):
         return self
 
     @property
-    def ends(self) -> tuple[float, float]:
-        """Where it is cut off; infinite for nowhere."""
+    def _ends(self) -> tuple[float, float]:
         return -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
 
+    def quantile(self, share: float) -> Value:
+        """See `VaryBase`."""
+        low, high = ((end - self.mean) / self.deviation for end in self._ends)
+        return float(scipy.stats.truncnorm.ppf(share, low, high, loc=self.mean, scale=self.deviation))
 
-class ChoiceSpec(VaryBase):
+    def extremes(self) -> list[Value]:
+        """See `VaryBase`."""
+        low, high = self._ends
+        return [
+            low if math.isfinite(low) else self.quantile(_TAIL),
+            high if math.isfinite(high) else self.quantile(1.0 - _TAIL),
+        ]
+
+
+class _Listed(VaryBase):
+    """One of several values."""
+
+    values: Values
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        numbers = [isinstance(each, int | float) and not isinstance(each, bool) for each in self.values]
+        if len({"a number" if number else type(each) for number, each in zip(numbers, self.values, strict=True)}) > 1:
+            raise ValueError(f"values must all be of one kind; got {self.values}")
+        if len(set(map(str, self.values))) < len(self.values):
+            raise ValueError(f"values must be distinct; got {self.values}")
+        return self
+
+    def extremes(self) -> list[Value]:
+        """See `VaryBase`."""
+        return list(self.values)
+
+
+class ChoiceSpec(_Listed):
     """One of several values, each with its own weight."""
 
     distribution: Literal["choice"]
-    values: Values
     weights: Annotated[list[Annotated[float, Field(ge=0.0, le=1e6)]], MaxLen(MOST_ENTRIES)] | None = Field(
         default=None, description="one per value, of any sum; absent: all the same"
     )
 
     @model_validator(mode="after")
-    def _check(self) -> ChoiceSpec:
-        require_alike(self.values)
+    def _check_weights(self) -> Self:
         if self.weights is not None and len(self.weights) != len(self.values):
             raise ValueError(f"weights must be as many as values, {len(self.values)}; got {len(self.weights)}")
         if self.weights is not None and not sum(self.weights) > 0.0:
             raise ValueError(f"weights must not all be 0; got {self.weights}")
         return self
 
-
-class IntegerSpec(VaryBase):
-    """Every whole number between two bounds, both included, is equally likely."""
-
-    distribution: Literal["integer"]
-    low: Whole
-    high: Whole
-
-    @model_validator(mode="after")
-    def _check(self) -> IntegerSpec:
-        require_range(self.low, self.high)
-        return self
+    def quantile(self, share: float) -> Value:
+        """See `VaryBase`."""
+        edges = np.cumsum(self.weights or [1.0] * len(self.values))
+        return self.values[int(np.searchsorted(edges, share * edges[-1], side="right"))]
 
 
-class GridSpec(VaryBase):
+class GridSpec(_Listed):
     """Every value in turn; several grids make every combination, the last one changing fastest."""
 
     distribution: Literal["grid"]
-    values: Values
-
-    @model_validator(mode="after")
-    def _check(self) -> GridSpec:
-        require_alike(self.values)
-        return self
 
 
 VarySpec = Annotated[
@@ -142,17 +193,6 @@ def require_range(low: float, high: float) -> None:
     """Refuse a range without a width."""
     if not low < high:
         raise ValueError(f"low must be below high; got {low:g} and {high:g}")
-
-
-def require_alike(values: Sequence[Value]) -> None:
-    """Refuse values of different kinds, which cannot stand in one column."""
-    kinds = {
-        "a number" if isinstance(each, int | float) and not isinstance(each, bool) else type(each) for each in values
-    }
-    if len(kinds) > 1:
-        raise ValueError(f"values must all be of one kind; got {values}")
-    if len({str(each) for each in values}) < len(values):
-        raise ValueError(f"values must be distinct; got {values}")
 
 
 class LimitsSpec(Spec):
@@ -198,15 +238,12 @@ class CampaignSpec(Spec):
         if len(set(names)) < len(names):
             raise ValueError(f"vary must have distinct names; got {names}")
         check_fields(self.vary, "vary", {})
-        grids = [entry.name for entry in self.vary if isinstance(entry, GridSpec)]
+        grids = ", ".join(entry.name for entry in self.vary if isinstance(entry, GridSpec))
         if grids and self.sampling in ("sobol", "halton"):
-            rule = (
-                f"random or latin_hypercube where there are grids ({', '.join(grids)}), whose turns go with its points"
-            )
+            rule = f"random or latin_hypercube where there are grids ({grids}), whose turns go with its points"
             raise ValueError(f"sampling must be {rule}; got {self.sampling!r}")
-        cells = self.cells
-        if self.flights % cells:
-            rule = f"a multiple of the {cells} combinations of its grids"
+        if self.flights % self.cells:
+            rule = f"a multiple of the {self.cells} combinations of its grids"
             raise ValueError(f"flights must be {rule}; got {self.flights}")
         for text in self.failure:
             try:
@@ -229,13 +266,7 @@ class CampaignSpec(Spec):
 def check_fields(entries: Sequence[VaryBase], table: str, owners: dict[str, str]) -> None:
     """Refuse fields that two entries replace, and those that are not to be replaced.
 
-    Args:
-        entries: of the file.
-        table: of the file that has them.
-        owners: by field, who replaces it; the entries' own are added.
-
-    Raises:
-        ValueError: naming the entry and the field.
+    `table` names the entries; `owners` has who replaces a field, and gets the entries' own.
     """
     for entry in entries:
         for field in entry.fields:

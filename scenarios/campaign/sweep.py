@@ -21,26 +21,11 @@ from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario
 
 
-class SweepPlan(Plan):
-    """A plan whose flights differ in what is swept alone: each has the scenario's own seed."""
-
-    def of(self, flight: int) -> Scenario:
-        """The scenario of one flight; see `Plan.of`."""
-        values = self.draws.values(flight)
-        changes = [(entry, values[entry.name]) for entry in self.spec.vary]
-        return self._varied(changes, name=f"{self.scenario.name[:70]}-{flight}", seed=self.scenario.seed)
-
-
 @dataclass(frozen=True)
 class Sweep:
-    """The flights of a sweep, a row each.
+    """The flights of a sweep, a row each, with the units in the columns' metadata."""
 
-    Attributes:
-        table: what was swept, by dotted path; verdict; tracking errors; commands; margins of each constraint; step
-            times.  Units are in the columns' metadata.
-    """
-
-    table: pa.Table
+    table: pa.Table  # what was swept, by dotted path; verdict; tracking errors; commands; margins; step times
 
     def __getitem__(self, column: str) -> np.ndarray[Any, Any]:
         """(flights,) of a column by its name.
@@ -72,13 +57,7 @@ class Sweep:
 def fly_sweep(
     scenario: Scenario, values: Mapping[str, Sequence[Any]], workers: int | None = None, progress: Progress = silent
 ) -> Sweep:
-    """Fly every combination, the last field varying fastest.
-
-    Args:
-        scenario: what is flown.
-        values: what to try, by dotted path.
-        workers: processes that fly; one per usable core where absent.
-        progress: called with (what, done, total).
+    """Fly every combination of values, by dotted path, the last field varying fastest.
 
     Raises:
         InputError: a field does not exist, or a value is not allowed.
@@ -86,15 +65,15 @@ def fly_sweep(
     for path, tried in values.items():
         if isinstance(tried, str) or not len(tried):
             raise ParameterError("sweep", path, tried, "a list of values to try")
-    lists = {path: getattr(tried, "tolist", lambda tried=tried: list(tried))() for path, tried in values.items()}
+    lists = [getattr(tried, "tolist", lambda tried=tried: list(tried))() for tried in values.values()]
     entries = [
-        {"name": f"field-{i}", "fields": [path], "distribution": "grid", "values": tried}
-        for i, (path, tried) in enumerate(lists.items())
+        {"name": f"field-{i}", "fields": [path], "distribution": "grid", "values": lists[i]}
+        for i, path in enumerate(values)
     ]
-    count = math.prod(len(tried) for tried in lists.values())
+    count = math.prod(map(len, lists))
     data = {"name": scenario.name, "scenario": scenario.name, "flights": count, "vary": entries}
     spec = parse_campaign(data, source="sweep")
-    plan = SweepPlan(spec=spec, scenario=resolve_vehicle(scenario, build_vehicle(scenario)))
+    plan = Plan(spec, resolve_vehicle(scenario, build_vehicle(scenario)), one_seed=True)
     plan.check()
     progress("sweep", 0, count)
     rows = []
@@ -103,6 +82,5 @@ def fly_sweep(
             rows.append(row)
             progress("sweep", len(rows), count)
     table = make_table(rows, plan.schema).drop_columns(["flight", "seed", "failed"])
-    table = table.rename_columns({f"{DRAW}field-{i}": path for i, path in enumerate(lists)})
-    first = [*lists, *(name for name in table.column_names if name not in lists)]
-    return Sweep(table.select(first))
+    table = table.rename_columns({f"{DRAW}field-{i}": path for i, path in enumerate(values)})
+    return Sweep(table.select([*values, *(name for name in table.column_names if name not in values)]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import re
 import time as clock
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -22,17 +21,14 @@ from scenarios.campaign.report.campaign_tables import (
     worst_table,
 )
 from scenarios.campaign.report.comparison_tables import comparison_tables, difference_table, pairing
-from scenarios.campaign.run import Standing, Watch
+from scenarios.campaign.run import Result, Standing, Watch
 from scenarios.campaign.statistics.comparison import Comparison
 from scenarios.campaign.statistics.inference import proportion
-from scenarios.campaign.statistics.requirement import Judgement
 from scenarios.campaign.statistics.wording import interval
 from scenarios.commands import console
 from scenarios.commands.console import stderr, stdout, styled
 
 MOST_LINES: Final = 8  # of a table on the terminal; the report has them all
-LEAST_WORDS, MOST_WORDS = 20, 60  # Characters of a reason on the terminal, as there is room
-_TIME: Final = re.compile(r"^at t = \S+ s: ")
 LINE_EVERY: Final = 30.0  # between two lines of progress where stderr is no terminal [s]
 
 
@@ -64,47 +60,34 @@ def progress(*, enabled: bool, lines: bool = True) -> Iterator[Watch]:
 def describe(standing: Standing) -> str:
     """How far it is, how fast, until when, and how it looks."""
     share = proportion(standing.failed, standing.flown)
-    left = (standing.flights - standing.flown) / standing.rate if standing.rate else 0.0
-    ends = interval(share.lower, share.upper)
+    left = datetime.timedelta(seconds=round((standing.flights - standing.flown) / standing.rate))
     return (
-        f"{standing.flown}/{standing.flights}, {standing.rate:.2f}/s, {datetime.timedelta(seconds=round(left))} left; "
-        f"{standing.failed} failed ({ends})"
+        f"{standing.flown}/{standing.flights}, {standing.rate:.2f}/s, {left} left; "
+        f"{standing.failed} failed ({interval(share.lower, share.upper)})"
     )
 
 
-def print_campaign(
-    summary: Mapping[str, Any], failure: Sequence[str], judgements: Sequence[Judgement], where: str
-) -> None:
+def print_campaign(result: Result, where: str) -> None:
     """What came of a campaign."""
-    out = stdout()
+    out, summary = stdout(), result.summary
     out.print(styled((summary["campaign"], "bold"), f": {verdict_sentence(summary)}"), soft_wrap=True)
     if summary["parameters"]:
         out.print(driver_sentence(summary), soft_wrap=True)
-    tables = [event_table(summary, failure), constraint_table(summary), worst_table(summary, where)]
-    brief = [replace(grid, note="", lines=grid.lines[:MOST_LINES]) for grid in tables if grid.lines]
-    shown = [_with_short_ends(grid, out.width) if grid.key == "worst" else grid for grid in brief]
-    console.print_grids(shown, None, prose=("constraint", "reason"))
+    tables = [event_table(summary), constraint_table(summary), worst_table(summary, where)]
+    console.print_grids([_brief(grid) for grid in tables if grid.lines], None, prose=("constraint", "reason"))
     if summary["worst"]:
         command = replay_command(where, summary["worst"][0]["flight"])
         out.print(styled("to fly one of them again: ", (command, "bold")), soft_wrap=True)
-    for judgement in judgements:
+    for judgement in result.judgements:
         out.print(styled((judgement.sentence, "green" if judgement.holds else "red")), soft_wrap=True)
     console.print_place(where)
 
 
-def _with_short_ends(grid: Grid, width: int) -> Grid:
-    """A table whose last column, of words, stays in a line each on a terminal so wide."""
-    others = zip(grid.head[:-1], *(line[:-1] for line in grid.lines), strict=True)
-    taken = sum(2 + max(len(head), *(len(cell.text) for cell in cells)) for head, *cells in others)
-    room = max(LEAST_WORDS, min(MOST_WORDS, width - taken))
-    lines = tuple((*line[:-1], replace(line[-1], text=_shortened(line[-1].text, room))) for line in grid.lines)
-    return replace(grid, lines=lines)
-
-
-def _shortened(text: str, room: int) -> str:
-    """A reason in one line, without its time, which stands beside it."""
-    line = _TIME.sub("", " ".join(text.split()))
-    return line if len(line) <= room else f"{line[: room - 3]}..."
+def _brief(grid: Grid) -> Grid:
+    """The first lines of a table, with a short last column."""
+    ends = [(line, " ".join(line[-1].text.split())) for line in grid.lines[:MOST_LINES]]
+    lines = [(*line[:-1], replace(line[-1], text=end if len(end) <= 60 else f"{end[:57]}...")) for line, end in ends]
+    return replace(grid, note="", lines=tuple(lines))
 
 
 def print_replay(number: int, row: Mapping[str, Any], differing: Sequence[str]) -> None:

@@ -18,9 +18,9 @@ def campaign(options: Namespace) -> int:
     """`quadsim campaign`."""
     from scenarios.commands.campaign_console import print_campaign
 
-    if options.junit is not None and not options.requirements:
-        raise ParameterError("", "--junit", options.junit, "given with --require, whose verdicts it is to hold")
     if options.junit is not None:
+        if not options.requirements:
+            raise ParameterError("", "--junit", options.junit, "given with --require, whose verdicts it is to hold")
         options.junit = junit_file(options.junit)
     try:
         result = fly_campaign(
@@ -43,15 +43,14 @@ def campaign(options: Namespace) -> int:
             raise
         console.say(f"interrupted (Ctrl-C); {stop}, --resume continues it")
         return EXIT_FAILED
-    judgements = result.judgements
     if options.junit is not None:
         write_junit(result, options.junit)
     if options.json:
-        gate = [judgement.to_json() for judgement in judgements]
+        gate = [judgement.to_json() for judgement in result.judgements]
         print(json.dumps({**result.summary, "requirements": gate}, indent=2))
     else:
-        print_campaign(result.summary, result.failure, judgements, shown(result.directory))
-    return EXIT_DONE if all(judgement.holds for judgement in judgements) else EXIT_FAILED
+        print_campaign(result, shown(result.directory))
+    return EXIT_DONE if all(judgement.holds for judgement in result.judgements) else EXIT_FAILED
 
 
 def replay(options: Namespace) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
 import random
@@ -20,9 +19,9 @@ import psutil
 import pytest
 from toy_flights import Toy, below, fly, fly_slowly, living, report, until
 
-from quadsim.errors import MissingPackageError, ParameterError, QuadsimError
+from quadsim.errors import MissingPackageError, ParameterError
 from scenarios import many
-from scenarios.many import ClusterError, answers, fly_many
+from scenarios.many import ClusterError, fly_many
 
 ROOT = Path(__file__).resolve().parents[2]
 CALM: list[Toy] = [(number, "calm") for number in range(30)]
@@ -140,15 +139,6 @@ def test_workers_that_cannot_be_are_refused_at_once(options: dict[str, Any], mes
         fly_many([], fly, **options)
     with pytest.raises(ParameterError, match=message):
         many.count_workers(options.get("workers"), options.get("cluster"))
-
-
-def test_answers_come_in_the_order_of_their_questions() -> None:
-    heard: list[tuple[int, int]] = []
-    found = answers(abs, [-3, 2, -1], workers=2, progress=lambda done, total: heard.append((done, total)))
-    assert found == [3, 2, 1]
-    assert heard == [(1, 3), (2, 3), (3, 3)]
-    with pytest.raises(QuadsimError, match=r"-1: error \(ZeroDivisionError: "):
-        answers(functools.partial(pow, 0), [1, -1], workers=1)
 
 
 # --- a caller that ends ----------------------------------------------------------------------------------------------

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
+from scenarios.campaign.results.events import HARMLESS, INCOMPLETE
 from scenarios.campaign.results.table import Summary
-from scenarios.campaign.results.verdicts import HARMLESS, INCOMPLETE
 from scenarios.campaign.statistics.estimates import drivers
 from scenarios.campaign.statistics.inference import ALPHA
 from scenarios.campaign.statistics.wording import count_of, interval, label, p_value, percent
 
 _MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN}
+_ENDS: Final = ("lower", "upper")
 _ALWAYS: Final = ("failure", "violation", "lost")  # events that are listed even where they never happened
 
 
 def verdict_sentence(summary: Summary) -> str:
     """How many flights failed, and how sure that is: `37 of 1000 flights failed: 3.7 % (95 %: 2.6 to 5.1 %)`."""
     failure = summary["events"]["failure"]
-    left_out = summary["flights"] - failure["flights"]
-    apart = f"; {count_of(left_out, 'incomplete flight')} not counted" if left_out else ""
     text = f"{failure['count']} of {count_of(failure['flights'], 'flight')} failed"
     if failure["flights"]:
         share, ends = _shares(failure)
         text += f": {share} ({100.0 * summary['confidence']:g} %: {ends})"
-    return text + apart
+    left_out = summary["flights"] - failure["flights"]
+    return text + (f"; {count_of(left_out, 'incomplete flight')} not counted" if left_out else "")
 
 
 def driver_sentence(summary: Summary) -> str:
@@ -51,10 +51,7 @@ def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
         title="How often",
         head=("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}"),
         lines=tuple(
-            line(
-                *(name, str(found["count"]), *_shares(found)),
-                *(percent(found["lower_one_sided"]), percent(found["upper_one_sided"])),
-            )
+            line(name, str(found["count"]), *_shares(found), *(percent(found[f"{end}_one_sided"]) for end in _ENDS))
             for name, found in summary["events"].items()
             if found["count"] or name in _ALWAYS
         ),
@@ -69,12 +66,11 @@ def constraint_table(summary: Summary) -> Grid:
     """How often each constraint did not hold, and by how much at worst."""
     lines = []
     for name, found in summary["constraints"].items():
-        failed = found["not_satisfied"]
-        mark = Mark.BAD if failed["count"] else Mark.NONE
-        margin = ABSENT if found["worst_margin"] is None else f"{format_number(found['worst_margin'])} {found['unit']}"
-        flight = ABSENT if found["worst_flight"] is None else str(found["worst_flight"])
-        count = Cell(text=str(failed["count"]), mark=mark)
-        lines.append(line(name, count, *_shares(failed), margin, flight))
+        failed, worst = found["not_satisfied"], (ABSENT, ABSENT)
+        if found["worst_margin"] is not None:
+            worst = f"{format_number(found['worst_margin'])} {found['unit']}", str(found["worst_flight"])
+        count = Cell(text=str(failed["count"]), mark=Mark.BAD if failed["count"] else Mark.NONE)
+        lines.append(line(name, count, *_shares(failed), *worst))
     return Grid(
         key="constraints",
         title="Constraints",
@@ -92,9 +88,7 @@ def metric_table(summary: Summary) -> Grid:
     """How every metric is distributed."""
     measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
     lines = tuple(
-        line(
-            label(name, found["unit"]), *(format_number(found[measure]) for measure in measures), str(found["flights"])
-        )
+        line(label(name, found["unit"]), *(format_number(found[each]) for each in measures), str(found["flights"]))
         for name, found in summary["metrics"].items()
     )
     return Grid(
@@ -134,7 +128,7 @@ def worst_draws_table(summary: Summary) -> Grid:
     """Parameters of the worst flights, a column for each."""
     worst = summary["worst"]
     lines = tuple(
-        line(label(name, found["unit"]), *(_value(flight["draws"][name]) for flight in worst))
+        line(label(name, found["unit"]), *(_drawn(flight["draws"][name]) for flight in worst))
         for name, found in summary["parameters"].items()
     )
     return Grid(
@@ -145,33 +139,12 @@ def worst_draws_table(summary: Summary) -> Grid:
     )
 
 
-def manifest_table(manifest: Mapping[str, Any]) -> Grid:
-    """How the campaign was made, a line for each entry."""
-    lines = tuple(line(key, Cell(text=value, mark=Mark.TEXT)) for key, value in _flat(manifest))
-    return Grid(key="manifest", title="How it was made", head=("", ""), lines=lines)
-
-
 def replay_command(directory: str, flight: int) -> str:
     """The command that flies one flight of a campaign again."""
     return f"quadsim replay {shlex.quote(directory)} --flight {flight}"
 
 
-def _flat(entries: Mapping[str, Any], head: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in entries.items():
-        name = f"{head}{key}"
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{name}.")
-        elif isinstance(value, list | tuple):
-            yield name, ", ".join(map(_value, value)) or ABSENT
-        else:
-            yield name, _value(value)
-
-
-def _value(value: Any) -> str:
-    if value is None:
-        return ABSENT
-    if isinstance(value, bool):
-        return "true" if value else "false"
+def _drawn(value: Any) -> str:
     return format_number(value) if isinstance(value, float) else str(value)
 
 
@@ -185,14 +158,11 @@ def driver_table(summary: Summary) -> Grid:
         line(label(name, found["unit"]), *_association(found["worst_margin"]), *_association(found["failed"]))
         for name, found in drivers(summary).items()
     )
+    measures = ("rho", "after Holm", "xi", "after Holm")
     return Grid(
         key="drivers-table",
         title="Which parameters matter",
-        head=(
-            "varied parameter",
-            *("worst margin: rho", "after Holm", "xi", "after Holm"),
-            *("failure: rho", "after Holm", "xi", "after Holm"),
-        ),
+        head=("varied parameter", *(f"{of}: {each}" for of in ("worst margin", "failure") for each in measures)),
         lines=tuple(lines),
         note="rho: Spearman's rank correlation. xi: Chatterjee's (2021), of any dependence, also of harm at both ends "
         "of a range. p-values are corrected by Holm's method for all of this table; bold: beyond chance at "
@@ -203,14 +173,11 @@ def driver_table(summary: Summary) -> Grid:
 def group_table(summary: Summary) -> Grid:
     """How often flights failed over each varied parameter, lowest values first; of none or all failed, no lines."""
     failure = summary["events"]["failure"]
-    listed = {
-        label(name, found["unit"]): [_group(group) for group in found["groups"]]
-        if found["kind"] == "number"
-        else [f"{level}: {percent(share['share'])}" for level, share in found["levels"].items()]
-        for name, found in summary["parameters"].items()
-        if 0 < failure["count"] < failure["flights"]
-    }
-    listed = {name: cells for name, cells in listed.items() if cells}
+    listed = {}
+    for name, found in summary["parameters"].items() if 0 < failure["count"] < failure["flights"] else ():
+        levels = [f"{level}: {percent(share['share'])}" for level, share in found.get("levels", {}).items()]
+        if cells := levels + [_group(group) for group in found.get("groups", ())]:
+            listed[label(name, found["unit"])] = cells
     size = max(map(len, listed.values()), default=0)
     return Grid(
         key="groups",
@@ -225,12 +192,9 @@ def group_table(summary: Summary) -> Grid:
 def _association(found: Mapping[str, Any] | None) -> tuple[Cell, ...]:
     if found is None:
         return line(*[ABSENT] * 4)
-    return line(
-        Cell(text=f"{found['rho']:+.2f}", mark=Mark.BEST if found["p_holm"] < ALPHA else Mark.NONE),
-        p_value(found["p_holm"]),
-        Cell(text=f"{found['xi']:.2f}", mark=Mark.BEST if found["p_xi_holm"] < ALPHA else Mark.NONE),
-        p_value(found["p_xi_holm"]),
-    )
+    sure = [Mark.BEST if found[p] < ALPHA else Mark.NONE for p in ("p_holm", "p_xi_holm")]
+    rho, xi = Cell(text=f"{found['rho']:+.2f}", mark=sure[0]), Cell(text=f"{found['xi']:.2f}", mark=sure[1])
+    return line(rho, p_value(found["p_holm"]), xi, p_value(found["p_xi_holm"]))
 
 
 def _group(group: Mapping[str, Any]) -> str:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
-from scenarios.campaign.statistics.comparison import Comparison, EventComparison, MetricComparison
+from scenarios.campaign.statistics.comparison import Comparison
 from scenarios.campaign.statistics.inference import ALPHA, CONFIDENCE
-from scenarios.campaign.statistics.wording import label, p_value, percent, signed_interval, signed_points
+from scenarios.campaign.statistics.wording import label, p_value, percent
 from scenarios.schema.settings import shown
-
-_SURE = f"{100.0 * CONFIDENCE:g} %"
 
 
 def comparison_tables(comparison: Comparison) -> list[Grid]:
@@ -45,47 +43,41 @@ def pairing(comparison: Comparison) -> str:
 
 def _events(comparison: Comparison) -> Grid:
     a, b = comparison.names
+    lines = []
+    for event in comparison.events:
+        counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
+        pairs = map(str, (event.only_a, event.only_b, event.both))
+        sure = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
+        if any(event.counts):
+            corrected = Cell(text=p_value(event.p_holm), mark=sure)
+            lines.append(line(event.event, *counts, *pairs, p_value(event.p), corrected))
     return Grid(
         key="events",
         title="Events",
-        head=(
-            *("event", a, b, f"{a} alone", f"{b} alone", "both"),
-            *("p", "after Holm", "difference [points]", f"{_SURE} interval"),
-        ),
-        lines=tuple(_event(event) for event in comparison.events if any(event.counts)),
+        head=("event", a, b, f"{a} alone", f"{b} alone", "both", "p", "after Holm"),
+        lines=tuple(lines),
         note="p: McNemar's exact test, two-sided, of each event by itself; the verdict is by that of failure. After "
         "Holm: corrected for all events that one flight of a pair alone had; bold: beyond chance at "
-        f"{100.0 * ALPHA:g} %. Difference: {b} less {a}, with Tango's score interval for pairs.",
+        f"{100.0 * ALPHA:g} %.",
     )
-
-
-def _event(event: EventComparison) -> tuple[Cell, ...]:
-    counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
-    pairs = map(str, (event.only_a, event.only_b, event.both))
-    corrected = Cell(text=p_value(event.p_holm), mark=Mark.BEST if event.p_holm < ALPHA else Mark.NONE)
-    difference = signed_points(event.difference), signed_interval(event.lower, event.upper)
-    return line(event.event, *counts, *pairs, p_value(event.p), corrected, *difference)
 
 
 def _metrics(comparison: Comparison) -> Grid:
     a, b = comparison.names
+    lines = []
+    for metric in comparison.metrics:
+        found, ends, mark = metric.difference, ABSENT, Mark.NONE
+        if found.lower is not None and found.upper is not None:
+            ends = f"{format_number(found.lower)} to {format_number(found.upper)}"
+            mark = Mark.BEST if found.lower > 0.0 or found.upper < 0.0 else Mark.NONE
+        means = map(format_number, (metric.mean_a, metric.mean_b))
+        difference = Cell(text=format_number(found.mean), mark=mark)
+        lines.append(line(label(metric.name, metric.unit), *means, difference, ends, str(found.pairs)))
     return Grid(
         key="metrics",
         title="Metrics",
-        head=("metric", f"{a}, mean", f"{b}, mean", "mean difference", f"{_SURE} interval", "pairs"),
-        lines=tuple(_metric(metric) for metric in comparison.metrics),
+        head=("metric", f"{a}, mean", f"{b}, mean", "mean difference", f"{100.0 * CONFIDENCE:g} % interval", "pairs"),
+        lines=tuple(lines),
         note=f"Over the {comparison.completed} of {comparison.flights} pairs in which both flights were completed. "
         f"Differences are {b} less {a}; bold where Student's t interval does not hold 0.",
     )
-
-
-def _metric(metric: MetricComparison) -> tuple[Cell, ...]:
-    found = metric.difference
-    means = (format_number(value) for value in (metric.mean_a, metric.mean_b))
-    if found.lower is None or found.upper is None:
-        difference, ends = Cell(text=format_number(found.mean)), ABSENT
-    else:
-        mark = Mark.BEST if found.lower > 0.0 or found.upper < 0.0 else Mark.NONE
-        difference = Cell(text=format_number(found.mean), mark=mark)
-        ends = f"{format_number(found.lower)} to {format_number(found.upper)}"
-    return line(label(metric.name, metric.unit), *means, difference, ends, str(found.pairs))

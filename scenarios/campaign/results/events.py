@@ -5,6 +5,7 @@ One rule for what is not known: where a flight has no value, the event holds, si
 
 from __future__ import annotations
 
+import contextlib
 import math
 import operator
 import re
@@ -14,37 +15,61 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from scenarios.campaign.results.verdicts import VERDICT_EVENTS
+from quadsim.report.curves import BOUND, LINES, REFERENCE
+from scenarios.many import DIED, ERROR, MEMORY, TIMEOUT
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 Flags = np.ndarray[Any, np.dtype[np.bool_]]
+HARMLESS: Final = "satisfied"
+INCOMPLETE: Final = "incomplete"  # of a flight that ended before it reached a required constraint: neither good nor bad
+
+
+class Verdict(NamedTuple):
+    """What is to be known of a verdict."""
+
+    badness: int  # its place among the worst flights: the larger, the worse
+    colour: str
+    symbol: str
+
+
+VERDICTS: Final = {
+    HARMLESS: Verdict(0, LINES[0], "circle"),
+    INCOMPLETE: Verdict(1, LINES[2], "cross"),
+    "violated": Verdict(2, LINES[1], "diamond"),
+    "lost": Verdict(6, BOUND, "x"),
+    ERROR: Verdict(5, REFERENCE, "square"),
+    DIED: Verdict(5, LINES[3], "pentagon"),
+    TIMEOUT: Verdict(4, LINES[4], "triangle-up"),
+    MEMORY: Verdict(3, LINES[5], "triangle-down"),
+}
+"""In the order in which they are drawn and counted."""
 
 _NAMED: Final[dict[str, tuple[str, bool | str]]] = {
     "failure": ("failed", True),
     "violation": ("violated", True),
     "lost": ("verdict", "lost"),
     "crash": ("crashed", True),
-    **{verdict: ("verdict", verdict) for verdict in VERDICT_EVENTS},
+    **{verdict: ("verdict", verdict) for verdict in VERDICTS if verdict not in (HARMLESS, "violated")},
 }
 """Column of each event that has a name, and its value there where the event holds."""
 _SPELLINGS: Final = {"failed": "failure", "violated": "violation", "crashed": "crash"}
-_OPERATIONS: Final = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
+OPERATIONS: Final = {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge}
 _NEVER_COMPARED: Final = ("flight", "seed", "failed")
 """Columns that identify flights, or are covered by other events."""
 _COMPARISON: Final = re.compile(r"(?P<column>[^<>=]*?)\s*(?P<operation><=|>=|<|>)\s*(?P<number>[^<>=]*)")
 
-EVENT_NAMES: Final = tuple(_NAMED)  # the events that have a name; every other one is `COLUMN OP NUMBER`
+EVENT_NAMES: Final = tuple(_NAMED)
 
 
 class Event(NamedTuple):
     """Something that a flight's row shows to have happened, or not."""
 
-    text: str  # the event in its standard form: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`
-    column_name: str  # the column that shows it
+    text: str  # in its standard form: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`
+    column_name: str
     operation: str  # `==`, `<`, `<=`, `>` or `>=`
-    value: bool | str | float  # what the column is compared with
+    value: bool | str | float
 
     def holds(self, row: Mapping[str, Any]) -> bool:
         """Whether it happened in one flight, given its values by column; so it did where the flight has no value.
@@ -62,20 +87,13 @@ class Event(NamedTuple):
             return bool(value == self.value)
         if isinstance(value, str):
             raise _no_number(self.text, self.column_name)
-        return math.isnan(value) or bool(_OPERATIONS[self.operation](value, self.value))
+        return math.isnan(value) or bool(OPERATIONS[self.operation](value, self.value))
 
     def column(self, table: pa.Table) -> Flags:
-        """(K,) whether it happened, flight by flight; the same as `holds` of every row.
-
-        Raises:
-            UnknownNameError: there is no such column.
-            InputError: a number is required, and the column holds text.
-        """
-        if self.column_name not in table.column_names:
-            raise UnknownNameError("column", self.column_name, table.column_names)
-        if self.operation != "==" and not is_number(table.schema.field(self.column_name).type):
-            raise _no_number(self.text, self.column_name)
-        return np.array([self.holds({self.column_name: value}) for value in table[self.column_name].to_pylist()], bool)
+        """(K,) whether it happened, flight by flight; the same as `holds` of every row, with the same refusals."""
+        if self.operation != "==":
+            _require_number(self.text, self.column_name, {field.name: field.type for field in table.schema})
+        return np.array([self.holds(row) for row in table.select([self.column_name]).to_pylist()], bool)
 
 
 def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> Event:
@@ -100,18 +118,17 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> 
     if found is None:
         hint = "or a comparison, COLUMN OP NUMBER with < <= > or >=, such as 'rmse.z > 0.5'"
         raise UnknownNameError("event", text, {*_NAMED, *_SPELLINGS}, hint=hint)
-    column = found["column"]
+    column, operation, given = found.groups()
     if column in _NEVER_COMPARED:
         raise InputError(
             f"event {text!r} must compare a column that measures a flight, such as rmse.z; {column!r} does not"
         )
     if columns is not None:
-        if column not in columns:
-            raise UnknownNameError("column", column, [name for name, kind in columns.items() if is_number(kind)])
-        if not is_number(columns[column]):
-            raise _no_number(text, column)
-    number = _number(found["number"], text)
-    return Event(f"{column} {found['operation']} {number:.15g}", column, found["operation"], number)
+        _require_number(text, column, columns)
+    with contextlib.suppress(ValueError):
+        if math.isfinite(number := float(given)):
+            return Event(f"{column} {operation} {number:.15g}", column, operation, number)
+    raise ParameterError(f"event {text!r}", "number", given, "a finite number")
 
 
 def is_number(kind: pa.DataType) -> bool:
@@ -121,15 +138,12 @@ def is_number(kind: pa.DataType) -> bool:
     return bool(types.is_boolean(kind) or types.is_integer(kind) or types.is_floating(kind))
 
 
+def _require_number(event: str, column: str, columns: Mapping[str, pa.DataType]) -> None:
+    if column not in columns:
+        raise UnknownNameError("column", column, [name for name, kind in columns.items() if is_number(kind)])
+    if not is_number(columns[column]):
+        raise _no_number(event, column)
+
+
 def _no_number(event: str, column: str) -> InputError:
     return InputError(f"event {event!r} compares with a number; the column {column!r} holds text")
-
-
-def _number(given: str, event: str) -> float:
-    try:
-        number = float(given)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise ParameterError(f"event {event!r}", "number", given, "a finite number")
-    return number

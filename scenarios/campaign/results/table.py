@@ -21,8 +21,7 @@ from quadsim.flight.audit import Finding, Limit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
-from scenarios.campaign.results.events import Event, Flags
-from scenarios.campaign.results.verdicts import HARMLESS, INCOMPLETE, VERDICTS
+from scenarios.campaign.results.events import HARMLESS, INCOMPLETE, VERDICTS, Event, Flags
 from scenarios.many import ERROR
 
 Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
@@ -30,38 +29,35 @@ DRAW: Final = "draw."  # how the columns of drawn values begin
 MARGIN, TIME_VIOLATED, SATISFIED = "margin.", "time_violated.", "satisfied."
 """How the columns of a constraint begin, before its name."""
 _MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
-_HEAD: Final = (
-    ("status", "-", pa.string()),
-    ("verdict", "-", pa.string()),
-    ("reason", "-", pa.string()),
-    ("failed", "-", pa.bool_()),
-    ("violated", "-", pa.bool_()),
-    ("crashed", "-", pa.bool_()),
-    ("duration", "s", pa.float64()),
-)
-_COMMANDS: Final = (
-    ("peak_tilt", "deg", pa.float64()),
-    ("speed_min", "rad/s", pa.float64()),
-    ("speed_max", "rad/s", pa.float64()),
-    ("slew_min", "rad/s", pa.float64()),
-    ("slew_max", "rad/s", pa.float64()),
-    ("total_variation", "rad/s", pa.float64()),
-    ("fallback_periods", "-", pa.int64()),
-    ("fallback_max", "-", pa.int64()),
-    ("unsolved_periods", "-", pa.int64()),
-    ("slack_max", "rad", pa.float64()),
-    ("solver_periods", "-", pa.int64()),
-    ("iterations.mean", "-", pa.float64()),
-    ("iterations.max", "-", pa.int64()),
-)
-_WORST: Final = (("worst_margin", "-", pa.float64()), ("worst_constraint", "-", pa.string()))
 _COMMANDED: Final = ("speed", "slew")  # signals that the controller sets itself
-TIMING: Final = (
-    ("machine", "-", pa.string()),
-    ("wall_s", "s", pa.float64()),
-    ("step_p50_ms", "ms", pa.float64()),
-    ("step_p99_ms", "ms", pa.float64()),
-)
+_FLOAT, _WHOLE = pa.float64(), pa.int64()
+
+
+def _fields(kind: pa.DataType, unit: str, *names: str) -> list[pa.Field]:
+    return [pa.field(name, kind, metadata={"unit": unit}) for name in names]
+
+
+_HEAD: Final = [
+    *_fields(pa.string(), "-", "status", "verdict", "reason"),
+    *_fields(pa.bool_(), "-", "failed", "violated", "crashed"),
+    *_fields(_FLOAT, "s", "duration"),
+]
+_COMMANDS: Final = [
+    *_fields(_FLOAT, "deg", "peak_tilt"),
+    *_fields(_FLOAT, "rad/s", "speed_min", "speed_max", "slew_min", "slew_max", "total_variation"),
+    *_fields(_WHOLE, "-", "fallback_periods", "fallback_max", "unsolved_periods"),
+    *_fields(_FLOAT, "rad", "slack_max"),
+    *_fields(_WHOLE, "-", "solver_periods"),
+    *_fields(_FLOAT, "-", "iterations.mean"),
+    *_fields(_WHOLE, "-", "iterations.max"),
+]
+_WORST: Final = [*_fields(_FLOAT, "-", "worst_margin"), *_fields(pa.string(), "-", "worst_constraint")]
+_TIMING: Final = [
+    *_fields(pa.string(), "-", "machine"),
+    *_fields(_FLOAT, "s", "wall_s"),
+    *_fields(_FLOAT, "ms", "step_p50_ms", "step_p99_ms"),
+]
+TIMES: Final = tuple(field.name for field in _TIMING)
 """What a clock measured of a flight, and where; it stands in a table of its own."""
 Summary = Mapping[str, Any]
 Texts = np.ndarray[Any, np.dtype[np.object_]]
@@ -70,50 +66,24 @@ Rows = np.ndarray[Any, np.dtype[np.intp]]
 
 
 def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit]) -> pa.Schema:
-    """The columns of a campaign, clock times last.
-
-    Args:
-        draws: type and unit, `-` for none, of each varied parameter, by name.
-        limits: what its flights are audited against.
-    """
-    tracked = [
-        (f"{measure}.{channel}", unit, pa.float64())
-        for measure in _MEASURES
-        for channel, unit in zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)
-    ]
-    audited = [
-        column
-        for limit in limits
-        for column in (
-            (MARGIN + limit.name, limit.unit, pa.float64()),
-            (TIME_VIOLATED + limit.name, "s", pa.float64()),
-            (SATISFIED + limit.name, "-", pa.bool_()),
-        )
-    ]
-    columns = [
-        ("flight", "-", pa.int64()),
-        ("seed", "-", pa.int64()),
-        *((DRAW + name, unit, kind) for name, (kind, unit) in draws.items()),
-        *_HEAD,
-        *tracked,
-        *_COMMANDS,
-        *audited,
-        *_WORST,
-        *TIMING,
-    ]
-    return pa.schema([pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in columns])
+    """The columns of a campaign, clock times last; `draws` has type and unit of each varied parameter."""
+    fields = _fields(_WHOLE, "-", "flight", "seed")
+    for name, (kind, unit) in draws.items():
+        fields += _fields(kind, unit, DRAW + name)
+    fields += _HEAD
+    for measure in _MEASURES:
+        for channel, unit in zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True):
+            fields += _fields(_FLOAT, unit, f"{measure}.{channel}")
+    fields += _COMMANDS
+    for limit in limits:
+        fields += _fields(_FLOAT, limit.unit, MARGIN + limit.name)
+        fields += _fields(_FLOAT, "s", TIME_VIOLATED + limit.name)
+        fields += _fields(pa.bool_(), "-", SATISFIED + limit.name)
+    return pa.schema([*fields, *_WORST, *_TIMING])
 
 
 def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall_s: float, machine: str) -> Row:
-    """What a campaign keeps of a flight.
-
-    Args:
-        log: with plant rows at the physics rate.
-        findings: its audit.
-        verdict: `satisfied`, `violated`, `lost` or `incomplete`.
-        wall_s: how long it took to fly [s].
-        machine: the processor that flew it.
-    """
+    """What a campaign keeps of a flight, whose plant rows are at the physics rate, and of its audit."""
     row: Row = {
         "status": log.status,
         "verdict": verdict,
@@ -158,15 +128,18 @@ def worst_margin(findings: Iterable[Finding]) -> tuple[float | None, str | None]
 
 def make_table(rows: Iterable[Row], schema: pa.Schema) -> pa.Table:
     """Rows as a table, sorted by flight; what a row lacks is null, and text that is no Unicode has backslashes."""
+
+    def storable(value: object) -> object:
+        return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
+
     ordered = sorted(rows, key=lambda row: row["flight"])
-    columns = [pa.array([_storable(row.get(field.name)) for row in ordered], field.type) for field in schema]
+    columns = [pa.array([storable(row.get(field.name)) for row in ordered], field.type) for field in schema]
     return pa.Table.from_arrays(columns, schema=schema)
 
 
 def split_times(table: pa.Table) -> tuple[pa.Table, pa.Table]:
     """What a seed determines, and what a clock measured, by flight."""
-    times = [name for name, *_ in TIMING]
-    return table.drop_columns(times), table.select(["flight", *times])
+    return table.drop_columns([*TIMES]), table.select(["flight", *TIMES])
 
 
 def read_table(path: Path) -> pa.Table:
@@ -183,8 +156,7 @@ def read_table(path: Path) -> pa.Table:
 
 def unit_of(table: pa.Table, column: str) -> str:
     """The unit of a column; `-` for none."""
-    metadata = table.schema.field(column).metadata or {}
-    return str(metadata.get(b"unit", b"-").decode())
+    return str((table.schema.field(column).metadata or {}).get(b"unit", b"-").decode())
 
 
 def _numbers(log: FlightLog) -> Row:
@@ -204,7 +176,8 @@ def _numbers(log: FlightLog) -> Row:
         "solver_periods": int(by_solver.sum()),
         "iterations.mean": float(control.iterations[by_solver].mean()) if by_solver.any() else None,
         "iterations.max": int(control.iterations[by_solver].max()) if by_solver.any() else None,
-        **dict(zip(("step_p50_ms", "step_p99_ms"), np.percentile(log.timing.step_ms, [50, 99]).tolist(), strict=True)),
+        "step_p50_ms": float(np.percentile(log.timing.step_ms, 50)),
+        "step_p99_ms": float(np.percentile(log.timing.step_ms, 99)),
     }
 
 
@@ -214,11 +187,6 @@ def _share(finding: Finding) -> float:
     at_samples = finding.worst_margin_sampled + finding.limit.tolerance_sampled
     nearest = np.fmin(at_physics_rate, at_samples) if math.isfinite(at_physics_rate) else at_physics_rate
     return float(nearest) / finding.limit.half_band
-
-
-def _storable(value: object) -> object:
-    """A text without lone surrogates, which no file holds; all else as it is."""
-    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 
 def numbers(table: pa.Table, name: str) -> Array:
@@ -235,14 +203,13 @@ def flags(table: pa.Table, name: str, *, absent: bool) -> Flags:
 
 def texts(table: pa.Table, name: str) -> Texts:
     """(K,) a column as text, `-` where a flight has none; truth values as `true` and `false`."""
-    words = {None: "-", True: "true", False: "false"} if pa.types.is_boolean(table[name].type) else {None: "-"}
-    return np.array([str(words.get(value, value)) for value in table[name].to_pylist()], object)
+    words = table[name].cast(pa.string()) if pa.types.is_boolean(table[name].type) else table[name]
+    return np.array(["-" if value is None else str(value) for value in words.to_pylist()], object)
 
 
 def verdicts(table: pa.Table) -> dict[str, Flags]:
     """(K,) which flights have each verdict."""
-    found = texts(table, "verdict")
-    return {verdict: np.asarray(found == verdict, bool) for verdict in VERDICTS}
+    return {verdict: np.asarray(texts(table, "verdict") == verdict, bool) for verdict in VERDICTS}
 
 
 def is_counted(table: pa.Table, event: Event) -> Flags:
@@ -267,12 +234,7 @@ def constraint_names(table: pa.Table) -> list[str]:
 
 def metric_names(table: pa.Table) -> list[str]:
     """The columns that measure a flight by a number, `worst_margin` included."""
-    return [
-        field.name
-        for field in table.schema
-        if (pa.types.is_integer(field.type) or pa.types.is_floating(field.type))
-        and not field.name.startswith(_NO_METRIC)
-    ]
+    return [name for name in table.column_names if is_number(table, name) and not name.startswith(_NO_METRIC)]
 
 
 def is_number(table: pa.Table, name: str) -> bool:

@@ -7,14 +7,13 @@ far smaller differences than two campaigns side by side would.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError
-from quadsim.state import Array
 from scenarios.campaign.results.events import EVENT_NAMES, Flags, parse_event
 from scenarios.campaign.results.table import (
     DRAW,
@@ -29,15 +28,12 @@ from scenarios.campaign.results.table import (
 )
 from scenarios.campaign.statistics import inference
 from scenarios.campaign.statistics.estimates import FAILURE
-from scenarios.campaign.statistics.wording import p_value, signed_interval, signed_points
+from scenarios.campaign.statistics.wording import p_value
 
 COMPARED: Final = (
     *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
     *(f"max_error.{name}" for name in ("x", "y", "z")),
-    "peak_tilt",
-    "worst_margin",
-    "total_variation",
-    "fallback_periods",
+    *("peak_tilt", "worst_margin", "total_variation", "fallback_periods"),
 )
 """Metrics that are compared, where both campaigns have them."""
 Differences = tuple[tuple[str, Any, Any], ...]
@@ -46,19 +42,16 @@ Differences = tuple[tuple[str, Any, Any], ...]
 
 @dataclass(frozen=True, kw_only=True)
 class EventComparison:
-    """How often an event happened to one, to the other, and to both."""
+    """In how many pairs an event happened to both flights, to one alone, and to none."""
 
-    event: str  # its name
-    both: int  # pairs in which it happened to both flights
-    only_a: int  # to the first campaign's alone
-    only_b: int  # to the second campaign's alone
-    neither: int  # to none of them
-    p: float  # two-sided p-value of McNemar's exact test
-    # that, corrected by Holm's method for all compared events that happened to one flight of a pair alone
-    p_holm: float
+    event: str
+    both: int
+    only_a: int
+    only_b: int
+    neither: int
+    p: float  # two-sided, of McNemar's exact test
+    p_holm: float  # corrected for all compared events that happened to one flight of a pair alone
     difference: float  # share of b - share of a
-    lower: float  # lower end of Tango's interval of that
-    upper: float  # its upper end
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -75,44 +68,26 @@ class EventComparison:
 class MetricComparison:
     """A metric over the pairs in which both flights were completed and have it."""
 
-    name: str  # its column
-    unit: str  # its unit, `-` for none
-    mean_a: float | None  # mean of the first campaign over these pairs; None of no pairs
-    mean_b: float | None  # mean of the second
+    name: str
+    unit: str
+    mean_a: float | None  # None of no pairs
+    mean_b: float | None
     difference: inference.PairedDifference  # of the second less the first
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """What two campaigns on the same draws show of each other.
+    """What two campaigns on the same draws show of each other."""
 
-    Attributes:
-        names: of the first and the second campaign.
-        flights: pairs, flights that both campaigns have.
-        left_out: flights that only one of them has, or of whose pair one is incomplete.
-        completed: pairs in which both flights were completed.
-        shared_draws: parameters that both drew, alike in every pair.
-        own_draws: parameters that only one of them drew.
-        differences: fields in which their scenarios and draws differ, with both values; None where not known.
-        events: failure, then every other event that has a name, then for each constraint that it was not held.
-        metrics: the main metrics.
-        numbers: (flights,) of the pairs.
-        margins: (flights, 2) worst margins; NaN where a flight has none.
-        failed: (flights, 2) which flights failed.
-    """
-
-    names: tuple[str, str]
-    flights: int
-    left_out: int
-    completed: int
-    shared_draws: tuple[str, ...]
-    own_draws: tuple[str, ...]
-    differences: Differences | None
-    events: tuple[EventComparison, ...]
+    names: tuple[str, str]  # of the first and the second campaign
+    flights: int  # pairs
+    left_out: int  # flights that only one of them has, or of whose pair one is incomplete
+    completed: int  # pairs in which both flights were completed
+    shared_draws: tuple[str, ...]  # parameters that both drew, alike in every pair
+    own_draws: tuple[str, ...]  # parameters that only one of them drew
+    differences: Differences | None  # fields in which their scenarios and draws differ; None where not known
+    events: tuple[EventComparison, ...]  # failure, then every other event with a name, then each constraint not held
     metrics: tuple[MetricComparison, ...]
-    numbers: Array = field(repr=False, compare=False)
-    margins: Array = field(repr=False, compare=False)
-    failed: Flags = field(repr=False, compare=False)
 
     @property
     def verdict(self) -> str:
@@ -125,31 +100,28 @@ class Comparison:
     @property
     def sentence(self) -> str:
         """The verdict with its numbers."""
-        a, b = self.names
-        failure = self.events[0]
-        count_a, count_b = failure.counts
-        phrase = (
-            f"{b} and {a} are not distinguishable by their failures"
-            if self.verdict == "not distinguishable"
-            else f"{b} is {self.verdict} than {a}"
-        )
+        (a, b), failure = self.names, self.events[0]
+        phrase = f"{b} is {self.verdict} than {a}"
+        if self.verdict == "not distinguishable":
+            phrase = f"{b} and {a} are not distinguishable by their failures"
         return (
-            f"{phrase}: of {self.flights} paired flights, {count_b} failed with {b} and {count_a} with {a} "
-            f"(McNemar's exact test, {p_value(failure.p)}). The difference is {signed_points(failure.difference)} "
-            f"percentage points ({100.0 * inference.CONFIDENCE:g} %: {signed_interval(failure.lower, failure.upper)})."
+            f"{phrase}: of {self.flights} paired flights, {failure.counts[1]} failed with {b} and {failure.counts[0]} "
+            f"with {a} (McNemar's exact test, {p_value(failure.p)})."
         )
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for a file; differences are of the second campaign less the first."""
-        named = ("flights", "left_out", "completed", "shared_draws", "own_draws")
-        differences = [{"field": name, "values": [first, second]} for name, first, second in self.differences or ()]
         return {
             "names": list(self.names),
             "verdict": self.verdict,
             "sentence": self.sentence,
             "confidence": inference.CONFIDENCE,
-            **{name: list(of) if isinstance(of := getattr(self, name), tuple) else of for name in named},
-            "differences": None if self.differences is None else differences,
+            **{name: getattr(self, name) for name in ("flights", "left_out", "completed")},
+            "shared_draws": list(self.shared_draws),
+            "own_draws": list(self.own_draws),
+            "differences": None
+            if self.differences is None
+            else [{"field": name, "values": list(values)} for name, *values in self.differences],
             "events": {event.event: asdict(event) for event in self.events},
             "metrics": {metric.name: asdict(metric) for metric in self.metrics},
         }
@@ -181,8 +153,7 @@ def compare(
     shared = np.intersect1d(numbers(table_a, "flight"), numbers(table_b, "flight"))
     if not shared.size:
         raise InputError(f"campaigns {names[0]!r} and {names[1]!r} have no flight of one number: nothing can be paired")
-    a, b = (table.take(np.flatnonzero(np.isin(numbers(table, "flight"), shared))) for table in (table_a, table_b))
-    a, b = (table.sort_by("flight") for table in (a, b))
+    a, b = (table.filter(np.isin(numbers(table, "flight"), shared)).sort_by("flight") for table in (table_a, table_b))
     complete = is_counted(a, FAILURE) & is_counted(b, FAILURE)
     if not complete.any():
         raise InputError(
@@ -193,7 +164,13 @@ def compare(
     draws_a, draws_b = draw_names(a), draw_names(b)
     shared_draws = tuple(name for name in draws_a if name in draws_b)
     for column in ("seed", *(DRAW + name for name in shared_draws)):
-        _require_alike(a, b, column, names)
+        for flight, *values in zip(*(each.to_pylist() for each in (a["flight"], a[column], b[column])), strict=True):
+            if values[0] != values[1]:
+                raise InputError(
+                    f"flight {flight} of {names[0]!r} has {column} = {values[0]!r}, and of {names[1]!r} {values[1]!r}: "
+                    "only campaigns of one seed and the same draws can be compared in pairs; fly one of them again "
+                    "with the other's seed, sampling and [[vary]]"
+                )
     completed = (texts(a, "status") == "completed") & (texts(b, "status") == "completed")
     return Comparison(
         names=names,
@@ -207,42 +184,25 @@ def compare(
         metrics=tuple(
             _compare_metric(a, b, name, completed)
             for name in COMPARED
-            if name in a.column_names and name in b.column_names
+            if {name} <= {*a.column_names} & {*b.column_names}
         ),
-        numbers=numbers(a, "flight"),
-        margins=np.stack([numbers(table, "worst_margin") for table in (a, b)], axis=1),
-        failed=np.stack([FAILURE.column(table) for table in (a, b)], axis=1),
     )
 
 
 def _require_same_questions(
     a: pa.Table, b: pa.Table, names: Sequence[str], failures: tuple[Sequence[str], Sequence[str]] | None
 ) -> None:
-    if failures is not None:
-        first, second = (sorted({parse_event(text).text for text in events}) for events in failures)
-        if first != second:
-            raise InputError(
-                f"{names[0]!r} counts {', '.join(first)} as failure, and {names[1]!r} {', '.join(second)}: only "
-                "campaigns with the same failure events can be compared; fly one of them again with the other's"
-            )
-    only = [sorted(set(constraint_names(one)) - set(constraint_names(other))) for one, other in ((a, b), (b, a))]
-    for name, own in zip(names, only, strict=True):
-        if own:
+    first, second = (sorted({parse_event(text).text for text in events}) for events in failures or ((), ()))
+    if first != second:
+        raise InputError(
+            f"{names[0]!r} counts {', '.join(first)} as failure, and {names[1]!r} {', '.join(second)}: only "
+            "campaigns with the same failure events can be compared; fly one of them again with the other's"
+        )
+    for name, one, other in ((names[0], a, b), (names[1], b, a)):
+        if own := sorted(set(constraint_names(one)) - set(constraint_names(other))):
             raise InputError(
                 f"{name!r} alone has the constraints {', '.join(own)}: only campaigns that are audited against the "
                 "same constraints can be compared"
-            )
-
-
-def _require_alike(a: pa.Table, b: pa.Table, column: str, names: Sequence[str]) -> None:
-    for flight, first, second in zip(
-        a["flight"].to_pylist(), a[column].to_pylist(), b[column].to_pylist(), strict=True
-    ):
-        if first != second:
-            raise InputError(
-                f"flight {flight} of {names[0]!r} has {column} = {first!r}, and of {names[1]!r} {second!r}: only "
-                "campaigns of one seed and the same draws can be compared in pairs; fly one of them again with the "
-                "other's seed, sampling and [[vary]]"
             )
 
 
@@ -251,32 +211,26 @@ def _compare_events(a: pa.Table, b: pa.Table) -> tuple[EventComparison, ...]:
 
     These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).
     """
-    happened = {name: tuple(parse_event(name).column(table) for table in (a, b)) for name in EVENT_NAMES}
+    happened = {name: [parse_event(name).column(table) for table in (a, b)] for name in EVENT_NAMES}
     for name in constraint_names(a):
-        happened[f"{name} not held"] = tuple(~flags(table, SATISFIED + name, absent=False) for table in (a, b))
+        happened[f"{name} not held"] = [~flags(table, SATISFIED + name, absent=False) for table in (a, b)]
     alone = {event: (int((in_a & ~in_b).sum()), int((in_b & ~in_a).sum())) for event, (in_a, in_b) in happened.items()}
     p = {event: inference.mcnemar(*counts) for event, counts in alone.items()}
     tested = [event for event, counts in alone.items() if any(counts)]
     corrected = dict(zip(tested, inference.holm([p[event] for event in tested]), strict=True))
-    found = []
-    for event, (in_a, in_b) in happened.items():
-        (only_a, only_b), both, pairs = alone[event], int((in_a & in_b).sum()), a.num_rows
-        lower, upper = inference.paired_shares(only_a, only_b, pairs)
-        found.append(
-            EventComparison(
-                event=event,
-                both=both,
-                only_a=only_a,
-                only_b=only_b,
-                neither=pairs - both - only_a - only_b,
-                p=p[event],
-                p_holm=corrected.get(event, 1.0),
-                difference=(only_b - only_a) / pairs,
-                lower=lower,
-                upper=upper,
-            )
+    return tuple(
+        EventComparison(
+            event=event,
+            both=int((in_a & in_b).sum()),
+            only_a=alone[event][0],
+            only_b=alone[event][1],
+            neither=int((~in_a & ~in_b).sum()),
+            p=p[event],
+            p_holm=corrected.get(event, 1.0),
+            difference=(alone[event][1] - alone[event][0]) / a.num_rows,
         )
-    return tuple(found)
+        for event, (in_a, in_b) in happened.items()
+    )
 
 
 def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> MetricComparison:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, Final
@@ -12,7 +11,7 @@ import pyarrow as pa
 
 from quadsim.errors import ParameterError
 from quadsim.state import Array
-from scenarios.campaign.results.events import EVENT_NAMES, Event, Flags, parse_event
+from scenarios.campaign.results.events import EVENT_NAMES, INCOMPLETE, VERDICTS, Flags, parse_event
 from scenarios.campaign.results.table import (
     DRAW,
     MARGIN,
@@ -29,13 +28,12 @@ from scenarios.campaign.results.table import (
     unit_of,
     verdicts,
 )
-from scenarios.campaign.results.verdicts import INCOMPLETE, VERDICTS
 from scenarios.campaign.statistics.dependence import dependence
-from scenarios.campaign.statistics.inference import CONFIDENCE, holm, lower_bounds, share_of, upper_bounds
+from scenarios.campaign.statistics.inference import CONFIDENCE, holm, share_of
 
 FAILURE: Final = parse_event("failure")
 WORST_FLIGHTS: Final = 10
-_CURVE_POINTS: Final = 80
+_PERCENTILES: Final = {"min": 0, "p5": 5, "p50": 50, "p95": 95, "p99": 99, "max": 100}
 _GROUPS: Final = ((50, 5), (12, 3))
 """Flights from which a varied parameter's values are looked at in this many groups of about equal size."""
 
@@ -46,23 +44,23 @@ def estimate(table: pa.Table) -> dict[str, Any]:
     Keys: `flights`; `confidence` of every interval; `verdicts`, flights of each; `events` and `constraints`, by name,
     as proportions (`inference.Proportion`), a constraint's being that it did not hold, among the flights that reached
     it or were lost before; `metrics`, over the flights that have each; `parameters`, how the outcome depends on each
-    varied parameter (`parameters`); `worst`, the ten worst flights; `convergence` of the shares of failure and
-    violation over the first n flights.
+    varied parameter (`parameters`); `worst`, the ten worst flights.
 
     Incomplete flights are neither failures nor successes (`results.table.is_counted`): the shares of failure and
-    violation, `parameters` and `convergence` leave them out.
+    violation, and `parameters`, leave them out.
     """
-    counted = table.filter(is_counted(table, FAILURE))
     return {
         "flights": table.num_rows,
         "confidence": CONFIDENCE,
         "verdicts": {verdict: int(found.sum()) for verdict, found in verdicts(table).items()},
-        "events": {name: _event(table, parse_event(name)) for name in EVENT_NAMES},
+        "events": {
+            event.text: share_of(event.column(table)[is_counted(table, event)])
+            for event in map(parse_event, EVENT_NAMES)
+        },
         "metrics": {name: _metric(table, name) for name in metric_names(table)},
         "constraints": {name: _constraint(table, name) for name in constraint_names(table)},
-        "parameters": parameters(counted),
+        "parameters": parameters(table.filter(is_counted(table, FAILURE))),
         "worst": [_flight(table, int(i)) for i in ranking(table)[:WORST_FLIGHTS]],
-        "convergence": _convergence(counted),
     }
 
 
@@ -84,8 +82,7 @@ def ranking(table: pa.Table) -> np.ndarray[Any, np.dtype[np.intp]]:
     without a margin come after those with one, by their RMS error in position, the largest first.  What is still equal
     is in the order of the flights' numbers.
     """
-    known = {name: verdict.badness for name, verdict in VERDICTS.items()}
-    badness = np.array([known.get(name, max(known.values())) for name in texts(table, "verdict")], int)
+    badness = np.array([VERDICTS[name].badness for name in texts(table, "verdict")], int)
     margin = numbers(table, "worst_margin")
     errors = np.stack([np.nan_to_num(numbers(table, f"rmse.{axis}")) for axis in "xyz"])
     distance = np.where(np.isnan(margin), np.linalg.norm(errors, axis=0), 0.0)
@@ -104,19 +101,13 @@ def _metric(table: pa.Table, name: str) -> dict[str, Any]:
     values = values[np.isfinite(values)]
     found: dict[str, Any] = {"unit": unit_of(table, name), "flights": int(values.size)}
     if not values.size:
-        return found | dict.fromkeys(("mean", "sd", "min", "p5", "p50", "p95", "p99", "max"))
-    percentiles = np.percentile(values, [5, 50, 95, 99]).tolist()
+        return found | dict.fromkeys(("mean", "sd", *_PERCENTILES))
+    percentiles = np.percentile(values, [*_PERCENTILES.values()]).tolist()
     return found | {
         "mean": float(values.mean()),
         "sd": float(values.std(ddof=1)) if values.size > 1 else None,
-        "min": float(values.min()),
-        **dict(zip(("p5", "p50", "p95", "p99"), percentiles, strict=True)),
-        "max": float(values.max()),
+        **dict(zip(_PERCENTILES, percentiles, strict=True)),
     }
-
-
-def _event(table: pa.Table, event: Event) -> dict[str, Any]:
-    return share_of(event.column(table)[is_counted(table, event)])
 
 
 def _constraint(table: pa.Table, name: str) -> dict[str, Any]:
@@ -124,41 +115,19 @@ def _constraint(table: pa.Table, name: str) -> dict[str, Any]:
     held = flags(table, SATISFIED + name, absent=False)
     unknown = [value is None for value in table[SATISFIED + name].to_pylist()]
     reached = ~(np.array(unknown, bool) & np.isin(texts(table, "verdict").astype(str), (INCOMPLETE, "violated")))
-    found: dict[str, Any] = {
+    worst = int(np.nanargmin(margin)) if np.isfinite(margin).any() else None
+    return {
         "unit": unit_of(table, MARGIN + name),
         "not_satisfied": share_of(~held[reached]),
-        "worst_margin": None,
-        "worst_flight": None,
+        "worst_margin": None if worst is None else float(margin[worst]),
+        "worst_flight": None if worst is None else table["flight"][worst].as_py(),
     }
-    if np.isfinite(margin).any():
-        row = int(np.nanargmin(margin))
-        found |= {"worst_margin": float(margin[row]), "worst_flight": table["flight"][row].as_py()}
-    return found
 
 
 def _flight(table: pa.Table, row: int) -> dict[str, Any]:
     shown = ("flight", "verdict", "failed", "worst_margin", "worst_constraint", "duration", "reason")
     values = table.slice(row, 1).to_pylist()[0]
-    margin = values["worst_margin"]
-    if margin is not None and not math.isfinite(margin):
-        values["worst_margin"] = None
     return {name: values[name] for name in shown} | {"draws": {name: values[DRAW + name] for name in draw_names(table)}}
-
-
-def _convergence(table: pa.Table) -> dict[str, Any]:
-    """Shares over the first n flights, n evenly spread on a logarithmic scale."""
-    total = table.num_rows
-    n = np.unique(np.round(np.geomspace(1.0, total, _CURVE_POINTS)).astype(int)) if total else np.empty(0, int)
-    either = 0.5 * (1.0 + CONFIDENCE)
-    found: dict[str, Any] = {"flights": n.tolist()}
-    for name in ("failure", "violation"):
-        counts = np.cumsum(parse_event(name).column(table))[n - 1]
-        found[name] = {
-            "share": (counts / n).tolist(),
-            "lower": lower_bounds(counts, n, either).tolist(),
-            "upper": upper_bounds(counts, n, either).tolist(),
-        }
-    return found
 
 
 def parameters(table: pa.Table) -> dict[str, Any]:

@@ -23,25 +23,25 @@ ALPHA: Final = 0.05  # level of the tests
 
 @dataclass(frozen=True, kw_only=True)
 class Proportion:
-    """A share of flights, with its Clopper-Pearson intervals."""
+    """A share of flights, with its Clopper-Pearson interval and its one-sided bounds."""
 
     count: int  # flights in which it happened
-    flights: int  # of how many
-    share: float | None  # count / flights; None of no flights
-    lower: float  # lower end of the two-sided interval
-    upper: float  # upper end of the two-sided interval
-    lower_one_sided: float  # what the share is at least, with all the doubt on that side
-    upper_one_sided: float  # what the share is at most, with all the doubt on that side
+    flights: int
+    share: float | None  # None of no flights
+    lower: float
+    upper: float
+    lower_one_sided: float
+    upper_one_sided: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class PairedDifference:
     """The differences b - a of pairs."""
 
-    pairs: int  # how many
-    mean: float | None = None  # their mean; None of no pairs
-    lower: float | None = None  # lower end of the mean's t interval; None of fewer than two pairs
-    upper: float | None = None  # its upper end
+    pairs: int
+    mean: float | None = None  # None of no pairs
+    lower: float | None = None  # ends of the mean's t interval; None of fewer than two pairs
+    upper: float | None = None
 
 
 def upper_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> Array:
@@ -62,7 +62,7 @@ def lower_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFI
 
 
 def proportion(count: int, flights: int) -> Proportion:
-    """A share of flights with its two-sided interval and its one-sided bounds, all Clopper-Pearson."""
+    """A share of flights."""
     either = 0.5 * (1.0 + CONFIDENCE)
     return Proportion(
         count=count,
@@ -95,33 +95,6 @@ def mcnemar(only_a: int, only_b: int) -> float:
     """Two-sided p-value of McNemar's exact test: a discordant pair is as likely to be of the first as of the second."""
     discordant = only_a + only_b
     return float(scipy.stats.binomtest(only_a, discordant).pvalue) if discordant else 1.0
-
-
-def paired_shares(only_a: int, only_b: int, pairs: int) -> tuple[float, float]:
-    """Interval of the difference of paired proportions, share of b - share of a: Tango's score interval.
-
-    It holds every difference that a score test does not reject; with no difference, that is McNemar's test.  Of all
-    `pairs`, at least one, it happened to the first alone in `only_a`, and to the second alone in `only_b`.
-    Source: Tango, Statistics in Medicine 17 (1998).
-    """
-    z = float(scipy.stats.norm.ppf(0.5 * (1.0 + CONFIDENCE)))
-    estimate, square = (only_b - only_a) / pairs, 2.0 * pairs
-
-    def excess(difference: float) -> float:
-        """How far the score statistic is beyond z, without its denominator."""
-        linear = (square - only_b + only_a) * difference - only_b - only_a
-        constant = -only_a * difference * (1.0 - difference)
-        share_a = (math.sqrt(max(linear * linear - 4.0 * square * constant, 0.0)) - linear) / (2.0 * square)
-        variance = pairs * (2.0 * share_a + difference * (1.0 - difference))  # by the restricted likelihood
-        return abs(only_b - only_a - pairs * difference) - z * math.sqrt(max(variance, 0.0))
-
-    def end(limit: float) -> float:
-        if excess(limit) <= 0.0:
-            return limit
-        beside = estimate + 1e-7 * (limit - estimate)  # at the estimate itself both terms may be 0
-        return float(scipy.optimize.brentq(excess, beside, limit, xtol=1e-14))
-
-    return end(-1.0), end(1.0)
 
 
 def paired_difference(a: Array, b: Array) -> PairedDifference:

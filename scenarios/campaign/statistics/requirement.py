@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from dataclasses import asdict, dataclass
@@ -11,7 +12,7 @@ from typing import Any, Final
 import pyarrow as pa
 
 from quadsim.errors import InputError, ParameterError
-from scenarios.campaign.results.events import Event, parse_event
+from scenarios.campaign.results.events import OPERATIONS, Event, parse_event
 from scenarios.campaign.results.table import is_counted
 from scenarios.campaign.statistics.inference import lower_bounds, upper_bounds
 from scenarios.campaign.statistics.wording import count_of, percent
@@ -30,11 +31,11 @@ _FORM: Final = re.compile(
 class Requirement:
     """The probability of an event on one side of a share, with this confidence."""
 
-    text: str  # as it was given
-    event: Event  # whose probability
-    operation: str  # `<`, `<=`, `>` or `>=`
-    share: float  # the limit on the probability, from 1e-9 to 1 - 1e-9
-    confidence: float  # of the one-sided bound, from 0.5 to 0.999999
+    text: str
+    event: Event
+    operation: str
+    share: float
+    confidence: float
 
     @property
     def at_most(self) -> bool:
@@ -43,9 +44,7 @@ class Requirement:
 
     def supported_by(self, bound: float) -> bool:
         """Whether a one-sided bound on the probability is on the required side."""
-        strict = len(self.operation) == 1
-        inside = bound < self.share if self.at_most else bound > self.share
-        return inside or (not strict and bound == self.share)
+        return bool(OPERATIONS[self.operation](bound, self.share))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,14 +53,10 @@ class Judgement:
 
     requirement: Requirement
     count: int  # flights in which the event happened
-    flights: int  # of how many
-    # the one-sided Clopper-Pearson bound at the requirement's confidence: upper where the probability is to be small,
-    # lower where it is to be large
-    bound: float
-    holds: bool  # whether the bound supports the requirement
-    # how many flights it takes at the very least, all of them without the event where it is to be rare, and all with it
-    # where it is to be frequent
-    least_flights: int
+    flights: int
+    bound: float  # one-sided, at the requirement's confidence: upper where the probability is to be small, else lower
+    holds: bool
+    least_flights: int  # that can support it, all of them in its favour
 
     @property
     def sentence(self) -> str:
@@ -87,12 +82,9 @@ class Judgement:
 
 
 def parse_requirement(text: str) -> Requirement:
-    """A requirement from its text.
+    """A requirement `P(EVENT) OP SHARE @ CONFIDENCE%`, with an event as `events.parse_event` takes it.
 
-    Args:
-        text: `P(EVENT) OP SHARE @ CONFIDENCE%`: an event as `events.parse_event` takes it, one of
-            `< <= > >=`, a share from 1e-9 to 1 - 1e-9, as such or in percent, and the confidence, from 50 to
-            99.9999 percent.
+    The share is from 1e-9 to 1 - 1e-9, as such or in percent, the confidence from 50 to 99.9999 percent.
 
     Raises:
         InputError: it is not of that form.
@@ -100,21 +92,17 @@ def parse_requirement(text: str) -> Requirement:
         ParameterError: a number is outside what is allowed.
     """
     text = " ".join(text.split())
-    found = _FORM.fullmatch(text)
+    owner, found = f"requirement {text!r}", _FORM.fullmatch(text)
     if found is None:
         raise InputError(
-            f"requirement {text!r} must read P(EVENT) OP SHARE @ CONFIDENCE%, with one of < <= > >=, such as "
-            f"{EXAMPLE!r}"
+            f"{owner} must read P(EVENT) OP SHARE @ CONFIDENCE%, with one of < <= > >=, such as {EXAMPLE!r}"
         )
-    owner = f"requirement {text!r}"
-    share = _number(owner, "share", found["share"], *_SHARES)
-    confidence = _number(owner, "confidence", found["confidence"] + "%", *_CONFIDENCES)
     return Requirement(
         text=text,
         event=parse_event(found["event"].strip()),
         operation=found["operation"],
-        share=share,
-        confidence=confidence,
+        share=_number(owner, "share", found["share"], *_SHARES),
+        confidence=_number(owner, "confidence", found["confidence"] + "%", *_CONFIDENCES),
     )
 
 
@@ -131,13 +119,9 @@ def judge(table: pa.Table, requirement: Requirement) -> Judgement:
     happened = requirement.event.column(table)[is_counted(table, requirement.event)]
     count, flights = int(happened.sum()), happened.size
     bound = _bound(requirement, count, flights)
+    holds, least = flights > 0 and requirement.supported_by(bound), least_flights(requirement)
     return Judgement(
-        requirement=requirement,
-        count=count,
-        flights=flights,
-        bound=bound,
-        holds=flights > 0 and requirement.supported_by(bound),
-        least_flights=least_flights(requirement),
+        requirement=requirement, count=count, flights=flights, bound=bound, holds=holds, least_flights=least
     )
 
 
@@ -163,15 +147,11 @@ def _bound(requirement: Requirement, count: int, flights: int) -> float:
 def _number(owner: str, name: str, given: str, low: Decimal, high: Decimal) -> float:
     """A share of one, given as such or in percent."""
     in_percent = given.endswith("%")
+    with contextlib.suppress(ArithmeticError):
+        value = Decimal(given.removesuffix("%").strip()) / (100 if in_percent else 1)
+        if low <= value <= high:
+            return float(value)
+    rule = f"a number from {low} to {high}".lower()
     if in_percent:
         rule = f"from {(100 * low).normalize():f}% to {(100 * high).normalize():f}%"
-    else:
-        rule = f"a number from {low} to {high}".lower()
-    try:
-        value = Decimal(given.removesuffix("%").strip()) / (100 if in_percent else 1)
-        allowed = low <= value <= high
-    except ArithmeticError:
-        allowed = False
-    if not allowed:
-        raise ParameterError(owner, name, given, rule)
-    return float(value)
+    raise ParameterError(owner, name, given, rule)

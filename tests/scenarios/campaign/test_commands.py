@@ -11,12 +11,9 @@ import time as clock
 from pathlib import Path
 from xml.etree import ElementTree
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import tomlkit
 
-from quadsim.outputs import amend, digest_of
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
@@ -83,12 +80,6 @@ def test_a_requirement_decides_the_exit_status(file: Path, capsys: pytest.Captur
     assert (suite.get("tests"), suite.get("failures")) == ("2", "1")
 
 
-def test_a_campaign_has_its_report(flown: Path) -> None:
-    page = (flown / "first" / "index.html").read_text(encoding="utf-8")
-    assert "first" in page
-    assert (flown / "first" / "campaign.png").is_file()
-
-
 def test_a_replay_gives_the_same_numbers(
     flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -96,6 +87,7 @@ def test_a_replay_gives_the_same_numbers(
     assert main(["replay", str(flown / "first"), "--flight", "2", *BARE]) == EXIT_DONE
     assert "each the same as in the campaign" in capsys.readouterr().out
     assert json.loads((tmp_path / "runs" / "first-2" / "summary.json").read_text())["scenario"] == "first-2"
+    assert {"index.html", "campaign.png"} <= {path.name for path in (flown / "first").iterdir()}
 
 
 def test_a_replay_by_other_code_starts_with_a_notice(
@@ -107,20 +99,6 @@ def test_a_replay_by_other_code_starts_with_a_notice(
     (other / "manifest.json").write_text(json.dumps({**manifest, "code": "sha256:0"}))
     assert main(["replay", str(other), "--flight", "2", *BARE]) == EXIT_DONE
     notice = "quadsim: other code flew that campaign, so numbers may differ"
-    assert capsys.readouterr().err.splitlines()[0] == notice
-
-
-def test_a_replay_of_a_flight_that_met_a_limit_starts_with_a_notice(
-    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    other = shutil.copytree(flown / "first", tmp_path / "other")
-    rows = pq.read_table(other / "flights.parquet")
-    ended = [row | {"verdict": "timeout", "reason": "for ever"} for row in rows.to_pylist()]
-    pq.write_table(pa.Table.from_pylist(ended, schema=rows.schema), other / "flights.parquet")
-    amend(other, {"files": {"flights.parquet": digest_of(other / "flights.parquet")}})
-    assert main(["replay", str(other), "--flight", "2", *BARE]) == EXIT_FAILED
-    notice = "quadsim: flight 2 was ended in the campaign (for ever); here nothing ends it but Ctrl-C"
     assert capsys.readouterr().err.splitlines()[0] == notice
 
 
@@ -146,7 +124,6 @@ def test_two_campaigns_are_compared_flight_by_flight(
     [
         (["campaign", "gone.toml"], "gone.toml: no such campaign file"),
         (["campaign", "little.toml", "--workers", "0"], "workers must be 1 or more; got 0"),
-        (["campaign", "little.toml", "--flights", "0"], "flights must be >= 1; got 0"),
         (["campaign", "little.toml", "--until-width", "2"], "--until-width must be between 0 and 1; got 2.0"),
         (["campaign", "little.toml", "--require", "P(lost) < 2 @ 95%"], "requirement 'P(lost) < 2 @ 95%'"),
         (["campaign", "little.toml", "--require", "P(rmse.q > 1) < 0.1 @ 95%"], "no column named 'rmse.q'"),
@@ -156,7 +133,6 @@ def test_two_campaigns_are_compared_flight_by_flight(
             ["campaign", "little.toml", "--require", "P(lost) < 1% @ 95%", "--junit", "gone/v.xml"],
             "gone/v.xml: No such",
         ),
-        (["campaign", "little.toml", "--set", "duratoin=1"], "duratoin is not a field of the scenario file"),
         (["campaign", "little.toml", "--cluster", "gone.toml"], "gone.toml"),
         (["replay", "little.toml"], "is not a campaign"),
         (["compare", "{flown}/first", "--out", "pairs"], "compare takes two campaigns, each by itself, not 1"),

@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 import tomlkit
 
-from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.outputs import Growing, growing
+from quadsim.errors import InputError, OutputError
+from quadsim.outputs import Growing
 from scenarios.campaign import manifest as records
 from scenarios.campaign import run as module
 from scenarios.campaign.manifest import read_manifest
@@ -46,17 +46,16 @@ CAMPAIGN: dict[str, Any] = {
 
 @dataclass
 class Alone:
-    """Flies in this process: backwards or not, and stopped by an exception after so many flights."""
+    """Flies in this process: backwards or not, and interrupted after so many flights."""
 
     backwards: bool = False
     stops_after: int | None = None
-    stopped_by: type[BaseException] = KeyboardInterrupt
 
     def fly(self, pilot: Pilot, flights: Sequence[int], **_: object) -> Generator[Row, None, None]:
         ordered = list(reversed(flights)) if self.backwards else list(flights)
         for i, flight in enumerate(ordered):
             if i == self.stops_after:
-                raise self.stopped_by
+                raise KeyboardInterrupt
             yield pilot.fly(flight)
 
 
@@ -115,12 +114,9 @@ def test_results_are_the_same_bytes_with_any_worker(plan: Plan, whole: Result, b
     assert 0 < sum(results[0].table["failed"].to_pylist()) < 12
 
 
-@pytest.mark.parametrize("ended_by", [KeyboardInterrupt, RuntimeError])
-def test_what_was_flown_stays_and_the_rest_follows(
-    plan: Plan, whole: Result, tmp_path: Path, ended_by: type[BaseException]
-) -> None:
-    with pytest.raises(ended_by):
-        fly_campaign(plan, tmp_path / "again", Alone(backwards=True, stops_after=5, stopped_by=ended_by))
+def test_what_was_flown_stays_and_the_rest_follows(plan: Plan, whole: Result, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        fly_campaign(plan, tmp_path / "again", Alone(backwards=True, stops_after=5))
     manifest = read_manifest(tmp_path / "again")
     assert (manifest["status"], manifest["flown"]) == ("interrupted", 5)
     seen: list[Standing] = []
@@ -254,13 +250,6 @@ def test_it_stops_when_the_interval_is_narrow_enough_at_the_same_flight(tmp_path
     assert (resumed.table.num_rows, resumed.manifest["status"]) == (40, "complete")
 
 
-@pytest.mark.parametrize("width", [0.0, 1.0, -0.1])
-def test_a_width_that_is_no_share_is_refused(plan: Plan, tmp_path: Path, width: float) -> None:
-    with pytest.raises(ParameterError, match=r"--until-width must be between 0 and 1"):
-        fly_campaign(plan, tmp_path / "c", Alone(), until_width=width)
-    assert not (tmp_path / "c").exists()
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     result = fly_campaign(plan, tmp_path / "c", Alone(), report=True)
@@ -271,24 +260,11 @@ def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     assert {"campaign.toml", "scenario.toml", "flights.parquet", "index.html", "manifest.json"} <= set(listed)
     assert manifest["versions"]["mujoco"]
     assert manifest["code"].startswith("sha256:")
-    assert json.loads((result.directory / SUMMARY_FILE).read_text())["flights"] == 12
+    assert manifest["machines"] == {processor_name(): 12}
+    assert read_table(result.directory / "flights.parquet").equals(result.table)
 
 
 # --- what is refused -----------------------------------------------------------------------------------------------
-
-
-def test_a_campaign_is_not_overwritten_without_a_request(plan: Plan, flown: Path) -> None:
-    with pytest.raises(OutputError, match="a campaign is already there; continue it with --resume"):
-        fly_campaign(plan, flown, Alone())
-
-
-def test_a_directory_of_something_else_is_left_alone(plan: Plan, tmp_path: Path) -> None:
-    (tmp_path / "c").mkdir()
-    (tmp_path / "c" / "thesis.tex").write_text("years of work")
-    for resume in (False, True):
-        with pytest.raises(OutputError, match="it is not empty"):
-            fly_campaign(plan, tmp_path / "c", Alone(), resume=resume)
-    assert [path.name for path in (tmp_path / "c").iterdir()] == ["thesis.tex"]
 
 
 @pytest.mark.parametrize(
@@ -306,6 +282,8 @@ def test_another_campaign_does_not_go_on_with_it(
 ) -> None:
     with pytest.raises(InputError, match=rf"its {named} differs from the one there"):
         fly_campaign(make_plan(tmp_path, **changes), flown, Alone(), resume=True)
+    with pytest.raises(OutputError, match="a campaign is already there; continue it with --resume"):
+        fly_campaign(make_plan(tmp_path, **changes), flown, Alone())
 
 
 def test_a_latin_hypercube_does_not_grow(tmp_path: Path) -> None:
@@ -370,35 +348,11 @@ def test_dying_while_it_grows_locks_nothing_out(
     assert fly_campaign(more, flown, Alone(), resume=True).table.num_rows == 15
 
 
-def test_files_of_the_user_are_not_written_over(tmp_path: Path) -> None:
-    (tmp_path / "mine").mkdir()
-    path = tmp_path / "mine" / "campaign.toml"
-    path.write_text("# by hand\n" + tomlkit.dumps(CAMPAIGN), encoding="utf-8")
-    before = path.read_text()
-    for resume in (False, True):
-        with pytest.raises(OutputError, match="it is not empty"):
-            fly_campaign(load_plan(str(path)), tmp_path / "mine", Alone(), resume=resume)
-    assert path.read_text() == before
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_a_report_of_fewer_flights_goes(plan: Plan, tmp_path: Path) -> None:
     fly_campaign(plan, tmp_path / "c", Alone(), report=True)
     fly_campaign(make_plan(tmp_path, flights=14), tmp_path / "c", Alone(), resume=True)
     assert not (tmp_path / "c" / "index.html").exists()
-
-
-def test_a_full_disk_ends_it_with_a_message_and_resuming_completes_it(
-    plan: Plan, whole: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(self: Any, rows: Sequence[Row]) -> None:
-        raise OutputError("part", "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(module.Store, "append", full)
-        with pytest.raises(OutputError, match="No space left on device"):
-            fly_campaign(plan, tmp_path / "c", Alone())
-    assert content(fly_campaign(plan, tmp_path / "c", Alone(), resume=True)) == content(whole)
 
 
 # --- replay --------------------------------------------------------------------------------------------------------
@@ -422,23 +376,11 @@ def test_a_replay_reports_when_numbers_differ(whole: Result, tmp_path: Path) -> 
     other = replace(recorded, row={**recorded.row, "rmse.z": 0.0, "draw.mass": 0.0, "gone": 1.0})
     differing = replay_flight(other, tmp_path / "run", Outputs(video=False, recording=False, figures=False)).differing
     assert sorted(differing) == ["draw.mass", "gone", "rmse.z"]
-
-
-def test_a_replay_knows_that_other_code_flew_the_campaign(flown: Path) -> None:
-    assert recorded_flight(flown, 3).otherwise == []
-    manifest = read_manifest(flown)
-    with growing(flown, records.MANIFEST_FILE) as files:
-        records.write({**manifest, "code": "sha256:0", "machine": {"processor": "another"}}, files)
-    assert recorded_flight(flown, 3).otherwise == ["code", "machine"]
-
-
-def test_the_manifest_knows_what_flew(by_two: Result) -> None:
-    assert by_two.manifest["machines"] == {processor_name(): 12}
-
-
-def test_a_flight_that_there_is_not_is_named(whole: Result) -> None:
-    with pytest.raises(ParameterError, match=r"--flight must be one of the flights 0 to 11 of .*; got 12"):
-        recorded_flight(whole.directory, 12)
+    ended = replace(recorded, otherwise=["code"], row={**recorded.row, "verdict": "timeout", "reason": "for ever"})
+    assert ended.notes == [
+        "other code flew that campaign, so numbers may differ",
+        "flight 3 was ended in the campaign (for ever); here nothing ends it but Ctrl-C",
+    ]
 
 
 def test_a_campaign_whose_files_were_changed_is_not_replayed(flown: Path) -> None:
@@ -446,7 +388,3 @@ def test_a_campaign_whose_files_were_changed_is_not_replayed(flown: Path) -> Non
     path.write_text(path.read_text().replace("duration = 0.5", "duration = 0.6"))
     with pytest.raises(InputError, match=r"scenario\.toml: is missing or not the file that was written"):
         recorded_flight(flown, 0)
-
-
-def test_the_table_reads_back(whole: Result) -> None:
-    assert read_table(whole.directory / "flights.parquet").equals(whole.table)

@@ -10,19 +10,17 @@ import pyarrow as pa
 import pytest
 from browser import open_page
 
-from quadsim.errors import OutputError
 from quadsim.report.figure import Panel
 from quadsim.report.to_matplotlib import to_png
-from scenarios.campaign.report.campaign_figures import histograms, overview, scatters
-from scenarios.campaign.report.campaign_page import write_report
+from scenarios.campaign.report.campaign_page import histograms, overview, scatters, write_report
 from scenarios.campaign.results.table import Summary
+from scenarios.campaign.spec import CampaignSpec
 from scenarios.campaign.statistics.estimates import estimate
-from scenarios.campaign.statistics.wording import interval, percent, signed_points
+from scenarios.campaign.statistics.wording import interval, percent
 
 MakeCampaign = Callable[..., pa.Table]
 
 HOSTILE = "<script>alert(1)</script> & more"
-MANIFEST = {"engine": "local", "versions": {"numpy": "2"}, "failure": ["lost", "violated"], "note": HOSTILE, "no": None}
 PROBE = """<script>
 (async () => {
   while (!("drawn" in document.documentElement.dataset)) await new Promise((done) => setTimeout(done, 50));
@@ -40,17 +38,11 @@ NAME = "paper-robustness"
 CASES = {"five": (5, 1.0), "clean": (60, 0.0), "lost": (40, 100.0), "one": (1, 1.0), "none": (0, 1.0)}
 
 
-def write(directory: Path, table: pa.Table, name: str = NAME, summary: Summary | None = None) -> str:
+def write(directory: Path, table: pa.Table, text: str = "What is flown.", summary: Summary | None = None) -> str:
     directory.mkdir(exist_ok=True)
-    page = write_report(
-        directory,
-        table=table,
-        summary=json.loads(json.dumps(summary or estimate(table))),
-        manifest=MANIFEST,
-        name=name,
-        description="What is flown.",
-        failure=["violated", "rmse.z > 0.5"],
-    )
+    failure = ["violated", "rmse.z > 0.5"]
+    spec = CampaignSpec(name=NAME, description=text, scenario="hover", flights=1, failure=failure)
+    page = write_report(directory, table, json.loads(json.dumps(summary or estimate(table))), spec)
     assert page == directory / "index.html"
     return page.read_text()
 
@@ -85,7 +77,6 @@ def test_the_page_shows_what_the_flights_show(estimated: Summary, reported: Path
         assert f"<h2>{heading}</h2>" in text
     for table in ("Constraints", "Failures over each varied parameter", "Their parameters"):
         assert f"<h3>{table}</h3>" in text
-    assert "versions.numpy" in text
     assert {path.name for path in directory.iterdir()} == {"index.html", "campaign.png", "flights.parquet"}
     for url in re.findall(r'(?:href|src)="([^"#]+)"', text):
         assert url == "data:," or (directory / url).is_file(), url
@@ -113,16 +104,6 @@ def test_a_campaign_without_required_constraints_has_a_page(thousand: pa.Table, 
         some = some.set_column(i, some.schema.field(i), pa.nulls(50, some.schema.field(i).type))
     assert scatters(some) == []
     assert 'id="scatter"' not in write(tmp_path / "out", some)
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_hostile_names_are_text(thousand: pa.Table, tmp_path: Path) -> None:
-    names = [HOSTILE if name == "draw.wind" else name for name in thousand.column_names]
-    table = thousand.rename_columns([name.replace(HOSTILE, f"draw.{HOSTILE}") for name in names])
-    text = write(tmp_path / "out", table, name=HOSTILE)
-    assert "<script>alert" not in text
-    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
-    assert "ValueError: &lt;b&gt;no&lt;/b&gt; step" in text
 
 
 def with_values(table: pa.Table, name: str, changes: dict[int, float | None]) -> pa.Table:
@@ -163,21 +144,14 @@ def test_many_flights_are_thinned_evenly_and_by_verdict(make_campaign: MakeCampa
     table = make_campaign(5000)
     shown = {series.label: series.x.size for series in over(table, "solver").series if series.marker[:8] != "triangle"}
     verdicts = table["verdict"].to_pylist()
-    assert shown["satisfied"] == 500
+    assert shown["satisfied"] == 1000
     assert shown["violated"] == verdicts.count("violated")
     assert over(table, "solver").x_names == ("daqp", "gain", "piqp")
 
 
 def test_the_figure_shows_the_parameters_that_matter_most(thousand: pa.Table, estimated: Summary) -> None:
     figure = overview(thousand, estimated, NAME)
-    assert [panel.x_label for panel in figure.panels] == [
-        *("flights", "worst_margin", "rank correlation, or xi", "wind [m/s]", "mass", "yaw")
-    ]
-    share, drivers = figure.panels[0], figure.panels[2]
-    assert share.series[0].y[-1] == pytest.approx(3.0), "30 of 1000 flights, in percent"
-    np.testing.assert_array_less(share.bands[0].low[-1], 3.0)
-    strong = next(series for series in drivers.series if series.style == "points")
-    assert strong.x[0] == pytest.approx(estimated["parameters"]["wind"]["worst_margin"]["rho"])
+    assert [panel.x_label for panel in figure.panels] == [*("worst_margin", "wind [m/s]", "mass", "yaw")]
     assert to_png(figure, dpi=40) == to_png(figure, dpi=40)
 
 
@@ -187,25 +161,19 @@ def test_shares_are_reported_with_the_digits_they_need() -> None:
     ]
     assert interval(0.0262, 0.0506) == "2.6 to 5.1 %"
     assert interval(0.0, 0.00368) == "0 to 0.37 %"
-    assert interval(0.9106, 0.999578) == "91.1 to 99.96 %"
-    assert [signed_points(value) for value in (-0.025, 0.0, 0.0004)] == ["-2.5", "0", "+0.040"]
+    assert interval(0.9106, 0.999578) == "91.1 to 99.958 %"
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_a_browser_draws_the_page_and_has_no_complaint(make_campaign: MakeCampaign, tmp_path: Path) -> None:
-    write(tmp_path / "out", make_campaign(300), name=HOSTILE)
+    write(tmp_path / "out", make_campaign(300), HOSTILE)
     page = tmp_path / "out" / "index.html"
     page.write_text(page.read_text().replace("</body>", f"{PROBE}</body>"))
+    assert "<script>alert" not in page.read_text()
     dom, console = open_page(page, tmp_path / "profile")
     assert console == []
     report = dict(one.split(" ", 1) for one in re.findall(r"<output>(.*?)</output>", dom)[-1].split("; "))
-    assert report["drawn"] == "4"
+    assert report["drawn"] == "2"
     assert int(report["points"]) == 9 * 300, "every flight over every parameter"
     assert int(report["bars"]) > 100
     assert "Chart Studio" not in report["buttons"]
-
-
-def test_a_place_that_cannot_be_is_reported(thousand: pa.Table, estimated: Summary, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="Not a directory"):
-        write_report(tmp_path / "file" / "gone", table=thousand, summary=estimated, manifest={}, name="a")

@@ -6,14 +6,16 @@ import contextlib
 import errno
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from quadsim.errors import FileError, OutputError
 from quadsim.outputs import Growing, growing
-from scenarios.campaign.results.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store
-from scenarios.campaign.results.table import Row, failed_row, make_schema, read_table
+from scenarios.campaign.results.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store, read_flights
+from scenarios.campaign.results.table import Row, failed_row, make_schema, make_table, read_table
 
 SCHEMA = make_schema({"mass": (pa.float64(), "kg")}, [])
 
@@ -36,17 +38,11 @@ def flights(store: Store) -> list[int]:
 def test_rows_come_back_sorted_from_whatever_parts(tmp_path: Path) -> None:
     with store_in(tmp_path) as store:
         store.append([row(3), row(1)])
-        store.append([row(2)])
+        store.append([row(2), row(3)])
         store.append([])
     with store_in(tmp_path) as store:
-        assert flights(store) == [1, 2, 3]
-
-
-def test_a_row_that_is_there_twice_counts_once(tmp_path: Path) -> None:
-    with store_in(tmp_path) as store:
-        store.append([row(1), row(2)])
-        store.append([row(2), row(3)])
-        assert flights(store) == [1, 2, 3]
+        assert flights(store) == [1, 2, 3], "one that is there twice counts once"
+        assert store.close(flights=3)["flight"].to_pylist() == [1, 2], "those beyond the first three do not"
 
 
 def test_the_end_is_the_same_however_it_was_appended(tmp_path: Path) -> None:
@@ -69,12 +65,6 @@ def test_more_may_follow_on_what_was_closed(tmp_path: Path) -> None:
         assert flights(store) == [0, 1, 2]
         store.close(flights=3)
     assert read_table(tmp_path / TIMES_FILE)["wall_s"].to_pylist() == [1.0, 1.0, 1.0]
-
-
-def test_flights_beyond_those_that_count_are_left_out(tmp_path: Path) -> None:
-    with store_in(tmp_path) as store:
-        store.append([row(flight) for flight in range(5)])
-        assert store.close(flights=3)["flight"].to_pylist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize("dies_before", [TIMES_FILE, FLIGHTS_FILE, "parts go"])
@@ -126,3 +116,19 @@ def test_a_part_of_another_campaign_is_refused(tmp_path: Path) -> None:
         store.append([row(0)])
     with store_in(tmp_path) as store, pytest.raises(FileError, match="has other columns than this campaign"):
         store.table()
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("flight", [3, 3], "has flights that are not numbered upwards from 0"),
+        ("flight", [-1, 3], "has flights that are not numbered upwards from 0"),
+        ("failed", ["no", "yes"], "has other columns than this campaign"),
+    ],
+)
+def test_a_table_that_others_changed_is_refused(tmp_path: Path, name: str, values: list[Any], message: str) -> None:
+    table = make_table([row(1), row(2)], SCHEMA)
+    table = table.set_column(table.column_names.index(name), name, pa.array(values))
+    pq.write_table(table, tmp_path / "t.parquet")
+    with pytest.raises(FileError, match=message):
+        read_flights(tmp_path / "t.parquet", SCHEMA)

@@ -67,15 +67,6 @@ def test_a_row_agrees_with_the_summary(short_run: Run) -> None:
     assert row["satisfied.arrival_x"] is None, "neither held nor violated"
 
 
-def test_a_flight_that_raised_has_a_row_too(short_run: Run) -> None:
-    schema = make_schema({}, short_run.limits)
-    table = make_table([{"flight": 0, "seed": 0, "failed": True} | failed_row("boom")], schema)
-    assert table.select(["status", "verdict", "reason", "violated"]).to_pylist() == [
-        {"status": "error", "verdict": "error", "reason": "boom", "violated": True}
-    ]
-    assert table["rmse.x"].null_count == 1
-
-
 def test_rows_are_sorted_and_clock_times_stand_apart(short_run: Run) -> None:
     schema = make_schema({}, short_run.limits)
     rows = [{"flight": k, "seed": k, "failed": False, "wall_s": 1.0} | failed_row("x") for k in (2, 0, 1)]

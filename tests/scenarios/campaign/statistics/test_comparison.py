@@ -38,7 +38,7 @@ def test_a_better_controller_is_found_to_be(thousand: pa.Table, better: pa.Table
     assert failure.counts == (failed[0].sum(), failed[1].sum())
     assert (failure.only_a, failure.only_b) == ((failed[0] & ~failed[1]).sum(), (failed[1] & ~failed[0]).sum())
     assert failure.pairs == found.flights == 1000
-    assert failure.lower < failure.difference < failure.upper < 0.0
+    assert failure.difference == (failure.only_b - failure.only_a) / 1000 < 0.0
     assert found.sentence.startswith("robust is better than paper: of 1000 paired flights, ")
     assert compare(better, thousand, NAMES).verdict == "worse"
 
@@ -86,7 +86,6 @@ def test_a_campaign_and_itself_are_not_distinguishable(thousand: pa.Table) -> No
     assert found.verdict == "not distinguishable"
     assert found.sentence.startswith("b and a are not distinguishable by their failures: of 1000")
     assert found.events[0].p == 1.0
-    assert found.events[0].lower < 0.0 < found.events[0].upper
     assert all(metric.difference.mean == 0.0 for metric in found.metrics)
 
 
@@ -173,9 +172,3 @@ def test_the_page_stands_with_its_files(thousand: pa.Table, better: pa.Table, tm
     (theirs / "index.html").write_text("mine")
     with pytest.raises(OutputError, match="it is not empty"):
         write_comparison_report(compare(thousand, better, NAMES), theirs)
-
-
-def test_campaigns_without_margins_have_no_plot(thousand: pa.Table, tmp_path: Path) -> None:
-    free = changed(thousand, "worst_margin", [None] * 1000).slice(0, 3)
-    page = write_comparison_report(compare(free, free, NAMES), tmp_path / "out")
-    assert 'class="plot"' not in page.read_text()

@@ -88,7 +88,6 @@ def test_incomplete_flights_are_neither_failures_nor_successes(small: pa.Table) 
         assert found["events"][event]["count"] == before["events"][event]["count"]
     assert found["events"]["lost"] == before["events"]["lost"]
     assert found["constraints"]["roll"]["not_satisfied"]["flights"] == 6
-    assert found["convergence"]["flights"][-1] == 6
     assert judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).flights == 6
     assert verdict_sentence(found).startswith("6 of 6 flights failed")
     assert verdict_sentence(found).endswith("; 2 incomplete flights not counted")
@@ -161,19 +160,6 @@ def test_nothing_goes_with_what_never_happens(make_campaign: MakeCampaign) -> No
     found = estimate(make_campaign(40, severity=0.0))
     assert found["events"]["failure"]["count"] == 0
     assert all(entry["failed"] is None for entry in found["parameters"].values() if entry["kind"] == "number")
-
-
-def test_convergence_ends_at_the_estimate(thousand: pa.Table) -> None:
-    found = estimate(thousand)
-    curves, failure = found["convergence"], found["events"]["failure"]
-    assert (curves["flights"][0], curves["flights"][-1]) == (1, 1000)
-    assert np.all(np.diff(curves["flights"]) > 0)
-    for key in ("share", "lower", "upper"):
-        assert curves["failure"][key][-1] == pytest.approx(failure[key])
-    i = curves["flights"].index(next(n for n in curves["flights"] if n > 100))
-    n = curves["flights"][i]
-    exact = stats.binomtest(sum(thousand["failed"].to_pylist()[:n]), n).proportion_ci(0.95)
-    assert (curves["failure"]["lower"][i], curves["failure"]["upper"][i]) == pytest.approx((exact.low, exact.high))
 
 
 @pytest.mark.parametrize("flights", [0, 1, 2, 5])

@@ -1,18 +1,16 @@
 """Intervals and tests against closed forms, published numbers, other routes through scipy, and simulation."""
 
-import itertools
 import math
 
 import numpy as np
 import pytest
-from scipy import optimize, stats
+from scipy import stats
 
 from scenarios.campaign.statistics.inference import (
     holm,
     lower_bounds,
     mcnemar,
     paired_difference,
-    paired_shares,
     proportion,
     upper_bounds,
 )
@@ -73,58 +71,6 @@ def test_mcnemar_in_closed_form() -> None:
     assert mcnemar(0, 6) == pytest.approx(2.0 / 2**6)
     assert mcnemar(5, 15) == pytest.approx(2.0 * sum(math.comb(20, k) for k in range(6)) / 2**20)
     assert mcnemar(15, 5) == mcnemar(5, 15)
-
-
-def test_paired_shares_as_published() -> None:
-    """Airway hyper-responsiveness, Fagerland, Lydersen and Laake, BMC Medical Research Methodology 14:49 (2014)."""
-    assert paired_shares(7, 1, 21) == pytest.approx((-0.517, -0.026), abs=5e-4)
-
-
-@pytest.mark.parametrize(("only_a", "only_b", "pairs"), [(7, 1, 21), (1, 0, 44), (0, 0, 30), (40, 20, 160), (5, 0, 5)])
-def test_paired_shares_invert_a_score_test(only_a: int, only_b: int, pairs: int) -> None:
-    """The ends, from a likelihood that is maximised numerically rather than in closed form."""
-
-    def statistic(difference: float) -> float:
-        low, high = max(0.0, -difference) + 1e-12, (1.0 - difference) / 2.0 - 1e-12
-
-        def loss(share: float) -> float:
-            rest = 1.0 - 2.0 * share - difference
-            counts = ((only_a, share), (only_b, share + difference), (pairs - only_a - only_b, rest))
-            return -sum(count * math.log(p) for count, p in counts if count)
-
-        share = float(optimize.minimize_scalar(loss, bounds=(low, high), method="bounded", options={"xatol": 1e-13}).x)
-        variance = pairs * (2.0 * share + difference * (1.0 - difference))
-        return (only_b - only_a - pairs * difference) / math.sqrt(variance)
-
-    lower, upper = paired_shares(only_a, only_b, pairs)
-    assert -1.0 <= lower <= (only_b - only_a) / pairs <= upper <= 1.0
-    z = stats.norm.ppf(0.975)
-    if lower > -1.0 + 1e-9:
-        assert statistic(lower) == pytest.approx(z, abs=1e-3)
-    if upper < 1.0 - 1e-9:
-        assert statistic(upper) == pytest.approx(-z, abs=1e-3)
-    flipped = paired_shares(only_b, only_a, pairs)
-    assert flipped == pytest.approx((-upper, -lower), abs=1e-9)
-
-
-def test_paired_shares_of_no_discordant_pair_in_closed_form() -> None:
-    end = stats.norm.ppf(0.975) ** 2
-    assert paired_shares(0, 0, 30) == pytest.approx((-end / (30 + end), end / (30 + end)), abs=1e-9)
-
-
-def test_paired_shares_without_a_difference_is_mcnemars_test() -> None:
-    """Zero is in the interval where (b - c)^2 / (b + c) is below z^2, and only there."""
-    for only_a, only_b in itertools.product(range(0, 30, 3), range(1, 30, 4)):
-        lower, upper = paired_shares(only_a, only_b, 200)
-        inside = (only_a - only_b) ** 2 / (only_a + only_b) < stats.norm.ppf(0.975) ** 2
-        assert (lower <= 0.0 <= upper) is bool(inside), (only_a, only_b)
-
-
-def test_paired_shares_cover_simulated_campaigns() -> None:
-    rng = np.random.default_rng(4)
-    cells = rng.multinomial(200, (0.06, 0.02, 0.92), 1500)
-    found = [paired_shares(int(only_a), int(only_b), 200) for only_a, only_b, _ in cells]
-    assert np.mean([lower <= -0.04 <= upper for lower, upper in found]) == pytest.approx(0.95, abs=0.02)
 
 
 def test_paired_difference_is_scipys() -> None:
