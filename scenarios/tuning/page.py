@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -75,8 +75,8 @@ def tables(summary: Summary) -> tuple[Grid, Grid]:
     )
 
 
-def write_page(directory: Path, *, study: Study, summary: Summary, folders: Sequence[str]) -> None:
-    """Write `index.html`, with Optuna's own plots, into a directory that has the folders of the fresh campaigns."""
+def write_page(directory: Path, *, study: Study, summary: Summary) -> None:
+    """Write `index.html`, with Optuna's own plots, for a directory that has the fresh campaigns."""
     from optuna import visualization
     from optuna.importance import PedAnovaImportanceEvaluator
 
@@ -96,8 +96,8 @@ def write_page(directory: Path, *, study: Study, summary: Summary, folders: Sequ
         shares = visualization.plot_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), **by)
         plots.append(_plot(shares, f"importance{i}", f"importance for {name}", 170 + 34 * len(summary["search"])))
         plots.append(_plot(visualization.plot_slice(study, **by), f"slice{i}", f"{name} by field", 380))
-    holds = summary["fresh"]["best"]["requirement"]["holds"]
-    pages = [*folders, *(() if summary["answer"] == START else ("comparison",))]
+    answer, holds = summary["answer"], summary["fresh"]["best"]["requirement"]["holds"]
+    pages = ["start"] if answer == START else ["start", f"candidate-{answer}", "comparison"]
     page = render_page(
         "tuning",
         summary["tuning"],

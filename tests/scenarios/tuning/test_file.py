@@ -45,10 +45,10 @@ def campaign(**changes: Any) -> dict[str, Any]:
             "e.expression: .* must be arithmetic on",
         ),
         ({"objectives": 3 * TUNING["objectives"]}, "objectives must be of 2 or fewer entries; got 3"),
-        ({"campaign": campaign(seed=3)}, "campaign must not have seed: a tuning has its own"),
+        ({"campaign": campaign(seed=3)}, "campaign.seed must be absent: a tuning has its own"),
         ({"campaign": campaign(base="papers")}, "no campaign named 'papers'"),
         ({"campaign": campaign(scenario="hove")}, "no scenario named 'hove'; did you mean 'hover'"),
-        ({"campaign": campaign(failure=["fell"])}, "campaign.failure has an entry 'fell' that is no event"),
+        ({"campaign": campaign(failure=["fell"])}, "campaign: failure has an entry 'fell' that is no event"),
         ({"trails": 3}, "trails is not a field of the tuning file; did you mean 'trials'"),
     ],
 )
@@ -85,17 +85,17 @@ def test_a_file_may_hold_only_what_differs(tmp_path: Path) -> None:
     write_tuning(tmp_path, campaign=campaign(base="held.toml"))
     (tmp_path / "held.toml").write_text('base = "paper-nominal"\nname = "held"\nfailure = ["lost"]\n', encoding="utf-8")
     (tmp_path / "shorter.toml").write_text('base = "little.toml"\ntrials = 12\n', encoding="utf-8")
-    found = load_tuning(str(tmp_path / "shorter.toml")).spec
-    assert (found.trials, found.batch, found.name) == (12, 6, "little")
-    assert found.campaign.failure == ["lost"]
-    assert [each.name for each in found.campaign.vary][-1] == "pitch"
+    found = load_tuning(str(tmp_path / "shorter.toml"))
+    assert (found.spec.trials, found.spec.batch, found.spec.name) == (12, 6, "little")
+    assert found.start.spec.failure == ["lost"]
+    assert [each.name for each in found.start.spec.vary][-1] == "pitch"
 
 
 def test_a_file_written_out_is_the_same_tuning(tmp_path: Path) -> None:
     plan = load_tuning(str(write_tuning(tmp_path)))
     written = tmp_path / "again.toml"
-    written.write_text(plan.spec.to_toml(), encoding="utf-8")
-    (tmp_path / "scenario.toml").write_text(plan.scenario.to_toml(), encoding="utf-8")
+    written.write_text(plan.to_toml(), encoding="utf-8")
+    (tmp_path / "scenario.toml").write_text(plan.start.scenario.to_toml(), encoding="utf-8")
     again = load_tuning(str(written))
-    assert again.scenario == plan.scenario
-    assert again.spec.to_toml() == plan.spec.to_toml()
+    assert again.start.scenario == plan.start.scenario
+    assert again.to_toml() == plan.to_toml()
