@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 
 from quadsim.controller import Command, Moment, Phase
-from quadsim.errors import FlightError, InputError, ParameterError
+from quadsim.errors import FlightError, ParameterError
 from quadsim.flight.audit import Limit
-from quadsim.flight.log import FlightLog, PlantLog
+from quadsim.flight.log import FlightLog
 from quadsim.report.film.camera import Camera
 from quadsim.sim.loop import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array
@@ -125,7 +125,6 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._preview, self._reward, self._action = preview, reward, action
         self._flight: StartedFlight | None = None
         self._camera: Camera | None = None
-        self._started = False
         self.scenario, self.limits = self._base, build_limits(self._base)
 
     @property
@@ -158,24 +157,23 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         """
         if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed <= LARGEST_SEED):
             raise ParameterError("", "seed", seed, f"from 0 to {LARGEST_SEED}")
-        first = not self._started
-        super().reset(seed=self._base.seed if first and seed is None else seed)
-        self._started = True
-        scenario = self._drawn(seed, first, dict(options or {}))
+        if seed is None and self._flight is None:
+            seed = self._base.seed
+        super().reset(seed=seed)
+        scenario = self._drawn(seed, options or {})
         if self._flight is not None:
             self._flight.close()
         self.scenario = scenario
-        vehicle = build_vehicle(scenario)
         if self._plan is not None:
-            self.actions = Actions(self._action, scenario, vehicle)
+            self.actions = Actions(self._action, scenario, build_vehicle(scenario))
         # events that change the controller need a real one
         law: Any = None if scenario.controller_changes else Agent(scenario.controller.horizon)
         self._flight = start(scenario, law)
         self.limits = self._flight.limits
         self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
-        self._seen, plant = self._flight.observation, self._flight.loop.log().plant
-        self._truth, self._rotors = plant.state[-1], plant.speeds[-1]
-        return self._vector(self._seen), self._info(*_start_margins(self.limits, plant))
+        self._seen, log = self._flight.observation, self._flight.loop.log()
+        self._truth, self._rotors = log.plant.state[-1], log.plant.speeds[-1]
+        return self._vector(self._seen), self._info(*_margins(self.limits, log))
 
     def step(self, action: Action) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Fly one control period.
@@ -192,28 +190,33 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if np.shape(action) != self.action_space.shape:
             raise ParameterError("", "action", np.shape(action), f"of shape {self.action_space.shape}")
         seen = self._seen
-        match self._answered:
-            case (flight.k, answered, command) if np.array_equal(answered, action):
-                pass
-            case _:
-                command = self.actions.command(action, seen.moment.body_rates, flight.loop.controller.horizon)
+        if self._answered and self._answered[0] == flight.k and np.array_equal(self._answered[1], action):
+            command = self._answered[2]
+        else:
+            command = self.actions.command(action, seen.moment.body_rates, flight.loop.controller.horizon)
         nothing = np.full(len(self.limits), np.inf)
         try:
             sample = flight.loop.step(command)
         except FlightError:
             return self._vector(seen), 0.0, True, False, self._info(nothing, nothing)
         period = one_period(sample, self.scenario.plant.timestep)
-        self._truth, self._rotors = state, _ = period.plant.state[-1], period.plant.speeds[-1]
+        self._truth, self._rotors = period.plant.state[-1], period.plant.speeds[-1]
         try:
             self._seen = flight.loop.observation
         except FlightError:  # lost: no controller would be called any more
             moment = replace(seen.moment, acting=sample.speeds)
             rows = seen.preview
-            self._seen = replace(seen, state=state, reference=rows[0], preview=rows[1:], moment=moment)
+            self._seen = replace(seen, state=self._truth, reference=rows[0], preview=rows[1:], moment=moment)
         terminated = flight.loop.reason is not None or self._seen.moment.phase is Phase.CRASHED
-        reward = float(self._reward(state, self._seen.reference, sample.speeds))
+        reward = float(self._reward(self._truth, self._seen.reference, sample.speeds))
         truncated = flight.done and not terminated
-        return self._vector(self._seen), reward, terminated, truncated, self._info(*_margins(self.limits, period))
+        return (
+            self._vector(self._seen),
+            reward,
+            terminated,
+            truncated,
+            self._info(*_margins(self.limits, period, begin=1)),
+        )
 
     def controller_action(self) -> Action:
         """What the scenario's own controller would do now, computed once per period.
@@ -279,21 +282,18 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             self._camera.close()
             self._camera = None
 
-    def _drawn(self, seed: int | None, first: bool, options: dict[str, Any]) -> Scenario:
+    def _drawn(self, seed: int | None, options: Mapping[str, Any]) -> Scenario:
         """The scenario of the episode that starts."""
-        if unknown := set(options) - {"flight"}:
-            raise InputError(f"options must not have {', '.join(sorted(unknown))}; they may have flight")
-        if self._plan is not None:
-            count = self._plan.spec.flights
-            flight = options["flight"] if "flight" in options else int(self.np_random.integers(count))
-            if not (isinstance(flight, int | np.integer) and 0 <= flight < count):
-                raise ParameterError("options", "flight", flight, f"from 0 to {count - 1}")
-            return self._plan.of(int(flight))
-        if "flight" in options:
-            raise ParameterError("options", "flight", options["flight"], "absent where nothing varies")
-        if seed is None:
-            seed = self._base.seed if first else int(self.np_random.integers(2**31))
-        return self._base.model_copy(update={"seed": seed})
+        if self._plan is None:
+            if options:
+                raise ParameterError("", "options", options, "absent where nothing varies")
+            seed = int(self.np_random.integers(2**31)) if seed is None else seed
+            return self._base.model_copy(update={"seed": seed})
+        flights = self._plan.spec.flights
+        flight = options["flight"] if "flight" in options else int(self.np_random.integers(flights))
+        if set(options) - {"flight"} or not (isinstance(flight, int | np.integer) and 0 <= flight < flights):
+            raise ParameterError("", "options", options, f"absent, or a flight from 0 to {flights - 1}")
+        return self._plan.of(int(flight))
 
     def _vector(self, seen: Observation) -> Array:
         """What is observed; beyond its end the reference stays where it is."""
@@ -339,25 +339,15 @@ class Agent:
         raise NotImplementedError
 
 
-def _margins(limits: Sequence[Limit], period: FlightLog) -> tuple[Array, Array]:
-    """(m,) smallest margins within a period, its begin left out, which is the end of the one before, and at its end."""
-    worst, sampled = np.empty(len(limits)), np.empty(len(limits))
+def _margins(limits: Sequence[Limit], log: FlightLog, begin: int = 0) -> tuple[Array, Array]:
+    """(m,) smallest margins of a log, from this row of the plant on, and at its end; inf where there is none."""
+    found = np.full((2, len(limits)), np.inf)
     for i, limit in enumerate(limits):
-        t, values = limit.source.finest(period)
-        if limit.source.plant is not None:
-            t, values = t[1:], values[1:]
-        margins = np.where(limit.holds_at(t), limit.margin(values), np.inf)
-        worst[i], sampled[i] = margins.min(), margins[-1]
-    return worst, sampled
-
-
-def _start_margins(limits: Sequence[Limit], plant: PlantLog) -> tuple[Array, Array]:
-    """(m,), twice, of the state at the start; inf of what exists at control samples alone."""
-    margins = np.full(len(limits), np.inf)
-    for i, limit in enumerate(limits):
-        if limit.source.plant is not None and limit.holds_at(plant.t)[0]:
-            margins[i] = limit.margin(limit.source.plant(plant))[0]
-    return margins, margins
+        t, values = limit.source.finest(log)
+        margins = np.where(limit.holds_at(t), limit.margin(values), np.inf)[begin * (limit.source.plant is not None) :]
+        if margins.size:
+            found[:, i] = margins.min(), margins[-1]
+    return found[0], found[1]
 
 
 def _varying(scenario: Scenario, campaign: str) -> Plan:

@@ -10,7 +10,6 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 
 from quadsim.errors import ParameterError
-from quadsim.sim.physics import steps_per_period
 from scenarios.api import as_scenario
 from scenarios.schema.bases import read_scenario
 from scenarios.schema.scenario import Scenario
@@ -35,11 +34,7 @@ def register_library() -> None:
     """Register the scenarios that ship; they are right, and not checked."""
     for name in scenario_names():
         if environment_id(name) not in gymnasium.registry:
-            data = read_scenario(scenario_path(name), scenario_path)
-            if "duration" in data:
-                periods = steps_per_period(data["duration"], data["control_period"])
-            else:
-                periods = Scenario.read(data).periods
+            periods = Scenario.read(read_scenario(scenario_path(name), scenario_path)).periods
             gymnasium.register(**_description(name, name, periods))
 
 
@@ -92,9 +87,6 @@ def make_vec(scenario: Scenario | str | Path, num_envs: int, **options: Any) -> 
         ((2, 216), 'AutoresetMode.NEXT_STEP')
         >>> envs.close()
     """
-    from gymnasium.vector import AutoresetMode
-
     if num_envs < 1:
         raise ParameterError("", "num_envs", num_envs, "at least 1")
-    modes = {"autoreset_mode": AutoresetMode.NEXT_STEP}
-    return gymnasium.make_vec(_specification(scenario), num_envs, "async", vector_kwargs=modes, **options)
+    return gymnasium.make_vec(_specification(scenario), num_envs, "async", **options)
