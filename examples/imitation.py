@@ -7,20 +7,18 @@ learning and structured prediction to no-regret online learning").  Both then fl
 
 from __future__ import annotations
 
+import itertools
 import tomllib
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 import quadsim
 import quadsim.gym
-from quadsim.errors import FlightError
 
 Array = NDArray[np.float64]
 
-OBSERVED: dict[str, Any] = {"observation": ("ahead", "state", "command"), "action": "speeds"}
 AHEAD = [1, 2, 4, 7, 11, 16, 22, 29, 37, 45, 50]
 """Periods ahead of which the student sees the reference."""
 MOVING = [1, 3, 5, 6, 7, 8, 9, 11]
@@ -48,68 +46,54 @@ def features(state: Array, preview: Array, command: Array, hover: float) -> Arra
     return np.concatenate([ahead.ravel() / 5.0, state[MOVING] * 2.0, (command - hover) / 10.0])
 
 
-def of_observation(observed: Array, hover: float) -> Array:
-    """The same of an observation `ahead`, `state`, `command`."""
-    ahead, state, command = observed[:-16].reshape(-1, 4), observed[-16:-4], observed[-4:]
-    return features(state, ahead + state[[0, 2, 4, 10]], command, hover)
-
-
-@dataclass
 class Network:
-    """Two hidden layers, tanh, beside a linear map; trained by Adam on the mean squared error."""
+    """A linear map, and two hidden layers of tanh for what that leaves: least squares, then L-BFGS."""
 
-    sizes: tuple[int, ...]
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        rng = np.random.default_rng(self.seed)
-        pairs = list(zip(self.sizes[:-1], self.sizes[1:], strict=True))
-        self.weights = [rng.normal(size=pair) / np.sqrt(pair[0]) for pair in pairs]
-        self.weights.append(np.zeros((self.sizes[0] + 1, self.sizes[-1])))
-        self.offsets = [np.zeros(b) for _, b in pairs]
+    def __init__(self, *sizes: int) -> None:
+        rng, self.shapes = np.random.default_rng(0), [(a + 1, b) for a, b in itertools.pairwise(sizes)]
+        self.linear: Array = np.zeros((sizes[0] + 1, sizes[-1]))
+        self.weights = np.concatenate([(rng.normal(size=shape) / np.sqrt(shape[0])).ravel() for shape in self.shapes])
 
     def __call__(self, x: Array) -> Array:
         """(K, outputs) of inputs (K, inputs)."""
-        return self._layers(x)[-1] + self._linear(x)
+        return with_ones(x) @ self.linear + self.layers(x, self.weights)[-1]
 
-    def _linear(self, x: Array) -> Array:
-        return x @ self.weights[-1][:-1] + self.weights[-1][-1]
+    def matrices(self, weights: Array) -> list[Array]:
+        """The layers' matrices, the offsets in their last rows."""
+        ends = np.cumsum([a * b for a, b in self.shapes])[:-1]
+        return [part.reshape(shape) for part, shape in zip(np.split(weights, ends), self.shapes, strict=True)]
 
-    def _layers(self, x: Array) -> list[Array]:
+    def layers(self, x: Array, weights: Array) -> list[Array]:
+        """The inputs, and what comes out of each layer."""
         found = [x]
-        for i, (weight, offset) in enumerate(zip(self.weights[:-1], self.offsets, strict=True)):
-            y = found[-1] @ weight + offset
-            found.append(np.tanh(y) if i < len(self.offsets) - 1 else y)
+        for matrix in self.matrices(weights):
+            found.append(with_ones(np.tanh(found[-1]) if len(found) > 1 else x) @ matrix)
         return found
 
-    def fit(self, x: Array, y: Array, *, epochs: int, rate: float = 2e-3) -> float:
-        """Fit the linear map, then the rest; the root mean square error."""
-        whole = np.column_stack([x, np.ones(len(x))])
-        self.weights[-1] = np.linalg.solve(whole.T @ whole + 1e-3 * np.eye(whole.shape[1]), whole.T @ y)
-        rest, rng = y - self._linear(x), np.random.default_rng(self.seed)
-        parameters = [*self.weights[:-1], *self.offsets]
-        mean, square, step = [np.zeros_like(p) for p in parameters], [np.zeros_like(p) for p in parameters], 0
-        for epoch in range(epochs):
-            order, now = rng.permutation(len(x)), rate * 0.5 * (1.0 + np.cos(np.pi * epoch / epochs))
-            for batch in np.array_split(order, max(1, len(x) // 256)):
-                step += 1
-                for i, slope in enumerate(self._gradient(x[batch], rest[batch])):
-                    mean[i] = 0.9 * mean[i] + 0.1 * slope
-                    square[i] = 0.999 * square[i] + 0.001 * slope**2
-                    size = np.sqrt(square[i] / (1.0 - 0.999**step)) + 1e-8
-                    parameters[i] -= now * mean[i] / (1.0 - 0.9**step) / size
-        return float(np.sqrt(np.mean((self(x) - y) ** 2)))
+    def error(self, weights: Array, x: Array, y: Array) -> tuple[float, Array]:
+        """The mean squared error of the layers, and its gradient."""
+        layers = self.layers(x, weights)
+        back, slopes = 2.0 * (layers[-1] - y) / y.size, []
+        for i, matrix in reversed(list(enumerate(self.matrices(weights)))):
+            inputs = np.tanh(layers[i]) if i else x
+            slopes.append((with_ones(inputs).T @ back).ravel())
+            back = (back @ matrix[:-1].T) * (1.0 - inputs**2)
+        return float(np.mean((layers[-1] - y) ** 2)), np.concatenate(slopes[::-1])
 
-    def _gradient(self, x: Array, y: Array) -> list[Array]:
-        layers = self._layers(x)
-        back = 2.0 * (layers[-1] - y) / y.size
-        weights: list[Array] = []
-        offsets: list[Array] = []
-        for i in reversed(range(len(self.offsets))):
-            weights.insert(0, layers[i].T @ back)
-            offsets.insert(0, back.sum(axis=0))
-            back = (back @ self.weights[i].T) * (1.0 - layers[i] ** 2)
-        return [*weights, *offsets]
+    def fit(self, x: Array, y: Array, steps: int) -> float:
+        """Fit the linear map, then the rest; the root mean square error."""
+        self.linear = np.linalg.lstsq(with_ones(x), y)[0]
+        rest = x, y - with_ones(x) @ self.linear
+        found = scipy.optimize.minimize(
+            self.error, self.weights, rest, jac=True, method="L-BFGS-B", options={"maxiter": steps}
+        )
+        self.weights = found.x
+        return float(np.sqrt(found.fun))
+
+
+def with_ones(x: Array) -> Array:
+    """Inputs (K, n) with a column of ones, whose weights are the offsets."""
+    return np.column_stack([x, np.ones(len(x))])
 
 
 class Student:
@@ -120,50 +104,52 @@ class Student:
     def __init__(self, network: Network, vehicle: quadsim.Vehicle) -> None:
         self.network, self.hover = network, vehicle.hover_speed
 
-    def speeds(self, x: Array) -> Array:
-        """(4,) rotor speeds [rad/s] for features (56,)."""
-        found: Array = self.hover + 10.0 * self.network(x[None])[0]
-        return np.clip(found, 0.0, 250.0)
-
     def step(self, now: quadsim.Moment, state: Array, reference: Array) -> Array:
         """See `quadsim.controller.Controller.step`."""
         assert now.acting is not None
-        return self.speeds(features(state, reference, now.acting, self.hover))
+        found: Array = self.hover + 10.0 * self.network(features(state, reference, now.acting, self.hover)[None])[0]
+        return np.clip(found, 0.0, 250.0)
 
 
-def answers(
-    scenario: quadsim.Scenario, hover: float, student: Student | None = None
-) -> tuple[list[Array], list[Array]]:
-    """Features and the teacher's rotor speeds, period by period, of its own flight or of a student's."""
-    env = quadsim.gym.make_env(scenario, **OBSERVED)
-    observed, _ = env.reset()
-    seen, speeds, ended = [], [], False
-    while not ended:
-        try:
-            action = env.unwrapped.controller_action()
-        except FlightError:  # the teacher has no answer to where the student flew
-            break
-        if env.unwrapped.controller_status in ("solved", "unconstrained"):
-            seen.append(of_observation(observed, hover))
-            speeds.append(action)
-        action = action if student is None else student.speeds(of_observation(observed, hover))
-        observed, _, terminated, truncated, _ = env.step(action)
-        ended = terminated or truncated
-    env.close()
-    return seen, speeds
+class Lesson:
+    """The teacher as a controller that writes down what it does, and lets a student fly if there is one."""
+
+    name, solver, horizon = "lesson", "", 50
+
+    def __init__(self, scenario: quadsim.Scenario, student: Student | None = None) -> None:
+        self.teacher, self.student = quadsim.make_controller(scenario), student
+        self.hover = quadsim.load_vehicle("lopes2011").hover_speed
+        self.seen: list[Array] = []
+        self.speeds: list[Array] = []
+
+    def reset(self, speeds: Array) -> None:
+        """See `quadsim.controller.Controller.reset`."""
+        self.teacher.reset(speeds)
+
+    def step(self, now: quadsim.Moment, state: Array, reference: Array) -> quadsim.Command | Array:
+        """See `quadsim.controller.Controller.step`."""
+        assert now.acting is not None
+        command = self.teacher.step(now, state, reference)
+        if command.status in ("solved", "unconstrained"):
+            self.seen.append(features(state, reference, now.acting, self.hover))
+            self.speeds.append(command.speeds)
+        return command if self.student is None else self.student.step(now, state, reference)
 
 
-def learn(*, courses: int = 12, rounds: int = 3, epochs: int = 100) -> Student:
+def learn(*, courses: int = 12, rounds: int = 3, steps: int = 150) -> Student:
     """A student of the paper's controller: of its own flights first, then of its labels for the student's."""
     vehicle = quadsim.load_vehicle("lopes2011")
-    student, hover = Student(Network((INPUTS, 64, 64, 4)), vehicle), vehicle.hover_speed
-    x, y = np.empty((0, INPUTS)), np.empty((0, 4))
+    student = Student(Network(INPUTS, 64, 64, 4), vehicle)
+    seen: list[Array] = []
+    speeds: list[Array] = []
     for round_ in range(rounds + 1):
         for i in range(courses):
-            seen, speeds = answers(course(1000 + round_ * courses + i), hover, student if round_ else None)
-            x, y = np.concatenate([x, seen]), np.concatenate([y, (np.array(speeds) - hover) / 10.0])
-        error = student.network.fit(x, y, epochs=epochs)
-        print(f"round {round_}: {len(x)} samples, RMS error {10.0 * error:.3f} rad/s")
+            flown = course(1000 + round_ * courses + i)
+            lesson = Lesson(flown, student if round_ else None)
+            quadsim.fly(flown, controller=lesson, progress=False)  # which ends where the teacher has no answer
+            seen, speeds = seen + lesson.seen, speeds + lesson.speeds
+        error = student.network.fit(np.array(seen), (np.array(speeds) - vehicle.hover_speed) / 10.0, steps)
+        print(f"round {round_}: {len(seen)} samples, RMS error {10.0 * error:.3f} rad/s")
     return student
 
 
@@ -174,12 +160,12 @@ def behind_filter(student: Student, scenario: quadsim.Scenario) -> quadsim.Fligh
     limits = list(most.values())
     calm = {"of": list(most), "rows": np.eye(4).tolist(), "lower": [-each for each in limits], "upper": limits}
     table["polytopes"] = [{"name": "calm", **calm}]
-    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(scenario, **OBSERVED), table)
-    observed, _ = env.reset(seed=0)
-    ended = False
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(scenario, action="speeds"), table)
+    env.reset(seed=0)
+    started, ended = env.unwrapped.started, False
     while not ended:
-        action = student.speeds(of_observation(observed, student.hover))
-        observed, _, terminated, truncated, _ = env.step(action)
+        now = started.observation
+        _, _, terminated, truncated, _ = env.step(student.step(now.moment, now.state, now.preview))
         ended = terminated or truncated
     flight: quadsim.Flight = env.unwrapped.flight()
     env.close()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
 
@@ -14,47 +15,27 @@ import imitation
 import safety_filter
 
 import quadsim
-import quadsim.gym
 
 
 def test_the_gradient_is_that_of_the_mean_squared_error() -> None:
-    network, rng = imitation.Network((5, 4, 3, 2)), np.random.default_rng(0)
+    network, rng = imitation.Network(5, 4, 3, 2), np.random.default_rng(0)
     x, y = rng.normal(size=(7, 5)), rng.normal(size=(7, 2))
-
-    def error() -> float:
-        return float(np.mean((network._layers(x)[-1] - y) ** 2))
-
-    parameters = [*network.weights[:-1], *network.offsets]
-    for parameter, slope in zip(parameters, network._gradient(x, y), strict=True):
-        for index in np.ndindex(parameter.shape):
-            there, step = parameter[index], 1e-6
-            parameter[index] = there + step
-            above = error()
-            parameter[index] = there - step
-            below = error()
-            parameter[index] = there
-            assert slope[index] == pytest.approx((above - below) / (2.0 * step), abs=1e-8)
-
-
-def test_features_are_the_same_from_an_observation_and_from_a_controllers_arguments() -> None:
-    rng = np.random.default_rng(0)
-    state, preview, command = rng.normal(size=12), rng.normal(size=(50, 4)), rng.normal(size=4)
-    observed = np.concatenate([(preview - state[[0, 2, 4, 10]]).ravel(), state, command])
-    found = imitation.of_observation(observed, 200.0)
-    assert found == pytest.approx(imitation.features(state, preview, command, 200.0), abs=1e-12)
+    numeric = scipy.optimize.approx_fprime(network.weights, lambda weights: network.error(weights, x, y)[0])
+    assert network.error(network.weights, x, y)[1] == pytest.approx(numeric, abs=1e-6)
 
 
 def test_the_network_learns_beyond_its_linear_map() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=(400, 3))
     y = np.column_stack([x @ [1.0, -1.0, 0.5], np.clip(2.0 * x[:, 0], -1.0, 1.0)])
-    network = imitation.Network((3, 16, 16, 2))
-    linear = np.linalg.lstsq(x, y, rcond=None)[0]
-    assert network.fit(x, y, epochs=300, rate=1e-2) < 0.3 * np.sqrt(np.mean((x @ linear - y) ** 2))
+    network = imitation.Network(3, 16, 16, 2)
+    error = network.fit(x, y, steps=200)
+    assert error == pytest.approx(np.sqrt(np.mean((network(x) - y) ** 2)))
+    assert error < 0.3 * np.sqrt(np.mean((imitation.with_ones(x) @ network.linear - y) ** 2))
 
 
 def test_a_student_is_audited_like_its_teacher(capsys: pytest.CaptureFixture[str]) -> None:
-    student = imitation.learn(courses=1, rounds=0, epochs=2)
+    student = imitation.learn(courses=1, rounds=0, steps=2)
     assert "round 0: 600 samples" in capsys.readouterr().out
     flights = imitation.compared(student, flights=1, duration=3.0)
     assert [flights[name][0].controller for name in ("teacher", "student")] == ["constrained", "student"]
@@ -75,11 +56,13 @@ def test_the_filter_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_teacher_labels_its_own_flight_and_the_students() -> None:
     scenario = imitation.course(0).replace({"duration": 1.0})
-    hover = quadsim.load_vehicle("lopes2011").hover_speed
-    _, speeds = imitation.answers(scenario, hover)
-    assert np.array_equal(speeds, quadsim.fly(scenario, progress=False).command)
-    student = imitation.Student(imitation.Network((imitation.INPUTS, 4, 4)), quadsim.load_vehicle("lopes2011"))
-    seen, labels = imitation.answers(scenario, hover, student)
-    assert len(seen) == len(labels) > 1
-    assert np.array_equal(labels[0], speeds[0])
-    assert not np.array_equal(labels[1], speeds[1])
+    own = imitation.Lesson(scenario)
+    flight = quadsim.fly(scenario, controller=own, progress=False)
+    assert np.array_equal(flight.command, quadsim.fly(scenario, progress=False).command)
+    assert np.array_equal(own.speeds, flight.command)
+    student = imitation.Student(imitation.Network(imitation.INPUTS, 4, 4), quadsim.load_vehicle("lopes2011"))
+    other = imitation.Lesson(scenario, student)
+    quadsim.fly(scenario, controller=other, progress=False)
+    assert len(other.seen) == len(other.speeds) > 1
+    assert np.array_equal(other.speeds[0], own.speeds[0])
+    assert not np.array_equal(other.speeds[1], own.speeds[1])
