@@ -82,7 +82,7 @@ class Network:
 
     def fit(self, x: Array, y: Array, steps: int) -> float:
         """Fit the linear map, then the rest; the root mean square error."""
-        self.linear = np.linalg.lstsq(with_ones(x), y)[0]
+        self.linear = np.asarray(np.linalg.lstsq(with_ones(x), y)[0], float)
         rest = x, y - with_ones(x) @ self.linear
         found = scipy.optimize.minimize(
             self.error, self.weights, rest, jac=True, method="L-BFGS-B", options={"maxiter": steps}

@@ -62,13 +62,13 @@ class Formula:
     violated: Callable[[Scenario], bool] = lambda scenario: False
     backwards: bool = False
     stops_after: int | None = None
-    stopped_by: type[BaseException] = KeyboardInterrupt
+    stopped_by: Callable[[], BaseException] = KeyboardInterrupt
     flown: list[int] = field(default_factory=list)
 
     def fly(self, pilot: Any, flights: Sequence[int], **_: object) -> Generator[Row, None, None]:
         for flight in reversed(flights) if self.backwards else flights:
             if len(self.flown) == self.stops_after:
-                raise self.stopped_by
+                raise self.stopped_by()
             self.flown.append(flight)
             scenario = pilot.plan.of(flight)
             violated = self.violated(scenario)

@@ -240,11 +240,6 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         assert self._answered is not None
         return self._answered[1]
 
-    @property
-    def controller_status(self) -> str:
-        """The status of the last query; see `quadsim.controller.Command`."""
-        return "" if self._answered is None else self._answered[2].status
-
     def action_for(self, command: Command) -> Action:
         """The action equivalent to a command: taken next, that very command is flown, with its plan and status.
 

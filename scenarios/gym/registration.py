@@ -33,19 +33,12 @@ def environment_id(name: str) -> str:
 def register_library() -> None:
     """Register the scenarios that ship; they are right, and not checked."""
     for name in scenario_names():
-        if environment_id(name) not in gymnasium.registry:
-            periods = Scenario.read(read_scenario(scenario_path(name), scenario_path)).periods
-            gymnasium.register(**_description(name, name, periods))
+        scenario = Scenario.read(read_scenario(scenario_path(name), scenario_path))
+        gymnasium.registry.setdefault(environment_id(name), _specification(scenario, scenario=name))
 
 
-def _description(name: str, scenario: Scenario | str, periods: int) -> dict[str, Any]:
-    kwargs = {"scenario": scenario}
-    return {"id": environment_id(name), "entry_point": ENTRY_POINT, "max_episode_steps": periods, "kwargs": kwargs}
-
-
-def _specification(scenario: Scenario | str | Path) -> EnvSpec:
-    scenario = as_scenario(scenario)
-    return EnvSpec(**_description(scenario.name, scenario, scenario.periods))
+def _specification(flown: Scenario, **kwargs: Any) -> EnvSpec:
+    return EnvSpec(environment_id(flown.name), ENTRY_POINT, max_episode_steps=flown.periods, kwargs=kwargs)
 
 
 def make_env(scenario: Scenario | str | Path, **options: Any) -> gymnasium.Env[Any, Any]:
@@ -66,7 +59,8 @@ def make_env(scenario: Scenario | str | Path, **options: Any) -> gymnasium.Env[A
         ((12,), 200, 0)
         >>> env.close()
     """
-    return gymnasium.make(_specification(scenario), **options)
+    scenario = as_scenario(scenario)
+    return gymnasium.make(_specification(scenario, scenario=scenario), **options)
 
 
 def make_vec(scenario: Scenario | str | Path, num_envs: int, **options: Any) -> VectorEnv:
@@ -89,4 +83,5 @@ def make_vec(scenario: Scenario | str | Path, num_envs: int, **options: Any) -> 
     """
     if num_envs < 1:
         raise ParameterError("", "num_envs", num_envs, "at least 1")
-    return gymnasium.make_vec(_specification(scenario), num_envs, "async", **options)
+    scenario = as_scenario(scenario)
+    return gymnasium.make_vec(_specification(scenario, scenario=scenario), num_envs, "async", **options)
