@@ -88,10 +88,9 @@ class TuningPlan:
             self.start.data, changes, lambda data: parse_scenario({**data, "name": name}, source=name), table="search"
         )
 
-    def of(self, values: Values, *, name: str | None = None, fresh: bool = False) -> Plan:
-        """The campaign of a candidate, on the draws of the search or on fresh ones; errors: `candidate`."""
-        name = name or self.spec.name
-        changes = {"name": name, **(dict(self.spec.fresh) if fresh else {})}
+    def fresh(self, values: Values, name: str) -> Plan:
+        """The campaign of a candidate on fresh draws; errors: `candidate`."""
+        changes = {"name": name, **dict(self.spec.fresh)}
         return Plan(self.start.spec.model_copy(update=changes), self.candidate(values, name))
 
     def shown(self, values: Values) -> dict[str, Value | str | None]:
@@ -170,7 +169,8 @@ class SearchPlan(Plan):
         """The scenario of one flight; errors: `TuningPlan.candidate`."""
         candidate, draw = divmod(flight, self.tuning.most)
         if candidate not in self._plans:
-            self._plans[candidate] = self.tuning.of(self.candidates[candidate])
+            scenario = self.tuning.candidate(self.candidates[candidate], self.spec.name)
+            self._plans[candidate] = Plan(self.spec, scenario)
         return self._plans[candidate].of(draw)
 
     def identity(self, flight: int) -> Row:

@@ -18,7 +18,7 @@ from quadsim.errors import InputError, OutputError
 from quadsim.flight.summary import read_json
 from quadsim.outputs import SUMMARY_FILE, growing, to_json
 from quadsim.report.page import PAGE_FILE
-from scenarios.campaign import manifest as records
+from scenarios.campaign.manifest import flown_by
 from scenarios.campaign.pilot import fly_flights
 from scenarios.campaign.plan import plan_differences
 from scenarios.campaign.report.campaign_page import write_comparison_report
@@ -107,15 +107,16 @@ def tune(
         files.write({f"{each.name.removeprefix(f'{name}-')}.toml": each.to_toml().encode() for each in found})
 
         folders = {START: "start", answer: "start" if answer == START else f"candidate-{answer}"}
-        finish = partial(fly_campaign, workers=workers, cluster=cluster, report=report, watch=watch)
-        campaigns, tables = [], []
-        for candidate, folder in folders.items():
-            campaigns.append(plan.of(search.candidates[candidate], name=f"{name}-{folder}", fresh=True))
-            target = files.path / folder
-            tables.append(finish(campaigns[-1], target, resume=records.is_campaign(target)).table)
+        campaigns = {
+            folder: plan.fresh(search.candidates[each], f"{name}-{folder}") for each, folder in folders.items()
+        }
+        finish = partial(fly_campaign, workers=workers, cluster=cluster, resume=True, report=report, watch=watch)
+        tables = [finish(campaign, files.path / folder).table for folder, campaign in campaigns.items()]
         comparison = None
         if answer != START:
-            comparison = compare(tables[0], tables[1], ("start", "best"), differences=plan_differences(*campaigns))
+            comparison = compare(
+                tables[0], tables[1], ("start", "best"), differences=plan_differences(*campaigns.values())
+            )
             if report:
                 write_comparison_report(comparison, files.path / "comparison", overwrite=True)
         summary = _summary(plan, search, answer, front, tables)
@@ -172,7 +173,7 @@ def _manifest(plan: TuningPlan) -> dict[str, Any]:
     campaign = plan.start.spec.model_dump(mode="json", exclude={*OWN})
     scenario = json.loads(plan.start.scenario.model_dump_json())  # infinite bounds are null
     own = {"format": "quadsim tuning", **tables, "campaign": campaign, "scenario": scenario}
-    return {**own, "optuna": require_optuna().__version__, **records.flown_by(plan.start)}
+    return {**own, "optuna": require_optuna().__version__, **flown_by(plan.start)}
 
 
 def _require_same(manifest: Mapping[str, Any], directory: Path) -> None:
