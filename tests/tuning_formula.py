@@ -20,6 +20,7 @@ from scenarios.tuning.run import TuningResult, tune
 BEST_SPEED, BEST_Z = 0.05, 300.0  # where the formula is smallest
 TUNING: dict[str, Any] = {
     "name": "little",
+    "description": "a <b>bowl</b>",
     "trials": 24,
     "batch": 6,
     "flights": [2, 4, 8],

@@ -15,7 +15,6 @@ from quadsim.errors import InputError, MissingPackageError
 from quadsim.outputs import Growing
 from quadsim.state import Array
 from scenarios.campaign.pilot import CampaignPilot
-from scenarios.campaign.plan import cell
 from scenarios.campaign.results.store import Store
 from scenarios.campaign.results.table import Row
 from scenarios.campaign.spec import ChoiceSpec, IntegerSpec, LogUniformSpec, Value
@@ -92,13 +91,13 @@ class Search:
         plan = self._plan
         self._fly_missing([START], plan.most)
         if all(_contains(entry, plan.start_values.get(entry.name)) for entry in plan.spec.search):
-            self.study.enqueue_trial(plan.shown({}))
+            self.study.enqueue_trial(dict(plan.start_values))
             self._judge([self.study.ask(self._space)])
         else:  # no trial of this search, which numbers its candidates from 1
             self._judge([self.study.ask()])
         for _ in range(0, plan.spec.trials, plan.spec.batch):
             trials = [self.study.ask(self._space) for _ in range(plan.spec.batch)]
-            self.candidates.update((trial.number, self._values(trial)) for trial in trials)
+            self.candidates.update((trial.number, trial.params) for trial in trials)
             self._judge(trials)
         return self._store.close(max(self._rows) + 1)
 
@@ -179,12 +178,6 @@ class Search:
         finally:
             self._store.flush()
 
-    def _values(self, trial: Trial) -> Values:
-        """The values of a trial as a scenario has them."""
-        choices = [entry for entry in self._plan.spec.search if isinstance(entry, ChoiceSpec)]
-        chosen = {each.name: {cell(v): v for v in each.values}[trial.params[each.name]] for each in choices}
-        return {**trial.params, **chosen}
-
     def answer(self) -> tuple[int, list[int]]:
         """The answer, and the Pareto front by its first objective: of one objective, the best.
 
@@ -210,7 +203,7 @@ class Search:
 def _distribution(kinds: Any, entry: SearchSpec) -> Any:
     match entry:
         case ChoiceSpec():
-            return kinds.CategoricalDistribution([cell(value) for value in entry.values])
+            return kinds.CategoricalDistribution(entry.values)
         case IntegerSpec():
             return kinds.IntDistribution(entry.low, entry.high)
     return kinds.FloatDistribution(entry.low, entry.high, log=isinstance(entry, LogUniformSpec))

@@ -82,4 +82,6 @@ class TuningSpec(Spec):
         for entry in self.search:
             if isinstance(entry, ChoiceSpec) and entry.weights is not None:
                 raise ValueError(f"search.{entry.name}.weights must be absent: nothing is drawn")
+            if isinstance(entry, ChoiceSpec) and isinstance(entry.values[0], list):
+                raise ValueError(f"search.{entry.name}.values must be no lists: search their entries, by index")
         return self

@@ -1,17 +1,22 @@
-"""Tuning files: every wrong field refused by its name, in one message, with status 2."""
+"""Tuning files: every wrong field refused by its name, and objectives that are arithmetic and nothing else."""
 
 from __future__ import annotations
 
 import copy
+import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from tuning_formula import TUNING, write_tuning
 
 from quadsim.errors import InputError
 from scenarios.cli import main
 from scenarios.shipped import tuning_names
+from scenarios.tuning.objective import value_of
 from scenarios.tuning.plan import load_tuning
 
 
@@ -40,10 +45,7 @@ def campaign(**changes: Any) -> dict[str, Any]:
         ({"search": entry(fields=["effects.load.mass_factor"])}, "must not have effects.load.mass_factor, which mass"),
         ({"search": entry(name="z")}, r"search must have distinct names; got \['z', 'z'\]"),
         ({"objectives": [{"name": "e", "expression": "verdict"}]}, "objectives.e.expression: no column of numbers"),
-        (
-            {"objectives": [{"name": "e", "expression": "rmse.x +"}]},
-            "e.expression: .* must be arithmetic on",
-        ),
+        ({"objectives": [{"name": "e", "expression": "rmse.x +"}]}, "e.expression: .* must be arithmetic on"),
         ({"objectives": 3 * TUNING["objectives"]}, "objectives must be of 2 or fewer entries; got 3"),
         ({"campaign": campaign(seed=3)}, "campaign.seed must be absent: a tuning has its own"),
         ({"campaign": campaign(base="papers")}, "no campaign named 'papers'"),
@@ -99,3 +101,39 @@ def test_a_file_written_out_is_the_same_tuning(tmp_path: Path) -> None:
     again = load_tuning(str(written))
     assert again.start.scenario == plan.start.scenario
     assert again.to_toml() == plan.to_toml()
+
+
+ROW = {"rmse.x": 3.0, "rmse.y": 4.0, "peak_tilt": -2.0, "fallback_periods": 2, "lost": None, "violated": True}
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("sqrt(rmse.x**2 + rmse.y**2)", 5.0),
+        ("-rmse.x * 2 - (1 - rmse.y) / 2", -4.5),
+        ("max(rmse.x, rmse.y, peak_tilt) + min(1, 2) + abs(peak_tilt)", 7.0),
+        ("fallback_periods + violated", 3.0),
+    ],
+)
+def test_values(text: str, value: float) -> None:
+    assert value_of(text, ROW) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("text", ["lost", "1 / (rmse.x - 3)", "9.9**9**9", "peak_tilt**0.5"])
+def test_what_has_no_finite_value_is_nan(text: str) -> None:
+    assert math.isnan(value_of(text, ROW))
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["__import__('os')", "rmse.x if 1 else 2", "[1]", "'text'", "1 < 2", "sqrt()", "max(1, key=2)", "sqrt.x(1)", ""],
+)
+def test_what_is_no_arithmetic_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"must be|no column of numbers"):
+        value_of(text, ROW)
+
+
+@given(st.text(max_size=40))
+def test_any_text_is_an_expression_or_refused(text: str) -> None:
+    with suppress(InputError):
+        assert isinstance(value_of(text, ROW), float)

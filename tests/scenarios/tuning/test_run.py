@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -21,9 +22,10 @@ from scenarios.campaign.results.table import read_table
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 from scenarios.tuning import run as module
+from scenarios.tuning.page import sentences, verdict
 from scenarios.tuning.plan import START, TuningPlan, load_tuning
 from scenarios.tuning.run import TuningResult
-from scenarios.tuning.search import JOURNAL_FILE, Search
+from scenarios.tuning.search import JOURNAL_FILE
 
 
 def tune(plan: TuningPlan, directory: Path, by: Formula | int, **options: Any) -> TuningResult:
@@ -40,9 +42,9 @@ def plan(tmp_path: Path) -> TuningPlan:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
-    """The tuning, undisturbed; nobody changes its directory."""
+    """The tuning, undisturbed, with its pages; nobody changes its directory."""
     here = tmp_path_factory.mktemp("whole")
-    return tune(load_tuning(str(write_tuning(here))), here / "t", Formula())
+    return tune_by(Formula(), load_tuning(str(write_tuning(here))), here / "t")
 
 
 def content(result: TuningResult) -> tuple[bytes, ...]:
@@ -103,6 +105,25 @@ def test_fresh_draws_are_others_and_the_optimism_is_reported(whole: TuningResult
     difference = gain["best"] - gain["start"]
     assert [gain["mean"], gain["lower"], gain["upper"]] == pytest.approx([difference] * 3)
     assert gain["fresh_best"] - gain["fresh_start"] == pytest.approx(difference)
+
+
+def test_the_page_has_optunas_plots_and_links_to_what_is_there(whole: TuningResult) -> None:
+    page, plots = read_page(whole)
+    links = re.findall(r'href="([^"#:]+)"', page)
+    pages = {"start/index.html", f"candidate-{whole.summary['answer']}/index.html", "comparison/index.html"}
+    assert pages | {"best.toml", "journal.log"} <= set(links)
+    assert [link for link in links if not (whole.directory / link).is_file()] == []
+    assert "a &lt;b&gt;bowl" in page
+    assert plots == {"candidates", "importance0", "slice0"}
+    assert "://" not in re.sub(r"<script>.*?</script>|<script type.*?</script>", "", page, flags=re.DOTALL)
+    assert verdict(whole.summary) in page
+    assert "violation in 0 of 20 flights" in sentences(whole.summary)[0]
+
+
+def read_page(result: TuningResult) -> tuple[str, set[str]]:
+    """The page, and the names of its plots."""
+    page = (result.directory / "index.html").read_text(encoding="utf-8")
+    return page, set(re.findall(r'<div class="plot" id="(\w+)"', page))
 
 
 def test_an_interrupted_search_ends_as_it_would_have(plan: TuningPlan, whole: TuningResult, tmp_path: Path) -> None:
@@ -173,7 +194,8 @@ def test_two_objectives_have_a_front_of_files_that_fly(tmp_path: Path) -> None:
     opposed = {"name": "opposed", "expression": "sqrt(rmse.x) * draw.mass - 3 * rmse.x"}
     objectives = [{"name": "error", "expression": "rmse.x"}, opposed]
     plan = load_tuning(str(write_tuning(tmp_path, objectives=objectives, trials=12)))
-    result = tune(plan, tmp_path / "t", Formula())
+    result = tune_by(Formula(), plan, tmp_path / "t")
+    assert read_page(result)[1] == {"candidates", "importance0", "slice0", "importance1", "slice1"}
     values = {each["candidate"]: each["values"] for each in result.summary["candidates"]}
     front = [values[candidate] for candidate in result.summary["front"]]
     assert len(front) > 1
@@ -195,13 +217,12 @@ def test_optuna_opens_the_journal(whole: TuningResult) -> None:
 
 def test_a_start_outside_of_the_ranges_is_no_trial_of_the_search(tmp_path: Path) -> None:
     horizon = {"name": "n", "fields": ["controller.horizon"], "distribution": "integer", "low": 20, "high": 30}
-    bounds = {"name": "b", "fields": ["controller.input_bounds.speed"], "distribution": "choice"}
-    bounds["values"] = [[0.0, 250.0], [10.0, 240.0]]
-    plan = load_tuning(str(write_tuning(tmp_path, search=[horizon, bounds], trials=6)))
+    solver = {"name": "s", "fields": ["controller.solver"], "distribution": "choice"}
+    solver["values"] = ["piqp-dense", "piqp-multistage"]
+    plan = load_tuning(str(write_tuning(tmp_path, search=[horizon, solver], trials=6)))
     start, *others = tune(plan, tmp_path / "t", Formula()).summary["candidates"]
-    assert start["search"] == {"n": 4.0, "b": "[0.0, 250.0]"}
-    assert all(20 <= each["search"]["n"] <= 30 for each in others)
-    assert {each["search"]["b"] for each in others} == {"[0.0, 250.0]", "[10.0, 240.0]"}
+    assert start["search"] == {"n": 4.0, "s": plan.start_values["s"]}
+    assert all(20 <= each["search"]["n"] <= 30 and each["search"]["s"] in solver["values"] for each in others)
     assert [each["candidate"] for each in others] == [1, 2, 3, 4, 5, 6]
 
 
@@ -242,8 +263,7 @@ def test_flights_of_other_candidates_are_not_gone_on_with(
     """As of a processor whose last bits lead Optuna elsewhere."""
     with pytest.raises(KeyboardInterrupt):
         tune(plan, tmp_path / "t", Formula(stops_after=10))
-    values = Search._values
-    monkeypatch.setattr(Search, "_values", lambda self, trial: {**values(self, trial), "z": 299.0})
+    monkeypatch.setattr(optuna.trial.Trial, "params", {"speed": 0.01, "z": 299.0})
     with pytest.raises(InputError, match="--resume needs the candidates that flew there"):
         tune(plan, tmp_path / "t", Formula(), resume=True)
 
