@@ -103,11 +103,10 @@ class Search:
 
     def _judge(self, trials: Sequence[Trial]) -> None:
         """All trials fly a few draws, those that are not worse than the best go on to more; then all are told."""
-        going, before = list(trials), 0
+        going = list(trials)
         for flights in self._plan.spec.flights:
             self._fly_missing([trial.number for trial in going], flights)
-            going = [trial for trial in going if self._goes_on(trial, before, flights)]
-            before = flights
+            going = [trial for trial in going if self._goes_on(trial, flights)]
         states = require_optuna().trial.TrialState
         for trial in trials:
             found = self.scores[trial.number]
@@ -116,8 +115,8 @@ class Search:
             state = states.FAIL if not trial.params else None if found.values else states.PRUNED
             self.study.tell(trial, found.values if state is None else None, state=state)
 
-    def _goes_on(self, trial: Trial, before: int, flights: int) -> bool:
-        """Whether a trial flies on: it can still hold the requirement, and the pruner, by the draws since, agrees."""
+    def _goes_on(self, trial: Trial, flights: int) -> bool:
+        """Whether a trial flies on: it can still hold the requirement, and the pruner agrees."""
         rows = self._first(trial.number, flights)
         found = self.scores[trial.number] = self._score(trial.number, rows)
         if found.count > self._plan.requirement.share * self._plan.most:
@@ -125,8 +124,8 @@ class Search:
         if len(found.values) > 1:  # of several objectives Optuna prunes none
             return True
         for draw, (value,) in enumerate(self._plan.objectives(rows)):
-            if draw >= before and np.isfinite(value):
-                trial.report(float(value), draw)
+            if np.isfinite(value):
+                trial.report(float(value), draw)  # which leaves alone what it was told before
         return not trial.should_prune()
 
     def _score(self, candidate: int, rows: Sequence[Row]) -> Score:

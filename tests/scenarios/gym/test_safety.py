@@ -58,13 +58,12 @@ def test_what_is_safe_passes_to_the_bit() -> None:
     assert np.array_equal(env.unwrapped.flight().command[0], wanted)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_an_action_that_is_not_finite_is_not_flown(value: float) -> None:
+def test_an_action_that_is_not_finite_is_not_flown() -> None:
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("robust", action="speeds"))
     with pytest.raises(ResetNeeded, match="reset"):
         env.step(np.zeros(4))
     env.reset(seed=0)
-    for _ in range(10):
+    for value in 3 * [np.nan, np.inf, -np.inf]:
         _, _, terminated, _, info = env.step(np.array([400.0, value, 400.0, 400.0]))
         assert not terminated
         assert info["filter"]["intervened"]
