@@ -18,16 +18,15 @@ from quadsim.errors import MissingPackageError
 
 if TYPE_CHECKING:
     from scenarios.gym.environment import QuadrotorEnv as QuadrotorEnv
-    from scenarios.gym.registration import environment_id as environment_id
-    from scenarios.gym.registration import make_env as make_env
-    from scenarios.gym.registration import make_vec as make_vec
+    from scenarios.gym.environment import environment_id as environment_id
+    from scenarios.gym.environment import make_env as make_env
+    from scenarios.gym.environment import make_vec as make_vec
     from scenarios.gym.safety import MPCSafetyFilter as MPCSafetyFilter
 
 __all__ = ["MPCSafetyFilter", "QuadrotorEnv", "environment_id", "make_env", "make_vec"]
 
 if find_spec("gymnasium") is None:
     raise MissingPackageError("quadsim.gym", "gymnasium", extra="gym")
-for _room in ("environment", "registration", "safety"):
-    _module = importlib.import_module(f"scenarios.gym.{_room}")
-    globals().update({name: getattr(_module, name) for name in __all__ if hasattr(_module, name)})
-importlib.import_module("scenarios.gym.registration").register_library()
+_environment, _safety = (importlib.import_module(f"scenarios.gym.{room}") for room in ("environment", "safety"))
+globals().update({name: getattr(_environment, name, None) or getattr(_safety, name) for name in __all__})
+_environment.register_library()
