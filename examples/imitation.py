@@ -1,4 +1,4 @@
-"""A network imitates the paper's controller, and is audited like it: `python examples/imitation.py`, two minutes.
+"""A linear map imitates the paper's controller, and is audited like it: `python examples/imitation.py`, two minutes.
 
 The teacher flies courses of random steps, the student learns its commands by least squares, then flies itself while the
 teacher labels them with its own actions (data aggregation: Ross, Gordon and Bagnell, 2011, "A reduction of imitation
@@ -8,7 +8,6 @@ learning and structured prediction to no-regret online learning").  Both then fl
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,17 +15,14 @@ from numpy.typing import NDArray
 
 import quadsim
 import quadsim.gym
-from quadsim.errors import FlightError
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
-OBSERVED: dict[str, Any] = {"observation": ("ahead", "state", "command"), "action": "speeds"}
-AHEAD = [1, 2, 4, 7, 11, 16, 22, 29, 37, 45, 50]
-"""Periods ahead of which the student sees the reference."""
 MOVING = [1, 3, 5, 6, 7, 8, 9, 11]
-"""States that it sees: velocities, roll, pitch and all rates; where it is, and its yaw, are in what lies ahead."""
+"""States that the student sees: velocities, roll, pitch and all rates; place and yaw are in what lies ahead."""
 TOLERANCE = 0.2  # deg, of roll and pitch
-INPUTS = 4 * len(AHEAD) + len(MOVING) + 4
+PREVIEW = 50  # periods
+INPUTS = 4 * PREVIEW + len(MOVING) + 5
 
 
 def course(seed: int) -> quadsim.Scenario:
@@ -42,128 +38,66 @@ def course(seed: int) -> quadsim.Scenario:
     return every.model_copy(update={"constraints": [each for each in every.constraints if "arrival" not in each.name]})
 
 
-def features(state: Array, preview: Array, command: Array, hover: float) -> Array:
-    """(56,) what the network is given, of a state (12,), a reference (N, 4) and the command in force (4,)."""
-    ahead = preview[[i - 1 for i in AHEAD]] - state[[0, 2, 4, 10]]
-    return np.concatenate([ahead.ravel() / 5.0, state[MOVING] * 2.0, (command - hover) / 10.0])
-
-
-def of_observation(observed: Array, hover: float) -> Array:
-    """The same of an observation `ahead`, `state`, `command`."""
-    ahead, state, command = observed[:-16].reshape(-1, 4), observed[-16:-4], observed[-4:]
-    return features(state, ahead + state[[0, 2, 4, 10]], command, hover)
-
-
-@dataclass
-class Network:
-    """Two hidden layers, tanh, beside a linear map; trained by Adam on the mean squared error."""
-
-    sizes: tuple[int, ...]
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        rng = np.random.default_rng(self.seed)
-        pairs = list(zip(self.sizes[:-1], self.sizes[1:], strict=True))
-        self.weights = [rng.normal(size=pair) / np.sqrt(pair[0]) for pair in pairs]
-        self.weights.append(np.zeros((self.sizes[0] + 1, self.sizes[-1])))
-        self.offsets = [np.zeros(b) for _, b in pairs]
-
-    def __call__(self, x: Array) -> Array:
-        """(K, outputs) of inputs (K, inputs)."""
-        return self._layers(x)[-1] + self._linear(x)
-
-    def _linear(self, x: Array) -> Array:
-        return x @ self.weights[-1][:-1] + self.weights[-1][-1]
-
-    def _layers(self, x: Array) -> list[Array]:
-        found = [x]
-        for i, (weight, offset) in enumerate(zip(self.weights[:-1], self.offsets, strict=True)):
-            y = found[-1] @ weight + offset
-            found.append(np.tanh(y) if i < len(self.offsets) - 1 else y)
-        return found
-
-    def fit(self, x: Array, y: Array, *, epochs: int, rate: float = 2e-3) -> float:
-        """Fit the linear map, then the rest; the root mean square error."""
-        whole = np.column_stack([x, np.ones(len(x))])
-        self.weights[-1] = np.linalg.solve(whole.T @ whole + 1e-3 * np.eye(whole.shape[1]), whole.T @ y)
-        rest, rng = y - self._linear(x), np.random.default_rng(self.seed)
-        parameters = [*self.weights[:-1], *self.offsets]
-        mean, square, step = [np.zeros_like(p) for p in parameters], [np.zeros_like(p) for p in parameters], 0
-        for epoch in range(epochs):
-            order, now = rng.permutation(len(x)), rate * 0.5 * (1.0 + np.cos(np.pi * epoch / epochs))
-            for batch in np.array_split(order, max(1, len(x) // 256)):
-                step += 1
-                for i, slope in enumerate(self._gradient(x[batch], rest[batch])):
-                    mean[i] = 0.9 * mean[i] + 0.1 * slope
-                    square[i] = 0.999 * square[i] + 0.001 * slope**2
-                    size = np.sqrt(square[i] / (1.0 - 0.999**step)) + 1e-8
-                    parameters[i] -= now * mean[i] / (1.0 - 0.9**step) / size
-        return float(np.sqrt(np.mean((self(x) - y) ** 2)))
-
-    def _gradient(self, x: Array, y: Array) -> list[Array]:
-        layers = self._layers(x)
-        back = 2.0 * (layers[-1] - y) / y.size
-        weights: list[Array] = []
-        offsets: list[Array] = []
-        for i in reversed(range(len(self.offsets))):
-            weights.insert(0, layers[i].T @ back)
-            offsets.insert(0, back.sum(axis=0))
-            back = (back @ self.weights[i].T) * (1.0 - layers[i] ** 2)
-        return [*weights, *offsets]
+def features(now: quadsim.Moment, state: Array, preview: Array, hover: float) -> Array:
+    """(213,) what the student knows: a state (12,), a reference (50, 4), the command in force, and a one."""
+    assert now.acting is not None
+    ahead = (preview - state[[0, 2, 4, 10]]).ravel()
+    return np.concatenate([ahead, state[MOVING], (now.acting - hover) / 10.0, [1.0]])
 
 
 class Student:
-    """The network as a controller: `quadsim.fly(scenario, controller=Student(...))`."""
+    """A linear map as a controller: `quadsim.fly(scenario, controller=Student(...))`."""
 
-    name, solver, horizon = "student", "", 50
+    name, solver, horizon = "student", "", PREVIEW
 
-    def __init__(self, network: Network, vehicle: quadsim.Vehicle) -> None:
-        self.network, self.hover = network, vehicle.hover_speed
-
-    def speeds(self, x: Array) -> Array:
-        """(4,) rotor speeds [rad/s] for features (56,)."""
-        found: Array = self.hover + 10.0 * self.network(x[None])[0]
-        return np.clip(found, 0.0, 250.0)
+    def __init__(self, gain: Array, hover: float) -> None:
+        self.gain, self.hover = gain, hover
 
     def step(self, now: quadsim.Moment, state: Array, reference: Array) -> Array:
         """See `quadsim.controller.Controller.step`."""
-        assert now.acting is not None
-        return self.speeds(features(state, reference, now.acting, self.hover))
+        return np.clip(self.hover + features(now, state, reference, self.hover) @ self.gain, 0.0, 250.0)
 
 
-def answers(
-    scenario: quadsim.Scenario, hover: float, student: Student | None = None
-) -> tuple[list[Array], list[Array]]:
-    """Features and the teacher's rotor speeds, period by period, of its own flight or of a student's."""
-    env = quadsim.gym.make_env(scenario, **OBSERVED)
-    observed, _ = env.reset()
-    seen, speeds, ended = [], [], False
-    while not ended:
-        try:
-            action = env.unwrapped.controller_action()
-        except FlightError:  # the teacher has no answer to where the student flew
-            break
-        if env.unwrapped.controller_status in ("solved", "unconstrained"):
-            seen.append(of_observation(observed, hover))
-            speeds.append(action)
-        action = action if student is None else student.speeds(of_observation(observed, hover))
-        observed, _, terminated, truncated, _ = env.step(action)
-        ended = terminated or truncated
-    env.close()
-    return seen, speeds
+class Lesson:
+    """The teacher as a controller that writes down what it does, and lets a student fly if there is one."""
+
+    name, solver, horizon = "lesson", "", PREVIEW
+
+    def __init__(self, scenario: quadsim.Scenario, hover: float, student: Student | None = None) -> None:
+        self.teacher, self.hover, self.student = quadsim.make_controller(scenario), hover, student
+        self.seen: list[Array] = []
+        self.speeds: list[Array] = []
+
+    def reset(self, speeds: Array) -> None:
+        """See `quadsim.controller.Controller.reset`."""
+        self.teacher.reset(speeds)
+
+    def step(self, now: quadsim.Moment, state: Array, reference: Array) -> quadsim.Command | Array:
+        """See `quadsim.controller.Controller.step`."""
+        command = self.teacher.step(now, state, reference)
+        if command.status in ("solved", "unconstrained"):
+            self.seen.append(features(now, state, reference, self.hover))
+            self.speeds.append(command.speeds)
+        return command if self.student is None else self.student.step(now, state, reference)
 
 
-def learn(*, courses: int = 12, rounds: int = 3, epochs: int = 100) -> Student:
+def learn(*, courses: int = 6, rounds: int = 1) -> Student:
     """A student of the paper's controller: of its own flights first, then of its labels for the student's."""
-    vehicle = quadsim.load_vehicle("lopes2011")
-    student, hover = Student(Network((INPUTS, 64, 64, 4)), vehicle), vehicle.hover_speed
-    x, y = np.empty((0, INPUTS)), np.empty((0, 4))
-    for round_ in range(rounds + 1):
-        for i in range(courses):
-            seen, speeds = answers(course(1000 + round_ * courses + i), hover, student if round_ else None)
-            x, y = np.concatenate([x, seen]), np.concatenate([y, (np.array(speeds) - hover) / 10.0])
-        error = student.network.fit(x, y, epochs=epochs)
-        print(f"round {round_}: {len(x)} samples, RMS error {10.0 * error:.3f} rad/s")
+    hover = quadsim.load_vehicle("lopes2011").hover_speed
+    student: Student | None = None
+    seen: list[Array] = []
+    speeds: list[Array] = []
+    for i in range(courses * (rounds + 1)):
+        flown = course(1000 + i)
+        lesson = Lesson(flown, hover, student)
+        quadsim.fly(flown, controller=lesson, progress=False)  # which ends where the teacher has no answer
+        seen, speeds = seen + lesson.seen, speeds + lesson.speeds
+        if (i + 1) % courses == 0:
+            x, y = np.array(seen), np.array(speeds) - hover
+            student = Student(np.linalg.solve(x.T @ x + 1e-3 * np.eye(INPUTS), x.T @ y), hover)
+            error = np.sqrt(np.mean((x @ student.gain - y) ** 2))
+            print(f"{len(x)} samples, RMS error {error:.3f} rad/s")
+    assert student is not None
     return student
 
 
@@ -174,12 +108,12 @@ def behind_filter(student: Student, scenario: quadsim.Scenario) -> quadsim.Fligh
     limits = list(most.values())
     calm = {"of": list(most), "rows": np.eye(4).tolist(), "lower": [-each for each in limits], "upper": limits}
     table["polytopes"] = [{"name": "calm", **calm}]
-    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(scenario, **OBSERVED), table)
-    observed, _ = env.reset(seed=0)
-    ended = False
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(scenario, action="speeds"), table)
+    env.reset(seed=0)
+    started, ended = env.unwrapped.started, False
     while not ended:
-        action = student.speeds(of_observation(observed, student.hover))
-        observed, _, terminated, truncated, _ = env.step(action)
+        now = started.observation
+        _, _, terminated, truncated, _ = env.step(student.step(now.moment, now.state, now.preview))
         ended = terminated or truncated
     flight: quadsim.Flight = env.unwrapped.flight()
     env.close()

@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 import tomlkit
 
-from scenarios.campaign.pilot import CampaignPilot
 from scenarios.campaign.results.table import Row
 from scenarios.schema.scenario import Scenario
 from scenarios.tuning.plan import TuningPlan
 from scenarios.tuning.run import TuningResult, tune
-from scenarios.tuning.search import TuningPilot
 
 BEST_SPEED, BEST_Z = 0.05, 300.0  # where the formula is smallest
 TUNING: dict[str, Any] = {
     "name": "little",
+    "description": "a <b>bowl</b>",
     "trials": 24,
     "batch": 6,
     "flights": [2, 4, 8],
@@ -64,25 +63,18 @@ class Formula:
     violated: Callable[[Scenario], bool] = lambda scenario: False
     backwards: bool = False
     stops_after: int | None = None
-    stopped_by: type[BaseException] = KeyboardInterrupt
+    stopped_by: Callable[[], BaseException] = KeyboardInterrupt
     flown: list[int] = field(default_factory=list)
 
     def fly(self, pilot: Any, flights: Sequence[int], **_: object) -> Generator[Row, None, None]:
         for flight in reversed(flights) if self.backwards else flights:
             if len(self.flown) == self.stops_after:
-                raise self.stopped_by
+                raise self.stopped_by()
             self.flown.append(flight)
-            scenario = self._scenario(pilot, flight)
+            scenario = pilot.plan.of(flight)
             violated = self.violated(scenario)
             row = pilot.failed(flight, "", "violated" if violated else "satisfied")
             yield {**row, "status": "completed", "violated": violated, "failed": violated, "rmse.x": error_of(scenario)}
-
-    @staticmethod
-    def _scenario(pilot: TuningPilot | CampaignPilot, flight: int) -> Scenario:
-        if isinstance(pilot, CampaignPilot):
-            return pilot.plan.of(flight)
-        candidate, draw = divmod(flight, pilot._tuning.most)
-        return pilot._tuning.of(pilot._candidates[candidate]).of(draw)
 
 
 def tune_by(formula: Formula, plan: TuningPlan, directory: Path, **options: Any) -> TuningResult:

@@ -73,7 +73,8 @@ class Plan:
             raise InputError(f"failure: {error}") from error
 
     @cached_property
-    def _data(self) -> dict[str, Any]:
+    def data(self) -> dict[str, Any]:
+        """The scenario's tables."""
         return tomllib.loads(self.scenario.to_toml())
 
     def of(self, flight: int) -> Scenario:
@@ -117,18 +118,18 @@ class Plan:
         def parse(data: dict[str, Any]) -> Scenario:
             return parse_scenario({**data, "name": name, "seed": seed}, source=name)
 
-        return changed(self._data, changes, parse, table="vary")
+        return changed(self.data, changes, parse, table="vary")
 
 
-def read_campaign(name: str) -> dict[str, Any]:
-    """The tables of a campaign's file, merged over its base's.
+def read_campaign(name: str, find: Callable[[str], Path] = campaign_path) -> dict[str, Any]:
+    """The tables of a campaign's file, or of a tuning's, which `find` knows, merged over its base's.
 
     Raises:
         FileError, UnknownNameError: there is none, or it cannot be read.
     """
     try:
-        path = campaign_path(name)
-        data = read_scenario(path, campaign_path, locate=locate)
+        path = find(name)
+        data = read_scenario(path, find, locate=locate)
         locate(data, path.parent)
         return data
     except OSError as error:
@@ -217,11 +218,14 @@ def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], .
 
 
 def locate(data: dict[str, Any], directory: Path) -> None:
-    """Make the paths in a campaign's tables independent of its folder, in place."""
-    file, changes = data.get("scenario"), data.get("set")
-    if isinstance(file, str) and file.endswith(".toml") and (directory / file).is_file():
-        data["scenario"] = str((directory / file).resolve())
-    if isinstance(changes, dict):
+    """Make the paths in a campaign's tables, or in a tuning's, independent of its folder, in place."""
+    for name in ("scenario", "base"):
+        file = data.get(name)
+        if isinstance(file, str) and file.endswith(".toml") and (directory / file).is_file():
+            data[name] = str((directory / file).resolve())
+    if isinstance(tuned := data.get("campaign"), dict):
+        locate(tuned, directory)
+    if isinstance(changes := data.get("set"), dict):
         locate_files(changes, directory)
 
 

@@ -1,22 +1,24 @@
-"""One scenario as a Gymnasium environment: the plant, sensors, air and audit of `quadsim run`, an agent in the loop."""
+"""Scenarios as Gymnasium environments: the plant, sensors, air and audit of `quadsim run`, an agent in the loop."""
 
 from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
+from gymnasium.vector import VectorEnv
 
 from quadsim.controller import Command, Moment, Phase
-from quadsim.errors import FlightError, InputError, ParameterError
+from quadsim.errors import FlightError, ParameterError
 from quadsim.flight.audit import Limit
-from quadsim.flight.log import FlightLog, PlantLog
+from quadsim.flight.log import FlightLog
 from quadsim.report.film.camera import Camera
 from quadsim.sim.loop import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array
@@ -30,8 +32,9 @@ from scenarios.loading import parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import StartedFlight, start
 from scenarios.schema.base import LARGEST_SEED
-from scenarios.schema.bases import merge
+from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.scenario import Scenario
+from scenarios.shipped import scenario_names, scenario_path
 
 Reward = Callable[[Array, Array, Array], float]
 """From the true state (12,) after a step, the reference (4,) there, and the rotor speeds commanded (4,) [rad/s]."""
@@ -125,7 +128,6 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self._preview, self._reward, self._action = preview, reward, action
         self._flight: StartedFlight | None = None
         self._camera: Camera | None = None
-        self._started = False
         self.scenario, self.limits = self._base, build_limits(self._base)
 
     @property
@@ -158,24 +160,23 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         """
         if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed <= LARGEST_SEED):
             raise ParameterError("", "seed", seed, f"from 0 to {LARGEST_SEED}")
-        first = not self._started
-        super().reset(seed=self._base.seed if first and seed is None else seed)
-        self._started = True
-        scenario = self._drawn(seed, first, dict(options or {}))
+        if seed is None and self._flight is None:
+            seed = self._base.seed
+        super().reset(seed=seed)
+        scenario = self._drawn(seed, options or {})
         if self._flight is not None:
             self._flight.close()
         self.scenario = scenario
-        vehicle = build_vehicle(scenario)
         if self._plan is not None:
-            self.actions = Actions(self._action, scenario, vehicle)
+            self.actions = Actions(self._action, scenario, build_vehicle(scenario))
         # events that change the controller need a real one
         law: Any = None if scenario.controller_changes else Agent(scenario.controller.horizon)
         self._flight = start(scenario, law)
         self.limits = self._flight.limits
         self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
-        self._seen, plant = self._flight.observation, self._flight.loop.log().plant
-        self._truth, self._rotors = plant.state[-1], plant.speeds[-1]
-        return self._vector(self._seen), self._info(*_start_margins(self.limits, plant))
+        self._seen, log = self._flight.observation, self._flight.loop.log()
+        self._truth, self._rotors = log.plant.state[-1], log.plant.speeds[-1]
+        return self._vector(self._seen), self._info(*_margins(self.limits, log))
 
     def step(self, action: Action) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Fly one control period.
@@ -192,28 +193,33 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if np.shape(action) != self.action_space.shape:
             raise ParameterError("", "action", np.shape(action), f"of shape {self.action_space.shape}")
         seen = self._seen
-        match self._answered:
-            case (flight.k, answered, command) if np.array_equal(answered, action):
-                pass
-            case _:
-                command = self.actions.command(action, seen.moment.body_rates, flight.loop.controller.horizon)
+        if self._answered and self._answered[0] == flight.k and np.array_equal(self._answered[1], action):
+            command = self._answered[2]
+        else:
+            command = self.actions.command(action, seen.moment.body_rates, flight.loop.controller.horizon)
         nothing = np.full(len(self.limits), np.inf)
         try:
             sample = flight.loop.step(command)
         except FlightError:
             return self._vector(seen), 0.0, True, False, self._info(nothing, nothing)
         period = one_period(sample, self.scenario.plant.timestep)
-        self._truth, self._rotors = state, _ = period.plant.state[-1], period.plant.speeds[-1]
+        self._truth, self._rotors = period.plant.state[-1], period.plant.speeds[-1]
         try:
             self._seen = flight.loop.observation
         except FlightError:  # lost: no controller would be called any more
             moment = replace(seen.moment, acting=sample.speeds)
             rows = seen.preview
-            self._seen = replace(seen, state=state, reference=rows[0], preview=rows[1:], moment=moment)
+            self._seen = replace(seen, state=self._truth, reference=rows[0], preview=rows[1:], moment=moment)
         terminated = flight.loop.reason is not None or self._seen.moment.phase is Phase.CRASHED
-        reward = float(self._reward(state, self._seen.reference, sample.speeds))
+        reward = float(self._reward(self._truth, self._seen.reference, sample.speeds))
         truncated = flight.done and not terminated
-        return self._vector(self._seen), reward, terminated, truncated, self._info(*_margins(self.limits, period))
+        return (
+            self._vector(self._seen),
+            reward,
+            terminated,
+            truncated,
+            self._info(*_margins(self.limits, period, begin=1)),
+        )
 
     def controller_action(self) -> Action:
         """What the scenario's own controller would do now, computed once per period.
@@ -236,11 +242,6 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             self.action_for(command)
         assert self._answered is not None
         return self._answered[1]
-
-    @property
-    def controller_status(self) -> str:
-        """The status of the last query; see `quadsim.controller.Command`."""
-        return "" if self._answered is None else self._answered[2].status
 
     def action_for(self, command: Command) -> Action:
         """The action equivalent to a command: taken next, that very command is flown, with its plan and status.
@@ -279,21 +280,18 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             self._camera.close()
             self._camera = None
 
-    def _drawn(self, seed: int | None, first: bool, options: dict[str, Any]) -> Scenario:
+    def _drawn(self, seed: int | None, options: Mapping[str, Any]) -> Scenario:
         """The scenario of the episode that starts."""
-        if unknown := set(options) - {"flight"}:
-            raise InputError(f"options must not have {', '.join(sorted(unknown))}; they may have flight")
-        if self._plan is not None:
-            count = self._plan.spec.flights
-            flight = options["flight"] if "flight" in options else int(self.np_random.integers(count))
-            if not (isinstance(flight, int | np.integer) and 0 <= flight < count):
-                raise ParameterError("options", "flight", flight, f"from 0 to {count - 1}")
-            return self._plan.of(int(flight))
-        if "flight" in options:
-            raise ParameterError("options", "flight", options["flight"], "absent where nothing varies")
-        if seed is None:
-            seed = self._base.seed if first else int(self.np_random.integers(2**31))
-        return self._base.model_copy(update={"seed": seed})
+        if self._plan is None:
+            if options:
+                raise ParameterError("", "options", options, "absent where nothing varies")
+            seed = int(self.np_random.integers(2**31)) if seed is None else seed
+            return self._base.model_copy(update={"seed": seed})
+        flights = self._plan.spec.flights
+        flight = options["flight"] if "flight" in options else int(self.np_random.integers(flights))
+        if set(options) - {"flight"} or not (isinstance(flight, int | np.integer) and 0 <= flight < flights):
+            raise ParameterError("", "options", options, f"absent, or a flight from 0 to {flights - 1}")
+        return self._plan.of(int(flight))
 
     def _vector(self, seen: Observation) -> Array:
         """What is observed; beyond its end the reference stays where it is."""
@@ -339,25 +337,15 @@ class Agent:
         raise NotImplementedError
 
 
-def _margins(limits: Sequence[Limit], period: FlightLog) -> tuple[Array, Array]:
-    """(m,) smallest margins within a period, its begin left out, which is the end of the one before, and at its end."""
-    worst, sampled = np.empty(len(limits)), np.empty(len(limits))
+def _margins(limits: Sequence[Limit], log: FlightLog, begin: int = 0) -> tuple[Array, Array]:
+    """(m,) smallest margins of a log, from this row of the plant on, and at its end; inf where there is none."""
+    found = np.full((2, len(limits)), np.inf)
     for i, limit in enumerate(limits):
-        t, values = limit.source.finest(period)
-        if limit.source.plant is not None:
-            t, values = t[1:], values[1:]
-        margins = np.where(limit.holds_at(t), limit.margin(values), np.inf)
-        worst[i], sampled[i] = margins.min(), margins[-1]
-    return worst, sampled
-
-
-def _start_margins(limits: Sequence[Limit], plant: PlantLog) -> tuple[Array, Array]:
-    """(m,), twice, of the state at the start; inf of what exists at control samples alone."""
-    margins = np.full(len(limits), np.inf)
-    for i, limit in enumerate(limits):
-        if limit.source.plant is not None and limit.holds_at(plant.t)[0]:
-            margins[i] = limit.margin(limit.source.plant(plant))[0]
-    return margins, margins
+        t, values = limit.source.finest(log)
+        margins = np.where(limit.holds_at(t), limit.margin(values), np.inf)[begin * (limit.source.plant is not None) :]
+        if margins.size:
+            found[:, i] = margins.min(), margins[-1]
+    return found[0], found[1]
 
 
 def _varying(scenario: Scenario, campaign: str) -> Plan:
@@ -369,3 +357,73 @@ def _varying(scenario: Scenario, campaign: str) -> Plan:
     return make_plan(
         scenario, {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
     )
+
+
+def environment_id(name: str) -> str:
+    """The id of a scenario of that name.
+
+    Examples:
+        >>> import quadsim.gym
+        >>> quadsim.gym.environment_id("hummingbird-figure-eight")
+        'quadsim/HummingbirdFigureEight-v0'
+    """
+    words = name.replace("_", "-").replace(".", "-").split("-")
+    return f"quadsim/{''.join(word[:1].upper() + word[1:] for word in words)}-v0"
+
+
+def register_library() -> None:
+    """Register the scenarios that ship; they are right, and not checked."""
+    for name in scenario_names():
+        scenario = Scenario.read(read_scenario(scenario_path(name), scenario_path))
+        gymnasium.registry.setdefault(environment_id(name), _specification(scenario, scenario=name))
+
+
+def _specification(flown: Scenario, **kwargs: Any) -> EnvSpec:
+    entry_point = f"{__name__}:{QuadrotorEnv.__name__}"
+    return EnvSpec(environment_id(flown.name), entry_point, max_episode_steps=flown.periods, kwargs=kwargs)
+
+
+def make_env(scenario: Scenario | str | Path, **options: Any) -> gymnasium.Env[Any, Any]:
+    """The environment of any scenario, with the wrappers of `gymnasium.make`: its time limit is the duration.
+
+    Args:
+        scenario: it, or its name or file.
+        options: what `QuadrotorEnv` takes: `action`, `observation`, `preview`, `vary`, `reward`, `render_mode`, ...
+
+    Raises:
+        InputError: the scenario or an option is not possible.
+
+    Examples:
+        >>> import quadsim.gym
+        >>> env = quadsim.gym.make_env("hover", action="speeds", observation=("state",))
+        >>> observation, info = env.reset(seed=7)
+        >>> observation.shape, env.spec.max_episode_steps, info["constraint_violation"]
+        ((12,), 200, 0)
+        >>> env.close()
+    """
+    scenario = as_scenario(scenario)
+    return gymnasium.make(_specification(scenario, scenario=scenario), **options)
+
+
+def make_vec(scenario: Scenario | str | Path, num_envs: int, **options: Any) -> VectorEnv:
+    """The same several times over, each in a process of its own; an episode's end is reset in the next step.
+
+    Args:
+        scenario: it, or its name or file.
+        num_envs: how many.
+        options: as of `make_env`.
+
+    Raises:
+        InputError: as of `make_env`.
+
+    Examples:
+        >>> import quadsim.gym
+        >>> envs = quadsim.gym.make_vec("hover", 2)
+        >>> envs.reset(seed=7)[0].shape, str(envs.metadata["autoreset_mode"])
+        ((2, 216), 'AutoresetMode.NEXT_STEP')
+        >>> envs.close()
+    """
+    if num_envs < 1:
+        raise ParameterError("", "num_envs", num_envs, "at least 1")
+    scenario = as_scenario(scenario)
+    return gymnasium.make_vec(_specification(scenario, scenario=scenario), num_envs, "async", **options)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,11 +26,10 @@ def verdict(summary: Summary) -> str:
     """What is better, by how much, on fresh draws."""
     if summary["answer"] == START:
         return f"No candidate of {summary['trials']} was better than the start"
-    gains = (
-        f"{label(each['name'], each['unit'])} {_text(each['fresh_best'])} against {_text(each['fresh_start'])} "
-        f"({_change(each['fresh_start'], each['fresh_best'])})"
-        for each in summary["objectives"]
-    )
+    gains = []
+    for each in summary["objectives"]:
+        start, best, change = _compared(each["fresh_start"], each["fresh_best"])
+        gains.append(f"{label(each['name'], each['unit'])} {best} against {start} ({change})")
     return f"Candidate {summary['answer']} on fresh draws: {', '.join(gains)}"
 
 
@@ -45,38 +44,33 @@ def tables(summary: Summary) -> tuple[Grid, Grid]:
     objectives = [
         line(
             label(each["name"], each["unit"]),
-            *(_text(each[key]) for key in ("start", "best")),
-            _change(each["start"], each["best"]),
-            *(_text(each[key]) for key in ("fresh_start", "fresh_best")),
-            _change(each["fresh_start"], each["fresh_best"]),
-            f"{_text(each['lower'])} to {_text(each['upper'])}",
+            *_compared(each["start"], each["best"]),
+            *_compared(each["fresh_start"], each["fresh_best"]),
+            f"{format_number(each['lower'])} to {format_number(each['upper'])}",
         )
         for each in summary["objectives"]
     ]
-    search = [
+    values = [
         line(
             label(each["name"], each["unit"]),
             Cell(text=", ".join(each["fields"]), mark=Mark.CODE),
-            *(_text(each[key]) for key in ("start", "best")),
+            *(str(v) if isinstance(v, str | bool) else format_number(v) for v in (each["start"], each["best"])),
         )
         for each in summary["search"]
     ]
     head = ("objective", "start, search", "best, search", "promised", "start, fresh", "best, fresh", "confirmed")
-    note = f"Search: {summary['search_flights']} flights, each on the first of the same {summary['draws']} draws."
-    return (
-        Grid(
-            key="objectives",
-            title="The draws that chose it, and fresh ones",
-            head=(*head, "mean difference, 95 %"),
-            lines=tuple(objectives),
-            note=note,
-        ),
-        Grid(key="values", title="Values", head=("name", "fields", "start", "best"), lines=tuple(search)),
+    found = Grid(
+        key="objectives",
+        title="The draws that chose it, and fresh ones",
+        head=(*head, "mean difference, 95 %"),
+        lines=tuple(objectives),
+        note=f"Search: {summary['search_flights']} flights, each on the first of the same {summary['draws']} draws.",
     )
+    return found, Grid(key="values", title="Values", head=("name", "fields", "start", "best"), lines=tuple(values))
 
 
-def write_page(directory: Path, *, study: Study, summary: Summary, folders: Sequence[str]) -> None:
-    """Write `index.html`, with Optuna's own plots, into a directory that has the folders of the fresh campaigns."""
+def write_page(directory: Path, *, study: Study, summary: Summary) -> None:
+    """Write `index.html`, with Optuna's own plots, for a directory that has the fresh campaigns."""
     from optuna import visualization
     from optuna.importance import PedAnovaImportanceEvaluator
 
@@ -96,8 +90,8 @@ def write_page(directory: Path, *, study: Study, summary: Summary, folders: Sequ
         shares = visualization.plot_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), **by)
         plots.append(_plot(shares, f"importance{i}", f"importance for {name}", 170 + 34 * len(summary["search"])))
         plots.append(_plot(visualization.plot_slice(study, **by), f"slice{i}", f"{name} by field", 380))
-    holds = summary["fresh"]["best"]["requirement"]["holds"]
-    pages = [*folders, *(() if summary["answer"] == START else ("comparison",))]
+    answer, holds = summary["answer"], summary["fresh"]["best"]["requirement"]["holds"]
+    pages = ["start"] if answer == START else ["start", f"candidate-{answer}", "comparison"]
     page = render_page(
         "tuning",
         summary["tuning"],
@@ -117,10 +111,7 @@ def _plot(figure: Any, key: str, title: str, height: int) -> Plot:
     return embed(figure, key, title, height)
 
 
-def _change(start: float | None, best: float | None) -> str:
-    return f"{100.0 * (best - start) / abs(start):+.1f} %" if start and best is not None else ABSENT
-
-
-def _text(value: Any) -> str:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return ABSENT if value is None else format_number(value) if number else str(value)
+def _compared(start: float | None, best: float | None) -> tuple[str, str, str]:
+    """Both values, and the change from the one to the other."""
+    change = f"{100.0 * (best - start) / abs(start):+.1f} %" if start and best is not None else ABSENT
+    return format_number(start), format_number(best), change

@@ -1,63 +1,63 @@
-"""A tuning ready to be flown: its file, its campaign, and from these the scenario and the flights of each candidate."""
+"""A tuning ready to be flown: its file, and the campaigns of its start and of each candidate."""
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
+import numpy as np
 import pyarrow as pa
+import tomlkit
 from pydantic import ValidationError
 
-from quadsim.errors import FileError, InputError, ParameterError
-from scenarios.campaign.plan import Plan, cell, changed, check_ends, column_type, flown_scenario, locate, read_campaign
-from scenarios.campaign.results.events import Event, parse_event
-from scenarios.campaign.spec import Value, VaryBase
+from quadsim.errors import InputError, ParameterError
+from quadsim.state import Array
+from scenarios.campaign.plan import (
+    Plan,
+    cell,
+    changed,
+    check_ends,
+    column_type,
+    flown_scenario,
+    parse_campaign,
+    read_campaign,
+)
+from scenarios.campaign.results.events import Event, is_number, parse_event
+from scenarios.campaign.results.table import Row
+from scenarios.campaign.spec import CampaignSpec, Value, VaryBase, check_fields
 from scenarios.campaign.statistics.requirement import Requirement, parse_requirement
 from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
-from scenarios.schema.bases import merge, read_scenario
+from scenarios.schema.bases import merge
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
+from scenarios.schema.writing import to_toml
 from scenarios.shipped import tuning_path
-from scenarios.tuning.objective import Expression, parse_expression
-from scenarios.tuning.spec import OWN, TuningSpec
+from scenarios.tuning.objective import value_of
+from scenarios.tuning.spec import TuningSpec
 
 START: Final = 0  # the candidate that is the scenario as it is
+OWN: Final = ("name", "description", "flights", "seed")  # fields of a campaign that a tuning has itself
 Values = Mapping[str, Value]
 """Of a candidate, by the names of the entries of `[[search]]`; empty of the start."""
 
 
 @dataclass(frozen=True)
 class TuningPlan:
-    """A tuning's file and the scenario that its candidates differ from."""
+    """A tuning's file and the campaign of its start."""
 
     spec: TuningSpec  # the file
-    scenario: Scenario  # the start: the campaign's, with every number of its vehicle in it
+    start: Plan  # on the draws of the search; its scenario has every number of its vehicle in it
 
     @property
     def most(self) -> int:
         """Flights of a candidate that goes on to the end."""
         return self.spec.flights[-1]
-
-    @cached_property
-    def start(self) -> Plan:
-        """The campaign of the start, on the draws of the search."""
-        return self.of({})
-
-    @cached_property
-    def schema(self) -> pa.Schema:
-        """The columns of all flights of the search: a campaign's, and the candidate with its values."""
-        own = [("candidate", "-", pa.int64())]
-        own += [(f"search.{entry.name}", entry.unit, column_type(entry)) for entry in self.spec.search]
-        fields = [pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in own]
-        first, *others = self.start.schema
-        return pa.schema([first, *fields, *others])
 
     @cached_property
     def requirement(self) -> Requirement:
@@ -69,14 +69,13 @@ class TuningPlan:
         """The event that counts in the search."""
         return parse_event(self.spec.guard or self.requirement.event.text, self.start.columns)
 
-    @cached_property
-    def expressions(self) -> tuple[Expression, ...]:
-        """Of the objectives, in their order."""
-        return tuple(parse_expression(each.expression, self.start.columns) for each in self.spec.objectives)
-
-    @cached_property
-    def _data(self) -> dict[str, Any]:
-        return tomllib.loads(self.scenario.to_toml())
+    def objectives(self, rows: Sequence[Row]) -> Array:
+        """(flights, objectives) of some flights; NaN for one that was not completed."""
+        values = [
+            [value_of(each.expression, row) if row["status"] == "completed" else math.nan for row in rows]
+            for each in self.spec.objectives
+        ]
+        return np.array(values, float).T
 
     def candidate(self, values: Values, name: str) -> Scenario:
         """The scenario of a candidate.
@@ -86,15 +85,13 @@ class TuningPlan:
         """
         changes = [(entry, values[entry.name]) for entry in self.spec.search if entry.name in values]
         return changed(
-            self._data, changes, lambda data: parse_scenario({**data, "name": name}, source=name), table="search"
+            self.start.data, changes, lambda data: parse_scenario({**data, "name": name}, source=name), table="search"
         )
 
-    def of(self, values: Values, *, name: str | None = None, fresh: bool = False) -> Plan:
-        """The campaign of a candidate, on the draws of the search or on fresh ones; errors: `candidate`."""
-        name = name or self.spec.name
-        flights, seed = (self.spec.fresh.flights, self.spec.fresh.seed) if fresh else (self.most, self.spec.seed)
-        changes = {"name": name, "description": self.spec.description, "flights": flights, "seed": seed}
-        return Plan(self.spec.campaign.model_copy(update=changes), self.candidate(values, name))
+    def fresh(self, values: Values, name: str) -> Plan:
+        """The campaign of a candidate on fresh draws; errors: `candidate`."""
+        changes = {"name": name, **dict(self.spec.fresh)}
+        return Plan(self.start.spec.model_copy(update=changes), self.candidate(values, name))
 
     def shown(self, values: Values) -> dict[str, Value | str | None]:
         """The searched values of a candidate as tables have them; None where the start has no single one."""
@@ -106,7 +103,7 @@ class TuningPlan:
         """The start's values of what is searched; without entries for which it has no single one."""
         values: dict[str, Value] = {}
         for entry in self.spec.search:
-            given = [1.0 if entry.relative else get_field(merge(self._data, {}), field) for field in entry.fields]
+            given = [1.0 if entry.relative else get_field(merge(self.start.data, {}), each) for each in entry.fields]
             if given[0] is not None and all(value == given[0] for value in given):
                 values[entry.name] = given[0]
         return values
@@ -129,18 +126,58 @@ class TuningPlan:
             _ = self.guard
         for objective in self.spec.objectives:
             with _field(f"objectives.{objective.name}.expression"):
-                parse_expression(objective.expression, columns)
+                value_of(objective.expression, {name: 1.0 for name, kind in columns.items() if is_number(kind)})
         check_ends(self.spec.search, self._check_at, table="search")
 
     def _check_at(self, entry: VaryBase, value: Value) -> None:
         scenario = self.candidate({entry.name: value}, self.spec.name)
-        if build_limits(scenario) != build_limits(self.scenario):
+        if build_limits(scenario) != build_limits(self.start.scenario):
             rule = (
                 "of fields that leave alone what flights are audited against: constraints, obstacles, regions, and the "
                 "controller's bounds and polytopes"
             )
             raise ParameterError(f"search.{entry.name}", "fields", entry.fields, rule)
         check_parts(scenario)
+
+    def to_toml(self) -> str:
+        """The file with every field, for a directory that has the start as `scenario.toml`."""
+        campaign = self.start.spec.model_copy(update={"scenario": "scenario.toml", "set": {}})
+        document = tomlkit.parse(to_toml(self.spec.model_copy(update={"campaign": {}})))
+        document["campaign"] = {
+            key: value for key, value in tomlkit.parse(campaign.to_toml()).items() if key not in OWN
+        }
+        return document.as_string()
+
+
+@dataclass(frozen=True)
+class SearchPlan(Plan):
+    """The search as one campaign: its flight c * `TuningPlan.most` + i is that of candidate c on draw i."""
+
+    tuning: TuningPlan
+    candidates: Mapping[int, Values]
+    _plans: dict[int, Plan] = field(default_factory=dict)  # of candidates, where they fly
+
+    @cached_property
+    def schema(self) -> pa.Schema:
+        """The columns of all flights: a campaign's, and the candidate with its values."""
+        own = [("candidate", "-", pa.int64())]
+        own += [(f"search.{entry.name}", entry.unit, column_type(entry)) for entry in self.tuning.spec.search]
+        first, *others = super().schema
+        return pa.schema([first, *(pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in own), *others])
+
+    def of(self, flight: int) -> Scenario:
+        """The scenario of one flight; errors: `TuningPlan.candidate`."""
+        candidate, draw = divmod(flight, self.tuning.most)
+        if candidate not in self._plans:
+            scenario = self.tuning.candidate(self.candidates[candidate], self.spec.name)
+            self._plans[candidate] = Plan(self.spec, scenario)
+        return self._plans[candidate].of(draw)
+
+    def identity(self, flight: int) -> Row:
+        """The columns that identify a flight."""
+        candidate, draw = divmod(flight, self.tuning.most)
+        values = {f"search.{name}": value for name, value in self.tuning.shown(self.candidates[candidate]).items()}
+        return {**super().identity(draw), "flight": flight, "candidate": candidate, **values}
 
 
 @contextmanager
@@ -158,49 +195,31 @@ def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None
     Raises:
         InputError: the file is missing or malformed, a field is not allowed, or what it searches cannot be flown.
     """
-    path = tuning_path(name)
-    try:
-        data = read_scenario(path, tuning_path, locate=_locate)
-    except OSError as error:
-        raise FileError(path, f"cannot be read ({error.strerror})") from error
-    _locate(data, path.parent)
+    path, data = tuning_path(name), read_campaign(name, tuning_path)
     data |= {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
-    if isinstance(campaign := data.get("campaign"), dict):
-        match data.get("flights"):
-            case [*_, int(most)]:
-                data["campaign"] = _whole_campaign(campaign, most)
-            case _:
-                data["campaign"] = _whole_campaign(campaign, TuningSpec.model_fields["flights"].default[-1])
     try:
         spec = TuningSpec.model_validate(data)
     except ValidationError as error:
         raise ScenarioError(path.name, describe_all(error, data, TuningSpec, file="tuning")) from error
     try:
-        plan = TuningPlan(spec, flown_scenario(spec.campaign, path))
+        campaign = _campaign(spec, source=f"{path.name}: campaign")
+        check_fields(spec.search, "search", {each: entry.name for entry in campaign.vary for each in entry.fields})
+        plan = TuningPlan(spec, Plan(campaign, flown_scenario(campaign, path)))
         plan.check()
     except ScenarioError:
         raise
-    except InputError as error:
+    except ValueError as error:
         raise InputError(f"{path.name}: {error}") from error
     return plan
 
 
-def _whole_campaign(campaign: Mapping[str, Any], flights: int) -> dict[str, Any]:
-    """The tables of `[campaign]` over those of its base, with a name and a number of flights."""
-    if given := [name for name in OWN if name in campaign]:
-        raise InputError(f"campaign must not have {given[0]}: a tuning has its own")
-    own = dict(campaign)
-    base = own.pop("base", None)
-    if base is not None and not isinstance(base, str):
+def _campaign(spec: TuningSpec, *, source: str) -> CampaignSpec:
+    """The tables of `[campaign]` over those of its base, with what the tuning has itself."""
+    base = spec.campaign.get("base")
+    if not isinstance(base, str | None):
         raise ParameterError("campaign", "base", base, "a campaign's name or a path ending in .toml")
-    others = {} if base is None else {name: value for name, value in read_campaign(base).items() if name not in OWN}
-    return {"name": "tuned", "flights": flights, **merge(others, own)}
-
-
-def _locate(data: dict[str, Any], directory: Path) -> None:
-    """Make the paths in a tuning's tables independent of its folder, in place."""
-    if isinstance(campaign := data.get("campaign"), dict):
-        locate(campaign, directory)
-        base = campaign.get("base")
-        if isinstance(base, str) and base.endswith(".toml") and (directory / base).is_file():
-            campaign["base"] = str((directory / base).resolve())
+    if given := [name for name in OWN if name in spec.campaign]:
+        raise ParameterError("campaign", given[0], spec.campaign[given[0]], "absent: a tuning has its own")
+    own = {"name": spec.name, "description": spec.description, "flights": spec.flights[-1], "seed": spec.seed}
+    tables = {key: value for key, value in spec.campaign.items() if key != "base"}
+    return parse_campaign(merge(read_campaign(base) if base else {}, tables | own), source=source)

@@ -16,8 +16,9 @@ import pyarrow as pa
 
 from quadsim.errors import InputError, OutputError
 from quadsim.flight.summary import read_json
-from quadsim.outputs import SUMMARY_FILE, Growing, growing, to_json
-from scenarios.campaign import manifest as records
+from quadsim.outputs import SUMMARY_FILE, growing, to_json
+from quadsim.report.page import PAGE_FILE
+from scenarios.campaign.manifest import flown_by
 from scenarios.campaign.pilot import fly_flights
 from scenarios.campaign.plan import plan_differences
 from scenarios.campaign.report.campaign_page import write_comparison_report
@@ -27,9 +28,8 @@ from scenarios.campaign.statistics.inference import paired_difference
 from scenarios.campaign.statistics.requirement import judge
 from scenarios.many import count_workers
 from scenarios.schema.scenario import Scenario
-from scenarios.tuning.objective import objective_values
 from scenarios.tuning.page import Summary, write_page
-from scenarios.tuning.plan import START, TuningPlan
+from scenarios.tuning.plan import OWN, START, TuningPlan
 from scenarios.tuning.search import JOURNAL_FILE, Search, require_optuna
 
 MANIFEST_FILE: Final = "manifest.json"
@@ -88,41 +88,40 @@ def tune(
     going_on = (directory / MANIFEST_FILE).is_file() and not overwrite
     if going_on and not resume:
         raise OutputError(directory, "a tuning is already there; continue it with --resume, or choose another --out")
-    with growing(directory, MANIFEST_FILE, overwrite=overwrite) as files:
+    name = plan.spec.name
+    with growing(directory, MANIFEST_FILE, overwrite=overwrite) as files, _quiet():
         if going_on:
             _require_same(manifest, files.path)
         fronts = [path.name for path in files.path.glob("front-*.toml")]
         files.remove([SUMMARY_FILE, JOURNAL_FILE, f"{JOURNAL_FILE}.lock", *fronts])
-        _write(files, {"tuning": plan.spec.to_toml(), "scenario": plan.scenario.to_toml()})
-        files.write({MANIFEST_FILE: to_json(manifest).encode()})
+        texts = {"tuning.toml": plan.to_toml(), "scenario.toml": plan.start.scenario.to_toml()}
+        files.write({file: text.encode() for file, text in {**texts, MANIFEST_FILE: to_json(manifest)}.items()})
         fly = partial(fly_flights, workers=workers, cluster=cluster)
-        with _quiet():
-            search = Search(plan, files, fly, lambda **standing: watch(Standing(**standing)))
-            table = search.run()
+        search = Search(plan, files, fly, lambda **standing: watch(Standing(**standing)))
+        table = search.run()
         answer, front = search.answer()
-        name, candidates = plan.spec.name, search.candidates
-        best = plan.candidate(candidates[answer], f"{name}-best")
-        _write(files, {"best": best.to_toml()})
-        for each in front if len(plan.expressions) > 1 else ():
-            _write(files, {f"front-{each}": plan.candidate(candidates[each], f"{name}-front-{each}").to_toml()})
+        best = plan.candidate(search.candidates[answer], f"{name}-best")
+        found = [best]
+        if len(plan.spec.objectives) > 1:
+            found += [plan.candidate(search.candidates[each], f"{name}-front-{each}") for each in front]
+        files.write({f"{each.name.removeprefix(f'{name}-')}.toml": each.to_toml().encode() for each in found})
 
         folders = {START: "start", answer: "start" if answer == START else f"candidate-{answer}"}
-        campaigns = [plan.of(candidates[each], name=f"{name}-{folder}", fresh=True) for each, folder in folders.items()]
-        finish = partial(fly_campaign, workers=workers, cluster=cluster, report=report, watch=watch)
-        targets = [files.path / folder for folder in folders.values()]
-        tables = [
-            finish(campaign, target, resume=records.is_campaign(target)).table
-            for campaign, target in zip(campaigns, targets, strict=True)
-        ]
+        campaigns = {
+            folder: plan.fresh(search.candidates[each], f"{name}-{folder}") for each, folder in folders.items()
+        }
+        finish = partial(fly_campaign, workers=workers, cluster=cluster, resume=True, report=report, watch=watch)
+        tables = [finish(campaign, files.path / folder).table for folder, campaign in campaigns.items()]
         comparison = None
         if answer != START:
-            comparison = compare(tables[0], tables[1], ("start", "best"), differences=plan_differences(*campaigns))
+            comparison = compare(
+                tables[0], tables[1], ("start", "best"), differences=plan_differences(*campaigns.values())
+            )
             if report:
                 write_comparison_report(comparison, files.path / "comparison", overwrite=True)
         summary = _summary(plan, search, answer, front, tables)
-        with _quiet():
-            write = partial(write_page, study=search.study, summary=summary, folders=list(folders.values()))
-            put_report(files, ["index.html"], write if report else None)
+        write = partial(write_page, study=search.study, summary=summary)
+        put_report(files, [PAGE_FILE], write if report else None)
         files.finish(summary)
     return TuningResult(directory=files.path, best=best, table=table, summary=summary, comparison=comparison)
 
@@ -133,22 +132,19 @@ def _summary(
     """`summary.json`: the search, and the fresh flights of the start and of the answer."""
     shown = {candidate: plan.shown(values) for candidate, values in search.candidates.items()}
     fresh = {"start": tables[0], "best": tables[-1]}
-    values = [objective_values(plan, table.to_pylist()) for table in fresh.values()]
-    both = np.isfinite(values[0]) & np.isfinite(values[1])
+    values = [plan.objectives(table.to_pylist()) for table in fresh.values()]
+    both = np.isfinite(values).all(axis=(0, 2))
     objectives = []
     for i, objective in enumerate(plan.spec.objectives):
-        pairs = [each[both[:, i], i] for each in values]
-        found = [search.scores[candidate].values for candidate in (START, answer)]
-        numbers = [
-            *(each[i] if each else None for each in found),
-            *(float(each.mean()) if each.size else None for each in pairs),
-        ]
-        named = zip(("start", "best", "fresh_start", "fresh_best"), numbers, strict=True)
-        objectives.append({**objective.model_dump(), **dict(named), **asdict(paired_difference(pairs[0], pairs[1]))})
+        found = [(*search.scores[candidate].values, None, None)[i] for candidate in (START, answer)]
+        found += [float(each[both, i].mean()) if both.any() else None for each in values]
+        named = dict(zip(("start", "best", "fresh_start", "fresh_best"), found, strict=True))
+        difference = asdict(paired_difference(*(each[both, i] for each in values)))
+        objectives.append({**objective.model_dump(), **named, **difference})
     return {
         "tuning": plan.spec.name,
         "description": plan.spec.description,
-        "scenario": plan.scenario.name,
+        "scenario": plan.start.scenario.name,
         "guard": plan.guard.text,
         "answer": answer,
         "trials": plan.spec.trials,
@@ -174,8 +170,10 @@ def _summary(
 def _manifest(plan: TuningPlan) -> dict[str, Any]:
     """What is flown, with what."""
     tables = plan.spec.model_dump(mode="json", exclude=_MAY_CHANGE)
-    own = {"format": "quadsim tuning", **tables, "scenario": json.loads(plan.scenario.model_dump_json())}
-    return {**own, "optuna": require_optuna().__version__, **records.flown_by(plan.start)}
+    campaign = plan.start.spec.model_dump(mode="json", exclude={*OWN})
+    scenario = json.loads(plan.start.scenario.model_dump_json())  # infinite bounds are null
+    own = {"format": "quadsim tuning", **tables, "campaign": campaign, "scenario": scenario}
+    return {**own, "optuna": require_optuna().__version__, **flown_by(plan.start)}
 
 
 def _require_same(manifest: Mapping[str, Any], directory: Path) -> None:
@@ -192,10 +190,6 @@ def _require_same(manifest: Mapping[str, Any], directory: Path) -> None:
             f"{directory}: --resume needs the same tuning and the same code, and its {', '.join(differing)} differs "
             "from the one there; trials and fresh flights may; choose another --out"
         )
-
-
-def _write(files: Growing, texts: Mapping[str, str]) -> None:
-    files.write({f"{name}.toml": text.encode() for name, text in texts.items()})
 
 
 @contextlib.contextmanager

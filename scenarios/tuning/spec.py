@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
-import tomlkit
 from annotated_types import MaxLen, MinLen
 from pydantic import Field, model_validator
 
-from scenarios.campaign.spec import (
-    MOST_FLIGHTS,
-    CampaignSpec,
-    ChoiceSpec,
-    IntegerSpec,
-    LogUniformSpec,
-    UniformSpec,
-    check_fields,
-)
+from scenarios.campaign.spec import MOST_FLIGHTS, ChoiceSpec, IntegerSpec, LogUniformSpec, UniformSpec
 from scenarios.schema.base import LARGEST_SEED, Spec
-from scenarios.schema.writing import to_toml
 
-OWN: Final = ("flights", "seed", "name", "description")
-"""Fields of a campaign that a tuning has itself."""
 Seed = Annotated[int, Field(ge=0, le=LARGEST_SEED)]
 Flights = Annotated[int, Field(ge=1, le=MOST_FLIGHTS)]
 SearchSpec = Annotated[UniformSpec | LogUniformSpec | IntegerSpec | ChoiceSpec, Field(discriminator="distribution")]
@@ -77,7 +65,7 @@ class TuningSpec(Spec):
         description="one, or two for a Pareto front"
     )
     search: Annotated[list[SearchSpec], MinLen(1), MaxLen(50)] = Field(description="what is searched")
-    campaign: CampaignSpec = Field(description="what is flown: fields of a campaign file, or a campaign as its base")
+    campaign: dict[str, Any] = Field(description="what is flown: fields of a campaign file, or a campaign as its base")
 
     @model_validator(mode="after")
     def _check(self) -> TuningSpec:
@@ -94,13 +82,6 @@ class TuningSpec(Spec):
         for entry in self.search:
             if isinstance(entry, ChoiceSpec) and entry.weights is not None:
                 raise ValueError(f"search.{entry.name}.weights must be absent: nothing is drawn")
-        check_fields(self.search, "search", {field: each.name for each in self.campaign.vary for field in each.fields})
+            if isinstance(entry, ChoiceSpec) and isinstance(entry.values[0], list):
+                raise ValueError(f"search.{entry.name}.values must be no lists: search their entries, by index")
         return self
-
-    def to_toml(self) -> str:
-        """The file with every field, for a directory that has the start as `scenario.toml`."""
-        campaign = self.campaign.model_copy(update={"scenario": "scenario.toml", "set": {}})
-        document: Any = tomlkit.parse(to_toml(self.model_copy(update={"campaign": campaign})))
-        for name in OWN:
-            document["campaign"].remove(name)
-        return str(document.as_string())

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 
 import quadsim
 import quadsim.gym
-from quadsim.errors import InputError, ParameterError, RenderingUnavailableError, UnknownNameError
+from quadsim.errors import InputError, ParameterError, RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
 from quadsim.state import INDEX
 from scenarios.campaign.plan import load_plan
@@ -65,11 +65,13 @@ def test_the_checker_finds_nothing(action: str) -> None:
     check_env(env.unwrapped, skip_render_check=action == "rates" or not drawing_works())
 
 
-def test_raw_speeds_are_float64_within_the_controllers_bounds() -> None:
+def test_actions_are_within_the_controllers_bounds_or_the_vehicles() -> None:
     env = quadsim.gym.make_env("paper-constrained", action="speeds")
-    assert env.action_space.dtype == np.float64
-    assert env.action_space.low.tolist() == [0.0] * 4
-    assert env.action_space.high.tolist() == [250.0] * 4
+    assert env.action_space == gymnasium.spaces.Box(0.0, 250.0, (4,), dtype=np.float64)
+    actions = quadsim.gym.QuadrotorEnv("hover").actions
+    speeds = actions.command(np.array([-1.0, -0.3, 0.0, 1.0]), None, 1).speeds
+    assert speeds[[0, 3]].tolist() == [0.0, 250.0]
+    assert actions.of(speeds) == pytest.approx([-1.0, -0.3, 0.0, 1.0], abs=1e-7)
     free = quadsim.gym.make_env("torrente-loop4-drag", action="speeds").unwrapped
     vehicle = quadsim.load_vehicle(free.scenario.vehicle.file)
     assert free.action_space.high.tolist() == [vehicle.speed_max] * 4
@@ -175,16 +177,11 @@ def test_observations_follow_the_layout() -> None:
 
 def test_seeds_are_those_of_the_scenario() -> None:
     env = quadsim.gym.QuadrotorEnv(short("motion-capture", seed=5))
-    first, _ = env.reset()
-    assert env.scenario.seed == 5
-    second, _ = env.reset()
-    drawn = env.scenario.seed
-    assert drawn not in (0, 5)
-    again, _ = env.reset(seed=5)
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, second)
-    env.reset()
-    assert env.scenario.seed == drawn
+    first, second, again, last = ((env.reset(seed=seed)[0], env.scenario.seed) for seed in (None, None, 5, None))
+    assert first[1] == again[1] == 5
+    assert second[1] == last[1] != 5
+    assert np.array_equal(first[0], again[0])
+    assert not np.array_equal(first[0], second[0])
 
 
 def test_a_campaign_varies_each_episode() -> None:
@@ -209,40 +206,42 @@ def test_a_campaigns_duration_truncates(tmp_path: Path) -> None:
     env = quadsim.gym.make_env("hover", vary=str(campaign))
     env.reset()
     assert [env.step(HOVER)[2:4] for _ in range(2)] == [(False, False), (False, True)]
-    with pytest.raises(ResetNeeded, match="the scenario is over"):
-        env.step(HOVER)
 
 
-def test_wrong_options_are_named() -> None:
-    make = quadsim.gym.QuadrotorEnv
-    with pytest.raises(UnknownNameError, match="no action named 'torque'"):
-        make("hover", action="torque")
-    with pytest.raises(UnknownNameError, match="no part of the observation named 'wind'"):
-        make("hover", observation=("wind",))
-    with pytest.raises(ParameterError, match="observation must be one or more"):
-        make("hover", observation=())
-    with pytest.raises(ParameterError, match=r"preview must be from 1 to controller.horizon = 50"):
-        make("hover", preview=51)
-    with pytest.raises(ParameterError, match="render_mode must be rgb_array"):
-        make("hover", render_mode="ansi")
-    slow = quadsim.load("hover").replace({"controller.input_bounds.speed": [0.0, 150.0]})
-    with pytest.raises(ParameterError, match="below and above the hover speed"):
-        make(slow)
-    env = make("hover")
+SLOW = quadsim.load("hover").replace({"controller.input_bounds.speed": [0.0, 150.0]})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"action": "torque"}, "no action named 'torque'"),
+        ({"observation": ("wind",)}, "no part of the observation named 'wind'"),
+        ({"observation": ()}, "observation must be one or more"),
+        ({"preview": 51}, "preview must be from 1 to controller.horizon = 50"),
+        ({"render_mode": "ansi"}, "render_mode must be rgb_array"),
+        ({"scenario": SLOW}, "below and above the hover speed"),
+    ],
+)
+def test_a_wrong_option_is_named(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        quadsim.gym.QuadrotorEnv(**{"scenario": "hover", **options})
+
+
+def test_wrong_arguments_are_named() -> None:
+    env = quadsim.gym.QuadrotorEnv("hover")
     with pytest.raises(ParameterError, match="seed must be from 0"):
         env.reset(seed=-1)
+    with pytest.raises(ParameterError, match="options must be absent"):
+        env.reset(options={"flight": 1})
     env.reset()
     with pytest.raises(ParameterError, match=r"action must be of shape \(4,\); got \(3,\)"):
         env.step(np.zeros(3))
     with pytest.raises(ParameterError, match="num_envs must be at least 1"):
         quadsim.gym.make_vec("hover", 0)
-    with pytest.raises(InputError, match="options must not have wind; they may have flight"):
-        env.reset(options={"wind": 1})
-    with pytest.raises(ParameterError, match=r"options.flight must be absent"):
-        env.reset(options={"flight": 1})
-    varied = make("paper-constrained", vary="paper-nominal")
-    with pytest.raises(ParameterError, match=r"options.flight must be from 0 to"):
-        varied.reset(options={"flight": -1})
+    varied = quadsim.gym.QuadrotorEnv("paper-constrained", vary="paper-nominal")
+    for options in ({"flight": -1}, {"flight": 1.5}, {"wind": 1}):
+        with pytest.raises(ParameterError, match="options must be absent, or a flight from 0 to 999; got"):
+            varied.reset(options=options)
 
 
 def test_the_inner_loop_flies_thrust_and_body_rates() -> None:
@@ -261,14 +260,6 @@ def test_the_inner_loop_flies_thrust_and_body_rates() -> None:
     assert observed[INDEX["vz"]] > 0.5
     with pytest.raises(ParameterError, match="deviations or speeds"):
         env.controller_action()
-
-
-def test_deviations_are_undone_by_their_inverse() -> None:
-    env = quadsim.gym.QuadrotorEnv("hover")
-    action = np.array([-1.0, -0.3, 0.0, 1.0], np.float32)
-    speeds = env.actions.command(action, None, 1).speeds
-    assert speeds[[0, 3]].tolist() == [0.0, 250.0]
-    assert env.actions.of(speeds) == pytest.approx(action, abs=1e-7)
 
 
 def test_processes_reset_in_the_step_after_an_end() -> None:

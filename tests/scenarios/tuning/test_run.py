@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
-import time as clock
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,10 @@ from scenarios.campaign.results.table import read_table
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 from scenarios.tuning import run as module
+from scenarios.tuning.page import sentences, verdict
 from scenarios.tuning.plan import START, TuningPlan, load_tuning
 from scenarios.tuning.run import TuningResult
-from scenarios.tuning.search import JOURNAL_FILE, Search
+from scenarios.tuning.search import JOURNAL_FILE
 
 
 def tune(plan: TuningPlan, directory: Path, by: Formula | int, **options: Any) -> TuningResult:
@@ -41,9 +42,9 @@ def plan(tmp_path: Path) -> TuningPlan:
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> TuningResult:
-    """The tuning, undisturbed; nobody changes its directory."""
+    """The tuning, undisturbed, with its pages; nobody changes its directory."""
     here = tmp_path_factory.mktemp("whole")
-    return tune(load_tuning(str(write_tuning(here))), here / "t", Formula())
+    return tune_by(Formula(), load_tuning(str(write_tuning(here))), here / "t")
 
 
 def content(result: TuningResult) -> tuple[bytes, ...]:
@@ -57,27 +58,17 @@ def test_a_known_optimum_is_found(whole: TuningResult) -> None:
     controller: Any = whole.best.controller
     assert abs(np.log10(controller.input_weights.speed / BEST_SPEED)) < 0.5
     assert abs(controller.output_weights["z"] - BEST_Z) < 200.0
-    start = next(each for each in whole.summary["candidates"] if each["candidate"] == START)
-    best = next(each for each in whole.summary["candidates"] if each["candidate"] == whole.summary["answer"])
+    start, best = (whole.summary["candidates"][candidate] for candidate in (START, whole.summary["answer"]))
     assert best["values"][0] < start["values"][0]
     assert whole.holds
-
-
-def test_the_answer_flies(whole: TuningResult) -> None:
     found = load_scenario(str(whole.directory / "best.toml"))
     assert found == whole.best
     assert fly_scenario(found).outcome == "satisfied"
 
 
 def test_all_candidates_meet_the_same_draws(whole: TuningResult) -> None:
-    rows = whole.table.to_pylist()
-    most = whole.summary["draws"]
-    seeds: dict[int, set[tuple[int, float]]] = {}
-    for row in rows:
-        assert row["candidate"] == row["flight"] // most
-        seeds.setdefault(row["flight"] % most, set()).add((row["seed"], row["draw.mass"]))
-    assert len(seeds) == most
-    assert {len(met) for met in seeds.values()} == {1}
+    draws = {(row["flight"] - 8 * row["candidate"], row["seed"], row["draw.mass"]) for row in whole.table.to_pylist()}
+    assert sorted(draw for draw, *_ in draws) == list(range(8))
 
 
 def test_candidates_that_are_worse_on_shared_draws_stop_early(whole: TuningResult, plan: TuningPlan) -> None:
@@ -104,19 +95,35 @@ def test_few_flights_are_corrected_by_what_the_start_did_there(whole: TuningResu
 
 def test_fresh_draws_are_others_and_the_optimism_is_reported(whole: TuningResult) -> None:
     assert whole.comparison is not None
-    fresh = json.loads((whole.directory / SUMMARY_FILE).read_text())["objectives"][0]
-    (gain,) = whole.summary["objectives"]
-    assert gain == fresh
     assert whole.comparison.flights == 20
-    of_search = set(whole.table["seed"].to_pylist())
+    (gain,) = json.loads((whole.directory / SUMMARY_FILE).read_text())["objectives"]
     tables = [whole.directory / name / "flights.parquet" for name in ("start", f"candidate-{whole.summary['answer']}")]
     seeds = [set(read_table(path)["seed"].to_pylist()) for path in tables]
     assert seeds[0] == seeds[1]
-    assert not seeds[0] & of_search
+    assert not seeds[0] & set(whole.table["seed"].to_pylist())
     # the formula has the same difference on every draw
     difference = gain["best"] - gain["start"]
     assert [gain["mean"], gain["lower"], gain["upper"]] == pytest.approx([difference] * 3)
     assert gain["fresh_best"] - gain["fresh_start"] == pytest.approx(difference)
+
+
+def test_the_page_has_optunas_plots_and_links_to_what_is_there(whole: TuningResult) -> None:
+    page, plots = read_page(whole)
+    links = re.findall(r'href="([^"#:]+)"', page)
+    pages = {"start/index.html", f"candidate-{whole.summary['answer']}/index.html", "comparison/index.html"}
+    assert pages | {"best.toml", "journal.log"} <= set(links)
+    assert [link for link in links if not (whole.directory / link).is_file()] == []
+    assert "a &lt;b&gt;bowl" in page
+    assert plots == {"candidates", "importance0", "slice0"}
+    assert "://" not in re.sub(r"<script>.*?</script>|<script type.*?</script>", "", page, flags=re.DOTALL)
+    assert verdict(whole.summary) in page
+    assert "violation in 0 of 20 flights" in sentences(whole.summary)[0]
+
+
+def read_page(result: TuningResult) -> tuple[str, set[str]]:
+    """The page, and the names of its plots."""
+    page = (result.directory / "index.html").read_text(encoding="utf-8")
+    return page, set(re.findall(r'<div class="plot" id="(\w+)"', page))
 
 
 def test_an_interrupted_search_ends_as_it_would_have(plan: TuningPlan, whole: TuningResult, tmp_path: Path) -> None:
@@ -135,50 +142,30 @@ def test_an_interrupted_search_ends_as_it_would_have(plan: TuningPlan, whole: Tu
 
 
 KILLED = """
-import sys, time
+import os, signal, sys
 from pathlib import Path
 from scenarios.tuning.plan import load_tuning
 from tuning_formula import Formula, tune_by
 
-class Slow(Formula):
-    def fly(self, pilot, flights, **_):
-        for row in super().fly(pilot, flights):
-            time.sleep(0.01)
-            yield row
-
-tune_by(Slow(), load_tuning(sys.argv[1]), Path(sys.argv[2]), report=False)
+killed = Formula(stops_after=21, stopped_by=lambda: os.kill(os.getpid(), signal.SIGKILL))
+tune_by(killed, load_tuning(sys.argv[1]), Path(sys.argv[2]), report=False)
 """
 
 
 def test_a_killed_search_ends_as_it_would_have(plan: TuningPlan, whole: TuningResult, tmp_path: Path) -> None:
-    """SIGKILL, once some flights of the second batch are on the disk."""
-    target = tmp_path / "t"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", KILLED, str(tmp_path / "little.toml"), str(target)]
-    process = subprocess.Popen(command, env=environment)
-    until = clock.monotonic() + 120.0
-    while len(list((target / "parts").glob("*.parquet"))) < 6:
-        assert process.poll() is None
-        assert clock.monotonic() < until
-        clock.sleep(0.005)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL
+    """SIGKILL within the second batch, when the flights of the first are on the disk."""
+    command = [sys.executable, "-c", KILLED, str(tmp_path / "little.toml"), str(tmp_path / "t")]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)})
+    assert done.returncode == -signal.SIGKILL
     engine = Formula()
-    assert content(tune(plan, target, engine, resume=True)) == content(whole)
-    assert len(engine.flown) < whole.table.num_rows
+    assert content(tune(plan, tmp_path / "t", engine, resume=True)) == content(whole)
+    assert len(engine.flown) < whole.table.num_rows + 2 * plan.spec.fresh.flights
 
 
 def test_more_trials_may_follow(plan: TuningPlan, whole: TuningResult, tmp_path: Path) -> None:
     few = load_tuning(str(write_tuning(tmp_path)), trials=12)
     tune(few, tmp_path / "t", Formula())
     assert content(tune(plan, tmp_path / "t", Formula(), resume=True)) == content(whole)
-
-
-def test_another_seed_searches_elsewhere(whole: TuningResult, tmp_path: Path) -> None:
-    other = load_tuning(str(write_tuning(tmp_path)), seed=7, trials=6)
-    found = tune(other, tmp_path / "t", Formula())
-    searched = [result.summary["candidates"][1]["search"] for result in (whole, found)]
-    assert searched[0] != searched[1]
 
 
 def test_candidates_that_fail_too_often_stop_early_and_are_no_answer(tmp_path: Path) -> None:
@@ -204,15 +191,11 @@ def test_where_all_fail_the_answer_reports_it(tmp_path: Path) -> None:
 
 
 def test_two_objectives_have_a_front_of_files_that_fly(tmp_path: Path) -> None:
-    objectives = [
-        {"name": "error", "expression": "rmse.x"},
-        {"name": "z", "expression": "search.z"},
-    ]
-    with pytest.raises(InputError, match=r"objectives\.z\.expression: no column of numbers named 'search\.z'"):
-        load_tuning(str(write_tuning(tmp_path, objectives=objectives)))
-    objectives[1]["expression"] = "sqrt(rmse.x) * draw.mass - 3 * rmse.x"
+    opposed = {"name": "opposed", "expression": "sqrt(rmse.x) * draw.mass - 3 * rmse.x"}
+    objectives = [{"name": "error", "expression": "rmse.x"}, opposed]
     plan = load_tuning(str(write_tuning(tmp_path, objectives=objectives, trials=12)))
-    result = tune(plan, tmp_path / "t", Formula())
+    result = tune_by(Formula(), plan, tmp_path / "t")
+    assert read_page(result)[1] == {"candidates", "importance0", "slice0", "importance1", "slice1"}
     values = {each["candidate"]: each["values"] for each in result.summary["candidates"]}
     front = [values[candidate] for candidate in result.summary["front"]]
     assert len(front) > 1
@@ -234,12 +217,8 @@ def test_optuna_opens_the_journal(whole: TuningResult) -> None:
 
 def test_a_start_outside_of_the_ranges_is_no_trial_of_the_search(tmp_path: Path) -> None:
     horizon = {"name": "n", "fields": ["controller.horizon"], "distribution": "integer", "low": 20, "high": 30}
-    solver = {
-        "name": "s",
-        "fields": ["controller.solver"],
-        "distribution": "choice",
-        "values": ["piqp-dense", "piqp-multistage"],
-    }
+    solver = {"name": "s", "fields": ["controller.solver"], "distribution": "choice"}
+    solver["values"] = ["piqp-dense", "piqp-multistage"]
     plan = load_tuning(str(write_tuning(tmp_path, search=[horizon, solver], trials=6)))
     start, *others = tune(plan, tmp_path / "t", Formula()).summary["candidates"]
     assert start["search"] == {"n": 4.0, "s": plan.start_values["s"]}
@@ -264,18 +243,12 @@ def test_a_tuning_is_not_overwritten_without_a_request(plan: TuningPlan, whole: 
         tune(plan, whole.directory, Formula())
 
 
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"seed": 5}, "seed"),
-        ({"campaign": {"scenario": "hover", "set": {"duration": 1.0}}}, "campaign, scenario"),
-    ],
-)
-def test_another_tuning_is_not_gone_on_with(
-    whole: TuningResult, tmp_path: Path, changes: dict[str, Any], named: str
-) -> None:
-    with pytest.raises(InputError, match=f"--resume needs the same tuning and the same code, and its {named} differs"):
-        tune(load_tuning(str(write_tuning(tmp_path, **changes))), whole.directory, Formula(), resume=True)
+def test_another_tuning_is_not_gone_on_with(whole: TuningResult, tmp_path: Path) -> None:
+    other = {"scenario": "hover", "set": {"duration": 1.0}}
+    for changes, named in (({"seed": 5}, "seed"), ({"campaign": other}, "campaign, scenario")):
+        plan = load_tuning(str(write_tuning(tmp_path, **changes)))
+        with pytest.raises(InputError, match=f"needs the same tuning and the same code, and its {named} differs"):
+            tune(plan, whole.directory, Formula(), resume=True)
 
 
 def test_flights_of_other_candidates_are_not_gone_on_with(
@@ -284,8 +257,7 @@ def test_flights_of_other_candidates_are_not_gone_on_with(
     """As of a processor whose last bits lead Optuna elsewhere."""
     with pytest.raises(KeyboardInterrupt):
         tune(plan, tmp_path / "t", Formula(stops_after=10))
-    values = Search._values
-    monkeypatch.setattr(Search, "_values", lambda self, trial: {**values(self, trial), "z": 299.0})
+    monkeypatch.setattr(optuna.trial.Trial, "params", {"speed": 0.01, "z": 299.0})
     with pytest.raises(InputError, match="--resume needs the candidates that flew there"):
         tune(plan, tmp_path / "t", Formula(), resume=True)
 

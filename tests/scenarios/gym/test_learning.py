@@ -1,4 +1,4 @@
-"""The safety filter around an environment: a random agent behind it holds what it loses without."""
+"""The safety filter, and the examples that need it: a random agent, and a student that is audited like its teacher."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from quadsim.errors import ParameterError
 ROOT = Path(__file__).resolve().parents[3]
 sys.path.insert(0, str(ROOT / "examples"))
 
-from safety_filter import filtered_air  # noqa: E402
+import imitation  # noqa: E402
+import safety_filter  # noqa: E402
 
 
 def random_episode(env: gymnasium.Env[Any, Any], seed: int) -> tuple[list[dict[str, Any]], bool]:
@@ -33,7 +34,7 @@ def random_episode(env: gymnasium.Env[Any, Any], seed: int) -> tuple[list[dict[s
 
 
 def test_a_random_agent_holds_five_degrees_of_tilt_behind_it_and_crashes_without() -> None:
-    scenario = filtered_air("turbulence").replace({"duration": 5.0})
+    scenario = safety_filter.filtered_air("turbulence").replace({"duration": 5.0})
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(scenario))
     infos, terminated = random_episode(env, seed=0)
     assert not terminated
@@ -50,7 +51,7 @@ def test_a_random_agent_holds_five_degrees_of_tilt_behind_it_and_crashes_without
 
 
 def test_what_is_safe_passes_to_the_bit() -> None:
-    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(filtered_air("gust"), action="speeds"))
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(safety_filter.filtered_air("gust"), action="speeds"))
     env.reset(seed=0)
     wanted = env.unwrapped.started.vehicle.hover_speed + np.array([0.5, 0.25, -0.5, 0.125])
     info = env.step(wanted)[4]
@@ -58,13 +59,12 @@ def test_what_is_safe_passes_to_the_bit() -> None:
     assert np.array_equal(env.unwrapped.flight().command[0], wanted)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_an_action_that_is_not_finite_is_not_flown(value: float) -> None:
+def test_an_action_that_is_not_finite_is_not_flown() -> None:
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("robust", action="speeds"))
     with pytest.raises(ResetNeeded, match="reset"):
         env.step(np.zeros(4))
     env.reset(seed=0)
-    for _ in range(10):
+    for value in 3 * [np.nan, np.inf, -np.inf]:
         _, _, terminated, _, info = env.step(np.array([400.0, value, 400.0, 400.0]))
         assert not terminated
         assert info["filter"]["intervened"]
@@ -82,3 +82,36 @@ def test_what_cannot_be_filtered_is_refused() -> None:
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env("forest"))
     with pytest.raises(ParameterError, match="no half-spaces"):
         env.reset()
+
+
+def test_a_student_is_audited_like_its_teacher(capsys: pytest.CaptureFixture[str]) -> None:
+    student = imitation.learn(courses=1, rounds=0)
+    assert "600 samples, RMS error 0." in capsys.readouterr().out
+    flights = imitation.compared(student, flights=1, duration=3.0)
+    assert [flights[name][0].controller for name in ("teacher", "student")] == ["constrained", "student"]
+    limits = [{finding.limit.name for finding in each[0].audit} for each in flights.values()]
+    assert limits == [{"roll", "pitch", "speed", "slew"}] * 3
+    assert flights["teacher"][0].satisfied
+    assert imitation.beyond(flights["student"][0]) > imitation.TOLERANCE  # hardly taught at all
+    assert imitation.beyond(flights["student behind the filter"][0]) < imitation.TOLERANCE
+
+
+def test_the_filter_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    safety_filter.main(["gust"])
+    behind, alone = capsys.readouterr().out.splitlines()
+    assert behind.startswith("gust: 180 steps, tilt up to 4.")
+    assert "flown; stepped in" in behind
+    assert alone.endswith("lost; no filter")
+
+
+def test_the_teacher_labels_its_own_flight_and_the_students() -> None:
+    scenario, hover = imitation.course(0).replace({"duration": 1.0}), quadsim.load_vehicle("lopes2011").hover_speed
+    own = imitation.Lesson(scenario, hover)
+    flight = quadsim.fly(scenario, controller=own, progress=False)
+    assert np.array_equal(flight.command, quadsim.fly(scenario, progress=False).command)
+    assert np.array_equal(own.speeds, flight.command)
+    other = imitation.Lesson(scenario, hover, imitation.Student(np.ones((imitation.INPUTS, 4)), hover))
+    quadsim.fly(scenario, controller=other, progress=False)
+    assert len(other.seen) == len(other.speeds) > 1
+    assert np.array_equal(other.speeds[0], own.speeds[0])
+    assert not np.array_equal(other.speeds[1], own.speeds[1])
