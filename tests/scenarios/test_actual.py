@@ -17,7 +17,6 @@ from quadsim.report.comparison import comparison_rows
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import VEHICLE_UNITS
 from scenarios.build import build_plant, build_problem, resolve
-from scenarios.campaign.plan import make_plan
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
@@ -124,24 +123,3 @@ def test_what_the_effects_leave_to_the_vehicle_is_that_of_the_actual_one() -> No
     assert written.vehicle.rotor_rise == 0.0125
     again = parse_scenario(tomllib.loads(written.to_toml()))
     assert resolve(again, build_vehicle(again)).to_toml() == written.to_toml()
-
-
-def test_campaigns_draw_it_by_its_value_or_relative_to_the_model() -> None:
-    vary = [
-        {"name": "mass", "fields": ["actual.mass"], "distribution": "uniform", "low": 4.1, "high": 4.4},
-        {
-            "name": "inertia",
-            "fields": ["actual.inertia.0", "actual.inertia.1"],
-            "distribution": "uniform",
-            "low": 1.1,
-            "high": 1.2,
-            "relative": True,
-        },
-    ]
-    made = make_plan(load_scenario("hover"), {"flights": 3, "vary": vary})
-    made.check()
-    one, drawn = made.of(1), made.identity(1)
-    assert build_vehicle(one) == build_vehicle(made.scenario)
-    assert one.actual is not None
-    assert one.actual.mass == drawn["draw.mass"]
-    assert one.actual.inertia == pytest.approx([0.033 * drawn["draw.inertia"]] * 2 + [0.066])

@@ -49,11 +49,6 @@ def test_another_solver_answers_what_is_left_to_it_under_its_own_name() -> None:
     assert Counter(flight.log.control.answered_by)["clarabel"] == 1
 
 
-def test_an_unconstrained_mpc_is_a_gain() -> None:
-    control = fly_scenario(load_scenario("paper-unconstrained", ["duration=1"])).log.control
-    assert set(zip(control.status, control.answered_by, strict=True)) == {("unconstrained", "gain")}
-
-
 def test_a_period_in_fallback_or_too_late_is_answered_by_the_fallback() -> None:
     for name in ("worn-rotor-hard-bounds", "stalled-solver"):
         control = fly_scenario(load_scenario(name)).log.control

@@ -78,12 +78,6 @@ def test_a_vehicle_that_is_turned_away_from_steps_makes_a_jump_at_the_start(vehi
     assert finding.tilt == 0.0
 
 
-def test_an_entry_at_full_speed_is_seen(vehicle: Vehicle) -> None:
-    """Before the flight the vehicle is at rest: without a ramp the first period has to gain the whole speed."""
-    circle = {"type": "circle", "radius": 3.0, "speed": 1.0}
-    assert found(circle | {"ramp": 0.0}, vehicle).tilt > 60.0 > 5.0 > found(circle, vehicle).tilt
-
-
 def test_a_dense_table_of_a_smooth_course_requires_what_the_course_does(tmp_path: Path, vehicle: Vehicle) -> None:
     """Rows as close as the control period are samples, not corners: their torques count."""
     eight = scenario({"type": "figure_eight", "length": 6.0, "period": 6.0, "turns": 2.0})
@@ -120,15 +114,6 @@ def test_a_rounded_table_of_a_smooth_course_requires_what_the_course_does(
     assert not any("change of rotor speed" in problem for problem in found.problems)
     assert found.tilt == pytest.approx(smooth.tilt, abs=0.05)
     assert (found.rotor_min, found.rotor_max) == pytest.approx((smooth.rotor_min, smooth.rotor_max), abs=0.2)
-
-
-def test_a_real_corner_in_a_rounded_table_is_still_seen(tmp_path: Path, vehicle: Vehicle) -> None:
-    """From rest to 1 m/s within a period, 20 m/s^2; the course is what it was to the last decimal."""
-    poses = np.zeros((420, 4))
-    poses[:, 0] = np.maximum(0.05 * (np.arange(420) - 200), 0.0)
-    found = report(scenario(rounded(tmp_path / "corner.csv", poses, 4)), vehicle)
-    assert found.acceleration == pytest.approx(20.0, rel=0.02)
-    assert any("change of rotor speed" in problem for problem in found.problems)
 
 
 def poses_of(made: Scenario) -> Array:

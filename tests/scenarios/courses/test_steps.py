@@ -35,10 +35,6 @@ def test_later_windows_win_where_they_overlap() -> None:
     np.testing.assert_array_equal(steps(np.arange(5.0), windows, 0.0), [0.0, 1.0, 2.0, 1.0, 0.0])
 
 
-def test_no_window_leaves_an_axis_where_it_is() -> None:
-    np.testing.assert_array_equal(steps(np.arange(4.0), [], -3.5), np.full(4, -3.5))
-
-
 def test_a_course_switches_where_its_value_does() -> None:
     windows = [Window(start=0.0, stop=4.0, value=1.0), Window(start=1.0, stop=3.0, value=2.0)]
     found = switches(windows, 0.0, initial=0.0)
@@ -81,11 +77,6 @@ def test_the_filter_is_the_first_order_lag_in_closed_form() -> None:
     np.testing.assert_allclose(filtered, expected, rtol=1e-12)
 
 
-def test_the_response_time_is_that_of_95_percent() -> None:
-    filtered = smooth(np.ones(101), initial=0.0, response_time=5.0, period=PERIOD)
-    assert filtered[99] == pytest.approx(1.0 - math.exp(-3.0))  # after 100 periods, 5 s
-
-
 def test_the_filter_takes_the_previous_filtered_value() -> None:
     """Erratum to Eq. (31): with the unfiltered x(k-1) on the right, as printed, a step would be over in one period."""
     values = np.concatenate([np.zeros(5), np.ones(50)])
@@ -97,24 +88,10 @@ def test_the_filter_takes_the_previous_filtered_value() -> None:
     np.testing.assert_allclose(filtered[1:], values[1:] + keep * (filtered[:-1] - values[1:]), rtol=1e-14)
 
 
-def test_no_response_time_is_no_filter_and_another_array() -> None:
-    values = np.array([0.0, 1.0, 0.0])
-    filtered = smooth(values, initial=7.0, response_time=0.0, period=PERIOD)
-    np.testing.assert_array_equal(filtered, values)
-    assert filtered is not values
-
-
 def test_the_reference_starts_from_the_initial_position_and_zero_yaw() -> None:
     settings = ["initial.position=[1.0, -2.0, 3.0]", "reference.x=[]", "reference.y=[]", "reference.z=[]"]
     reference = build_reference(load_scenario("paper-constrained", settings), 100)
     np.testing.assert_array_equal(reference, np.tile([1.0, -2.0, 3.0, 0.0], (100, 1)))
-
-
-def test_outside_its_windows_an_axis_returns_to_the_initial_position() -> None:
-    settings = ["initial.position=[1.0, 2.0, 3.0]", "reference.response_time=0.0"]
-    reference = build_reference(load_scenario("paper-constrained", settings), 1200)
-    np.testing.assert_array_equal(reference[201], [10.0, 2.0, 10.0, 0.0])
-    np.testing.assert_array_equal(reference[801], [1.0, 2.0, 3.0, 0.0])
 
 
 def test_the_paper_course_is_eq_30() -> None:

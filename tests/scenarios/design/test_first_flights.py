@@ -16,8 +16,7 @@ from mpc.baselines.lqr import bryson_objective
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import Vehicle, load_vehicle
 from scenarios.design.first_scenario import BASELINE_SHARE, CLEARANCE, COURSES, LAWS, ROOM, first_scenario
-from scenarios.design.vehicle_template import vehicle_template
-from scenarios.loading import load_scenario, parse_scenario
+from scenarios.loading import parse_scenario
 from scenarios.schema.course import FigureEightSpec
 from scenarios.schema.robust import RobustSpec
 
@@ -119,18 +118,6 @@ def test_a_figure_eight_is_flown_to_its_end_however_long_it_takes() -> None:
         assert isinstance(scenario.reference, FigureEightSpec)
         assert 0.0 <= scenario.duration - scenario.reference.until < scenario.control_period
     assert made.replace({"duration": 5.0, "reference.turns": 3.0}).duration == 5.0
-
-
-def test_the_template_is_a_vehicle_that_flies(tmp_path: Path) -> None:
-    file = tmp_path / "mine.toml"
-    file.write_text(vehicle_template(), encoding="utf-8")
-    vehicle = load_vehicle(file)
-    assert vehicle.mass == 1.5
-    flight = fly_first(vehicle, "figure-eight", "robust")
-    assert flight.meets_the_bar, flight
-    made = tmp_path / "first.toml"
-    made.write_text(first_scenario(vehicle, "mine.toml").to_toml(), encoding="utf-8")
-    assert load_scenario(str(made)).vehicle.file == str(file.resolve())
 
 
 def test_the_default_lqr_is_slower_where_rotors_are_slow_and_as_it_was_elsewhere() -> None:
