@@ -12,12 +12,11 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from golden_numbers import library_entry, nearest, read
+from golden_numbers import library_entry, read
 
 from mpc.answer import INFEASIBLE
 from quadsim.controller import FALLBACK, LAW, MISSED, STOPPED
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
-from scenarios.courses.csv_course import read_table
 from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.run import fly_scenario
@@ -294,25 +293,3 @@ def test_the_page_states_every_loss_criterion_and_its_default() -> None:
     text = (ROOT / "docs" / "scenarios.md").read_text(encoding="utf-8")
     for name, info in LostSpec.model_fields.items():
         assert f"- `lost.{name} = {info.default:g}`: {info.description}\n" in text
-
-
-def test_nearest_is_the_constraint_with_the_least_left_of_its_range(
-    constrained_flight: Flight, unconstrained_flight: Flight
-) -> None:
-    """The constrained flight touches its bounds on tilt; the unconstrained one is required to arrive alone."""
-    assert nearest(constrained_flight).limit.name in ("roll", "pitch")
-    assert nearest(unconstrained_flight).limit.name.startswith("arrival_")
-
-
-def test_the_trefoils_table_is_that_of_its_formula() -> None:
-    table = read_table(LIBRARY / "csv-trefoil.csv")
-    a, h, c = 0.5, 1.5, 0.3
-    s = table.t / 30.0
-    p, rate = 2.0 * np.pi * (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5), 2.0 * np.pi * s**2 * (1.0 - s) ** 2
-    x, y = a * (np.sin(p) + 2.0 * np.sin(2.0 * p)), a * (np.cos(p) - 2.0 * np.cos(2.0 * p))
-    vx, vy = a * (np.cos(p) + 4.0 * np.cos(2.0 * p)) * rate, a * (4.0 * np.sin(2.0 * p) - np.sin(p)) * rate
-    poses = np.stack([x, y, h - c * np.sin(3.0 * p), 0.2 * np.sin(p)], axis=1)
-    assert np.array_equal(table.t, np.arange(61) * 0.5)
-    np.testing.assert_allclose(table.poses, poses, rtol=0.0, atol=1e-9)
-    velocities = np.stack([vx, vy, -3.0 * c * np.cos(3.0 * p) * rate], axis=1)
-    np.testing.assert_allclose(table.velocities, velocities, rtol=0.0, atol=1e-9)

@@ -48,15 +48,6 @@ def sampled(kind: str, *times: float, **fields: Any) -> Array:
 # --- what is right -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", REFERENCES)
-def test_every_type_comes_back_from_its_text(kind: str) -> None:
-    made = scenario(kind)
-    again = parse_scenario(tomllib.loads(made.to_toml()))
-    assert again == made
-    assert again.reference.type == kind
-    np.testing.assert_array_equal(build_reference(again, 50), build_reference(made, 50))
-
-
 @pytest.mark.parametrize("kind", [kind for kind in REFERENCES if kind != "steps"])
 def test_every_course_begins_at_the_initial_position_and_stays_at_its_end(kind: str) -> None:
     course = build_course(scenario(kind))

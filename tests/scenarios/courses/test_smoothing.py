@@ -28,11 +28,3 @@ def test_exact_values_and_short_pieces_stay_as_they_are() -> None:
     breaks = np.zeros(299, bool)
     breaks[::5] = True
     np.testing.assert_array_equal(within_rounding(values, 0.01, breaks), values)
-
-
-def test_a_corner_that_is_known_stays() -> None:
-    corner = np.round(np.maximum(T - T[150], 0.0), 4)
-    breaks = NONE.copy()
-    breaks[149:151] = True
-    found = within_rounding(corner, 1e-4, breaks)
-    np.testing.assert_allclose(found, np.maximum(T - T[150], 0.0), rtol=0.0, atol=1e-6)
