@@ -193,6 +193,12 @@ def test_check_writes_its_verdicts_as_junit(
     assert left_in(here) == ["verdicts.xml"]
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_compare_prints_markdown(hover_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", str(hover_directory), "--out", "page", "--markdown"]) == EXIT_DONE
+    assert capsys.readouterr().out.startswith("| ")
+
+
 # --- wrong input: status 2, one message, no traceback, nothing made ------------------------------------------------
 
 RUN = ["run", "hover", *SHORT, *TABLES]

@@ -40,12 +40,6 @@ def test_the_papers_course_steps_and_what_its_filter_leaves_is_beyond_the_bound(
     )
 
 
-def test_hover_requires_nothing() -> None:
-    made = load_scenario("hover")
-    finding = report(made, build_vehicle(made))
-    assert (finding.tilt, finding.jumps, finding.problems) == (0.0, (), ())
-
-
 def test_a_circle_requires_the_tilt_of_the_closed_form(vehicle: Vehicle) -> None:
     circle = {"type": "circle", "radius": 3.0, "speed": 1.0, "turns": 2.0, "ramp": 10.0}
     finding = found(circle, vehicle)
@@ -70,12 +64,6 @@ def test_where_it_begins_elsewhere_the_course_jumps(vehicle: Vehicle) -> None:
     assert finding.jumps == (2.0,)
     assert finding.tilt < 5.0
     assert found(circle, vehicle, duration=1.0).jumps == ()  # a start after the flight's end
-
-
-def test_a_vehicle_that_is_turned_away_from_steps_makes_a_jump_at_the_start(vehicle: Vehicle) -> None:
-    finding = found({}, vehicle, initial={"position": [0.0, 0.0, 1.0], "euler": [0.0, 0.0, 20.0]})
-    assert finding.jumps == (0.0,)
-    assert finding.tilt == 0.0
 
 
 def test_a_dense_table_of_a_smooth_course_requires_what_the_course_does(tmp_path: Path, vehicle: Vehicle) -> None:

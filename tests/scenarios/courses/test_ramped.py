@@ -144,14 +144,6 @@ def test_it_waits_for_its_start_at_rest() -> None:
     np.testing.assert_allclose(later.attitude, plain.attitude, atol=1e-12)
 
 
-def test_what_is_left_of_a_motion_ends_with_its_last_sample() -> None:
-    motion, _ = motion_of(load_scenario("torrente-loop4-ideal"))
-    assert len(motion.after(590)) == 10
-    assert len(motion.after(599)) == len(motion.after(10_000)) == 1
-    np.testing.assert_array_equal(motion.after(10_000).position[0], motion.position[-1])
-    assert np.shares_memory(motion.after(3).attitude, motion.attitude)
-
-
 def test_a_flight_starts_in_the_state_of_the_reference() -> None:
     scenario = load_scenario("torrente-loop8-ideal")
     motion, _ = motion_of(scenario)

@@ -209,15 +209,6 @@ def test_a_prediction_of_another_shape_is_refused(given: Any) -> None:
         law.predict(np.zeros((2, 12)), np.zeros((2, 3, 4)))
 
 
-def test_its_own_flight_errors_end_the_flight() -> None:
-    class Refuses:
-        def step(self, now: Moment, state: object, reference: object) -> Command:
-            raise CommandError("I will not", time=now.time)
-
-    with pytest.raises(CommandError, match=r"^at t = 2\.000 s: I will not$"):
-        PluginController(Refuses(), 3).step(Moment(time=2.0), np.zeros(12), np.zeros((3, 4)))
-
-
 # --- what is wrong -------------------------------------------------------------------------------------------------
 
 CALLED = "controller: mine:Hover cannot be called with vehicle, period, horizon"
