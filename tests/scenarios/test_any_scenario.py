@@ -113,14 +113,6 @@ COURSES = st.one_of(
     some({}, type=st.just("waypoints"), speed=number(0.1, 10.0), points=POINTS),
     some({}, type=st.just("minimum_snap"), speed=number(0.1, 10.0), points=POINTS),
     some(LOOP, type=st.just("circle"), ramp=RAMP, radius=number(0.1, 5.0), speed=number(0.1, 10.0)),
-    some(
-        LOOP,
-        type=st.just("helix"),
-        ramp=RAMP,
-        radius=number(0.1, 5.0),
-        climb=number(-2.0, 2.0),
-        period=number(0.5, 10.0),
-    ),
     some(LOOP, type=st.just("figure_eight"), ramp=RAMP, length=number(0.1, 5.0), period=number(0.5, 10.0)),
     some({}, type=st.just("yaw_turns"), turns=TURNS.map(lambda turns: sorted(turns, key=lambda turn: turn["start"]))),
 )

@@ -29,14 +29,6 @@ SHORT = "duration=0.5"
 UPSIDE = "initial.euler=[60.0, 0.0, 0.0]"
 """A start from which no plan brings roll within its bound: the first QP is infeasible."""
 
-TOO_WEAK = [
-    "duration=10",
-    "plant.limit_speeds=true",
-    "vehicle.speed_max=192.801",  # just enough to hover: height that is lost never comes back
-    "initial.euler=[4.9, 0.0, 30.0]",
-    "controller.horizon=10",
-    "controller.output_bounds.z=[-1.0, 20.0]",
-]
 
 CONTRACT = {
     "scenario": str,
@@ -144,18 +136,6 @@ def test_the_audit_sees_the_physics_rate_whatever_the_log_rate(tmp_path: Path) -
     assert dense.summary["constraints"][0]["worst_margin"] == pytest.approx(margin)
 
 
-@pytest.mark.parametrize("name", ["paper-constrained", "paper-unconstrained"])
-@pytest.mark.parametrize("horizon", [1, 2, 3, 7, 11])
-def test_any_horizon_flies(name: str, horizon: int) -> None:
-    """Also those that no block of a partially condensed QP divides."""
-    settings = [SHORT, f"controller.horizon={horizon}"]
-    by_qp = ["controller.shortcut=false"] if name == "paper-constrained" else []
-    flight = fly_scenario(load_scenario(name, settings + by_qp))
-    assert flight.log.control.status == (SOLVED if by_qp else UNCONSTRAINED,) * 10
-    assert flight.log.predicted is not None
-    assert flight.log.predicted.shape == (10, horizon, 3)
-
-
 # --- flights that end early ----------------------------------------------------------------------------------------
 
 
@@ -170,18 +150,6 @@ def test_a_flight_that_cannot_begin_is_recorded_with_its_reason(tmp_path: Path) 
     assert (flown.log.control.t.size, flown.log.plant.t.size) == (0, 1)
     assert np.degrees(flown.log.plant.state[0, 6]) == pytest.approx(60.0)
     assert {"scenario.toml", FLIGHT_FILE, TIMING_FILE, PLANT_FILE} == set(flown.summary["files"])
-
-
-def test_a_flight_lost_on_the_way_is_recorded_up_to_there(tmp_path: Path) -> None:
-    """Rotors too weak to climb, which the controller does not know: it falls below its bound, and gives up."""
-    flown = run(tmp_path / "run", *TOO_WEAK)
-    periods = flown.log.control.t.size
-    assert 0 < periods < 200
-    assert flown.summary["reason"].startswith(f"at t = {0.05 * periods:.3f} s: the solver answered 'primal_infeasible'")
-    assert flown.summary["reason"].endswith("after holding the last plan for 9 periods")
-    assert flown.summary["duration"] == flown.log.plant.t[-1] == pytest.approx(0.05 * periods)
-    assert flown.summary["controller"]["fallbacks"] == {"0": periods - 9, "1": 9}
-    assert flown.log.plant.state[-1, 4] < -1.0
 
 
 def test_ctrl_c_in_flight_keeps_what_was_flown(short_run: Run, tmp_path: Path) -> None:

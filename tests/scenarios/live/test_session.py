@@ -255,15 +255,6 @@ def test_a_script_that_is_none_is_refused(tmp_path: Path, text: str, refusal: st
         read_script(path)
 
 
-def test_where_it_cannot_be_saved_nothing_is_flown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "letter.txt").write_text("dear")
-    script = tmp_path / "script.toml"
-    script.write_text(SCRIPT, encoding="utf-8")
-    assert main(["live", "hover", "--script", str(script), "--out", str(tmp_path / "mine")]) == EXIT_WRONG_INPUT
-    assert "mine" in capsys.readouterr().err
-
-
 def test_the_script_on_the_page_plays(tmp_path: Path) -> None:
     page = (Path(__file__).resolve().parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)

@@ -140,25 +140,6 @@ def test_the_command_prints_and_fails_beyond_tolerance(tmp_path: Path, capsys: p
     assert ElementTree.parse(report).getroot().attrib["failures"] == "1"
 
 
-@pytest.mark.parametrize(
-    ("measure", "there"),
-    [
-        ("tracking.rmse.w", "tracking.rmse has: x, y, z, yaw"),
-        ("scenario", ""),
-    ],
-)
-def test_a_mistyped_measure_is_refused_and_told_what_is_there(
-    measure: str, there: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = Path(written(tmp_path, ("0.5", "absolute = 0.0"), ("0.4", "absolute = 0.0")))
-    text = path.read_text().replace('"hover"', '"paper-constrained"').replace(', controller = { type = "pid" }', "")
-    before, _, after = text.rpartition('measure = "duration"')
-    path.write_text(f'{before}measure = "{measure}"{after}')
-    assert main(["reproduce", str(path)]) == EXIT_WRONG_INPUT
-    message = f"time flown: measure must lead to a number of the flight's summary; got {measure!r}"
-    assert (f"{message} ({there}" if there else f"{message}\n") in capsys.readouterr().err
-
-
 def test_a_scenario_beside_the_papers_file_is_found(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('base = "hover"\nname = "mine"\ndescription = "mine"\n')
     path = Path(written(tmp_path, ("0.5", "absolute = 0.0")))
@@ -189,6 +170,7 @@ def test_what_cannot_be_flown_or_measured_is_refused(tmp_path: Path, capsys: pyt
     text = Path(written(tmp_path, ("0.5", "absolute = 0.0"))).read_text()
     path = tmp_path / "other.toml"
     for old, new, message in (
+        ('"duration"', '"tracking.rmse.w"', "got 'tracking.rmse.w' (tracking.rmse has: x, y, z, yaw"),
         ("duration = 0.5", "durations = 0.5", "durations is not a field of the scenario file"),
         ('"hover"', '"hovers"', "no scenario named 'hovers'"),
     ):
