@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quadsim.errors import CommandError, FlightError, InputError
-from quadsim.sim.loop import ClosedLoop
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.neutral import prepared
@@ -220,11 +219,3 @@ def test_without_a_record_there_is_no_log() -> None:
         assert set(started.margins()) == {limit.name for limit in started.limits}
         with pytest.raises(InputError, match="no period of this flight was recorded"):
             started.flight()
-
-
-def test_a_controller_takes_over_before_a_period_is_observed() -> None:
-    with start(load_scenario("hover")) as started:
-        loop: ClosedLoop = started.loop
-        assert started.observation.k == 0
-        with pytest.raises(InputError, match="before a period is observed"):
-            loop.switch(loop.controller)

@@ -14,7 +14,7 @@ from quadsim.flight.feasibility import Feasibility
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.feasibility_check import fitting, report
-from scenarios.courses.make import build_course, build_reference
+from scenarios.courses.make import build_course
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
@@ -64,24 +64,6 @@ def test_where_it_begins_elsewhere_the_course_jumps(vehicle: Vehicle) -> None:
     assert finding.jumps == (2.0,)
     assert finding.tilt < 5.0
     assert found(circle, vehicle, duration=1.0).jumps == ()  # a start after the flight's end
-
-
-def test_a_dense_table_of_a_smooth_course_requires_what_the_course_does(tmp_path: Path, vehicle: Vehicle) -> None:
-    """Rows as close as the control period are samples, not corners: their torques count."""
-    eight = scenario({"type": "figure_eight", "length": 6.0, "period": 6.0, "turns": 2.0})
-    smooth = report(eight, vehicle)
-    t = 0.05 * np.arange(401)
-    rows = np.column_stack([t, build_course(eight).sample(t)])
-    path = tmp_path / "eight.csv"
-    path.write_text("t,x,y,z,yaw\n" + "".join(",".join(map(repr, row.tolist())) + "\n" for row in rows))
-    table = {"type": "csv", "file": str(path)}
-    np.testing.assert_allclose(build_reference(scenario(table), 401), build_reference(eight, 401), atol=1e-12)
-    dense = report(scenario(table), vehicle)
-    assert dense.tilt == pytest.approx(smooth.tilt, rel=1e-6)
-    assert dense.rotor_max == pytest.approx(smooth.rotor_max, rel=1e-6)
-    path.write_text("t,x,y,z,yaw\n" + "".join(",".join(map(repr, row.tolist())) + "\n" for row in rows[::4]))
-    sparse = report(scenario(table), vehicle)
-    assert sparse.tilt > 1.5 * smooth.tilt  # every row a corner
 
 
 def rounded(path: Path, poses: Array, decimals: int) -> dict[str, str]:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import cumulative_trapezoid
 
 from mpc.flatness import attitudes, motion_along
 from quadsim.motion import Motion
@@ -16,7 +15,6 @@ from quadsim.rotation import quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, build_motion, build_reference
-from scenarios.courses.ramped import ramped_phase
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.problems import ScenarioError
@@ -79,17 +77,6 @@ def test_the_motion_is_that_of_the_specification(name: str) -> None:
     for k, text in CHECKS[name].items():
         rows = (motion.position, motion.attitude, motion.velocity, motion.body_rates, motion.thrusts / 20.0)
         np.testing.assert_allclose(np.concatenate([row[k] for row in rows]), [*map(float, text.split())], atol=6e-7)
-
-
-def test_the_phase_gains_and_loses_its_rate_by_rectangle_sums() -> None:
-    """Its length is 2 v / a + 2 T; the sums tend to integrals, and the end is at rest."""
-    phase = ramped_phase(rate=1.3, acceleration=0.25, ramp=1.1, step=1e-3)
-    assert len(phase.angle) == pytest.approx((2.0 * 1.3 / 0.25 + 2.2) / 1e-3, abs=2)
-    integral = cumulative_trapezoid(phase.acceleration, dx=1e-3, initial=0.0)
-    np.testing.assert_allclose(phase.rate, integral, atol=3e-4)
-    np.testing.assert_allclose(phase.angle, cumulative_trapezoid(integral, dx=1e-3, initial=0.0), atol=3e-3)
-    assert phase.rate.max() == pytest.approx(1.3 + 0.25 * 1.1 * (2.0 / math.pi - 0.5), abs=1e-3)
-    assert abs(phase.rate[-1]) < 1e-3
 
 
 @pytest.mark.parametrize("heading", ["free", "held"])
