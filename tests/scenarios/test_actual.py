@@ -95,11 +95,6 @@ def test_the_same_mass_in_the_model_leaves_no_error(fly_once: Callable[..., Flig
     assert fly_once("hover", "vehicle.mass=4.4").metrics["rmse.z"] < 1e-6
 
 
-def test_a_mass_factor_is_the_same_mismatch(heavy: Flight, fly_once: Callable[..., Flight]) -> None:
-    factor = fly_once("hover", "effects.load.mass_factor=1.1")
-    np.testing.assert_allclose(factor.state["z"], heavy.state["z"], atol=1e-9)
-
-
 def test_both_vehicles_are_recorded_and_shown(tmp_path: Path) -> None:
     scenario = load_scenario("hover", ["duration=0.5", "actual.mass=4.4", "actual.arm_length=0.35"])
     directory = tmp_path / "heavy"

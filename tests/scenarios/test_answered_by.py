@@ -43,12 +43,6 @@ def test_as_many_periods_are_a_solvers_as_it_had_calls(
     assert (counted["iterations"] is None) == (not calls)
 
 
-def test_another_solver_answers_what_is_left_to_it_under_its_own_name() -> None:
-    pytest.importorskip("clarabel")
-    flight = fly_scenario(load_scenario("paper-constrained", ["controller.solver=clarabel", "duration=5"]))
-    assert Counter(flight.log.control.answered_by)["clarabel"] == 1
-
-
 def test_a_period_in_fallback_or_too_late_is_answered_by_the_fallback() -> None:
     for name in ("worn-rotor-hard-bounds", "stalled-solver"):
         control = fly_scenario(load_scenario(name)).log.control

@@ -21,7 +21,7 @@ from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE
 from scenarios.design.authority import torque_ranges
-from scenarios.design.vehicle_figures import integrator_chains, make_sheet
+from scenarios.design.vehicle_figures import make_sheet
 
 VEHICLES = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]
 CRAZYFLIE, HUMMINGBIRD, LOPES, _ = VEHICLES
@@ -106,14 +106,6 @@ def test_the_linear_model_is_four_chains_of_integrators(vehicle: Vehicle) -> Non
     assert A_c[INDEX["vx"], INDEX["pitch"]] == vehicle.gravity
     shifted = hover_model(vehicle, sheet.period).A - np.eye(12)  # nilpotent: every pole of A is 1
     assert np.abs(np.linalg.matrix_power(shifted, 4)).max() < 1e-15
-
-
-def test_chains_are_distinguished_by_their_lengths() -> None:
-    chain = np.eye(6, k=1)
-    chain[2, 3] = 0.0
-    assert integrator_chains(chain) == (3, 3)
-    chain[1, 2] = 0.0
-    assert integrator_chains(chain) == (3, 2, 1)
 
 
 def test_rotors_that_lag_add_their_poles() -> None:
