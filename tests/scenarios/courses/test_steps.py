@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 
 from scenarios.courses.make import build_course_steps, build_reference
 from scenarios.courses.smoothing import smooth
@@ -63,17 +62,6 @@ def test_the_filter_is_the_first_order_lag_in_closed_form() -> None:
     filtered = smooth(np.full(300, 10.0), initial=2.0, response_time=response_time, period=PERIOD)
     expected = 10.0 + (2.0 - 10.0) * np.exp(-3.0 * (k + 1) * PERIOD / response_time)
     np.testing.assert_allclose(filtered, expected, rtol=1e-12)
-
-
-def test_the_filter_takes_the_previous_filtered_value() -> None:
-    """Erratum to Eq. (31): with the unfiltered x(k-1) on the right, as printed, a step would be over in one period."""
-    values = np.concatenate([np.zeros(5), np.ones(50)])
-    filtered = smooth(values, initial=0.0, response_time=5.0, period=PERIOD)
-    keep = math.exp(-3.0 * PERIOD / 5.0)
-    printed = values[1:] + keep * (values[:-1] - values[1:])
-    assert printed[5] == 1.0
-    assert filtered[6] == pytest.approx(1.0 - keep**2)
-    np.testing.assert_allclose(filtered[1:], values[1:] + keep * (filtered[:-1] - values[1:]), rtol=1e-14)
 
 
 def test_the_paper_course_is_eq_30() -> None:
