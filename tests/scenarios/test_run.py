@@ -30,56 +30,24 @@ UPSIDE = "initial.euler=[60.0, 0.0, 0.0]"
 """A start from which no plan brings roll within its bound: the first QP is infeasible."""
 
 
+TIMES = {"p50", "p95", "p99", "max"}
 CONTRACT = {
-    "scenario": str,
-    "status": str,
-    "duration": float,
-    "seed": int,
-    "tracking.rmse.x": float,
-    "tracking.rmse.yaw": float,
-    "tracking.max_error.z": float,
-    "tracking.final_error.y": float,
-    "tracking.overshoot.x": float,
-    "tracking.settling.0.channel": str,
-    "tracking.settling.0.time": float,
-    "tracking.settling.0.before": float,
-    "tracking.settling.0.after": float,
-    "constraints.0.name": str,
-    "constraints.0.unit": str,
-    "constraints.0.lower": float,
-    "constraints.0.upper": float,
-    "constraints.0.tolerance": float,
-    "constraints.0.peak_sampled": float,
-    "constraints.0.peak_plant": float,
-    "constraints.0.worst_margin": float,
-    "constraints.0.time_violated": float,
-    "constraints.0.satisfied": bool,
-    "control.speed_min": float,
-    "control.speed_max": float,
-    "control.slew_min": float,
-    "control.slew_max": float,
-    "control.total_variation": float,
-    "controller.name": str,
-    "controller.solver": str,
-    "controller.statuses.solved": int,
-    "controller.fallbacks.0": int,
-    "controller.iterations.mean": float,
-    "controller.iterations.max": int,
-    **{f"controller.{what}_ms.{value}": float for what in ("solve", "step") for value in ("p50", "p95", "p99", "max")},
-    "controller.deadline_ms": float,
-    "controller.deadline_misses": int,
-    "wall_s.simulate": float,
-    "wall_s.total": float,
-    "versions.mujoco": str,
-    "machine.cores": int,
+    "": {"scenario", "status", "duration", "seed", "versions", "machine", "wall_s"},
+    "tracking.rmse": {"x", "y", "z", "yaw"},
+    "tracking.max_error": {"x", "y", "z", "yaw"},
+    "tracking.final_error": {"x", "y", "z", "yaw"},
+    "tracking.overshoot": {"x", "y", "z"},
+    "tracking.settling.0": {"channel", "time", "before", "after"},
+    "constraints.0": {"name", "unit", "lower", "upper", "tolerance", "satisfied", "time_violated"}
+    | {"peak_sampled", "peak_plant", "worst_margin"},
+    "control": {"speed_min", "speed_max", "slew_min", "slew_max", "total_variation"},
+    "controller": {"name", "solver", "statuses", "fallbacks", "deadline_ms", "deadline_misses"},
+    "controller.iterations": {"mean", "max"},
+    "controller.solve_ms": TIMES,
+    "controller.step_ms": TIMES,
+    "wall_s": {"simulate", "total"},
 }
-
-
-def at(summary: dict[str, Any], path: str) -> Any:
-    value: Any = summary
-    for key in path.split("."):
-        value = value[int(key)] if isinstance(value, list) else value[key]
-    return value
+"""Tables of the summary, and what each has at least."""
 
 
 def run(target: Path, *settings: str, name: str = "paper-constrained") -> Run:
@@ -108,9 +76,11 @@ def test_equal_scenarios_give_equal_bytes(short_run_directory: Path, tmp_path: P
 
 
 def test_the_summary_has_every_entry_of_the_contract(short_run: Run) -> None:
-    for path, kind in CONTRACT.items():
-        value = at(short_run.summary, path)
-        assert type(value) is kind or (kind is float and type(value) is int), path
+    for path, keys in CONTRACT.items():
+        value: Any = short_run.summary
+        for key in filter(None, path.split(".")):
+            value = value[int(key)] if isinstance(value, list) else value[key]
+        assert value.keys() >= keys, path
 
 
 def test_the_summary_is_that_of_the_flight(short_run: Run) -> None:
