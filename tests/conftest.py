@@ -48,7 +48,7 @@ LONG = (
     *("scenarios/design/test_first_flights.py", "scenarios/test_api.py", "scenarios/test_diagnosis.py"),
     *("quadsim/report/film/test_video.py", "test_documents.py", "scenarios/test_process.py", "test_refusals.py"),
     *("scenarios/test_nothing_lost.py", "mpc/robust/test_robust.py", "scenarios/papers/test_reproduction.py"),
-    *("scenarios/test_bad_controllers.py", "scenarios/test_any_scenario.py", "mpc/test_staged.py"),
+    *("scenarios/test_any_scenario.py", "mpc/test_staged.py"),
     *("scenarios/test_run.py", "scenarios/test_cli.py", "scenarios/test_reaudit.py", "test_packaging.py"),
     *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
 )
@@ -174,19 +174,3 @@ def constrained_flight(fly_once: Fly) -> Flight:
 def unconstrained_flight(fly_once: Fly) -> Flight:
     """The paper's whole unconstrained flight."""
     return fly_once("paper-unconstrained")
-
-
-ARM_LENGTHS, DRAGS = (0.2, 0.3, 0.5), (0.012, 0.024, 0.048)  # L and d/b [m]; the paper gives none
-
-
-@pytest.fixture(scope="session")
-def varied_flights(fly_once: Fly, vehicle: Vehicle) -> dict[tuple[float, float], Flight]:
-    """The constrained flight over arm length [m] and drag to thrust [m], which the paper leaves out."""
-    own = (vehicle.arm_length, vehicle.drag_to_thrust)
-    return {
-        (arm, drag): fly_once("paper-constrained")
-        if (arm, drag) == own
-        else fly_once("paper-constrained", f"vehicle.arm_length={arm}", f"vehicle.drag_to_thrust={drag}")
-        for arm in (0.2, 0.3, 0.5)
-        for drag in (0.012, 0.024, 0.048)
-    }

@@ -140,14 +140,6 @@ def test_every_command_is_documented_and_every_documented_one_exists() -> None:
     assert {make_parser().parse_args(arguments_of(line)).command for line in QUADSIM} == set(COMMANDS)
 
 
-@pytest.mark.parametrize("line", QUADSIM)
-def test_documented_scenarios_and_settings_are_valid(line: str) -> None:
-    options = make_parser().parse_args(arguments_of(line))
-    scenario = getattr(options, "scenario", None) or getattr(options, "target", None)
-    if scenario is not None:
-        load_scenario(scenario, options.settings)
-
-
 @pytest.mark.usefixtures("workplace", "undrawn", "recorded_here", "campaigns_here")
 @pytest.mark.parametrize("line", RUNNABLE)
 def test_documented_command_runs(line: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -149,7 +149,7 @@ class TuningPlan:
         return document.as_string()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SearchPlan(Plan):
     """The search as one campaign: its flight c * `TuningPlan.most` + i is that of candidate c on draw i."""
 

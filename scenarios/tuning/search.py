@@ -66,7 +66,7 @@ class Search:
         self._plan, self._fly, self._watch, self._started = plan, fly, watch, clock.perf_counter()
         self.candidates: dict[int, Values] = {START: {}}
         self.scores: dict[int, Score] = {}
-        self._flights = SearchPlan(plan.start.spec, plan.start.scenario, plan, self.candidates)
+        self._flights = SearchPlan(plan.start.spec, plan.start.scenario, tuning=plan, candidates=self.candidates)
         self._store = Store(files, self._flights.schema)
         self._rows: dict[int, Row] = {row["flight"]: row for row in self._store.table().to_pylist()}
         self._flown = self._spared = 0  # flights: now, and those that stopped candidates left out

@@ -32,6 +32,8 @@ class FaultySolver(QPSolver):
             return answer._replace(plan=answer.plan * np.nan)
         if fault == "out_of_bounds":
             return answer._replace(plan=answer.plan + 100.0)
+        if fault == "infeasible_answer":  # leaves the tilt bound, from its second step on
+            return answer._replace(plan=answer.plan + np.outer(np.arange(50) > 0, [-3.0, 0.0, 3.0, 0.0]))
         if fault is not None:
             return answer._replace(status=fault, plan=answer.plan * 0.0)
         return answer
@@ -58,7 +60,9 @@ def test_commands_respect_their_hard_bounds_exactly() -> None:
     assert commands[0].active > 0
 
 
-@pytest.mark.parametrize("fault", ["primal_infeasible", "max_iterations", "numerics", "not_finite", "out_of_bounds"])
+@pytest.mark.parametrize(
+    "fault", ["primal_infeasible", "max_iterations", "numerics", "not_finite", "out_of_bounds", "infeasible_answer"]
+)
 def test_anything_but_a_good_answer_holds_the_shifted_plan(fault: str) -> None:
     commands = fly({3: fault, 4: fault}, 6)
     last_good = commands[2].plan

@@ -17,7 +17,6 @@ from quadsim.report.comparison import comparison_rows
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import VEHICLE_UNITS
 from scenarios.build import build_plant, build_problem, resolve
-from scenarios.campaign.plan import make_plan
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
@@ -96,11 +95,6 @@ def test_the_same_mass_in_the_model_leaves_no_error(fly_once: Callable[..., Flig
     assert fly_once("hover", "vehicle.mass=4.4").metrics["rmse.z"] < 1e-6
 
 
-def test_a_mass_factor_is_the_same_mismatch(heavy: Flight, fly_once: Callable[..., Flight]) -> None:
-    factor = fly_once("hover", "effects.load.mass_factor=1.1")
-    np.testing.assert_allclose(factor.state["z"], heavy.state["z"], atol=1e-9)
-
-
 def test_both_vehicles_are_recorded_and_shown(tmp_path: Path) -> None:
     scenario = load_scenario("hover", ["duration=0.5", "actual.mass=4.4", "actual.arm_length=0.35"])
     directory = tmp_path / "heavy"
@@ -124,24 +118,3 @@ def test_what_the_effects_leave_to_the_vehicle_is_that_of_the_actual_one() -> No
     assert written.vehicle.rotor_rise == 0.0125
     again = parse_scenario(tomllib.loads(written.to_toml()))
     assert resolve(again, build_vehicle(again)).to_toml() == written.to_toml()
-
-
-def test_campaigns_draw_it_by_its_value_or_relative_to_the_model() -> None:
-    vary = [
-        {"name": "mass", "fields": ["actual.mass"], "distribution": "uniform", "low": 4.1, "high": 4.4},
-        {
-            "name": "inertia",
-            "fields": ["actual.inertia.0", "actual.inertia.1"],
-            "distribution": "uniform",
-            "low": 1.1,
-            "high": 1.2,
-            "relative": True,
-        },
-    ]
-    made = make_plan(load_scenario("hover"), {"flights": 3, "vary": vary})
-    made.check()
-    one, drawn = made.of(1), made.identity(1)
-    assert build_vehicle(one) == build_vehicle(made.scenario)
-    assert one.actual is not None
-    assert one.actual.mass == drawn["draw.mass"]
-    assert one.actual.inertia == pytest.approx([0.033 * drawn["draw.inertia"]] * 2 + [0.066])

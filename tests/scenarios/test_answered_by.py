@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from typing import Any
 
@@ -11,12 +10,10 @@ import pytest
 from support import paper_problem
 
 from mpc.answer import INFEASIBLE, AnswerCheck
-from mpc.constrained import ConstrainedMPC
 from mpc.ocp import Query, predicted
 from mpc.qp import KKT_EVERY
 from mpc.solvers import QPSolver
 from mpc.solvers.piqp_backends import PiqpMultistage
-from quadsim.controller import Command, Moment
 from scenarios.flight import summarise
 from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
@@ -43,17 +40,6 @@ def test_as_many_periods_are_a_solvers_as_it_had_calls(
     assert (counted["iterations"] is None) == (not calls)
 
 
-def test_another_solver_answers_what_is_left_to_it_under_its_own_name() -> None:
-    pytest.importorskip("clarabel")
-    flight = fly_scenario(load_scenario("paper-constrained", ["controller.solver=clarabel", "duration=5"]))
-    assert Counter(flight.log.control.answered_by)["clarabel"] == 1
-
-
-def test_an_unconstrained_mpc_is_a_gain() -> None:
-    control = fly_scenario(load_scenario("paper-unconstrained", ["duration=1"])).log.control
-    assert set(zip(control.status, control.answered_by, strict=True)) == {("unconstrained", "gain")}
-
-
 def test_a_period_in_fallback_or_too_late_is_answered_by_the_fallback() -> None:
     for name in ("worn-rotor-hard-bounds", "stalled-solver"):
         control = fly_scenario(load_scenario(name)).log.control
@@ -72,41 +58,6 @@ def test_kkt_residuals_are_computed_as_often_as_stated(every: int) -> None:
         np.testing.assert_array_equal(np.isfinite(values), expected)
         assert values[expected].max() < 1e-6
     assert np.isfinite(control.infeasibility).all()
-
-
-class Drifting(QPSolver):
-    """The real solver, whose plan leaves the tilt bound from the second step on, in some periods; still `solved`."""
-
-    bad = False
-
-    def solve(self, query: Query) -> Any:
-        answer = super().solve(query)
-        if self.bad:
-            plan = answer.plan.copy()
-            plan[1:] += np.array([-3.0, 0.0, 3.0, 0.0]) if plan[1:].min() > 5.0 else 0.0
-            return answer._replace(plan=plan)
-        return answer
-
-
-def test_a_plan_that_violates_the_rows_as_posed_is_refused_and_its_kkt_residuals_are_computed() -> None:
-    problem = paper_problem()
-    solver = Drifting("piqp-multistage", problem)
-    law = ConstrainedMPC(problem, solver, shortcut=False)
-    law.reset(problem.model.u_bar)
-    reference = np.zeros((50, 4))
-    reference[:, 0] = 10.0
-
-    def step(k: int) -> Command:
-        return law.step(Moment(time=0.05 * k), np.zeros(12), reference)
-
-    good, solver.bad = [step(k) for k in range(2)], True
-    bad = step(2)
-    assert [command.answered_by for command in good] == ["piqp-multistage"] * 2
-    assert good[1].infeasibility < INFEASIBLE
-    assert [math.isfinite(command.kkt_stationarity) for command in good] == [True, False]  # periods 0, 20, ...
-    assert (bad.status, bad.answered_by, bad.fallback) == ("infeasible_answer", "fallback", 1)
-    assert bad.infeasibility > INFEASIBLE
-    assert math.isfinite(bad.kkt_stationarity)  # for every refused answer
 
 
 def test_infeasibility_is_the_largest_violation_of_a_row_step_by_step() -> None:

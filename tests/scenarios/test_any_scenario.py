@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from drawn_events import HAPPENING, kind, number
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,10 +26,6 @@ from scenarios.loading import check_parts, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Scenario
-
-
-def number(lower: float, upper: float) -> st.SearchStrategy[float]:
-    return st.floats(lower, upper)
 
 
 def vector(size: float, length: int = 3) -> st.SearchStrategy[list[float]]:
@@ -81,32 +78,9 @@ EFFECTS = some(
         ),
     }
 )
-FIELDS = some({"type": st.just("pid")}, horizon=st.integers(5, 30))
-AT = {"at": number(0.0, 0.19), "duration": number(1e-3, 1.0)}
-SENSOR_NAMES = st.sampled_from(["position", "velocity", "attitude", "rates"])
+CONTROLLED = kind("controller", fields=some({"type": st.just("pid")}, horizon=st.integers(5, 30)))
 EVENTS = st.lists(
-    st.one_of(
-        some({}, type=st.just("rotor_loss"), rotor=st.integers(1, 4), loss=number(0.01, 1.0), **AT),
-        some({}, type=st.just("payload_pickup"), at=AT["at"], mass=number(0.001, 5.0)),
-        some({}, type=st.just("payload_drop"), at=AT["at"]),
-        some({}, type=st.just("mass"), at=AT["at"], factor=number(0.1, 5.0)),
-        some({"fall": number(0.0, 1.0)}, type=st.just("rotor_lag"), at=AT["at"], rise=number(0.0, 1.0)),
-        some({"point": vector(0.5)}, type=st.just("push"), force=vector(20.0), **AT),
-        some({"yaw": number(-400.0, 400.0)}, type=st.just("setpoint"), at=AT["at"], z=number(-5.0, 5.0)),
-        st.fixed_dictionaries({"type": st.just("controller"), "at": AT["at"], "fields": FIELDS}),
-        some({}, type=st.just("gust"), velocity=vector(20.0), **AT),
-        some({}, type=st.just("wind"), velocity=vector(20.0), at=AT["at"]),
-        some({}, type=st.just("stall"), **AT),
-        some(
-            {},
-            type=st.just("sensor_fault"),
-            sensor=SENSOR_NAMES,
-            fault=st.sampled_from(["dropout", "freeze", "nan"]),
-            **AT,
-        ),
-        some({}, type=st.just("sensor_fault"), sensor=SENSOR_NAMES, fault=st.just("bias"), offset=vector(5.0), **AT),
-    ),
-    max_size=3,
+    st.tuples(number(0.0, 0.19), HAPPENING | CONTROLLED).map(lambda drawn: {"at": drawn[0], **drawn[1]}), max_size=3
 )
 SENSOR = some(
     {
@@ -139,14 +113,6 @@ COURSES = st.one_of(
     some({}, type=st.just("waypoints"), speed=number(0.1, 10.0), points=POINTS),
     some({}, type=st.just("minimum_snap"), speed=number(0.1, 10.0), points=POINTS),
     some(LOOP, type=st.just("circle"), ramp=RAMP, radius=number(0.1, 5.0), speed=number(0.1, 10.0)),
-    some(
-        LOOP,
-        type=st.just("helix"),
-        ramp=RAMP,
-        radius=number(0.1, 5.0),
-        climb=number(-2.0, 2.0),
-        period=number(0.5, 10.0),
-    ),
     some(LOOP, type=st.just("figure_eight"), ramp=RAMP, length=number(0.1, 5.0), period=number(0.5, 10.0)),
     some({}, type=st.just("yaw_turns"), turns=TURNS.map(lambda turns: sorted(turns, key=lambda turn: turn["start"]))),
 )

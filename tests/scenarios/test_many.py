@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -86,21 +85,6 @@ def test_a_worker_that_ran_out_of_memory_flies_no_more() -> None:
     rows = rows_of([(0, "calm"), (1, "takes memory"), (2, "calm")], workers=1, memory=300.0)
     assert rows[1]["verdict"] == "memory"
     assert rows[0]["process"] != rows[2]["process"]
-
-
-def test_workers_killed_at_random_cost_their_flights_alone() -> None:
-    dice, killed = random.Random(1), set[int]()
-    rows: dict[int, dict[str, Any]] = {}
-    for at, row in fly_many(range(80), fly_slowly, workers=2):
-        rows[at] = row
-        if dice.random() < 0.2 and (there := living(below() - killed)):
-            killed.add(dice.choice(sorted(there)))
-            for pid in killed & there:
-                os.kill(pid, signal.SIGKILL)
-    died = [at for at, row in rows.items() if row.get("verdict") == "died"]
-    assert 5 <= len(died) <= len(killed)  # one may be killed between two flights, in the end
-    assert all(row["value"] == at * at / 7.0 for at, row in rows.items() if at not in died)
-    assert len(rows) == 80
 
 
 def test_flights_are_drawn_as_they_are_flown_and_closing_ends_all() -> None:

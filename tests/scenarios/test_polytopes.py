@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from mpc.ocp import Problem
-from quadsim.flight.audit import SUM, TERMS, audit
+from quadsim.flight.audit import SUM, audit
 from quadsim.flight.summary import limit_from_json, limit_to_json
 from quadsim.state import INDEX
-from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_controller, build_problem
 from scenarios.limits import build_limits
 from scenarios.loading import load_scenario, parse_scenario
@@ -64,15 +63,6 @@ def test_the_audit_sees_the_same_rows_at_the_physics_rate() -> None:
         assert finding.worst_margin == pytest.approx(margin.min(), abs=1e-9)
         assert finding.worst_time == log.plant.t[np.argmin(margin)]
         assert limit_from_json(limit_to_json(finding)) == finding.limit
-
-
-def test_every_term_has_both_rates() -> None:
-    log = small_log()
-    assert len(TERMS) == 12 + N_ROTORS
-    for signal in TERMS.values():
-        assert signal.plant is not None
-        assert signal.sampled(log.control).shape == log.control.t.shape
-        assert signal.plant(log.plant).shape == log.plant.t.shape
 
 
 def test_the_robust_controller_takes_them_too() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +10,13 @@ import pytest
 
 from mpc.fallback.completion import completed_moment
 from mpc.nonlinear.rigidbody import thrust_axis
-from quadsim.controller import Command, Controller, Moment
-from quadsim.flight.parquet import log_tables, read_log, write_log
-from quadsim.motion import Motion
+from quadsim.controller import Command, Moment
+from quadsim.flight.parquet import read_log, write_log
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion, quaternion_to_euler
 from quadsim.sim.physics import physics_to_state
 from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, Array, YawTurns, tilt
-from scenarios.build import build_controller
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario
 
 
@@ -73,58 +69,6 @@ def test_a_loop_by_sensors_is_flown_audited_and_logged(fly_once: Callable[..., F
     assert np.degrees(np.abs(log.control.measured_error[:, ANGLES])).max() < 1.0  # past the vertical, too
 
 
-class Flipping:
-    """A law whose reference hovers, and turns once about body x in 0.5 s."""
-
-    name, solver = "flipping", ""
-
-    def __init__(self, law: Controller, motion: Motion) -> None:
-        self.law, self.motion, self.horizon, self.k = law, motion, law.horizon, 0
-
-    def reset(self, speeds: Array) -> None:
-        self.law.reset(speeds)
-
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        self.k += 1
-        return self.law.step(replace(now, motion=self.motion.after(self.k - 1)), state, reference)
-
-    def predict(self, states: Array, plans: Array) -> Array:
-        return self.law.predict(states, plans)
-
-
-def test_a_flip_by_sensors_is_flown() -> None:
-    settings = [
-        "reference={type='steps'}",
-        "constraints=[]",
-        "duration=4",
-        "initial.position=[0,0,10]",
-        "controller.horizon=40",
-    ]
-    weights = "controller.weights={position=5.0,attitude=20.0,velocity=0.5}"
-    scenario = load_scenario("power-loop", [*settings, weights])
-    vehicle = build_vehicle(scenario)
-    t = scenario.control_period * np.arange(201)
-    angle = 2.0 * np.pi * np.clip((t - 1.0) / 0.5, 0.0, 1.0)
-    nothing, still = np.zeros((t.size, 3)), np.zeros((t.size, 1))
-    motion = Motion(
-        position=np.tile([0.0, 0.0, 10.0], (t.size, 1)),
-        velocity=nothing,
-        acceleration=nothing,
-        attitude=np.column_stack([np.cos(angle / 2.0), np.sin(angle / 2.0), still, still]),
-        body_rates=np.column_stack([np.gradient(angle, t), still, still]),
-        thrusts=np.full((t.size, 4), vehicle.mass * vehicle.gravity / 4.0),
-    )
-    flight = fly_scenario(scenario, law=Flipping(build_controller(scenario, vehicle), motion))
-    log = flight.log
-    assert log.reason is None
-    assert log.plant.attitude is not None
-    assert np.degrees(tilt(log.plant.state)).max() > 150.0
-    assert log.plant.attitude[-1, 0] < -0.99  # one whole turn on
-    np.testing.assert_allclose(np.degrees(log.plant.state[-1, ANGLES]), 0.0, atol=3.0)
-    np.testing.assert_allclose(log.plant.state[-1, :6:2], [0.0, 0.0, 10.0], atol=0.2)
-    assert np.degrees(np.abs(log.control.measured_error[:, ANGLES])).max() < 1.5
-
-
 @pytest.mark.parametrize("way", [1.0, -1.0])
 def test_yaw_after_a_loop_is_that_before(way: float) -> None:
     """Through the vertical Euler's yaw turns by 180 deg; noise decides which way."""
@@ -146,12 +90,6 @@ def test_yaw_after_a_loop_is_that_before(way: float) -> None:
 
 def _product(p: Array, q: Array) -> Array:
     return np.concatenate([[p[0] * q[0] - p[1:] @ q[1:]], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])])
-
-
-def test_other_flights_have_no_such_columns() -> None:
-    tables = log_tables(fly_scenario(load_scenario("hover", ["duration=0.2"])).log, metadata={})
-    for name in ("flight", "plant"):
-        assert not {"qw", "body_rate_x"} & set(tables[name].column_names)
 
 
 @pytest.mark.parametrize("name", ["hover", "raw-sensors", "motion-capture"])

@@ -15,7 +15,6 @@ import pytest
 
 from quadsim.assets import vehicle_path
 from quadsim.controller import SOLVED, UNCONSTRAINED
-from quadsim.errors import OutputError
 from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import Run
@@ -23,7 +22,6 @@ from quadsim.sim import loop
 from scenarios.flight import Outputs
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.machine import PACKAGES
-from scenarios.reaudit import reaudit
 from scenarios.run import fly_scenario, run_scenario
 
 TABLES = Outputs(video=False, recording=False, figures=False)
@@ -31,65 +29,25 @@ SHORT = "duration=0.5"
 UPSIDE = "initial.euler=[60.0, 0.0, 0.0]"
 """A start from which no plan brings roll within its bound: the first QP is infeasible."""
 
-TOO_WEAK = [
-    "duration=10",
-    "plant.limit_speeds=true",
-    "vehicle.speed_max=192.801",  # just enough to hover: height that is lost never comes back
-    "initial.euler=[4.9, 0.0, 30.0]",
-    "controller.horizon=10",
-    "controller.output_bounds.z=[-1.0, 20.0]",
-]
 
+TIMES = {"p50", "p95", "p99", "max"}
 CONTRACT = {
-    "scenario": str,
-    "status": str,
-    "duration": float,
-    "seed": int,
-    "tracking.rmse.x": float,
-    "tracking.rmse.yaw": float,
-    "tracking.max_error.z": float,
-    "tracking.final_error.y": float,
-    "tracking.overshoot.x": float,
-    "tracking.settling.0.channel": str,
-    "tracking.settling.0.time": float,
-    "tracking.settling.0.before": float,
-    "tracking.settling.0.after": float,
-    "constraints.0.name": str,
-    "constraints.0.unit": str,
-    "constraints.0.lower": float,
-    "constraints.0.upper": float,
-    "constraints.0.tolerance": float,
-    "constraints.0.peak_sampled": float,
-    "constraints.0.peak_plant": float,
-    "constraints.0.worst_margin": float,
-    "constraints.0.time_violated": float,
-    "constraints.0.satisfied": bool,
-    "control.speed_min": float,
-    "control.speed_max": float,
-    "control.slew_min": float,
-    "control.slew_max": float,
-    "control.total_variation": float,
-    "controller.name": str,
-    "controller.solver": str,
-    "controller.statuses.solved": int,
-    "controller.fallbacks.0": int,
-    "controller.iterations.mean": float,
-    "controller.iterations.max": int,
-    **{f"controller.{what}_ms.{value}": float for what in ("solve", "step") for value in ("p50", "p95", "p99", "max")},
-    "controller.deadline_ms": float,
-    "controller.deadline_misses": int,
-    "wall_s.simulate": float,
-    "wall_s.total": float,
-    "versions.mujoco": str,
-    "machine.cores": int,
+    "": {"scenario", "status", "duration", "seed", "versions", "machine", "wall_s"},
+    "tracking.rmse": {"x", "y", "z", "yaw"},
+    "tracking.max_error": {"x", "y", "z", "yaw"},
+    "tracking.final_error": {"x", "y", "z", "yaw"},
+    "tracking.overshoot": {"x", "y", "z"},
+    "tracking.settling.0": {"channel", "time", "before", "after"},
+    "constraints.0": {"name", "unit", "lower", "upper", "tolerance", "satisfied", "time_violated"}
+    | {"peak_sampled", "peak_plant", "worst_margin"},
+    "control": {"speed_min", "speed_max", "slew_min", "slew_max", "total_variation"},
+    "controller": {"name", "solver", "statuses", "fallbacks", "deadline_ms", "deadline_misses"},
+    "controller.iterations": {"mean", "max"},
+    "controller.solve_ms": TIMES,
+    "controller.step_ms": TIMES,
+    "wall_s": {"simulate", "total"},
 }
-
-
-def at(summary: dict[str, Any], path: str) -> Any:
-    value: Any = summary
-    for key in path.split("."):
-        value = value[int(key)] if isinstance(value, list) else value[key]
-    return value
+"""Tables of the summary, and what each has at least."""
 
 
 def run(target: Path, *settings: str, name: str = "paper-constrained") -> Run:
@@ -117,16 +75,12 @@ def test_equal_scenarios_give_equal_bytes(short_run_directory: Path, tmp_path: P
     assert (again / TIMING_FILE).read_bytes() != (short_run_directory / TIMING_FILE).read_bytes()  # a clock's
 
 
-def test_a_runs_own_scenario_file_flies_it_again(short_run_directory: Path, tmp_path: Path) -> None:
-    scenario = load_scenario(str(short_run_directory / "scenario.toml"))
-    run_scenario(scenario, tmp_path / "again", TABLES)
-    assert (tmp_path / "again" / PLANT_FILE).read_bytes() == (short_run_directory / PLANT_FILE).read_bytes()
-
-
-@pytest.mark.parametrize("path", CONTRACT)
-def test_the_summary_has_every_entry_of_the_contract(short_run: Run, path: str) -> None:
-    value = at(short_run.summary, path)
-    assert type(value) is CONTRACT[path] or (CONTRACT[path] is float and type(value) is int)
+def test_the_summary_has_every_entry_of_the_contract(short_run: Run) -> None:
+    for path, keys in CONTRACT.items():
+        value: Any = short_run.summary
+        for key in filter(None, path.split(".")):
+            value = value[int(key)] if isinstance(value, list) else value[key]
+        assert value.keys() >= keys, path
 
 
 def test_the_summary_is_that_of_the_flight(short_run: Run) -> None:
@@ -144,28 +98,12 @@ def test_the_summary_is_that_of_the_flight(short_run: Run) -> None:
     assert parse_scenario(scenario).vehicle.mass == summary["vehicle"]["mass"] == 4.0
 
 
-def test_hashes_are_those_of_the_files(short_run: Run) -> None:
-    assert short_run.summary["files"] == rundir.file_hashes(short_run.directory)
-
-
 def test_the_audit_sees_the_physics_rate_whatever_the_log_rate(tmp_path: Path) -> None:
     dense, sparse = (run(tmp_path / rate, "duration=2.0", f"log_rate={rate}") for rate in ("1000", "20"))
     assert (dense.log.plant.t.size, sparse.log.plant.t.size) == (2001, 41)
     assert dense.summary["constraints"] == sparse.summary["constraints"]
     margin = min(5.0 - np.abs(np.degrees(dense.log.plant.state[:, 6])))
     assert dense.summary["constraints"][0]["worst_margin"] == pytest.approx(margin)
-
-
-@pytest.mark.parametrize("name", ["paper-constrained", "paper-unconstrained"])
-@pytest.mark.parametrize("horizon", [1, 2, 3, 7, 11])
-def test_any_horizon_flies(name: str, horizon: int) -> None:
-    """Also those that no block of a partially condensed QP divides."""
-    settings = [SHORT, f"controller.horizon={horizon}"]
-    by_qp = ["controller.shortcut=false"] if name == "paper-constrained" else []
-    flight = fly_scenario(load_scenario(name, settings + by_qp))
-    assert flight.log.control.status == (SOLVED if by_qp else UNCONSTRAINED,) * 10
-    assert flight.log.predicted is not None
-    assert flight.log.predicted.shape == (10, horizon, 3)
 
 
 # --- flights that end early ----------------------------------------------------------------------------------------
@@ -184,19 +122,7 @@ def test_a_flight_that_cannot_begin_is_recorded_with_its_reason(tmp_path: Path) 
     assert {"scenario.toml", FLIGHT_FILE, TIMING_FILE, PLANT_FILE} == set(flown.summary["files"])
 
 
-def test_a_flight_lost_on_the_way_is_recorded_up_to_there(tmp_path: Path) -> None:
-    """Rotors too weak to climb, which the controller does not know: it falls below its bound, and gives up."""
-    flown = run(tmp_path / "run", *TOO_WEAK)
-    periods = flown.log.control.t.size
-    assert 0 < periods < 200
-    assert flown.summary["reason"].startswith(f"at t = {0.05 * periods:.3f} s: the solver answered 'primal_infeasible'")
-    assert flown.summary["reason"].endswith("after holding the last plan for 9 periods")
-    assert flown.summary["duration"] == flown.log.plant.t[-1] == pytest.approx(0.05 * periods)
-    assert flown.summary["controller"]["fallbacks"] == {"0": periods - 9, "1": 9}
-    assert flown.log.plant.state[-1, 4] < -1.0
-
-
-def test_ctrl_c_in_flight_keeps_what_was_flown(tmp_path: Path) -> None:
+def test_ctrl_c_in_flight_keeps_what_was_flown(short_run: Run, tmp_path: Path) -> None:
     scenario = load_scenario("paper-constrained", ["duration=6.0"])
     flight = run_scenario(scenario, tmp_path / "run", TABLES, interrupt_after(33))
     flown = rundir.load_run(tmp_path / "run")
@@ -205,20 +131,13 @@ def test_ctrl_c_in_flight_keeps_what_was_flown(tmp_path: Path) -> None:
     assert flown.log.control.t.size == 33
     assert flown.log.plant.t[-1] == 1.65
     assert rundir.damaged_files(flown.directory, flown.summary) == []
-
-
-def test_what_was_flown_until_then_is_what_would_have_been(short_run: Run, tmp_path: Path) -> None:
-    scenario = load_scenario("paper-constrained", ["duration=6.0"])
-    flight = run_scenario(scenario, tmp_path / "run", TABLES, interrupt_after(33))
     np.testing.assert_array_equal(flight.log.control.speeds, short_run.log.control.speeds[:33])
 
 
 # --- nothing is ever half written ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt(), ValueError("no")]
-)
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
 def test_a_run_whose_product_fails_keeps_all_else_and_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
@@ -246,18 +165,6 @@ def test_a_defect_of_our_own_is_not_taken_for_a_flight(tmp_path: Path, monkeypat
     with pytest.raises(ZeroDivisionError):
         run(tmp_path / "new" / "run", SHORT)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_a_recording_that_was_asked_for_and_cannot_be_made_is_an_error_and_all_else_is_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("RERUN", "off")
-    scenario, target = load_scenario("hover", [SHORT]), tmp_path / "new" / "run"
-    with pytest.raises(OutputError, match=r"run/flight\.rrd: failed: .*rerun is switched off by .* RERUN; all else is"):
-        run_scenario(scenario, target, Outputs(video=False, recording=True))
-    assert reaudit(target).summary["products"]["figures"] == "made"
-    assert "flight.rrd" not in reaudit(target).summary["files"]
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drawn_events import HAPPENING, kind
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quadsim.errors import CommandError, FlightError, InputError
-from quadsim.sim.loop import ClosedLoop
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.events import prepared
@@ -36,16 +36,6 @@ SCENARIOS = {
 }
 
 
-def number(low: float, high: float) -> st.SearchStrategy[float]:
-    return st.floats(low, high).map(lambda value: round(value, 3))
-
-
-def vector(largest: float) -> st.SearchStrategy[list[float]]:
-    return st.lists(number(-largest, largest), min_size=3, max_size=3)
-
-
-LASTING = number(0.001, 0.5)
-SENSOR = st.sampled_from(["position", "velocity", "attitude", "rates"])
 FIELDS = st.sampled_from(
     [
         {"output_weights.x": 40.0},
@@ -63,28 +53,7 @@ FIELDS = st.sampled_from(
 )
 
 
-def kind(name: str, **fields: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
-    return st.fixed_dictionaries({"type": st.just(name), **fields})
-
-
-INPUT = st.one_of(
-    kind("push", duration=LASTING, force=vector(3.0), point=vector(0.1)),
-    kind("setpoint", x=number(-1.0, 1.0), yaw=number(-90.0, 90.0)),
-    kind("setpoint", z=number(-0.5, 0.5)),
-    kind("controller", fields=FIELDS),
-    kind("mass", factor=number(0.8, 1.3)),
-    kind("rotor_lag", rise=number(0.0, 0.1)),
-    kind("rotor_lag", rise=number(0.0, 0.1), fall=number(0.0, 0.1)),
-    kind("rotor_loss", rotor=st.integers(1, 4), loss=number(0.01, 0.2), duration=LASTING),
-    kind("rotor_loss", rotor=st.integers(1, 4), loss=number(0.01, 0.1)),
-    kind("payload_pickup", mass=number(0.01, 0.3), position=vector(0.05)),
-    kind("payload_drop"),
-    kind("wind", velocity=vector(4.0)),
-    kind("gust", velocity=vector(4.0), duration=LASTING),
-    kind("sensor_fault", sensor=SENSOR, fault=st.sampled_from(["dropout", "freeze", "nan"]), duration=LASTING),
-    kind("sensor_fault", sensor=SENSOR, fault=st.just("bias"), offset=vector(0.2), duration=LASTING),
-    kind("stall", duration=LASTING),
-)
+INPUT = HAPPENING | kind("controller", fields=FIELDS)
 INPUTS = st.lists(st.tuples(st.integers(0, PERIODS - 1), st.booleans(), INPUT), max_size=14)
 
 
@@ -250,11 +219,3 @@ def test_without_a_record_there_is_no_log() -> None:
         assert set(started.margins()) == {limit.name for limit in started.limits}
         with pytest.raises(InputError, match="no period of this flight was recorded"):
             started.flight()
-
-
-def test_a_controller_takes_over_before_a_period_is_observed() -> None:
-    with start(load_scenario("hover")) as started:
-        loop: ClosedLoop = started.loop
-        assert started.observation.k == 0
-        with pytest.raises(InputError, match="before a period is observed"):
-            loop.switch(loop.controller)

@@ -21,9 +21,7 @@ from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.cli import main
 from scenarios.commands import EXIT_DONE
 from scenarios.design.authority import torque_ranges
-from scenarios.design.vehicle_figures import integrator_chains, make_sheet
-from scenarios.loading import load_scenario
-from scenarios.run import fly_scenario
+from scenarios.design.vehicle_figures import make_sheet
 
 VEHICLES = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]
 CRAZYFLIE, HUMMINGBIRD, LOPES, _ = VEHICLES
@@ -110,14 +108,6 @@ def test_the_linear_model_is_four_chains_of_integrators(vehicle: Vehicle) -> Non
     assert np.abs(np.linalg.matrix_power(shifted, 4)).max() < 1e-15
 
 
-def test_chains_are_distinguished_by_their_lengths() -> None:
-    chain = np.eye(6, k=1)
-    chain[2, 3] = 0.0
-    assert integrator_chains(chain) == (3, 3)
-    chain[1, 2] = 0.0
-    assert integrator_chains(chain) == (3, 2, 1)
-
-
 def test_rotors_that_lag_add_their_poles() -> None:
     sheet = make_sheet(HUMMINGBIRD)
     assert sheet.lag_poles == {"rotor_rise": pytest.approx(-80.0), "rotor_fall": pytest.approx(-40.0)}
@@ -155,23 +145,3 @@ def test_the_portrait_shows_the_vehicle(tmp_path: Path) -> None:
     orange = (picture[..., 0] - picture[..., 2] > 80).nonzero()  # what points forward; the rest is grey and blue
     assert np.ptp(orange[1]) > 100  # both front arms, across a third of the picture
     assert [path.name for path in tmp_path.iterdir()] == ["cf.png"]
-
-
-FLOWN = {
-    "lopes2011": [],
-    "hummingbird": ["input_weights.speed=9e-4", "input_bounds.speed=[0, 838]", "input_bounds.slew=[-80, 80]"],
-    "crazyflie2": ["input_weights.speed=1e-4", "input_bounds.speed=[0, 2500]", "input_bounds.slew=[-250, 250]"],
-    "torrente2021": ["input_weights.speed=4e-4", "input_bounds.speed=[0, 1000]", "input_bounds.slew=[-100, 100]"],
-}
-
-
-@pytest.mark.parametrize("name", vehicle_names())
-def test_a_shipped_vehicle_hovers(name: str) -> None:
-    """From a tilted, turned start back to level at the reference within two seconds."""
-    settings = [f"vehicle.file={name}", "duration=2.0", "initial.euler=[2.0, -2.0, 3.0]", "controller.horizon=25"]
-    flight = fly_scenario(load_scenario("hover", [*settings, *(f"controller.{line}" for line in FLOWN[name])]))
-    assert flight.log.status == "completed"
-    end = flight.log.plant.state[-1]
-    assert np.abs(end[[INDEX[axis] for axis in "xyz"]] - [0.0, 0.0, 1.0]).max() < 0.02
-    assert np.degrees(np.abs(end[[INDEX[angle] for angle in ("roll", "pitch", "yaw")]])).max() < 0.6
-    assert np.abs(flight.log.plant.speeds - flight.vehicle.hover_speed).max() < 0.2 * flight.vehicle.hover_speed

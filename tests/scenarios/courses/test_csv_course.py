@@ -7,8 +7,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from scenarios.courses.csv_course import Table, read_table, through_rows
 
@@ -67,29 +65,6 @@ def test_with_velocities_a_cubic_is_met_exactly() -> None:
     np.testing.assert_allclose(path.pose(since)[:, 3], 2.0 + since)
 
 
-def test_with_velocities_the_velocity_is_continuous_and_the_one_given() -> None:
-    rng, t, h = np.random.default_rng(3), np.array([0.0, 0.4, 1.0, 2.0]), 1e-6
-    table = Table(t=t, poses=rng.normal(size=(4, 4)), velocities=rng.normal(size=(4, 3)), sha256="")
-    path = through_rows(table)
-    before = (path.pose(t[1:])[:, :3] - path.pose(t[1:] - h)[:, :3]) / h
-    after = (path.pose(t[:-1] + h)[:, :3] - path.pose(t[:-1])[:, :3]) / h
-    assert table.velocities is not None
-    np.testing.assert_allclose(before, table.velocities[1:], atol=1e-4)
-    np.testing.assert_allclose(after, table.velocities[:-1], atol=1e-4)
-
-
 def test_yaw_that_wraps_is_unwrapped(tmp_path: Path) -> None:
     path = write(tmp_path, "t,x,y,z,yaw\n0,0,0,0,3.1\n1,0,0,0,-3.1\n2,0,0,0,-2.9\n")
     np.testing.assert_allclose(read_table(path).poses[:, 3], [3.1, math.tau - 3.1, math.tau - 2.9])
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_any_table_comes_back_from_its_text(tmp_path: Path, data: st.DataObject) -> None:
-    t = sorted(data.draw(st.sets(st.floats(0.0, 1e6), min_size=2, max_size=6)))
-    number = st.floats(-1e6, 1e6)
-    rows = [[time, *data.draw(st.tuples(*[number] * 3)), 0.1, *data.draw(st.tuples(*[number] * 3))] for time in t]
-    text = "t,x,y,z,yaw,vx,vy,vz\n" + "".join(",".join(map(repr, row)) + "\n" for row in rows)
-    table = read_table(write(tmp_path, text))
-    assert table.velocities is not None
-    np.testing.assert_array_equal(np.column_stack([table.t, table.poses, table.velocities]), rows)

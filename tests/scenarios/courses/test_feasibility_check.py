@@ -14,7 +14,7 @@ from quadsim.flight.feasibility import Feasibility
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.feasibility_check import fitting, report
-from scenarios.courses.make import build_course, build_reference
+from scenarios.courses.make import build_course
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
@@ -38,12 +38,6 @@ def test_the_papers_course_steps_and_what_its_filter_leaves_is_beyond_the_bound(
     assert finding.sentence.startswith(
         "The course steps (at t = 0, 10, 20, 40 s); the rest requires up to 19.96 deg of tilt (bound 5 deg), "
     )
-
-
-def test_hover_requires_nothing() -> None:
-    made = load_scenario("hover")
-    finding = report(made, build_vehicle(made))
-    assert (finding.tilt, finding.jumps, finding.problems) == (0.0, (), ())
 
 
 def test_a_circle_requires_the_tilt_of_the_closed_form(vehicle: Vehicle) -> None:
@@ -72,36 +66,6 @@ def test_where_it_begins_elsewhere_the_course_jumps(vehicle: Vehicle) -> None:
     assert found(circle, vehicle, duration=1.0).jumps == ()  # a start after the flight's end
 
 
-def test_a_vehicle_that_is_turned_away_from_steps_makes_a_jump_at_the_start(vehicle: Vehicle) -> None:
-    finding = found({}, vehicle, initial={"position": [0.0, 0.0, 1.0], "euler": [0.0, 0.0, 20.0]})
-    assert finding.jumps == (0.0,)
-    assert finding.tilt == 0.0
-
-
-def test_an_entry_at_full_speed_is_seen(vehicle: Vehicle) -> None:
-    """Before the flight the vehicle is at rest: without a ramp the first period has to gain the whole speed."""
-    circle = {"type": "circle", "radius": 3.0, "speed": 1.0}
-    assert found(circle | {"ramp": 0.0}, vehicle).tilt > 60.0 > 5.0 > found(circle, vehicle).tilt
-
-
-def test_a_dense_table_of_a_smooth_course_requires_what_the_course_does(tmp_path: Path, vehicle: Vehicle) -> None:
-    """Rows as close as the control period are samples, not corners: their torques count."""
-    eight = scenario({"type": "figure_eight", "length": 6.0, "period": 6.0, "turns": 2.0})
-    smooth = report(eight, vehicle)
-    t = 0.05 * np.arange(401)
-    rows = np.column_stack([t, build_course(eight).sample(t)])
-    path = tmp_path / "eight.csv"
-    path.write_text("t,x,y,z,yaw\n" + "".join(",".join(map(repr, row.tolist())) + "\n" for row in rows))
-    table = {"type": "csv", "file": str(path)}
-    np.testing.assert_allclose(build_reference(scenario(table), 401), build_reference(eight, 401), atol=1e-12)
-    dense = report(scenario(table), vehicle)
-    assert dense.tilt == pytest.approx(smooth.tilt, rel=1e-6)
-    assert dense.rotor_max == pytest.approx(smooth.rotor_max, rel=1e-6)
-    path.write_text("t,x,y,z,yaw\n" + "".join(",".join(map(repr, row.tolist())) + "\n" for row in rows[::4]))
-    sparse = report(scenario(table), vehicle)
-    assert sparse.tilt > 1.5 * smooth.tilt  # every row a corner
-
-
 def rounded(path: Path, poses: Array, decimals: int) -> dict[str, str]:
     """The reference of a table with a row per control period."""
     lines = (",".join(f"{value:.{decimals}f}" for value in (0.05 * k, *row)) for k, row in enumerate(poses))
@@ -120,15 +84,6 @@ def test_a_rounded_table_of_a_smooth_course_requires_what_the_course_does(
     assert not any("change of rotor speed" in problem for problem in found.problems)
     assert found.tilt == pytest.approx(smooth.tilt, abs=0.05)
     assert (found.rotor_min, found.rotor_max) == pytest.approx((smooth.rotor_min, smooth.rotor_max), abs=0.2)
-
-
-def test_a_real_corner_in_a_rounded_table_is_still_seen(tmp_path: Path, vehicle: Vehicle) -> None:
-    """From rest to 1 m/s within a period, 20 m/s^2; the course is what it was to the last decimal."""
-    poses = np.zeros((420, 4))
-    poses[:, 0] = np.maximum(0.05 * (np.arange(420) - 200), 0.0)
-    found = report(scenario(rounded(tmp_path / "corner.csv", poses, 4)), vehicle)
-    assert found.acceleration == pytest.approx(20.0, rel=0.02)
-    assert any("change of rotor speed" in problem for problem in found.problems)
 
 
 def poses_of(made: Scenario) -> Array:

@@ -48,20 +48,6 @@ def sampled(kind: str, *times: float, **fields: Any) -> Array:
 # --- what is right -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", REFERENCES)
-def test_every_type_comes_back_from_its_text(kind: str) -> None:
-    made = scenario(kind)
-    again = parse_scenario(tomllib.loads(made.to_toml()))
-    assert again == made
-    assert again.reference.type == kind
-    np.testing.assert_array_equal(build_reference(again, 50), build_reference(made, 50))
-
-
-def test_a_table_without_a_type_is_one_of_steps() -> None:
-    assert load_scenario("paper-constrained").reference.type == "steps"
-    assert load_scenario("paper-constrained", ["reference.response_time=2.5"]).reference.response_time == 2.5
-
-
 @pytest.mark.parametrize("kind", [kind for kind in REFERENCES if kind != "steps"])
 def test_every_course_begins_at_the_initial_position_and_stays_at_its_end(kind: str) -> None:
     course = build_course(scenario(kind))
@@ -123,19 +109,6 @@ def test_speed_is_that_at_full_speed_for_every_loop() -> None:
         poses = build_course(scenario(kind, **fields)).sample(t)
         fastest = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max() / 1e-3
         assert fastest == pytest.approx(1.0, rel=1e-4), kind
-
-
-def test_a_helix_climbs_and_turns_in_the_direction_of_its_sign() -> None:
-    end = sampled("helix", 1e3)[0]
-    np.testing.assert_allclose(end[:3], [1.0, -2.0, 6.0], atol=1e-9)
-    early = sampled("helix", 4.0)[0]
-    assert early[1] < -2.0  # clockwise from +x: towards -y
-
-
-def test_a_figure_eight_has_half_its_length_for_a_width() -> None:
-    poses = build_course(scenario("figure_eight", angle=90.0)).sample(np.arange(0.0, 17.0, 0.01))
-    assert np.ptp(poses[:, 1]) == pytest.approx(4.0, rel=1e-4)
-    assert np.ptp(poses[:, 0]) == pytest.approx(2.0, rel=1e-4)
 
 
 def test_yaw_turns_are_in_degrees_and_leave_the_position() -> None:

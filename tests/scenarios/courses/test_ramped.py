@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import cumulative_trapezoid
 
 from mpc.flatness import attitudes, motion_along
 from quadsim.motion import Motion
@@ -16,7 +15,6 @@ from quadsim.rotation import quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.make import build_course, build_motion, build_reference
-from scenarios.courses.ramped import ramped_phase
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
 from scenarios.schema.problems import ScenarioError
@@ -55,14 +53,6 @@ def changed(**fields: Any) -> Scenario:
     return base.replace({f"reference.{name}": value for name, value in fields.items()})
 
 
-@pytest.mark.parametrize(
-    ("name", "duration"),
-    [("loop4-ideal", 12.0), ("loop8-ideal", 20.0), ("loop8-all", 20.0), ("lemniscate8-drag", 20.0)],
-)
-def test_the_published_flights_end_with_their_course(name: str, duration: float) -> None:
-    assert load_scenario(f"torrente-{name}").duration == duration
-
-
 @pytest.mark.parametrize("fields", [{"speed": 6.0}, {"speed": 6.005, "ramp": 1.99}, {"start": 1.5}, {"sampling": 0.03}])
 def test_a_flight_without_a_duration_ends_with_its_course(fields: dict[str, float]) -> None:
     scenario = changed(**fields)
@@ -87,25 +77,6 @@ def test_the_motion_is_that_of_the_specification(name: str) -> None:
     for k, text in CHECKS[name].items():
         rows = (motion.position, motion.attitude, motion.velocity, motion.body_rates, motion.thrusts / 20.0)
         np.testing.assert_allclose(np.concatenate([row[k] for row in rows]), [*map(float, text.split())], atol=6e-7)
-
-
-def test_top_speeds_and_lengths_are_those_of_the_specification() -> None:
-    for name, samples, speed in (("loop4", 600, 4.273), ("loop8", 1000, 8.273), ("lemniscate8", 1000, 11.69)):
-        motion, _ = motion_of(load_scenario(f"torrente-{name}-ideal"))
-        assert len(motion) == samples
-        assert np.linalg.norm(motion.velocity, axis=1).max() == pytest.approx(speed, abs=6e-4)
-    assert motion.thrusts.min() / 20.0 == pytest.approx(-0.046, abs=5e-4)  # the lemniscate's, not clipped
-
-
-def test_the_phase_gains_and_loses_its_rate_by_rectangle_sums() -> None:
-    """Its length is 2 v / a + 2 T; the sums tend to integrals, and the end is at rest."""
-    phase = ramped_phase(rate=1.3, acceleration=0.25, ramp=1.1, step=1e-3)
-    assert len(phase.angle) == pytest.approx((2.0 * 1.3 / 0.25 + 2.2) / 1e-3, abs=2)
-    integral = cumulative_trapezoid(phase.acceleration, dx=1e-3, initial=0.0)
-    np.testing.assert_allclose(phase.rate, integral, atol=3e-4)
-    np.testing.assert_allclose(phase.angle, cumulative_trapezoid(integral, dx=1e-3, initial=0.0), atol=3e-3)
-    assert phase.rate.max() == pytest.approx(1.3 + 0.25 * 1.1 * (2.0 / math.pi - 0.5), abs=1e-3)
-    assert abs(phase.rate[-1]) < 1e-3
 
 
 @pytest.mark.parametrize("heading", ["free", "held"])
@@ -149,14 +120,6 @@ def test_the_heading_begins_at_the_initial_yaw() -> None:
     np.testing.assert_allclose(other.body_rates, np.stack([cos * x + sin * y, cos * y - sin * x, z], axis=1), atol=1e-9)
 
 
-def test_the_course_is_the_same_at_another_control_period() -> None:
-    fine, coarse = changed(), load_scenario("torrente-loop8-ideal", ["control_period=0.05"])
-    t = 0.1 * np.arange(200)
-    np.testing.assert_allclose(build_course(fine).sample(t), build_course(coarse).sample(t), atol=1e-12)
-    motion, _ = motion_of(coarse)
-    assert len(motion) == 400  # the last sample at or before 19.98 s is 19.95 s
-
-
 def test_it_waits_for_its_start_at_rest() -> None:
     scenario = load_scenario("torrente-loop8-ideal", ["reference.start=1.0", "duration=22.0"])
     motion, _ = motion_of(scenario)
@@ -168,14 +131,6 @@ def test_it_waits_for_its_start_at_rest() -> None:
     np.testing.assert_allclose(later.attitude, plain.attitude, atol=1e-12)
 
 
-def test_what_is_left_of_a_motion_ends_with_its_last_sample() -> None:
-    motion, _ = motion_of(load_scenario("torrente-loop4-ideal"))
-    assert len(motion.after(590)) == 10
-    assert len(motion.after(599)) == len(motion.after(10_000)) == 1
-    np.testing.assert_array_equal(motion.after(10_000).position[0], motion.position[-1])
-    assert np.shares_memory(motion.after(3).attitude, motion.attitude)
-
-
 def test_a_flight_starts_in_the_state_of_the_reference() -> None:
     scenario = load_scenario("torrente-loop8-ideal")
     motion, _ = motion_of(scenario)
@@ -183,11 +138,6 @@ def test_a_flight_starts_in_the_state_of_the_reference() -> None:
     np.testing.assert_allclose(state, [0, 0, 0, 0, 1, 0, 0, 0, 0, 0.001257, 0, 0], atol=6e-7)
     at_rest = scenario.replace({"initial.on_reference": False})
     np.testing.assert_array_equal(build_initial_state(at_rest, motion)[5:], 0.0)
-
-
-def test_other_courses_state_no_motion() -> None:
-    scenario = load_scenario("circle")
-    assert build_motion(scenario, build_vehicle(scenario)) is None
 
 
 def test_flatness_of_a_hover_that_turns() -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 
-from quadsim.flight.metrics import CourseStep, settling
 from scenarios.courses.make import build_course_steps, build_reference
 from scenarios.courses.smoothing import smooth
 from scenarios.courses.steps import Window, steps, switches
@@ -35,10 +33,6 @@ def test_later_windows_win_where_they_overlap() -> None:
     np.testing.assert_array_equal(steps(np.arange(5.0), windows, 0.0), [0.0, 1.0, 2.0, 1.0, 0.0])
 
 
-def test_no_window_leaves_an_axis_where_it_is() -> None:
-    np.testing.assert_array_equal(steps(np.arange(4.0), [], -3.5), np.full(4, -3.5))
-
-
 def test_a_course_switches_where_its_value_does() -> None:
     windows = [Window(start=0.0, stop=4.0, value=1.0), Window(start=1.0, stop=3.0, value=2.0)]
     found = switches(windows, 0.0, initial=0.0)
@@ -62,59 +56,12 @@ def test_the_steps_of_the_papers_course() -> None:
     assert [(step.channel, step.until) for step in short] == [("x", 15.0), ("z", 15.0), ("yaw", 15.0)]
 
 
-def test_the_filtered_reference_settles_in_its_response_time() -> None:
-    """exp(-3) is just below 5 %; the step down is taken a sample earlier than the step up, Eq. (30)."""
-    steps_of_z = [
-        CourseStep(channel="z", time=0.0, before=0.0, after=10.0, until=37.5),
-        CourseStep(channel="z", time=40.0, before=10.0, after=0.0, until=60.0),
-    ]
-    t = PERIOD * np.arange(1200)
-    entries = settling(t, build_reference(load_scenario("paper-constrained"), t.size), steps_of_z)
-    assert [entry["settled"] for entry in entries] == [5.0, 4.95]
-
-
 def test_the_filter_is_the_first_order_lag_in_closed_form() -> None:
     """A step from a to b: F(k) = b + (a - b) exp(-3 (k + 1) tau_s / tau_r)."""
     response_time, k = 5.0, np.arange(300)
     filtered = smooth(np.full(300, 10.0), initial=2.0, response_time=response_time, period=PERIOD)
     expected = 10.0 + (2.0 - 10.0) * np.exp(-3.0 * (k + 1) * PERIOD / response_time)
     np.testing.assert_allclose(filtered, expected, rtol=1e-12)
-
-
-def test_the_response_time_is_that_of_95_percent() -> None:
-    filtered = smooth(np.ones(101), initial=0.0, response_time=5.0, period=PERIOD)
-    assert filtered[99] == pytest.approx(1.0 - math.exp(-3.0))  # after 100 periods, 5 s
-
-
-def test_the_filter_takes_the_previous_filtered_value() -> None:
-    """Erratum to Eq. (31): with the unfiltered x(k-1) on the right, as printed, a step would be over in one period."""
-    values = np.concatenate([np.zeros(5), np.ones(50)])
-    filtered = smooth(values, initial=0.0, response_time=5.0, period=PERIOD)
-    keep = math.exp(-3.0 * PERIOD / 5.0)
-    printed = values[1:] + keep * (values[:-1] - values[1:])
-    assert printed[5] == 1.0
-    assert filtered[6] == pytest.approx(1.0 - keep**2)
-    np.testing.assert_allclose(filtered[1:], values[1:] + keep * (filtered[:-1] - values[1:]), rtol=1e-14)
-
-
-def test_no_response_time_is_no_filter_and_another_array() -> None:
-    values = np.array([0.0, 1.0, 0.0])
-    filtered = smooth(values, initial=7.0, response_time=0.0, period=PERIOD)
-    np.testing.assert_array_equal(filtered, values)
-    assert filtered is not values
-
-
-def test_the_reference_starts_from_the_initial_position_and_zero_yaw() -> None:
-    settings = ["initial.position=[1.0, -2.0, 3.0]", "reference.x=[]", "reference.y=[]", "reference.z=[]"]
-    reference = build_reference(load_scenario("paper-constrained", settings), 100)
-    np.testing.assert_array_equal(reference, np.tile([1.0, -2.0, 3.0, 0.0], (100, 1)))
-
-
-def test_outside_its_windows_an_axis_returns_to_the_initial_position() -> None:
-    settings = ["initial.position=[1.0, 2.0, 3.0]", "reference.response_time=0.0"]
-    reference = build_reference(load_scenario("paper-constrained", settings), 1200)
-    np.testing.assert_array_equal(reference[201], [10.0, 2.0, 10.0, 0.0])
-    np.testing.assert_array_equal(reference[801], [1.0, 2.0, 3.0, 0.0])
 
 
 def test_the_paper_course_is_eq_30() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import tomllib
-from pathlib import Path
 
 import pytest
 
@@ -68,26 +67,13 @@ def test_the_template_documents_every_parameter() -> None:
     assert text.count("May be left out:") == len(OPTIONAL_PARAMETERS)
 
 
-def test_from_a_template_to_a_scenario_by_the_command_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["vehicle", "--template"]) == EXIT_DONE
-    Path("mine.toml").write_text(capsys.readouterr().out, encoding="utf-8")
-    assert main(["vehicle", "mine.toml", "--scenario", "hover"]) == EXIT_DONE
-    output = capsys.readouterr().out
-    assert "hover is 495.2 rad/s, the scenario allows 250" in output
-    assert "time constant of x, y, limited by the rotors' lag" in output
-    assert main(["vehicle", "mine.toml", "--scenario", "hover", "--json"]) == EXIT_DONE
-    sheet = json.loads(capsys.readouterr().out)
-    assert len(sheet["shortfalls"]) == 3
-    assert sheet["derived"]["designed"]["limited_by"] == "lag"
-    assert main(["vehicle", "mine.toml", "--json"]) == EXIT_DONE
-    assert "shortfalls" not in json.loads(capsys.readouterr().out)
-    assert main(["scenario", "--for", "mine.toml", "--course", "step", "--controller", "pid"]) == EXIT_DONE
-    Path("first.toml").write_text(capsys.readouterr().out, encoding="utf-8")
-    assert main(["vehicle", "mine.toml", "--scenario", "first.toml"]) == EXIT_DONE
+def test_the_command_reports_them_where_a_scenario_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["vehicle", "hummingbird", "--scenario", "hummingbird-figure-eight"]) == EXIT_DONE
     assert "none: the vehicle meets all of them" in capsys.readouterr().out
+    assert main(["vehicle", "hummingbird", "--scenario", "hover", "--json"]) == EXIT_DONE
+    assert len(json.loads(capsys.readouterr().out)["shortfalls"]) == 2
+    assert main(["vehicle", "hummingbird", "--json"]) == EXIT_DONE
+    assert "shortfalls" not in json.loads(capsys.readouterr().out)
 
 
 def test_the_speed_at_which_a_course_fits_is_reported_before_the_flight(

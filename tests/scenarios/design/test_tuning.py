@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from first_flights import vehicles
-from plausible_vehicles import HEAVIEST, LIGHTEST, QUICKEST, SLOWEST, STRONGEST, WEAKEST, plausible_vehicles
 
 from mpc.model import continuous_model, discretise
 from quadsim.controller import Moment
@@ -26,19 +25,6 @@ from scenarios.parts.controllers import make_controller
 
 ALL = vehicles()
 EVERY = pytest.mark.parametrize("vehicle", ALL, ids=lambda vehicle: vehicle.name)
-
-
-def test_authority_is_that_of_closed_forms() -> None:
-    """A plus at thrust to weight r: two rotors up to r of their share and two down, so that the sum stays."""
-    vehicle = next(each for each in ALL if each.name == "lopes2011")
-    can = authority(vehicle)
-    ratio = (250.0 / vehicle.hover_speed) ** 2
-    assert can.thrust_to_weight == pytest.approx(ratio)
-    assert math.cos(can.steady_tilt) == pytest.approx(1.0 / ratio)
-    assert can.climb == pytest.approx((ratio - 1.0) * 9.81)
-    share = 4.0 * 9.81 / 4.0
-    assert can.turning[0] == pytest.approx((ratio - 1.0) * 2.0 * share * 0.3 / 0.033)
-    assert can.turning[2] == pytest.approx((ratio - 1.0) * 4.0 * share * 0.024 / 0.066)
 
 
 @EVERY
@@ -125,14 +111,6 @@ def test_a_figure_eight_keeps_below_the_speed_at_which_the_air_turns_the_vehicle
     assert authority(next(each for each in ALL if each.name == "lopes2011")).munk == 0.0
 
 
-def test_a_butterworth_loop_stands_the_air_up_to_the_fourth_root_of_two() -> None:
-    """s^4 + a s^3 + (a^2/2 - p^2) s^2 + a s + 1 of bandwidth 1, a = 2.613: on the edge at p = 2^(1/4)."""
-    a = 2.0 * (math.cos(math.pi / 8.0) + math.sin(math.pi / 8.0))
-    for p, stable in ((0.99 * 2.0**0.25, True), (1.01 * 2.0**0.25, False)):
-        poles = np.roots([1.0, a, 0.5 * a**2 - p**2, a, 1.0])
-        assert (poles.real.max() < 0.0) == stable
-
-
 def test_a_delay_margin_is_where_a_simulated_loop_begins_to_grow() -> None:
     vehicle = next(each for each in ALL if each.name == "hummingbird")
     tuning = tune(vehicle)
@@ -156,20 +134,6 @@ def test_a_delay_margin_is_where_a_simulated_loop_begins_to_grow() -> None:
     assert is_stable(vehicle, tuning, K, 0.0)
     assert not grows(0.9 * margin)
     assert grows(1.1 * margin)
-
-
-def test_drawn_vehicles_fill_the_range_and_are_the_same_each_time() -> None:
-    drawn = plausible_vehicles(20, 2026)
-    assert drawn == plausible_vehicles(20, 2026)
-    assert drawn != plausible_vehicles(20, 2027)
-    for values, least, most in (
-        ([vehicle.mass for vehicle in drawn], LIGHTEST, HEAVIEST),
-        ([authority(vehicle).thrust_to_weight for vehicle in drawn], WEAKEST, STRONGEST),
-        ([vehicle.rotor_rise or 0.0 for vehicle in drawn], QUICKEST, SLOWEST),
-    ):
-        assert least <= min(values) < least * (most / least) ** 0.1
-        assert most >= max(values) > most / (most / least) ** 0.1
-    assert len({vehicle.rotor_azimuths for vehicle in drawn}) == 2
 
 
 def test_a_vehicle_with_nothing_in_reserve_is_refused_and_one_with_little_is_not() -> None:

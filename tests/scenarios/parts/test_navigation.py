@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from typing import Any
 
-import numpy as np
 import pytest
 from support import scenario_table
 
@@ -14,7 +12,6 @@ from quadsim.sim.sensing.sensor import FaultKind, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.loading import parse_scenario
 from scenarios.parts.navigation import build_fault, build_navigation, build_sensors
-from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Scenario
 
 SENSORS: dict[str, Any] = {
@@ -60,16 +57,3 @@ def test_faults_are_in_si_units() -> None:
 def test_perfect_state_stays_the_default(vehicle: Vehicle) -> None:
     assert build_navigation(scenario(), vehicle) is None
     assert build_navigation(scenario(sensors=SENSORS), vehicle) is not None
-
-
-def test_tables_come_back_from_the_resolved_file() -> None:
-    given = scenario(sensors=SENSORS, estimator=ESTIMATOR)
-    assert parse_scenario(tomllib.loads(given.to_toml())) == given
-
-
-def test_a_flight_by_estimate_is_the_same_each_time() -> None:
-    given = scenario(sensors=SENSORS, estimator=ESTIMATOR)
-    logs = [fly_scenario(given).log.control for _ in range(2)]
-    assert np.array_equal(logs[0].state, logs[1].state)
-    error = logs[0].state - logs[0].truth
-    assert 1e-6 < np.abs(error[:, [0, 2, 4]]).max() < 0.5

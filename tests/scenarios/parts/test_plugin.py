@@ -17,7 +17,6 @@ from quadsim.controller import Command, Moment
 from quadsim.errors import CommandError, InputError
 from quadsim.state import Array
 from scenarios.build import build_controller
-from scenarios.cli import main
 from scenarios.flight import Outputs
 from scenarios.loading import load_scenario
 from scenarios.parts.plugin import PluginController
@@ -190,13 +189,10 @@ class Answers:
     ("part", "given", "rule"),
     [
         ("speeds", np.zeros(3), r"its speeds must have shape \(4,\); got \(3,\)"),
-        ("speeds", "fast", "could not convert string to float: 'fast'"),
         ("speeds", None, "its speeds must have shape"),
         ("plan", np.zeros((2, 4)), r"its plan must have shape \(3, 4\); got \(2, 4\)"),
         ("status", None, "'NoneType' object has no attribute"),
-        ("fallback", None, "'NoneType' object cannot be interpreted as an integer"),
         ("iterations", 2.5, "'float' object cannot be interpreted as an integer"),
-        ("slack", "none", "could not convert string to float: 'none'"),
         ("inner", 500.0, "'float' object has no attribute 'rate'"),
     ],
 )
@@ -213,15 +209,6 @@ def test_a_prediction_of_another_shape_is_refused(given: Any) -> None:
         law.predict(np.zeros((2, 12)), np.zeros((2, 3, 4)))
 
 
-def test_its_own_flight_errors_end_the_flight() -> None:
-    class Refuses:
-        def step(self, now: Moment, state: object, reference: object) -> Command:
-            raise CommandError("I will not", time=now.time)
-
-    with pytest.raises(CommandError, match=r"^at t = 2\.000 s: I will not$"):
-        PluginController(Refuses(), 3).step(Moment(time=2.0), np.zeros(12), np.zeros((3, 4)))
-
-
 # --- what is wrong -------------------------------------------------------------------------------------------------
 
 CALLED = "controller: mine:Hover cannot be called with vehicle, period, horizon"
@@ -232,11 +219,6 @@ WRONG = {
         HOVER.replace("        self.speeds,", "        None + 1\n        self.speeds,"),
         None,
         f"{CALLED}: TypeError: unsupported operand type(s) for +: 'NoneType' and 'int' (FOLDER/mine.py, line 6)",
-    ),
-    "syntax": (
-        "class Hover\n",
-        None,
-        "controller.type: mine cannot be imported: SyntaxError: expected ':' (mine.py, line 1)",
     ),
     "raises": (
         "\n1 / 0\n",
@@ -254,21 +236,10 @@ WRONG = {
         "controller.type: mine_gone.law cannot be imported: ModuleNotFoundError: No module named 'mine_gone'; it is "
         "looked for among what is installed, and in HERE",
     ),
-    "no step": (
-        "def Hover(vehicle, **others): return vehicle.mass\n",
-        None,
-        "controller.type must be a class or an object with a method step(now, state, reference), or a function law("
-        "now, state, reference); got 'mine:Hover (4.0)'",
-    ),
     "unknown": (
         HOVER,
         WITH + "{ ofset = 1 }",
         f"{CALLED}, ofset: TypeError: Hover.__init__() got an unexpected keyword argument 'ofset'",
-    ),
-    "refused": (
-        HOVER.replace("        self", "        if offset > 1: raise ValueError('too far')\n        self", 1),
-        WITH + "{ offset = 2 }",
-        f"{CALLED}, offset: ValueError: too far (FOLDER/mine.py, line 6)",
     ),
 }
 
@@ -279,15 +250,4 @@ def test_one_message_names_field_module_attribute_and_line(
 ) -> None:
     path = written(code) if controller is None else written(code, controller)
     reported = message(path).removeprefix("mine.toml: ")
-    begins = expected.endswith("...")
-    assert reported.startswith(expected[:-3]) if begins else reported == expected
-    assert "\n" not in reported
-
-
-def test_wrong_input_has_exit_status_two_and_no_traceback(
-    written: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "out"
-    assert main(["run", written("class Hover\n"), "--no-video", "--out", str(out)]) == 2
-    assert capsys.readouterr().err.startswith("quadsim: controller.type: custom_")
-    assert not out.exists()
+    assert reported == expected

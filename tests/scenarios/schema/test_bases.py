@@ -98,21 +98,3 @@ def test_a_table_of_another_type_reports_why_it_has_none_of_its_bases_fields(tmp
         with pytest.raises(ScenarioError) as caught:
             load_scenario(str(tmp_path / name))
         assert caught.value.problems == (*MISSING, WHOLE)
-
-
-def test_a_type_that_is_set_reports_where_the_other_fields_are_from(tmp_path: Path) -> None:
-    (tmp_path / "mine.toml").write_text('base = "hover"\n')
-    changed = "controller: --set changed its type from 'constrained' to 'robust', and all other fields stayed"
-    for name, base in (("hover", "hover"), (str(tmp_path / "mine.toml"), "mine.toml")):
-        with pytest.raises(ScenarioError) as caught:
-            load_scenario(name, ["controller.type=robust"])
-        field, reason = caught.value.problems
-        assert field.startswith("controller.solver is not a field of the scenario file")
-        assert reason == f'{changed}; a file with base = "{base}" and a whole [controller] replaces them'
-
-
-def test_where_no_type_was_changed_or_another_value_is_wrong_no_type_is_mentioned(tmp_path: Path) -> None:
-    for settings in (["controller.horizn=3"], ["reference.type=circle", "reference.radius=-1.0"]):
-        with pytest.raises(ScenarioError) as caught:
-            load_scenario("hover", settings)
-        assert len(caught.value.problems) == 1

@@ -3,50 +3,18 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 from jsonschema import Draft202012Validator
 
 from quadsim.assets import read_toml
-from quadsim.flight.audit import SIGNALS
 from scenarios.loading import load_scenario
 from scenarios.schema.json_schema import scenario_schema
-from scenarios.schema.scenario import Group, Scenario
 from scenarios.shipped import scenario_names, scenario_path
 
 SCHEMA = scenario_schema()
-WHOLE, DIFFERENCE = SCHEMA["else"], SCHEMA["then"]
 VALIDATOR = Draft202012Validator(SCHEMA)
-
-
-def nodes(value: Any, path: str = "$") -> Iterator[tuple[str, dict[str, Any]]]:
-    """All tables of the schema, by their path."""
-    if isinstance(value, dict):
-        yield path, value
-        for key, inner in value.items():
-            yield from nodes(inner, f"{path}.{key}")
-    elif isinstance(value, list):
-        for i, inner in enumerate(value):
-            yield from nodes(inner, f"{path}.{i}")
-
-
-def test_it_has_the_fields_of_a_scenario_and_no_others() -> None:
-    assert list(WHOLE["properties"]) == list(Scenario.model_fields)
-    assert list(DIFFERENCE["properties"]) == ["base", *Scenario.model_fields]
-    assert WHOLE["additionalProperties"] is DIFFERENCE["additionalProperties"] is False
-    assert set(WHOLE["required"]) == {name for name, info in Scenario.model_fields.items() if info.is_required()}
-
-
-def test_ranges_and_choices_are_reported() -> None:
-    properties, tables = WHOLE["properties"], SCHEMA["$defs"]
-    assert (properties["duration"]["exclusiveMinimum"], properties["duration"]["type"]) == (0.0, "number")
-    assert properties["group"]["enum"] == list(get_args(Group))
-    assert tables["Limit"]["properties"]["signal"]["enum"] == list(SIGNALS)
-    horizon = tables["ConstrainedSpec"]["properties"]["horizon"]
-    assert (horizon["type"], horizon["minimum"], horizon["maximum"]) == ("integer", 1, 1000)
-    assert tables["InitialSpec"]["properties"]["position"]["maxItems"] == 3
 
 
 @pytest.mark.parametrize("name", scenario_names())

@@ -13,11 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import scenario_table
 
-from mpc.solvers import SOLVERS
 from quadsim.assets import vehicle_path
 from quadsim.errors import UnknownNameError
-from quadsim.flight.audit import SIGNALS
-from quadsim.state import STATE_NAMES
 from scenarios.limits import build_limits
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
@@ -105,90 +102,6 @@ def test_settings_replace_add_and_reach_into_constraints() -> None:
 
 
 # --- any file ------------------------------------------------------------------------------------------------------
-
-positive = st.floats(1e-6, 1e6)
-ordinary = st.floats(-1e6, 1e6)
-pair = st.lists(ordinary, min_size=2, max_size=2, unique=True).map(sorted)
-
-
-@st.composite
-def windows(draw: st.DrawFn) -> list[dict[str, float]]:
-    pairs = draw(st.lists(pair, max_size=2))
-    return [{"start": start, "stop": stop, "value": draw(ordinary)} for start, stop in pairs]
-
-
-@st.composite
-def constraints(draw: st.DrawFn) -> list[dict[str, Any]]:
-    names = draw(st.lists(st.from_regex(r"[A-Za-z0-9_.-]{1,8}", fullmatch=True), unique=True, max_size=3))
-    entries = []
-    for name in names:
-        (lower, upper), (start, stop) = draw(pair), draw(pair)
-        tolerance = draw(st.floats(0.0, 10.0))
-        entry = {
-            "name": name,
-            "signal": draw(st.sampled_from(sorted(SIGNALS))),
-            "lower": lower,
-            "upper": upper,
-            "tolerance": tolerance,
-            "tolerance_sampled": draw(st.floats(0.0, tolerance)),
-            "required": draw(st.booleans()),
-            "start": start,
-            "stop": stop,
-        }
-        for absent in draw(st.sets(st.sampled_from(["lower", "required", "stop"]))):
-            del entry[absent]
-        entries.append(entry)
-    return entries
-
-
-@st.composite
-def controllers(draw: st.DrawFn) -> dict[str, Any]:
-    states = st.sampled_from(STATE_NAMES)
-    table: dict[str, Any] = {
-        "type": draw(st.sampled_from(["constrained", "unconstrained"])),
-        "horizon": draw(st.integers(1, 200)),
-        "output_weights": draw(st.dictionaries(states, positive, min_size=1)),
-        "input_weights": {"speed": draw(positive | st.lists(positive, min_size=4, max_size=4))},
-    }
-    if table["type"] == "constrained":
-        table["solver"] = draw(st.sampled_from(sorted(SOLVERS)))
-        table["output_bounds"] = draw(st.dictionaries(states, pair))
-        slow, fast = draw(st.floats(0.0, 100.0)), draw(st.floats(101.0, 1000.0))
-        table["input_bounds"] = {"speed": [slow, fast], "slew": [-draw(positive), draw(positive)]}
-    return table
-
-
-@st.composite
-def tables(draw: st.DrawFn) -> dict[str, Any]:
-    """Scenario files that are right."""
-    steps = draw(st.integers(1, 200))
-    period = round(1e-3 * steps, 6)
-    return {
-        "name": draw(st.from_regex(r"[a-z0-9][a-z0-9._-]{0,20}", fullmatch=True)),
-        "description": draw(st.text(st.characters(exclude_categories=["Cs"]), max_size=20)),
-        "duration": round(period * draw(st.integers(1, 5000)), 6),
-        "control_period": period,
-        "seed": draw(st.integers(0, 2**40)),
-        "log_rate": draw(st.sampled_from([1000.0, 500.0, 200.0, 100.0, 40.0])),
-        "vehicle": {"file": "lopes2011"} | draw(st.dictionaries(st.sampled_from(["mass", "arm_length"]), positive)),
-        "initial": {
-            "position": draw(st.lists(ordinary, min_size=3, max_size=3)),
-            "euler": draw(st.lists(st.floats(-89.0, 89.0), min_size=3, max_size=3)),
-        },
-        "plant": {"timestep": 0.001, "limit_speeds": draw(st.booleans())},
-        "reference": {"response_time": draw(st.floats(0.0, 100.0))}
-        | draw(st.dictionaries(st.sampled_from(["x", "y", "z", "yaw"]), windows())),
-        "controller": draw(controllers()),
-        "constraints": draw(constraints()),
-    }
-
-
-@settings(max_examples=60)
-@given(table=tables())
-def test_any_right_file_parses_and_comes_back_from_its_text(table: dict[str, Any]) -> None:
-    scenario = parse_scenario(table)
-    assert reread(scenario) == scenario
-    assert scenario.periods * scenario.control_period == pytest.approx(table["duration"], rel=1e-9)
 
 
 JUNK = st.sampled_from([None, True, "", "junk", -1.0, np.nan, np.inf, -np.inf, 1e300, [], [1.0], [[]], {}, {"junk": 1}])
