@@ -161,5 +161,3 @@ def test_a_browser_draws_the_page_and_has_no_complaint(short_run: Run, aborted_r
         *("Download plot as a PNG", "Zoom", "Pan", "Zoom in", "Zoom out", "Autoscale", "Reset axes"),
         *("Orbital rotation", "Turntable rotation", "Reset camera to default", "Reset camera to last save"),
     }, "no button may send data away"
-
-
