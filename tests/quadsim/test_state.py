@@ -20,14 +20,12 @@ from quadsim.sim.physics import physics_to_state
 from quadsim.state import (
     EULER_RATE,
     INDEX,
-    N_STATES,
     REFERENCE_NAMES,
     REFERENCE_STATES,
     STATE_NAMES,
     STATE_UNITS,
     Array,
     make_state,
-    read_only,
 )
 
 
@@ -98,13 +96,6 @@ def test_euler_rates_are_the_slopes_of_the_angles(euler: Array, body: Array) -> 
     np.testing.assert_allclose(body_to_euler_rates(euler, body), slope, rtol=1e-4, atol=1e-4)
 
 
-def test_at_hover_both_sets_of_rates_are_equal_and_only_there() -> None:
-    """Sec. 2.2 takes one for the other."""
-    body = np.array([0.1, -0.2, 0.3])
-    np.testing.assert_array_equal(body_to_euler_rates(np.zeros(3), body), body)
-    assert np.abs(body_to_euler_rates(np.array([0.3, 0.3, 0.0]), body) - body).max() > 0.05
-
-
 def test_leading_dimensions_are_preserved() -> None:
     euler = np.random.default_rng(0).uniform(-1.0, 1.0, (4, 5, 3))
     assert body_to_world(euler).shape == (4, 5, 3, 3)
@@ -122,15 +113,3 @@ def test_yaw_is_unwrapped_along_a_flight() -> None:
     physics = np.zeros((200, 14))
     physics[:, 4:8] = euler_to_quaternion(np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1))
     np.testing.assert_allclose(physics_to_state(physics)[:, INDEX["yaw"]], yaw, atol=1e-9)
-
-
-def test_a_state_at_rest() -> None:
-    state = make_state(position=(1.0, 2.0, 3.0), euler=(0.1, 0.2, 0.3))
-    assert state.shape == (N_STATES,)
-    assert state.tolist() == [1.0, 0.0, 2.0, 0.0, 3.0, 0.0, 0.1, 0.0, 0.2, 0.0, 0.3, 0.0]
-
-
-def test_what_is_read_only_cannot_be_written() -> None:
-    array = read_only(np.zeros(3))
-    with pytest.raises(ValueError, match="read-only"):
-        array[0] = 1.0
