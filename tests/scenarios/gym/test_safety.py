@@ -21,22 +21,15 @@ sys.path.insert(0, str(ROOT / "examples"))
 from safety_filter import filtered_air  # noqa: E402
 
 
-def random_episode(env: gymnasium.Env[Any, Any], seed: int) -> tuple[list[dict[str, Any]], bool]:
-    env.reset(seed=seed)
-    env.action_space.seed(seed)
-    infos, ended = [], False
-    while not ended:
-        _, _, terminated, truncated, info = env.step(env.action_space.sample())
-        infos.append(info)
-        ended = terminated or truncated
-    return infos, terminated
-
-
-def test_a_random_agent_holds_five_degrees_of_tilt_behind_it_and_crashes_without() -> None:
+def test_a_random_agent_holds_five_degrees_of_tilt_behind_it() -> None:
+    """Which it does not without: tests/test_learning_examples.py."""
     scenario = filtered_air("turbulence").replace({"duration": 5.0})
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(scenario))
-    infos, terminated = random_episode(env, seed=0)
-    assert not terminated
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    steps = [env.step(env.action_space.sample()) for _ in range(100)]
+    assert [step[2:4] for step in steps] == [(False, False)] * 99 + [(False, True)]
+    infos: list[dict[str, Any]] = [step[4] for step in steps]
     assert min(info["margins"]["tilt"] for info in infos) >= 0.0
     stepped_in = [info["filter"]["intervened"] for info in infos]
     assert 0 < sum(stepped_in) < len(infos) == env.steps
@@ -44,9 +37,6 @@ def test_a_random_agent_holds_five_degrees_of_tilt_behind_it_and_crashes_without
     assert all((info["filter"]["correction"] > 0.0) == info["filter"]["intervened"] for info in infos)
     status = env.unwrapped.flight().log.control.status
     assert [each != "unconstrained" for each in status] == stepped_in
-    infos, terminated = random_episode(quadsim.gym.make_env(scenario), seed=0)
-    assert terminated
-    assert "tilted" in infos[-1]["reason"]
 
 
 def test_what_is_safe_passes_to_the_bit() -> None:
