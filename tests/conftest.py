@@ -174,19 +174,3 @@ def constrained_flight(fly_once: Fly) -> Flight:
 def unconstrained_flight(fly_once: Fly) -> Flight:
     """The paper's whole unconstrained flight."""
     return fly_once("paper-unconstrained")
-
-
-ARM_LENGTHS, DRAGS = (0.2, 0.3, 0.5), (0.012, 0.024, 0.048)  # L and d/b [m]; the paper gives none
-
-
-@pytest.fixture(scope="session")
-def varied_flights(fly_once: Fly, vehicle: Vehicle) -> dict[tuple[float, float], Flight]:
-    """The constrained flight over arm length [m] and drag to thrust [m], which the paper leaves out."""
-    own = (vehicle.arm_length, vehicle.drag_to_thrust)
-    return {
-        (arm, drag): fly_once("paper-constrained")
-        if (arm, drag) == own
-        else fly_once("paper-constrained", f"vehicle.arm_length={arm}", f"vehicle.drag_to_thrust={drag}")
-        for arm in (0.2, 0.3, 0.5)
-        for drag in (0.012, 0.024, 0.048)
-    }
