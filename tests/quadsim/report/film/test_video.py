@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import warnings
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,7 @@ import pytest
 
 from quadsim.errors import FileError, OutputError, RenderingUnavailableError
 from quadsim.flight.audit import Limit, audit
-from quadsim.flight.parquet import write_log
 from quadsim.flight.rundir import Run
-from quadsim.outputs import amend
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
 from quadsim.report.film.frames import make_footage
@@ -28,6 +26,9 @@ from quadsim.report.film.painter import RED
 from quadsim.report.film.video import render_gif, render_video, rendering_backend
 from quadsim.rotation import body_to_world
 from quadsim.state import EULER, INDEX, POSITION
+from scenarios.flight import Outputs
+from scenarios.loading import load_scenario
+from scenarios.run import run_scenario
 
 
 @pytest.fixture(scope="module")
@@ -50,25 +51,6 @@ def decode(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
         frames = iio.imread(path, plugin="FFMPEG")
         gc.collect()
     return frames, meta
-
-
-def lost_at_once(run: Run, directory: Path, periods: int) -> Path:
-    """A run of one control period or none, its plant far away."""
-    directory.mkdir()
-    control, timing, plant = run.log.control, run.log.timing, run.log.plant
-    head = {f.name: getattr(control, f.name) for f in fields(control) if f.name != "speeds_before"}
-    last = 1 + 10 * periods
-    log = replace(
-        run.log,
-        control=replace(control, **{name: column[:periods] for name, column in head.items() if column is not None}),
-        timing=replace(timing, **{name: getattr(timing, name)[:periods] for name in ("t", "solve_ms", "step_ms")}),
-        plant=replace(plant, t=plant.t[:last], state=1e5 * plant.state[:last], speeds=plant.speeds[:last]),
-        predicted=None,
-        reason="lost on purpose",
-    )
-    write_log(directory, log, plant_stride=1, metadata={})
-    amend(directory, {**run.summary, "status": "aborted", "reason": log.reason})
-    return directory
 
 
 def test_the_film_has_the_frames_requested(
@@ -103,16 +85,17 @@ def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path) 
     assert (tmp_path / "film.gif").stat().st_size < 200_000
 
 
-def test_a_flight_of_one_period_that_is_lost_far_away_can_be_filmed(
-    backend: str, short_run: Run, tmp_path: Path
+def test_a_flight_of_one_period_far_away_can_be_filmed_and_of_none_cannot(
+    backend: str, empty_run: Run, tmp_path: Path
 ) -> None:
-    directory = lost_at_once(short_run, tmp_path / "aborted", 1)
-    render_video(directory, tmp_path / "film.mp4", width=320, height=180, fps=10, workers=1)
+    far = load_scenario("paper-constrained", ["duration=0.05", "initial.position=[9e3, -9e3, 9e3]", "constraints=[]"])
+    run_scenario(far, tmp_path / "far", Outputs(video=False, recording=False, figures=False))
+    render_video(tmp_path / "far", tmp_path / "film.mp4", width=320, height=180, fps=10, workers=1)
     frames, _ = decode(tmp_path / "film.mp4")
     assert frames.shape == (1, 180, 320, 3)
     assert frames.mean() > 30.0
     with pytest.raises(FileError, match="nothing to film"):
-        render_video(lost_at_once(short_run, tmp_path / "empty", 0), tmp_path / "none.mp4")
+        render_video(empty_run.directory, tmp_path / "none.mp4")
     assert not (tmp_path / "none.mp4").exists()
 
 
