@@ -243,25 +243,6 @@ def test_a_flight_without_predictions_or_finite_end_is_recorded(
     assert np.isfinite(layout._overview(run)).all()
 
 
-def test_the_layout_is_inside_and_shows_only_what_exists(content: Content, short_run: Run) -> None:
-    (blueprint,) = content.reader.blueprints()
-    batches = [chunk.to_record_batch() for chunk in content.reader.stream(store=blueprint).to_chunks()]
-    shown = {
-        query.lstrip("+ ")
-        for batch in batches
-        for name in batch.schema.names
-        if name == "ViewContents:query"
-        for row in batch.column(name).to_pylist()
-        for query in row
-    }
-    unreached = {limit.name for limit in short_run.limits if limit.start > short_run.log.control.t[-1]}
-    for query in shown:
-        prefix = "/" + query.strip("/").removesuffix("/**")
-        known = any(entity.startswith(prefix) for entity in content.entities)
-        assert known or query.startswith("$origin") or prefix.split("/")[-1] in unreached, query
-    assert {f"signals/{name}" for name in SIGNALS} <= {query.lstrip("/") for query in shown}
-
-
 def test_the_viewer_is_given_the_file_and_listens_to_this_machine_alone(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
