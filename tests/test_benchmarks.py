@@ -16,11 +16,14 @@ from quadsim.report.film.video import rendering_backend
 ROOT = Path(__file__).parent.parent
 
 
+def script(*command: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True)
+
+
 def quick(name: str, tmp_path: Path) -> list[dict[str, Any]]:
     """The records of a benchmark, whose table has to show each."""
     file = tmp_path / f"{name}.json"
-    command = [sys.executable, f"benchmarks/{name}.py", "--quick", "--json", str(file)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = script(f"benchmarks/{name}.py", "--quick", "--json", file)
     assert done.returncode == 0, done.stderr
     written = json.loads(file.read_text())
     assert written["machine"]
@@ -76,8 +79,7 @@ def test_nonlinear_mpc_follows_where_lqr_does_not(tmp_path: Path) -> None:
 
 
 def test_wrong_input_is_one_message(tmp_path: Path) -> None:
-    command = [sys.executable, "benchmarks/solvers.py", "--scenario", "hover-pid", "--json", str(tmp_path / "out.json")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = script("benchmarks/solvers.py", "--scenario", "hover-pid", "--json", tmp_path / "out.json")
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "out.json").exists()
@@ -85,8 +87,7 @@ def test_wrong_input_is_one_message(tmp_path: Path) -> None:
 
 def test_the_example_of_what_constraints_cost_runs(tmp_path: Path) -> None:
     picture = tmp_path / "cost.png"
-    command = [sys.executable, "examples/constraint_cost.py", str(picture), "2.0"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = script("examples/constraint_cost.py", picture, "2.0")
     assert done.returncode == 0, done.stderr
     assert "inf" in done.stdout
     assert picture.is_file()

@@ -5,9 +5,6 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
-import subprocess
-import time as clock
-from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,26 +22,12 @@ from scenarios.loading import load_scenario
 from scenarios.run import run_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
-SHORT = ("--set", "duration=1.0", "--set", "controller.horizon=5")
+CAMPAIGN = ("--set", "duration=1.0", "--set", "constraints=[]", "--flights", "2", "--no-report")
 ADDED = {
     "run": ("--no-video", "--set", "duration=2.0", "--set", "constraints=[]", "--overwrite"),
     "compare": ("--overwrite",),
-    "bench solvers": (*SHORT, "--repeats", "1", "--horizons", "none"),
-    "bench flight": (*SHORT, "--repeats", "1"),
-    "bench render": (*SHORT, "--seconds", "0.2"),
-    "bench ladder": ("--set", "controller.horizon=5"),
     "export": ("--set", "duration=1.0"),
-    "campaign": (
-        "--set",
-        "duration=1.0",
-        "--set",
-        "constraints=[]",
-        "--flights",
-        "2",
-        "--no-report",
-        "--out",
-        "campaign",
-    ),
+    "campaign": (*CAMPAIGN, "--out", "campaign"),
     "tune": ("--no-report",),
     "live": ("--script", "push.toml"),
     "replay": ("--no-video", "--no-recording", "--no-figures"),
@@ -71,20 +54,6 @@ def arguments_of(line: str) -> list[str]:
     """A command line's words after the command itself, without its comment and where its output goes."""
     words = shlex.split(line, comments=True)[1:]
     return words[: words.index(">")] if ">" in words else words
-
-
-def promised_file(options: Namespace) -> Path | None:
-    """What a command writes, as the documents show it."""
-    match options.command:
-        case "run":
-            return Path(options.out or f"runs/{options.scenario}") / "summary.json"
-        case "check":
-            return Path(options.junit)
-        case "compare":
-            return Path(options.out) / "index.html"
-        case "video":
-            return Path(options.run) / "flight.mp4"
-    return None
 
 
 @pytest.fixture
@@ -131,7 +100,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("campaign") / "paper-robustness"
     with pytest.MonkeyPatch.context() as patch:
         fly_here(patch)
-        assert main(["campaign", "paper-robustness", *ADDED["campaign"][:-1], str(directory)]) == EXIT_DONE
+        assert main(["campaign", "paper-robustness", *CAMPAIGN, "--out", str(directory)]) == EXIT_DONE
     return directory
 
 
@@ -150,12 +119,9 @@ def test_documented_command_runs(line: str, capsys: pytest.CaptureFixture[str]) 
             rendering_backend()
         except RenderingUnavailableError as error:
             pytest.skip(str(error))
-    started = clock.time()
     unsupported = "--require" in arguments  # by so few flights
     assert main([*arguments, *ADDED.get(command, ())]) == (EXIT_FAILED if unsupported else EXIT_DONE)
     assert capsys.readouterr().out
-    promised = promised_file(make_parser().parse_args(arguments))
-    assert promised is None or promised.stat().st_mtime >= started - 0.1
 
 
 def test_documented_make_targets_exist() -> None:
@@ -167,11 +133,6 @@ def test_documented_make_targets_exist() -> None:
     }
     named = blocks | set(re.findall(r"`make ([a-z-]+)", DOCUMENTS))
     assert {"demo", "test", "setup", "check", "numbers"} <= named
-    output = subprocess.run(
-        ["make", "--no-print-directory", "help"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    offered = re.findall(r"^make ([\w-]+) +\S", output.stdout, re.MULTILINE)
     phony = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert phony is not None
-    assert sorted(offered) == sorted(phony[1].split())
-    assert named <= set(offered)
+    assert named <= set(phony[1].split())

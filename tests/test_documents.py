@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,10 @@ from scenarios.loading import load_scenario
 from scenarios.run import fly_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCKS = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+PYTHON = {page: blocks for page in PAGES if (blocks := BLOCKS.findall(page.read_text(encoding="utf-8")))}
+"""Pages with examples in Python."""
 MADE = {"gallery.md"}
 """Pages that `make docs` makes."""
 ENTRY_POINTS = {"quadsim.controllers"}
@@ -45,15 +50,22 @@ def test_tables_of_golden_numbers_are_filled(document: str) -> None:
     assert remake.filled(text)[0] == text, f"{document} is out of date: make numbers"
 
 
-def test_every_table_that_is_filled_has_its_columns() -> None:
-    """Every block of a page is known, and a page without its files stays as it is."""
-    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
-    blocks = [block for page in pages for block in remake.BLOCK.findall(page.read_text(encoding="utf-8"))]
-    opened = sum(page.read_text(encoding="utf-8").count("filled by docs/remake.py from") for page in pages)
+def test_every_table_that_is_filled_is_known_and_stays_where_its_file_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocks = [block for page in PAGES for block in remake.BLOCK.findall(page.read_text(encoding="utf-8"))]
+    opened = sum(page.read_text(encoding="utf-8").count("filled by docs/remake.py from") for page in PAGES)
     assert len(blocks) == opened
     assert {name for name, _, _ in blocks} == set(remake.TABLES)
-    page = "before\n<!-- peers: filled by docs/remake.py from no/such.json -->\nold\n<!-- peers end -->\nafter"
-    assert remake.filled(page) == (page, ["no/such.json"])
+    monkeypatch.setattr(remake, "ROOT", tmp_path)
+    page = "before\n<!-- solvers: filled by docs/remake.py from made.json -->\nold\n<!-- solvers end -->\nafter\n"
+    assert remake.filled(page) == (page, ["made.json"])
+    rows = [{"solver": "piqp", "p50_ms": 0.12345}, {"solver": "osqp", "p50_ms": None}]
+    (tmp_path / "made.json").write_text(json.dumps({"machine": "fast", "records": rows}))
+    text, missing = remake.filled(page)
+    assert missing == []
+    assert "| solver | p50 ms |\n| --- | --- |\n| piqp | 0.123 |\n| osqp | - |\n" in text
+    assert (text[:7], text[-7:]) == ("before\n", "\nafter\n")
 
 
 def test_the_examples_in_the_page_on_effects_are_a_scenario(tmp_path: Path) -> None:
@@ -72,44 +84,33 @@ def test_the_examples_in_the_page_on_effects_are_a_scenario(tmp_path: Path) -> N
     assert log.predicted.shape[1] == 30
 
 
-def test_documents_link_to_files_that_exist() -> None:
-    for document in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
-        for target in re.findall(r"\]\(([^)#]+)\)", document.read_text(encoding="utf-8")):
+def test_documents_link_to_files_that_exist_and_the_site_has_every_page() -> None:
+    pages = [*(ROOT / "docs").glob("*.md")]
+    for document in [*ROOT.glob("*.md"), *pages]:
+        text = document.read_text(encoding="utf-8")
+        for target in re.findall(r"\]\(([^)#]+)\)", text):
             if "://" not in target and target not in MADE:
                 assert (document.parent / target).exists(), f"{document.name} links to {target}"
-
-
-def test_pages_of_the_site_link_to_its_pages_alone() -> None:
-    """What is in the repository and not on the site is named, not linked."""
-    for document in (ROOT / "docs").glob("*.md"):
-        assert "](../" not in document.read_text(encoding="utf-8"), document.name
-
-
-def test_the_site_has_every_page() -> None:
+        assert document not in pages or "](../" not in text, "what is in the repository alone is named, not linked"
     site = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    pages = {path.name for path in (ROOT / "docs").glob("*.md")} | MADE
-    assert set(re.findall(r"[a-z-]+\.md", site)) == pages
+    assert set(re.findall(r"[a-z-]+\.md", site)) == {path.name for path in pages} | MADE
 
 
 @pytest.mark.usefixtures("campaigns_here")
-@pytest.mark.parametrize("document", ["../README.md", *sorted(path.name for path in (ROOT / "docs").glob("*.md"))])
-def test_python_on_the_pages_runs(document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("document", PYTHON, ids=lambda path: path.name)
+def test_python_on_the_pages_runs(document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The blocks of a page in their order, as the notebook that it is too."""
     mpl.use("Agg")
     monkeypatch.chdir(tmp_path)
-    text = (ROOT / "docs" / document).read_text(encoding="utf-8")
     module = ModuleType("page")
-    for block in re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+    for block in PYTHON[document]:
         exec(compile(block, document, "exec"), module.__dict__)
 
 
-@pytest.mark.parametrize(
-    "document", ["CONTRIBUTING.md", "README.md", *sorted(p.name for p in (ROOT / "docs").glob("*.md"))]
-)
-def test_documents_name_what_exists(document: str) -> None:
+def test_documents_name_what_exists() -> None:
     """Every dotted name of a package in backticks is a module, or something in one."""
-    page = next(path for path in (ROOT / document, ROOT / "docs" / document) if path.exists())
-    named = set(re.findall(r"`((?:mpc|quadsim|scenarios)(?:\.[A-Za-z_]+)+)`", page.read_text(encoding="utf-8")))
-    assert document != "equations.md" or len(named) > 40
+    pages = (path.read_text(encoding="utf-8") for path in [*PAGES, ROOT / "CONTRIBUTING.md"])
+    named = {name for text in pages for name in re.findall(r"`((?:mpc|quadsim|scenarios)(?:\.[A-Za-z_]+)+)`", text)}
+    assert len(named) > 60
     for name in sorted(named - ENTRY_POINTS):
         resolve_name(name)

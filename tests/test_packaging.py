@@ -13,7 +13,6 @@ import tarfile
 import tomllib
 import venv
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -25,27 +24,18 @@ PACKAGES = ("quadsim", "mpc", "scenarios")
 DATA = ("*.py", "py.typed", "*.toml", "*.csv", "*.xml", "*.j2", "*.css", "*.js", "export/c/*")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Archives:
-    """What a build made."""
-
-    wheel: Path
-    sdist: Path
-
-
 @pytest.fixture(scope="module")
-def archives(tmp_path_factory: pytest.TempPathFactory) -> Archives:
-    """The source archive, and the wheel built from that archive, not from the checkout."""
+def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With the source archive, and the wheel built from that archive, not from the checkout."""
     directory = tmp_path_factory.mktemp("dist")
     command: list[str | Path] = [sys.executable, "-m", "build", "--no-isolation", "--outdir", directory, ROOT]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    (wheel,), (sdist,) = directory.glob("*.whl"), directory.glob("*.tar.gz")
-    return Archives(wheel=wheel, sdist=sdist)
+    return directory
 
 
 @pytest.fixture(scope="module")
-def installed(archives: Archives, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(dist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """`bin` of an environment with the wheel in it, and of this one's packages all but the checkout.
 
     The packages come from a path file, which is read without the path files beside them: no editable install follows.
@@ -54,7 +44,7 @@ def installed(archives: Archives, tmp_path_factory: pytest.TempPathFactory) -> P
     venv.create(home)
     python = home / "bin" / "python"
     command: list[str | Path] = [sys.executable, "-m", "pip", "--python", python, "install", "--no-index", "--no-deps"]
-    subprocess.run([*command, archives.wheel], check=True, capture_output=True)
+    subprocess.run([*command, *dist.glob("*.whl")], check=True, capture_output=True)
     (site,) = home.glob("lib/python*/site-packages")
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
     return home / "bin"
@@ -68,19 +58,21 @@ def run_alone(command: list[str | Path], directory: Path) -> str:
     return done.stdout
 
 
-def test_wheel_holds_every_file_of_the_packages(archives: Archives) -> None:
+def test_wheel_holds_every_file_of_the_packages(dist: Path) -> None:
     files = {path for package in PACKAGES for pattern in DATA for path in (ROOT / package).rglob(pattern)}
     expected = {path.relative_to(ROOT).as_posix() for path in files}
     expected |= {f"quadsim/models/{path.name}" for path in (ROOT / "models").iterdir()}
-    with zipfile.ZipFile(archives.wheel) as wheel:
+    (file,) = dist.glob("*.whl")
+    with zipfile.ZipFile(file) as wheel:
         held = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert held == expected
     assert {"quadsim/models/quadrotor.xml", "quadsim/py.typed", "scenarios/library/hover.toml"} <= held
     assert any(name.startswith("quadsim/report/templates/") for name in held)
 
 
-def test_source_archive_can_be_built_and_tested_from(archives: Archives) -> None:
-    with tarfile.open(archives.sdist) as sdist:
+def test_source_archive_can_be_built_and_tested_from(dist: Path) -> None:
+    (file,) = dist.glob("*.tar.gz")
+    with tarfile.open(file) as sdist:
         held = {name.partition("/")[2] for name in sdist.getnames()}
     assert {"Makefile", "constraints.txt", "README.md", "LICENSE", "CITATION.cff", "tests/conftest.py"} <= held
     assert {".ci/run", "tests/peers/conftest.py", "docs/remake.py", "docs/verification.md"} <= held
@@ -108,7 +100,7 @@ def test_wheel_flies_alone(installed: Path, tmp_path: Path) -> None:
     assert (tmp_path / "page" / "index.html").is_file()
 
 
-def test_version_is_the_same_everywhere(archives: Archives) -> None:
+def test_version_is_the_same_everywhere(dist: Path) -> None:
     printed = subprocess.run(
         [sys.executable, "-m", "scenarios.cli", "--version"], cwd=ROOT, capture_output=True, text=True
     )
@@ -117,7 +109,7 @@ def test_version_is_the_same_everywhere(archives: Archives) -> None:
     assert changes is not None
     assert citation is not None
     assert printed.stdout.strip() == f"quadsim {__version__}"
-    assert archives.wheel.name == f"quadsim-{__version__}-py3-none-any.whl"
+    assert [file.name for file in dist.glob("*.whl")] == [f"quadsim-{__version__}-py3-none-any.whl"]
     assert (changes[1], citation[1]) == (__version__, __version__)
 
 

@@ -50,19 +50,6 @@ def report(_: object) -> dict[str, Any]:
     return {"folder": str(Path.cwd()), "threads": os.environ["OMP_NUM_THREADS"]}
 
 
-class Unwelcome:
-    """Something that flies, but that no worker can load."""
-
-    def __call__(self, flight: object) -> dict[str, Any]:
-        return {}
-
-    def __setstate__(self, state: object) -> None:
-        raise RuntimeError("not here")
-
-    def __getstate__(self) -> object:
-        return "a state"
-
-
 def _raises() -> NoReturn:
     raise ZeroDivisionError("of its\n own")
 

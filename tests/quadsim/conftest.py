@@ -1,11 +1,13 @@
-"""Runs made from the short flight, for what is drawn and written from runs."""
+"""Flights that ended early, for what is drawn and written from runs."""
 
 import dataclasses
 
 import pytest
 
-from quadsim.flight.log import ControlLog, TimingLog
-from quadsim.flight.rundir import Run
+from quadsim.flight.rundir import Run, load_run
+from scenarios.flight import Outputs
+from scenarios.loading import load_scenario
+from scenarios.run import run_scenario
 
 
 @pytest.fixture(scope="session")
@@ -17,34 +19,8 @@ def aborted_run(short_run: Run) -> Run:
 
 
 @pytest.fixture(scope="session")
-def empty_run(short_run: Run) -> Run:
+def empty_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A flight that ended before its first period was over: no numbers, no constraints reached."""
-
-    def head(log: ControlLog | TimingLog, *whole: str) -> dict[str, object]:
-        columns = {field.name: getattr(log, field.name) for field in dataclasses.fields(log) if field.name not in whole}
-        return {name: column[:0] for name, column in columns.items() if column is not None}
-
-    log = dataclasses.replace(
-        short_run.log,
-        control=dataclasses.replace(short_run.log.control, **head(short_run.log.control, "speeds_before")),
-        timing=dataclasses.replace(short_run.log.timing, **head(short_run.log.timing)),
-        plant=short_run.log.plant.every(short_run.log.plant.t.size),
-        predicted=None,
-        reason="at t = 0.000 s: the command is not finite",
-    )
-    unreached = {"peak_sampled": None, "peak_plant": None, "worst_margin_sampled": None, "worst_margin": None}
-    summary = {
-        **short_run.summary,
-        "scenario": "ended-at-once",
-        "status": "aborted",
-        "reason": log.reason,
-        "duration": 0.0,
-        "tracking": {},
-        "control": {},
-        "controller": {"name": "constrained", "solver": "piqp-multistage", "horizon": 50},
-        "constraints": [
-            {**entry, **unreached, "worst_time": None, "time_violated": 0.0, "satisfied": False}
-            for entry in short_run.summary["constraints"]
-        ],
-    }
-    return dataclasses.replace(short_run, summary=summary, log=log)
+    directory, tables = tmp_path_factory.mktemp("empty") / "run", Outputs(video=False, recording=False, figures=False)
+    run_scenario(load_scenario("paper-constrained", ["initial.euler=[60, 0, 0]"]), directory, tables)
+    return load_run(directory)

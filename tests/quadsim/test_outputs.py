@@ -44,9 +44,6 @@ def output(tmp_path: Path) -> Path:
     return tmp_path / "place" / "run"
 
 
-# --- a new one -----------------------------------------------------------------------------------------------------
-
-
 def test_a_directory_lists_its_files_with_their_digests(output: Path) -> None:
     files = json.loads((output / "summary.json").read_text())["files"]
     assert files == {
@@ -85,9 +82,6 @@ def test_paths_are_absolute_and_home_is_expanded(tmp_path: Path, monkeypatch: py
     for odd in ("loop", "a\0b"):
         with pytest.raises(OutputError):
             absolute(odd)
-
-
-# --- what is there -------------------------------------------------------------------------------------------------
 
 
 def test_what_is_there_is_refused_and_stays(output: Path) -> None:
@@ -147,9 +141,6 @@ def test_what_comes_in_while_it_is_made_stays_and_so_does_what_was_made(output: 
     assert (Path(caught.value.problem.rpartition(" ")[2]) / "new").read_text() == "new"
 
 
-# --- adding, and single files --------------------------------------------------------------------------------------
-
-
 def test_what_is_added_is_listed_and_nothing_is_where_it_fails(output: Path) -> None:
     before = tree(output.parent)
     with pytest.raises(KeyboardInterrupt):
@@ -174,9 +165,6 @@ def test_a_file_is_written_whole_and_replaced_only_on_request(tmp_path: Path) ->
     with writing_file(path, overwrite=True) as new:
         new.write_text("two")
     assert tree(tmp_path) == {"film.mp4": b"two"}
-
-
-# --- growing -------------------------------------------------------------------------------------------------------
 
 
 def test_a_directory_grows_in_place_and_ends_with_its_list(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Unit quaternions, against SciPy."""
+"""Attitudes: Euler angles, their rates and unit quaternions, against SciPy and finite differences."""
 
 from __future__ import annotations
 
@@ -12,24 +12,103 @@ from scipy.spatial.transform import Rotation
 
 from quadsim.rotation import (
     Vector,
+    body_rates_of,
+    body_to_euler_rates,
+    body_to_world,
     conjugate,
+    euler_to_body_rates,
     euler_to_quaternion,
     exponential,
     logarithm,
     multiply,
     normalise,
     of_euler,
+    quaternion_to_euler,
 )
+from quadsim.sim.physics import physics_to_state
+from quadsim.state import EULER_RATE, INDEX, REFERENCE_NAMES, REFERENCE_STATES, STATE_NAMES, Array, make_state
 
+
+def attitudes(largest_pitch: float) -> st.SearchStrategy[Array]:
+    """Roll, pitch, yaw [rad] short of the ends of their ranges."""
+    turn = st.floats(-3.14, 3.14)
+    return st.tuples(turn, st.floats(-largest_pitch, largest_pitch), turn).map(np.array)
+
+
+rates = st.tuples(*[st.floats(-10.0, 10.0)] * 3).map(np.array)
 vectors = st.tuples(*[st.floats(-1.8, 1.8)] * 3)
 """Rotation vectors no longer than pi."""
+
+
+def test_the_state_is_that_of_the_paper() -> None:
+    assert " ".join(STATE_NAMES) == "x vx y vy z vz roll roll_rate pitch pitch_rate yaw yaw_rate"
+    assert [STATE_NAMES[i] for i in REFERENCE_STATES] == list(REFERENCE_NAMES)
+    assert {name: STATE_NAMES.index(name) for name in STATE_NAMES} == INDEX
+
+
+@given(euler=attitudes(1.57))
+def test_euler_angles_and_rotations_are_those_of_scipy(euler: Array) -> None:
+    expected = Rotation.from_euler("ZYX", euler[::-1])
+    np.testing.assert_allclose(body_to_world(euler), expected.as_matrix(), atol=1e-14)
+    quaternion = euler_to_quaternion(euler)
+    assert abs(quaternion @ expected.as_quat(scalar_first=True)) == pytest.approx(1.0, abs=1e-14)  # q or -q
+    np.testing.assert_allclose(of_euler(*euler), quaternion, atol=1e-15)
+
+
+@given(euler=attitudes(1.5), body=rates)
+def test_euler_angles_and_rates_come_back(euler: Array, body: Array) -> None:
+    for sign in (1.0, -1.0):
+        np.testing.assert_allclose(quaternion_to_euler(sign * euler_to_quaternion(euler)), euler, atol=1e-12)
+    back = euler_to_body_rates(euler, body_to_euler_rates(euler, body))
+    np.testing.assert_allclose(back, body, atol=1e-10)
+    state = make_state(euler=(euler[0], euler[1], euler[2]))
+    state[list(EULER_RATE)] = body_to_euler_rates(euler, body)
+    np.testing.assert_allclose(body_rates_of(state.tolist()), back, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("pitch", [90.0, -90.0])
+def test_straight_up_and_down_give_a_pitch_and_no_nan(pitch: float) -> None:
+    euler = quaternion_to_euler(euler_to_quaternion(np.radians([0.0, pitch, 0.0])))
+    assert np.degrees(euler[1]) == pytest.approx(pitch, abs=1e-5)
+    assert np.all(np.isfinite(euler))
+
+
+@given(euler=attitudes(1.0), body=rates)
+def test_euler_rates_are_the_slopes_of_the_angles(euler: Array, body: Array) -> None:
+    """Turn by +-dt about the body rates and take the difference."""
+    dt = 1e-5
+    rotation = Rotation.from_euler("ZYX", euler[::-1])
+    ahead, behind = (
+        quaternion_to_euler((rotation * Rotation.from_rotvec(sign * dt * body)).as_quat(scalar_first=True))
+        for sign in (1.0, -1.0)
+    )
+    difference = ahead - behind
+    slope = (difference - 2.0 * np.pi * np.round(difference / (2.0 * np.pi))) / (2.0 * dt)
+    np.testing.assert_allclose(body_to_euler_rates(euler, body), slope, rtol=1e-4, atol=1e-4)
+
+
+def test_leading_dimensions_are_preserved() -> None:
+    euler = np.random.default_rng(0).uniform(-1.0, 1.0, (4, 5, 3))
+    np.testing.assert_allclose(quaternion_to_euler(euler_to_quaternion(euler)), euler)
+    for row in np.ndindex(4, 5):
+        np.testing.assert_array_equal(body_to_world(euler)[row], body_to_world(euler[row]))
+        np.testing.assert_array_equal(
+            body_to_euler_rates(euler, euler)[row], body_to_euler_rates(euler[row], euler[row])
+        )
+
+
+def test_yaw_is_unwrapped_along_a_flight() -> None:
+    yaw = np.linspace(0.0, 6.0 * np.pi, 200)
+    physics = np.zeros((200, 14))
+    physics[:, 4:8] = euler_to_quaternion(np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1))
+    np.testing.assert_allclose(physics_to_state(physics)[:, INDEX["yaw"]], yaw, atol=1e-9)
 
 
 @given(a=vectors, b=vectors)
 def test_products_are_those_of_scipy(a: Vector, b: Vector) -> None:
     expected = (Rotation.from_rotvec(a) * Rotation.from_rotvec(b)).as_quat(scalar_first=True)
     found = np.array(multiply(exponential(a), exponential(b)))
-    assert abs(found @ expected) == pytest.approx(1.0, abs=1e-14)  # q and -q are one rotation
+    assert abs(found @ expected) == pytest.approx(1.0, abs=1e-14)
 
 
 @given(vector=vectors)
@@ -50,11 +129,6 @@ def test_a_rotation_and_its_conjugate_cancel(a: Vector) -> None:
     q = exponential(a)
     assert multiply(q, conjugate(q)) == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-15)
     assert normalise((3.0 * q[0], 3.0 * q[1], 3.0 * q[2], 3.0 * q[3])) == pytest.approx(q, abs=1e-15)
-
-
-@given(euler=st.tuples(*[st.floats(-3.2, 3.2)] * 3))
-def test_euler_angles_are_those_of_the_state(euler: Vector) -> None:
-    np.testing.assert_allclose(of_euler(*euler), euler_to_quaternion(np.array(euler)), atol=1e-15)
 
 
 @given(vectors=st.lists(st.tuples(vectors, vectors), min_size=1, max_size=4))

@@ -20,7 +20,6 @@ from quadsim.space import (
     Corridor,
     Cylinder,
     Fence,
-    Obstacle,
     Place,
     Solids,
     Sphere,
@@ -32,7 +31,6 @@ from quadsim.space import (
 from quadsim.state import Array
 
 STILL = np.zeros(1)
-SPACING = 0.04
 numbers, lengths = st.floats(-2.0, 2.0), st.floats(0.2, 2.0)
 vectors = st.tuples(numbers, numbers, numbers)
 shared = {"name": st.just("it"), "position": vectors}
@@ -74,28 +72,6 @@ def holds(obstacle: AnyObstacle, points: Array) -> np.ndarray:
     return inside
 
 
-def surface(obstacle: AnyObstacle) -> Array:
-    """Points of the surface, none farther than `SPACING` from a point of it, by bisection along a grid's lines."""
-    reach = 0.5 * np.linalg.norm(getattr(obstacle, "size", getattr(obstacle, "axis", (0.0,)))) + 0.2
-    reach += getattr(obstacle, "radius", 0.0) + 0.5 * getattr(obstacle, "height", 0.0)
-    ticks = np.arange(-reach, reach, SPACING)
-    found = []
-    for axis in range(3):
-        grid = np.stack(np.meshgrid(ticks, ticks, indexing="ij"), -1).reshape(-1, 2)
-        grid = grid[np.random.default_rng(0).permutation(len(grid))[:300]]
-        lines = np.insert(grid[:, None, :].repeat(ticks.size, 1), axis, ticks, axis=2) + obstacle.position
-        inside = holds(obstacle, lines.reshape(-1, 3)).reshape(len(grid), ticks.size)
-        i, j = np.nonzero(inside[:, 1:] != inside[:, :-1])
-        low, high = lines[i, j].copy(), lines[i, j + 1].copy()
-        state = inside[i, j]
-        for _ in range(20):
-            middle = 0.5 * (low + high)
-            same = holds(obstacle, middle) == state
-            low[same], high[~same] = middle[same], middle[~same]
-        found.append(low)
-    return np.concatenate(found)
-
-
 @settings(max_examples=60, deadline=None)
 @given(obstacle=obstacles, points=st.lists(vectors, min_size=4, max_size=4))
 def test_the_nearest_point_is_of_the_surface(obstacle: AnyObstacle, points: list[tuple[float, float, float]]) -> None:
@@ -113,41 +89,24 @@ def test_the_nearest_point_is_of_the_surface(obstacle: AnyObstacle, points: list
     assert not holds(obstacle, foot + 1e-5 * normal)[far].any()
 
 
-@settings(max_examples=25, deadline=None)
-@given(obstacle=obstacles, points=st.lists(vectors, min_size=5, max_size=5))
-def test_no_point_of_the_surface_is_nearer(obstacle: AnyObstacle, points: list[tuple[float, float, float]]) -> None:
-    p = 2.0 * np.array(points)
-    distance = obstacle.clearance(np.zeros(len(p)), p)
-    if isinstance(obstacle, Capsule):
-        along = np.linspace(-0.5, 0.5, 4001)[:, None] * np.array(obstacle.axis) + obstacle.position
-        brute = np.linalg.norm(p[:, None] - along, axis=2).min(axis=1) - obstacle.radius
-        np.testing.assert_allclose(distance, brute, atol=2e-3)
-    else:
-        brute = np.linalg.norm(p[:, None] - surface(obstacle), axis=2).min(axis=1)
-        assert (np.abs(distance) <= brute + 1e-5).all()
-
-
 @settings(max_examples=60, deadline=None)
 @given(obstacle=obstacles, point=vectors, step=vectors)
 def test_the_normal_is_the_gradient_and_the_distance_no_steeper(
     obstacle: AnyObstacle, point: tuple[float, ...], step: tuple[float, ...]
 ) -> None:
+    """As it is 0 on the surface, no point of that is nearer."""
     p, d = 2.0 * np.array([point]), np.array([step])
     before, after = (obstacle.clearance(STILL, q)[0] for q in (p, p + d))
     assert abs(after - before) <= np.linalg.norm(d) + 1e-9
     for solid in obstacle.solids:
         relative, h = p - obstacle.position, 1e-6
-        distance, normal = solid.clearance(relative)
+        normal = solid.clearance(relative)[1]
         slope = [
             (solid.clearance(relative + h * e)[0] - solid.clearance(relative - h * e)[0])[0] / (2 * h)
             for e in np.eye(3)
         ]
         if np.linalg.norm(slope) > 1.0 - 1e-6:  # else on a ridge, where it has none
             np.testing.assert_allclose(slope, normal[0], atol=1e-4)
-        if distance[0] > 0.0:  # a convex solid lies behind the plane through its nearest point
-            corners = 3.0 * np.random.default_rng(1).uniform(-1.0, 1.0, (2000, 3)) + solid.centre
-            within = corners[solid.clearance(corners)[0] <= 0.0]
-            assert ((relative - within) @ normal[0] >= distance[0] - 1e-9).all()
 
 
 @settings(max_examples=60, deadline=None)
@@ -253,8 +212,3 @@ def test_footprints_are_as_wide_as_the_solid(obstacle: AnyObstacle) -> None:
         reach = ((outline - solid.centre[:2]) @ way[:2]).max()
         assert 1e6 - gap[0] == pytest.approx(reach, abs=2e-2 * max(reach, 0.1))
     assert footprint(obstacle.solids[0], 50.0, 60.0) is None
-
-
-def test_an_obstacle_is_a_union_of_solids() -> None:
-    with pytest.raises(NotImplementedError):
-        _ = Obstacle(name="a", position=(0.0, 0.0, 0.0)).solids

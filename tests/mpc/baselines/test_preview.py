@@ -21,10 +21,6 @@ def test_a_parabola_is_differentiated_exactly(samples: int) -> None:
     assert (target.yaw, target.yaw_rate, target.yaw_acceleration) == pytest.approx((0.5, -1.0, 0.5))
 
 
-def test_three_samples_give_the_ordinary_second_difference() -> None:
-    np.testing.assert_allclose(differentiator(3, 0.1)[2], np.array([1.0, -2.0, 1.0]) / 0.01, rtol=1e-9)
-
-
 def test_a_jump_of_the_velocity_becomes_a_hump_of_its_area() -> None:
     """Summed over the flight, the acceleration fed forward is the jump; it never pulls the other way."""
     period, samples = 0.05, 10

@@ -100,14 +100,6 @@ def test_rounding_beyond_the_bounds_is_taken_away() -> None:
     assert command.plan.max() == 250.0
 
 
-def test_what_a_good_answer_plans_for_later_is_brought_into_bounds() -> None:
-    plan = np.full((30, 4), 1e300)
-    command = call(guard(Scripted({0: {"plan": plan}})))
-    assert command.fallback == 0
-    assert command.plan.max() == 250.0
-    assert np.diff(command.plan, axis=0).max() <= 5.0 + 1e-9
-
-
 @pytest.mark.parametrize("reference", [np.full((30, 4), math.nan), np.full((30, 4), 1e9), np.zeros((29, 4))])
 def test_a_reference_that_is_none_is_not_passed_on(reference: Array) -> None:
     inner = Scripted()
@@ -124,18 +116,6 @@ def test_off_its_plan_the_vehicle_is_pulled_back() -> None:
     command = call(guarded, off)
     assert command.fallback == 1
     assert (command.speeds > plan[1] + 1.0).all()  # too low: faster
-
-
-def test_what_pulls_it_back_keeps_the_bounds() -> None:
-    guarded = guard(Scripted(failing([1])))
-    before = call(guarded).speeds
-    off = np.zeros(12)
-    off[[INDEX["roll"], INDEX["roll_rate"]]] = 0.19, 0.9
-    command = call(guarded, off)
-    assert command.fallback == 1
-    steps = command.speeds - before
-    assert (steps.min(), steps.max()) == (pytest.approx(-10.0), pytest.approx(5.0))
-    assert np.diff(command.plan, axis=0).max() <= 5.0 + 1e-9
 
 
 @pytest.mark.parametrize(("channel", "value"), [("x", 0.51), ("vy", -1.1), ("roll", 0.21), ("yaw_rate", 1.1)])
@@ -194,14 +174,6 @@ def test_a_missing_measurement_is_replaced_and_then_the_controller_is_not_called
     assert call(guarded).fallback == 0
 
 
-def test_a_state_that_was_never_measured_is_not_passed_on() -> None:
-    inner = Scripted()
-    unmeasured = np.zeros(12)
-    unmeasured[0] = math.nan
-    assert call(guard(inner), unmeasured).status == "state_unknown"
-    assert not inner.calls
-
-
 @pytest.mark.parametrize("acting", [np.full(4, math.nan), np.full(3, 190.0), np.full(4, 1e7)])
 def test_an_impossible_command_in_force_is_replaced_by_its_own_last_one(acting: Array) -> None:
     inner = Scripted()
@@ -213,18 +185,15 @@ def test_an_impossible_command_in_force_is_replaced_by_its_own_last_one(acting: 
     np.testing.assert_array_equal(inner.resets[-1], model().u_bar)
 
 
-def test_steps_start_from_the_command_in_force() -> None:
-    guarded = guard(Scripted(failing(range(9))))
-    assert call(guarded, acting=np.full(4, 120.0)).speeds.tolist() == [125.0] * 4
-
-
 def test_reset_forgets_plan_and_measurements() -> None:
     guarded = guard(Scripted(failing([1, 2])))
     call(guarded)
     guarded.reset(model().u_bar)
     assert call(guarded).fallback == 2
     guarded.reset(model().u_bar)
-    assert call(guarded, np.full(12, math.nan)).status == "state_unknown"
+    unmeasured = np.zeros(12)
+    unmeasured[0] = math.nan
+    assert call(guarded, unmeasured).status == "state_unknown"
 
 
 @pytest.mark.parametrize("phase", [Phase.LANDED, Phase.CRASHED])

@@ -74,5 +74,7 @@ def test_nothing_bad_ever_leaves(steps: list[Any], hover: float) -> None:
         assert (lower <= command.speeds).all()  # as NaN is not
         assert (command.speeds <= upper).all()
         assert ((bounds().u_min <= command.plan) & (command.plan <= bounds().u_max)).all()
+        steps = np.diff(command.plan, axis=0)
+        assert ((bounds().delta_min - 1e-9 <= steps) & (steps <= bounds().delta_max + 1e-9)).all()
         assert command.fallback in {0, 1, 2, 3}
         before = command.speeds

@@ -15,14 +15,13 @@ from scripted_controller import (
     call,
     failing,
     guard,
-    level,
     model,
     pressed,
 )
 
 from mpc.answer import ActuatorBounds
 from mpc.fallback.hover import LARGEST_CLIMB, HoverLaw
-from quadsim.state import INDEX, POSITION
+from quadsim.state import INDEX
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
@@ -39,17 +38,6 @@ def test_every_level_holds_what_presses_the_vehicle(yaw: float) -> None:
     assert sorted(set(levels)) == [0, 1, 2, 3]
     assert state[INDEX["vz"]] == pytest.approx(-0.5, abs=1e-3)
     np.testing.assert_allclose(np.delete(state - at_rest(yaw), [INDEX["z"], INDEX["vz"]]), 0.0, atol=1e-3)
-
-
-def test_without_that_it_would_be_pressed_away() -> None:
-    inner = Pressed(failing(range(1, 200)))
-    inner.trim = level()
-    guarded = guard(inner)
-    guarded.reset(pressed().speeds)
-    state = at_rest(0.0)
-    for _ in range(120):
-        state = advance(state, call(guarded, state).speeds, pressed())
-    assert np.abs(state - at_rest(0.0))[list(POSITION)].max() > 1.0
 
 
 def test_height_pulls_beside_what_holds_the_vehicle() -> None:

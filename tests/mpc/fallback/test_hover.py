@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -17,16 +16,14 @@ from scripted_controller import (
     random_state,
 )
 
-from mpc.fallback.completion import StateCompletion
 from mpc.fallback.hover import (
     ACCEPTABLE,
     ACCEPTABLE_ACCELERATION,
     HoverLaw,
 )
 from mpc.heading import predict_in_heading_frame, turn
-from mpc.model import LinearModel, hover_model
+from mpc.model import hover_model
 from quadsim.assets import vehicle_path
-from quadsim.errors import ParameterError
 from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle, load_vehicle
 
@@ -90,10 +87,3 @@ def test_the_law_s_plan_is_its_closed_loop() -> None:
     assert state[INDEX["vz"]] == pytest.approx(-0.5, abs=1e-3)
     assert state[INDEX["z"]] == pytest.approx(-0.5 * 200 * PERIOD, abs=1e-2)
     np.testing.assert_allclose(np.delete(state, [INDEX["z"], INDEX["vz"]]), 0.0, atol=1e-3)
-
-
-@pytest.mark.parametrize("make", [StateCompletion, lambda other: HoverLaw(other, tilt=0.2)])
-def test_another_kind_of_model_is_refused(make: Callable[[LinearModel], object]) -> None:
-    other = LinearModel(A=np.eye(3), B=np.ones((3, 2)), u_bar=np.zeros(2), period=PERIOD)
-    with pytest.raises(ParameterError, match="must be one of 12 states and 4 inputs; got '3 states and 2 inputs'"):
-        make(other)

@@ -266,13 +266,6 @@ def test_disturbed_model_is_the_derivative_of_the_nonlinear_one_at_hover(vehicle
 # Errors
 
 
-@pytest.mark.parametrize("name", ["acceleration", "angular_acceleration", "turning"])
-@pytest.mark.parametrize("value", [-0.1, math.inf, math.nan])
-def test_settings_name_the_number_that_is_impossible(name: str, value: float) -> None:
-    with pytest.raises(ParameterError, match=rf"controller\.tightening\.{name} must be at least 0 and finite"):
-        TighteningSettings(**{name: value})
-
-
 @pytest.mark.parametrize(("name", "given"), [("angular_acceleration", 20.0), ("turning", 200.0)])
 def test_disturbances_too_large_for_the_bounds_are_refused(vehicle: Vehicle, name: str, given: float) -> None:
     """In the file's words and units: the disturbance that takes most, the output, and how much there is."""
@@ -284,32 +277,12 @@ def test_disturbances_too_large_for_the_bounds_are_refused(vehicle: Vehicle, nam
         tilt_margins(vehicle, TighteningSettings(**{name: given}))
 
 
-def test_an_output_without_a_name_is_named_by_its_row(vehicle: Vehicle) -> None:
-    """As only Python code can make one: a sum of two states."""
-    bounds = tilt_bounds()
-    C_c = bounds.C_c.copy()
-    C_c[1, 0] = 1.0
-    with pytest.raises(
-        ParameterError, match=r"^controller\.tightening\.acceleration must .* bounds on row 1 of C_c wide"
-    ):
-        margins(
-            vehicle,
-            period=PERIOD,
-            horizon=HORIZON,
-            bounds=replace(bounds, C_c=C_c),
-            settings=TighteningSettings(acceleration=50.0),
-        )
-
-
 def test_a_delay_beyond_a_period_is_reported(vehicle: Vehicle) -> None:
     with pytest.raises(ParameterError, match=r"^controller\.delay must be at most the control period of .*; got 1\.0$"):
         tilt_margins(vehicle, delay=1.0)
 
 
-def test_rotors_too_quick_to_compute_with_are_refused(vehicle: Vehicle) -> None:
-    for lag in (1e-300, 1e-9, 0.99 * SHORTEST_LAG):
-        with pytest.raises(ParameterError, match=r"controller\.rotor_lag must be 0, or at least 0\.0001 s; got"):
-            tilt_margins(vehicle, rotor_lag=lag)
+def test_the_quickest_rotors_that_are_taken_are_as_good_as_none(vehicle: Vehicle) -> None:
     quickest, none = (tilt_margins(vehicle, rotor_lag=lag) for lag in (SHORTEST_LAG, 0.0))
     np.testing.assert_allclose(quickest, none, rtol=0.01)
 

@@ -54,60 +54,13 @@ def test_a_circle_requires_the_tilt_of_its_centripetal_acceleration(vehicle: Veh
     np.testing.assert_allclose(np.linalg.norm(found.state[:, VELOCITY], axis=1), radius * rate, rtol=1e-4)
 
 
-def test_the_nose_to_the_centre_of_a_circle_is_a_pitch_alone(vehicle: Vehicle) -> None:
-    """Seen from a yaw that turns along, the attitude is constant; the body turns by the yaw rate about the vertical."""
-    radius, rate = 2.0, 1.2
-    _, found = demanded(
-        vehicle, lambda t: (radius * np.cos(rate * t), radius * np.sin(rate * t), 0.0 * t, rate * t + math.pi)
-    )
-    pitch = math.atan(radius * rate**2 / vehicle.gravity)
-    np.testing.assert_allclose(found.state[:, PITCH], pitch, rtol=2e-5)
-    np.testing.assert_allclose(found.state[:, ROLL], 0.0, atol=1e-12)
-    ixx, iyy, izz = vehicle.inertia
-    body = rate * np.array([-math.sin(pitch), 0.0, math.cos(pitch)])
-    gyroscopic = [(izz - iyy) * body[1] * body[2], (ixx - izz) * body[2] * body[0], (iyy - ixx) * body[0] * body[1]]
-    np.testing.assert_allclose(found.torque, np.tile(gyroscopic, (len(found.torque), 1)), rtol=1e-4, atol=1e-7)
-
-
-def test_a_helix_requires_no_more_tilt_than_its_circle(vehicle: Vehicle) -> None:
-    radius, rate = 2.0, 1.2
-    turn = (lambda t: radius * np.cos(rate * t), lambda t: radius * np.sin(rate * t))
-    _, level = demanded(vehicle, lambda t: (turn[0](t), turn[1](t), 0.0 * t, 0.0 * t))
-    _, climbing = demanded(vehicle, lambda t: (turn[0](t), turn[1](t), 0.7 * t, 0.0 * t))
-    np.testing.assert_allclose(climbing.speeds, level.speeds, rtol=1e-7)
-    np.testing.assert_allclose(climbing.state[:, INDEX["vz"]], 0.7, rtol=1e-9)
-
-
-def test_going_up_and_down_is_thrust_alone(vehicle: Vehicle) -> None:
-    t, found = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.5 * np.sin(2.0 * t), 0.0 * t))
-    thrust = vehicle.mass * (vehicle.gravity - 0.5 * 4.0 * np.sin(2.0 * t))
-    np.testing.assert_allclose(found.thrust, thrust, rtol=1e-4)
-    expected = np.sqrt(thrust / (4.0 * vehicle.thrust_coefficient))
-    np.testing.assert_allclose(found.speeds, np.tile(expected, (4, 1)).T, rtol=1e-4)
-
-
-def test_a_yaw_that_swings_is_the_torque_of_its_angular_acceleration(vehicle: Vehicle) -> None:
-    t, found = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.0 * t, 0.3 * np.sin(2.0 * t)))
-    np.testing.assert_allclose(found.torque[:, 2], -vehicle.inertia[2] * 1.2 * np.sin(2.0 * t), atol=1e-5)
-    np.testing.assert_allclose(found.torque[:, :2], 0.0, atol=1e-12)
-    squared = np.linalg.solve(vehicle.allocation, np.column_stack([found.thrust, found.torque]).T).T
-    np.testing.assert_allclose(found.speeds**2, squared, rtol=1e-12)
-
-
-def test_a_sway_is_the_torque_of_the_pitch_that_it_needs(vehicle: Vehicle) -> None:
-    """The pitch is atan(a_x / g), the torque I_yy times its second derivative, taken of the closed form."""
-    t, found = demanded(vehicle, lambda t: (0.2 * np.sin(2.0 * t), 0.0 * t, 0.0 * t, 0.0 * t))
-    fine = np.linspace(-0.1, 2.1, 2201)
-    pitch = np.arctan(-0.8 * np.sin(2.0 * fine) / vehicle.gravity)
-    expected = vehicle.inertia[1] * np.gradient(np.gradient(pitch, fine), fine)
-    np.testing.assert_allclose(found.torque[:, 1], np.interp(t, fine, expected), atol=1e-5)
-
-
 def test_the_thrust_along_body_z_accelerates_the_vehicle_as_required(vehicle: Vehicle) -> None:
     _, found = demanded(vehicle, winding)
     up = body_to_world(found.state[:, EULER])[:, :, 2]
     acceleration = found.thrust[:, None] / vehicle.mass * up - [0.0, 0.0, vehicle.gravity]
     np.testing.assert_allclose(acceleration, found.acceleration, atol=1e-12)
+    wrench = found.speeds**2 @ vehicle.allocation.T
+    np.testing.assert_allclose(wrench, np.column_stack([found.thrust, found.torque]), atol=1e-9)
 
 
 def test_the_torque_changes_the_angular_momentum() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadsim.errors import LostError
-from quadsim.sim.phase import CRITERIA, check_loss
+from quadsim.sim.phase import check_loss
 from quadsim.state import INDEX, Array, make_state
 
 LIMITS = {"tilt": 120.0, "distance": 100.0, "depth": 50.0, "speed": 30.0}
@@ -66,7 +66,3 @@ def test_the_reason_names_which_criterion_its_value_its_limit_and_the_time() -> 
     assert str(caught.value) == reason
     assert (caught.value.criterion, caught.value.limit, caught.value.time) == ("tilt", 120.0, 1.5)
     assert caught.value.value == pytest.approx(131.0)
-
-
-def test_every_criterion_has_its_words() -> None:
-    assert list(CRITERIA) == list(LIMITS)

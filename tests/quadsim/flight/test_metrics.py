@@ -84,15 +84,6 @@ def test_a_first_order_response_settles_after_tau_ln_20(tau: float, before: floa
     assert found == pytest.approx(expected, abs=1e-9)
 
 
-def test_an_oscillation_settles_when_its_envelope_has() -> None:
-    """The extremes of 1 - exp(-t / 2) cos(pi t), near each whole second, are within 5 % from 2 ln 20 = 5.99 s on."""
-    t = np.arange(2000) * 0.01
-    x = 1.0 - np.exp(-0.5 * t) * np.cos(np.pi * t)
-    last = t[np.abs(x - 1.0) > 0.05][-1]
-    assert 5.0 < last < 2.0 * math.log(20.0)
-    assert settled(t, x, before=0.0, after=1.0, until=20.0) == pytest.approx(last + 0.01)
-
-
 def test_an_output_that_leaves_the_band_again_has_not_settled_before() -> None:
     t = np.arange(10.0)
     x = np.array([0.0, 1.0, 1.0, 1.0, 0.9, 1.0, 1.0, 1.0, 1.0, 1.0])
@@ -101,33 +92,19 @@ def test_an_output_that_leaves_the_band_again_has_not_settled_before() -> None:
     assert settled(t, np.where(t < 9.0, x, 0.5), before=0.0, after=1.0, until=10.0) is None
 
 
-def test_the_band_is_a_share_of_the_step() -> None:
-    t = np.arange(4.0)
-    assert settled(t, np.array([0.0, 9.4, 9.6, 9.6]), before=0.0, after=10.0, until=4.0) == 2.0
-    assert settled(t, np.array([9.0, 9.4, 9.6, 9.6]), before=9.0, after=10.0, until=4.0) is None
-
-
-def test_one_sample_settles_nothing() -> None:
-    assert settled(np.zeros(1), np.zeros(1), before=1.0, after=0.0, until=40.0) is None
-
-
 def test_a_flight_that_ended_before_has_not_settled() -> None:
     t, x = np.arange(5.0), np.array([0.0, 1.0, 1.0, 1.0, 1.0])
     assert settled(t, x, before=0.0, after=1.0, until=5.0) == 1.0
     assert settled(t, x, before=0.0, after=1.0, until=6.0) is None
     assert settled(t, x, before=0.0, after=1.0, start=7.0, until=9.0) is None
     assert settled(t[:0], x[:0], before=0.0, after=1.0, until=5.0) is None
+    assert settled(t[:1], x[:1], before=1.0, after=0.0, until=40.0) is None
 
 
 def test_peak_tilt_is_the_larger_of_roll_and_pitch() -> None:
     state = np.zeros((3, 12))
     state[1, 6], state[2, 8], state[2, 10] = math.radians(3.0), math.radians(-7.0), 2.0
     assert metrics.peak_tilt(state) == pytest.approx(7.0)
-
-
-def test_percentiles() -> None:
-    values = np.arange(101.0)[::-1]
-    assert metrics.percentiles(values) == {"p50": 50.0, "p95": 95.0, "p99": 99.0, "max": 100.0}
 
 
 def test_the_controllers_counts_and_times() -> None:
@@ -161,6 +138,8 @@ def test_the_controllers_counts_and_times() -> None:
     assert numbers["residuals"]["infeasibility"] == {"max": 3e-9, "periods": 3}
     assert numbers["residuals"]["kkt_dual"] == {"max": None, "periods": 0}  # absent, not 0
     json.dumps(numbers, allow_nan=False)
+    several = replace(log, answered_by=("piqp-dense", "fallback", "active-set", "daqp"))
+    assert metrics.controller(several, timing, deadline_ms=50.0)["iterations"] is None
 
 
 @pytest.mark.parametrize(
@@ -172,22 +151,12 @@ def test_the_controllers_counts_and_times() -> None:
         ([0] * 10 + [1] * 9 + [3], 10),
         ([1] * 5 + [0] + [1] * 14, 14),
         ([2, 2, 1], 3),  # the whole of a short flight
-        ([1], 1),
-        ([0], 0),
         ([], 0),
     ],
 )
 def test_fallback_for_good_is_the_last_second_at_least_or_the_whole_flight(levels: list[int], expected: int) -> None:
     log = replace(small_log(len(levels)).control, fallback=np.array(levels, np.int64))
     assert metrics.unrecovered(log) == expected
-    if levels:
-        assert metrics.controller(log, small_log(len(levels)).timing, 100.0)["unrecovered"] == expected
-
-
-def test_iterations_of_no_solver_and_of_several_are_absent() -> None:
-    log, timing = small_log(2).control, small_log(2).timing
-    for answerers in (("gain", "active-set"), ("piqp-dense", "daqp")):
-        assert metrics.controller(replace(log, answered_by=answerers), timing, 50.0)["iterations"] is None
 
 
 def test_a_flight_of_no_period_has_no_numbers() -> None:

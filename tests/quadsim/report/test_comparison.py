@@ -1,4 +1,4 @@
-"""The rows of a comparison agree with the summaries."""
+"""The rows of a comparison agree with the summaries, and the verdicts with their constraints."""
 
 import copy
 import dataclasses
@@ -8,132 +8,175 @@ from typing import Any
 import pytest
 
 from quadsim.flight.rundir import Run
-from quadsim.report.comparison import comparison_rows, distinct_courses, run_names
-from quadsim.report.table import Mark, Row, format_number, to_markdown
+from quadsim.report.comparison import (
+    comparison_rows,
+    distinct_courses,
+    failure_sentences,
+    run_names,
+    verdict,
+    verdict_cell,
+    violated_by_fallback,
+)
+from quadsim.report.table import Cell, Mark, Row, format_number, to_markdown
+
+COURSE = {"tilt": 5.61, "velocity": 0.5, "rotor_min": 183.2, "rotor_max": 201.9, "jumps": [1.0, 7.0],
+          "problems": ["pitch up to 5.61 deg (bound 5)"], "sentence": "up to 5.61 deg of tilt."}  # fmt: skip
+TOUCHDOWN = {"time": 15.885, "speed": 0.052, "horizontal_speed": 0.001, "tilt": 1.25}
+GROUND = {"takeoff_time": 2.155, "touchdown": TOUCHDOWN, "phase": "landed", "crashed": False}
+ESTIMATION = {
+    "rmse": {"x": 0.003, "y": 0.004, "z": 0.012, "roll": 0.01, "pitch": 0.0, "yaw": 0.0},
+    "max_error": {"x": 0.03, "y": 0.04, "z": 0.12, "roll": 0.1, "pitch": 0.0, "yaw": 0.0},
+    "not_finite": 10,
+    "samples": {"position": {"accepted": 95, "rejected": 5, "nis": 1.0}},
+}
+EVERYTHING: dict[str, Any] = {
+    "course": COURSE,
+    "events": [{"time": 2.0, "text": "rotor 2 loses 20 %"}, {"time": 3.5, "text": "a push of 4 N for 0.2 s"}],
+    "ground": GROUND,
+    "estimation": ESTIMATION,
+    "computation": {"delay_ms": {"p50": 12.0, "p95": 30.0, "p99": 45.0, "max": 60.0}, "missed": 3},
+}
+
+
+def having(run: Run, scenario: str, **entries: Any) -> Run:
+    return dataclasses.replace(run, summary={**copy.deepcopy(run.summary), "scenario": scenario, **entries})
+
+
+def with_margin(entry: dict[str, Any], margin: float) -> dict[str, Any]:
+    """A required constraint that was held, or violated, by a margin."""
+    margins = dict.fromkeys(("worst_margin", "worst_margin_sampled"), margin)
+    found = {"required": True, "satisfied": margin >= 0.0, "verdict": "satisfied" if margin >= 0.0 else "violated"}
+    return {**entry, **margins, **found, "worst_time": 1.0}
+
+
+@pytest.fixture
+def bare_run(short_run: Run) -> Run:
+    """The short flight as an older version wrote it: without what it met, expected, or could not solve."""
+    bare = {key: value for key, value in short_run.summary.items() if key not in {*EVERYTHING, "expected", "diagnosis"}}
+    return having(dataclasses.replace(short_run, summary=bare), "bare")
 
 
 @pytest.fixture
 def worse_run(short_run: Run) -> Run:
     """The short flight with a larger error in x, roll's bound exceeded but not required, the speed's violated."""
-    summary: dict[str, Any] = copy.deepcopy(short_run.summary)
-    summary["scenario"] = "worse"
-    summary["tracking"]["rmse"]["x"] += 1.0
-    for entry in summary["constraints"]:
+    run = having(short_run, "worse")
+    run.summary["tracking"]["rmse"]["x"] += 1.0
+    for entry in run.summary["constraints"]:
         if entry["name"] in ("roll", "speed"):
             entry.update(worst_margin=-2.5, time_violated=0.75, satisfied=False, required=entry["name"] == "speed")
-    summary["controller"]["step_ms"]["p50"] = 3.0 * short_run.summary["controller"]["step_ms"]["p50"]
-    summary["controller"]["deadline_misses"] = 1
-    return dataclasses.replace(short_run, summary=summary)
+    run.summary["controller"]["deadline_misses"] = 1
+    return run
 
 
-def row(rows: list[Row], label: str, group: str | None = None) -> Row:
-    (found,) = (each for each in rows if each.label == label and group in (None, each.group))
-    return found
+def cells(rows: list[Row], label: str, group: str | None = None) -> tuple[Cell, ...]:
+    (found,) = (row for row in rows if row.label == label and group in (None, row.group))
+    return found.cells
 
 
-def marks(found: Row) -> list[Mark]:
-    return [cell.mark for cell in found.cells]
+def texts(rows: list[Row], label: str, group: str | None = None) -> list[str]:
+    return [cell.text for cell in cells(rows, label, group)]
 
 
-def test_every_row_has_one_cell_per_run(short_run: Run, worse_run: Run, empty_run: Run) -> None:
+def marks(rows: list[Row], label: str, group: str | None = None) -> list[Mark]:
+    return [cell.mark for cell in cells(rows, label, group)]
+
+
+def test_values_are_the_summarys_with_angles_in_degrees(short_run: Run, worse_run: Run, empty_run: Run) -> None:
     rows = comparison_rows([short_run, worse_run, empty_run])
-    assert {len(each.cells) for each in rows} == {3}
-    assert len({(each.group, each.label) for each in rows}) == len(rows)
+    assert {len(row.cells) for row in rows} == {3}
+    assert len({(row.group, row.label) for row in rows}) == len(rows)
+    assert float(texts(rows, "largest error, yaw")[0]) == pytest.approx(30.0)
+    assert {row.unit for row in rows if row.label == "largest error, yaw"} == {"deg"}
+    assert float(texts(rows, "RMS error, z")[0]) == pytest.approx(short_run.summary["tracking"]["rmse"]["z"], rel=1e-3)
+    assert float(texts(rows, "highest rotor speed")[0]) == pytest.approx(250.0)
+    assert texts(rows, "bounds", "Constraint slew")[0] == "-10 .. 5"
+    assert texts(rows, "bounds", "Constraint arrival_x")[0] == "-0.01 .. 0.01, from 59 s"
+    assert texts(rows, "controller")[0] == "constrained MPC"
 
 
-def test_values_are_the_summarys_with_angles_in_degrees(short_run: Run) -> None:
-    rows, summary = comparison_rows([short_run]), short_run.summary
-    assert float(row(rows, "largest error, yaw").cells[0].text) == pytest.approx(30.0)
-    assert row(rows, "largest error, yaw").unit == "deg"
-    assert float(row(rows, "RMS error, z").cells[0].text) == pytest.approx(summary["tracking"]["rmse"]["z"], rel=1e-3)
-    assert float(row(rows, "highest rotor speed").cells[0].text) == pytest.approx(250.0)
-    assert row(rows, "bounds", "Constraint slew").cells[0].text == "-10 .. 5"
-    assert row(rows, "bounds", "Constraint arrival_x").cells[0].text == "-0.01 .. 0.01, from 59 s"
+def test_what_a_flight_met_has_rows_and_a_dash_where_a_run_has_no_entry(bare_run: Run) -> None:
+    rows = comparison_rows([having(bare_run, "full", **EVERYTHING), bare_run])
+    for label, text in {
+        "events": "rotor 2 loses 20 % at 2 s; a push of 4 N for 0.2 s at 3.5 s",
+        "largest tilt required": "5.61",
+        "jumps": "at 1 s; at 7 s",
+        "beyond the bounds": "pitch up to 5.61 deg (bound 5)",
+        "take-off at": "2.155",
+        "touchdown, descending with": "0.052",
+        "at the end": "landed",
+        "RMS error of the measured z": "0.012",
+        "largest error of the measured roll": "5.73",
+        "samples rejected by the filter": "position 5 of 100",
+        "command after its measurement, maximum": "60",
+        "commands too late to be used": "3",
+    }.items():
+        assert texts(rows, label) == [text, "-"]
+    groups = {row.group for row in comparison_rows([bare_run])}
+    assert not {"Course", "Ground", "Measured state", "Simulated computation"} & groups
 
 
-def test_a_law_has_its_name_and_a_custom_one_its_description(short_run: Run) -> None:
-    for recorded, shown in (("geometric", "geometric control"), ("constrained", "constrained MPC"), ("mine", "mine")):
-        summary = {**short_run.summary, "controller": {**short_run.summary["controller"], "name": recorded}}
-        rows = comparison_rows([dataclasses.replace(short_run, summary=summary)])
-        assert row(rows, "controller").cells[0].text == shown
+def test_courses_that_are_not_flyable_and_crashes_are_marked(bare_run: Run) -> None:
+    problems = ["not flyable: a rotor would need a negative thrust"]
+    aloft = {**GROUND, "takeoff_time": None, "touchdown": None, "phase": "flying"}
+    impossible = having(bare_run, "a", course={**COURSE, "rotor_min": 0.0, "problems": problems}, ground=aloft)
+    crashed = having(bare_run, "b", course=COURSE, ground={**GROUND, "phase": "crashed", "crashed": True})
+    rows = comparison_rows([impossible, crashed])
+    assert texts(rows, "lowest rotor speed required") == ["not flyable", "183.2"]
+    assert texts(rows, "touchdown at") == ["-", "15.88"]
+    assert marks(rows, "at the end") == [Mark.NONE, Mark.BAD]
 
 
 def test_settling_has_a_row_for_each_step_of_the_courses(short_run: Run) -> None:
-    def entry(channel: str, time: float, settled: float | None) -> dict[str, Any]:
-        return {"channel": channel, "time": time, "before": 0.0, "after": 1.0, "settled": settled}
+    def with_settling(x: float, z: float | None) -> Run:
+        steps = [("x", 10.0, x), ("z", 0.0, z)]
+        entries = [{"channel": c, "time": t, "before": 0.0, "after": 1.0, "settled": found} for c, t, found in steps]
+        return having(short_run, "steps", tracking={**short_run.summary["tracking"], "settling": entries})
 
-    def with_settling(*entries: dict[str, Any]) -> Run:
-        summary: dict[str, Any] = copy.deepcopy(short_run.summary)
-        summary["tracking"]["settling"] = list(entries)
-        return dataclasses.replace(short_run, summary=summary)
-
-    older: dict[str, Any] = copy.deepcopy(short_run.summary)
-    del older["tracking"]["settling"]
-    rows = comparison_rows(
-        [
-            with_settling(entry("x", 10.0, 4.05), entry("z", 0.0, 5.0)),
-            with_settling(entry("x", 10.0, 5.7), entry("z", 0.0, None)),
-            dataclasses.replace(short_run, summary=older),
-        ]
-    )
-    assert [cell.text for cell in row(rows, "settling, x at 10 s").cells] == ["4.05", "5.7", "-"]
-    assert marks(row(rows, "settling, x at 10 s")) == [Mark.BEST, Mark.NONE, Mark.NONE]
-    assert [cell.text for cell in row(rows, "settling, z at 0 s").cells] == ["5", "-", "-"]
+    rows = comparison_rows([with_settling(4.05, 5.0), with_settling(5.7, None)])
+    assert texts(rows, "settling, x at 10 s") == ["4.05", "5.7"]
+    assert marks(rows, "settling, x at 10 s") == [Mark.BEST, Mark.NONE]
+    assert texts(rows, "settling, z at 0 s") == ["5", "-"]
 
 
-def test_the_best_is_marked_only_where_runs_differ(short_run: Run, worse_run: Run) -> None:
-    rows = comparison_rows([worse_run, short_run])
-    assert marks(row(rows, "RMS error, x")) == [Mark.NONE, Mark.BEST]
-    assert marks(row(rows, "RMS error, y")) == [Mark.NONE, Mark.NONE]
+def test_the_best_of_completed_flights_is_marked_where_they_differ(
+    short_run: Run, worse_run: Run, aborted_run: Run
+) -> None:
+    rows = comparison_rows([aborted_run, worse_run, short_run])
+    assert marks(rows, "RMS error, x") == [Mark.NONE, Mark.NONE, Mark.BEST]
+    assert marks(rows, "RMS error, y") == [Mark.NONE] * 3
+    assert marks(comparison_rows([aborted_run, worse_run]), "RMS error, x") == [Mark.NONE] * 2
 
 
-def test_an_aborted_flight_is_never_best(short_run: Run, worse_run: Run, aborted_run: Run) -> None:
-    found = row(comparison_rows([aborted_run, worse_run]), "RMS error, x")
-    assert marks(found) == [Mark.NONE, Mark.NONE]
-    assert marks(row(comparison_rows([aborted_run, worse_run, short_run]), "RMS error, x"))[2] is Mark.BEST
-
-
-def test_verdicts_carry_their_tolerances_and_what_is_required(short_run: Run, worse_run: Run) -> None:
-    rows = comparison_rows([short_run, worse_run])
-    held, exceeded = row(rows, "verdict", "Constraint roll").cells
-    assert (held.text, held.mark) == ("holds (margin 5 deg, tolerance 0.05)", Mark.GOOD)
-    assert exceeded.text == "exceeded, not required (margin -2.5 deg, tolerance 0.05)"
-    assert exceeded.mark is Mark.WARN
-    violated = row(rows, "verdict", "Constraint speed").cells[1]
-    assert violated.text == "violated (margin -2.5 rad/s, tolerance 1e-06)"
-    assert violated.mark is Mark.BAD
-    assert marks(row(rows, "worst margin at the physics rate", "Constraint roll")) == [Mark.NONE, Mark.WARN]
-    assert row(rows, "time violated", "Constraint speed").cells[1].text == "0.75"
-    assert marks(row(rows, "deadline misses")) == [Mark.NONE, Mark.BAD]
+def test_constraints_carry_their_tolerances_and_what_is_required(short_run: Run, worse_run: Run) -> None:
+    free = having(short_run, "free", constraints=[])
+    rows = comparison_rows([short_run, worse_run, free])
+    assert texts(rows, "verdict", "Constraint roll") == [
+        "holds (margin 5 deg, tolerance 0.05)", "exceeded, not required (margin -2.5 deg, tolerance 0.05)", "-",
+    ]  # fmt: skip
+    assert marks(rows, "verdict", "Constraint roll")[:2] == [Mark.GOOD, Mark.WARN]
+    assert texts(rows, "verdict", "Constraint speed")[1] == "violated (margin -2.5 rad/s, tolerance 1e-06)"
+    assert marks(rows, "verdict", "Constraint speed")[1] is Mark.BAD
+    assert marks(rows, "worst margin at the physics rate", "Constraint roll")[:2] == [Mark.NONE, Mark.WARN]
+    assert texts(rows, "time violated", "Constraint speed")[1] == "0.75"
+    assert marks(rows, "deadline misses")[1] is Mark.BAD
+    assert texts(rows, "required constraints")[2] == "none"
 
 
 def test_a_bound_exceeded_in_the_commands_alone_is_marked(short_run: Run) -> None:
-    summary: dict[str, Any] = copy.deepcopy(short_run.summary)
-    (entry,) = (each for each in summary["constraints"] if each["name"] == "speed")
+    run = having(short_run, "clipped")
+    (entry,) = (each for each in run.summary["constraints"] if each["name"] == "speed")
     entry.update(worst_margin_sampled=-120.0, worst_margin=0.0, time_violated=0.0, satisfied=False, required=False)
-    clipped = dataclasses.replace(short_run, summary=summary)
-    verdict = row(comparison_rows([clipped]), "verdict", "Constraint speed").cells[0].text
-    assert verdict == "exceeded, not required (margin -120 rad/s at the samples, tolerance 1e-06)"
+    shown = texts(comparison_rows([run]), "verdict", "Constraint speed")
+    assert shown == ["exceeded, not required (margin -120 rad/s at the samples, tolerance 1e-06)"]
 
 
-def test_a_constraint_that_a_run_lacks_is_shown_as_absent(short_run: Run) -> None:
-    free = dataclasses.replace(short_run, summary={**short_run.summary, "scenario": "free", "constraints": []})
-    rows = comparison_rows([free, short_run])
-    assert row(rows, "verdict", "Constraint roll").cells[0].text == "-"
-    assert row(rows, "required constraints").cells[0].text == "none"
-
-
-def test_names_are_distinct(short_run: Run, aborted_run: Run) -> None:
+def test_runs_have_distinct_names_and_a_course_is_drawn_once(short_run: Run, aborted_run: Run, empty_run: Run) -> None:
     elsewhere = dataclasses.replace(short_run, directory=Path("elsewhere"))
     assert run_names([short_run, aborted_run]) == ("paper-constrained", "lost")
     assert run_names([short_run, elsewhere])[1] == "paper-constrained (elsewhere)"
     assert len(set(run_names([short_run, short_run, elsewhere]))) == 3
-
-
-def test_a_course_is_drawn_once(short_run: Run, aborted_run: Run, empty_run: Run) -> None:
-    control = short_run.log.control
-    moved = dataclasses.replace(control, reference=control.reference + 1.0)
-    other = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, control=moved))
+    control = dataclasses.replace(short_run.log.control, reference=short_run.log.control.reference + 1.0)
+    other = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, control=control))
     assert distinct_courses([empty_run, short_run, aborted_run, other]) == [short_run, other]
 
 
@@ -144,19 +187,55 @@ def test_markdown_has_a_line_per_row_and_escapes_bars(short_run: Run, worse_run:
     assert lines[0] == r"|  |  | a\|b | worse |"
     (best,) = (line for line in lines if "RMS error, x [m]" in line)
     assert best.count("**") == 4, "the group's name, and the better of the two"
+    numbers = {None: "-", 0.0: "0", -10.0: "-10", 0.344389: "0.3444", -2.1e-7: "-2.1e-07", 1.23e30: "1.2e+30"}
+    assert {value: format_number(value) for value in numbers} == numbers
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
+    ("status", "margin", "expected", "text", "mark"),
     [
-        (None, "-"),
-        (0.0, "0"),
-        (-10.0, "-10"),
-        (0.344389, "0.3444"),
-        (-2.1e-7, "-2.1e-07"),
-        (86400.0, "86400"),
-        (1.23e30, "1.2e+30"),
+        ("completed", 1.0, "satisfied", "satisfied, as expected", Mark.GOOD),
+        ("completed", -1.0, "violated", "violated, as expected", Mark.NONE),
+        ("completed", 1.0, "lost", "satisfied, expected: lost", Mark.BAD),
+        ("aborted", 1.0, "lost", "lost, as expected", Mark.NONE),
     ],
 )
-def test_numbers_are_short(value: float | None, text: str) -> None:
-    assert format_number(value) == text
+def test_a_verdict_is_held_against_the_one_the_scenario_states(
+    bare_run: Run, status: str, margin: float, expected: str, text: str, mark: Mark
+) -> None:
+    constraints = [with_margin(bare_run.summary["constraints"][0], margin)]
+    as_expected = text.endswith("as expected")
+    run = having(bare_run, "a", status=status, constraints=constraints, expected=expected, as_expected=as_expected)
+    assert verdict_cell(run.summary) == Cell(text=text, mark=mark)
+
+
+def test_a_verdict_minds_required_constraints_and_whether_they_were_reached(bare_run: Run) -> None:
+    entry = bare_run.summary["constraints"][0]
+    beyond = dict.fromkeys(("worst_margin", "worst_margin_sampled", "worst_time"))
+    unreached = {**with_margin(entry, 1.0), **beyond, "name": "arrival", "satisfied": False}
+    held, broken = with_margin(entry, 1.0), with_margin(entry, -1.0)
+    found = {
+        "incomplete": [held, unreached],
+        "violated": [broken, unreached],
+        "satisfied": [{**broken, "required": False}, {**unreached, "required": False}],
+    }
+    for word, constraints in found.items():
+        assert verdict({**bare_run.summary, "constraints": constraints}) == word
+
+
+def test_permanent_fallback_is_no_success_and_is_reported_with_its_reason(bare_run: Run) -> None:
+    held, broken = ([with_margin(entry, by) for entry in bare_run.summary["constraints"]] for by in (1.0, -1.0))
+    found = {"sentence": "no answer at t = 1.00 s", "advice": "to try: more", "time": 1.0}
+    controller = {**bare_run.summary["controller"], "unrecovered": 318}
+    good = having(bare_run, "good", constraints=held)
+    stuck = having(good, "stuck", controller=controller, diagnosis=found)
+    crashed = having(good, "crashed", ground={**GROUND, "crashed": True})
+    assert [verdict(run.summary) for run in (good, stuck, crashed)] == ["satisfied", "violated", "violated"]
+    assert violated_by_fallback(stuck.summary)
+    assert not violated_by_fallback(crashed.summary)
+    assert not violated_by_fallback(having(stuck, "both", constraints=broken).summary)
+    reasons = ["318 periods in fallback, never recovered", found["sentence"], found["advice"]]
+    assert failure_sentences(stuck.summary) == reasons
+    rows = comparison_rows([good, stuck])
+    assert texts(rows, "why no optimum") == ["-", "; ".join(map(str, reasons))]
+    assert texts(rows, "in permanent fallback") == ["0", "318"]

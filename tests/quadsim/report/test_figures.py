@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from quadsim.errors import OutputError
 from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
 from quadsim.flight.rundir import Run
 from quadsim.report import flight_figures
 from quadsim.report.curves import BOUND
-from quadsim.report.figure import Band, Bound, Figure, Panel, Scene, Series
+from quadsim.report.figure import Band, Bound, Figure, Panel, Series
 from quadsim.report.flight_figures import effects, inputs, overview, page_figures, states, times, write_figures
 from quadsim.report.to_matplotlib import draw, to_png
 from quadsim.report.to_plotly import thin, to_plot
@@ -33,18 +32,12 @@ def curves(panel: Panel) -> dict[str, Series]:
     return {series.label: series for series in panel.series}
 
 
-def with_effects(run: Run, *, wrench: bool = False, wind: bool = False, lag: bool = False, state: bool = False) -> Run:
-    """The flight as if it had met with some effects."""
-    plant, control = run.log.plant, run.log.control
-    rng = np.random.default_rng(0)
-    if wrench:
-        plant = dataclasses.replace(plant, wrench=rng.normal(size=(plant.t.size, 6)))
-    if wind:
-        plant = dataclasses.replace(plant, wind=rng.normal(size=(plant.t.size, 3)))
-    if lag:
-        plant = dataclasses.replace(plant, speeds=plant.speeds + 1.0)
-    if state:
-        control = dataclasses.replace(control, state=control.state + 0.01)
+def with_effects(run: Run) -> Run:
+    """The flight as if it had met with wrench, wind, lagging rotors and errors of measurement."""
+    plant, control, rng = run.log.plant, run.log.control, np.random.default_rng(0)
+    wrench, wind = rng.normal(size=(plant.t.size, 6)), rng.normal(size=(plant.t.size, 3))
+    plant = dataclasses.replace(plant, wrench=wrench, wind=wind, speeds=plant.speeds + 1.0)
+    control = dataclasses.replace(control, state=control.state + 0.01)
     return dataclasses.replace(run, log=dataclasses.replace(run.log, plant=plant, control=control))
 
 
@@ -58,14 +51,19 @@ def test_the_papers_scenario_gives_the_papers_figure_numbers(short_run: Run, tmp
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_another_scenario_gives_plain_names_and_its_effects(short_run: Run, tmp_path: Path) -> None:
-    run = with_effects(named(short_run, "hover"), wind=True)
+def test_another_scenario_gives_plain_names_and_its_effects(short_run: Run, empty_run: Run, tmp_path: Path) -> None:
+    run = with_effects(named(short_run, "hover"))
     assert [path.stem for path in write_figures(run, tmp_path)] == ["states", "inputs", "solve_times", "effects"]
-
-
-def test_the_same_flight_gives_the_same_bytes(short_run: Run) -> None:
-    figure = inputs([short_run])
-    assert to_png(figure) == to_png(figure)
+    assert write_figures(empty_run, tmp_path) == page_figures([empty_run]) == [], "it has no control period"
+    assert effects(short_run) == [], "an ideal flight"
+    (figure,) = effects(run)
+    assert list(panels(figure)) == [
+        *(f"rotor {i} [rad/s]" for i in range(1, 5)),
+        *("external force, world [N]", "external torque, body [N\u00a0m]", "wind, world [m/s]"),
+        *("error of the measured position [m]", "error of the measured attitude [deg]"),
+    ]
+    measured = curves(panels(states([run]))["roll [deg]"])["measured"].y
+    np.testing.assert_allclose(measured, np.degrees(run.log.control.state[:, INDEX["roll"]]))
 
 
 def test_states_are_those_of_the_plant_with_units_references_and_bounds(short_run: Run) -> None:
@@ -79,6 +77,9 @@ def test_states_are_those_of_the_plant_with_units_references_and_bounds(short_ru
         (-5.0, 0.0, short_run.end),
         (5.0, 0.0, short_run.end),
     ]
+    assert "measured" not in states([short_run]).labels
+    assert found["z [m]"].least_range is None, "it moves"
+    assert times([short_run]).panels[0].bounds[0].value == 50.0, "the deadline"
     late = dataclasses.replace(short_run, limits=(Limit(name="late", signal="roll", upper=5.0, start=100.0),))
     assert panels(states([late]))["roll [deg]"].bounds == (), "it begins after the flight"
 
@@ -96,72 +97,12 @@ def test_inputs_are_the_commands_of_each_rotor(short_run: Run) -> None:
     assert {bound.value for bound in overlaid.bounds} == {0.0, 250.0}
 
 
-def test_clock_times_stand_beside_the_deadline(short_run: Run) -> None:
-    step, solve, _, active = times([short_run]).panels
-    assert [bound.value for bound in step.bounds] == [50.0]
-    assert step.y_log
-    assert solve.bounds == ()
-    np.testing.assert_array_equal(active.series[0].y, short_run.log.control.active)
-
-
-def test_a_roll_that_wraps_is_no_line_across_the_panel(short_run: Run) -> None:
-    state = short_run.log.plant.state.copy()
-    state[:, INDEX["roll"]] = (4.0 * short_run.log.plant.t + np.pi) % (2.0 * np.pi) - np.pi
-    log = dataclasses.replace(short_run.log, plant=dataclasses.replace(short_run.log.plant, state=state))
-    values = curves(panels(states([dataclasses.replace(short_run, log=log)]))["roll [deg]"])["flight"].y
-    assert np.nanmax(values) - np.nanmin(values) > 350.0
-    assert np.nanmax(np.abs(np.diff(values))) < 10.0
-
-
-@pytest.mark.parametrize(
-    ("effect", "expected"),
-    [
-        ("lag", [f"rotor {i} [rad/s]" for i in range(1, 5)]),
-        ("wrench", ["external force, world [N]", "external torque, body [N\u00a0m]"]),
-        ("wind", ["wind, world [m/s]"]),
-        ("state", ["error of the measured position [m]", "error of the measured attitude [deg]"]),
-    ],
-)
-def test_effects_are_drawn_where_there_are_any(short_run: Run, effect: str, expected: list[str]) -> None:
-    assert effects(short_run) == [], "an ideal flight"
-    (figure,) = effects(with_effects(short_run, **{effect: True}))
-    assert list(panels(figure)) == expected
-    assert len(draw(figure).axes) >= len(expected)
-
-
-def test_states_are_drawn_as_measured_beside_the_true_ones(short_run: Run) -> None:
-    measured = with_effects(short_run, state=True)
-    found = curves(panels(states([measured]))["roll [deg]"])
-    np.testing.assert_allclose(found["measured"].y, np.degrees(measured.log.control.state[:, INDEX["roll"]]))
-    assert "measured" not in states([short_run]).labels
-
-
-def test_an_aborted_flight_is_drawn_as_far_as_it_went(
-    short_run: Run, empty_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn: list[Figure] = []
-    monkeypatch.setattr(flight_figures, "write_pngs", lambda figures, _: drawn.extend(figures) or [])
-    log = dataclasses.replace(short_run.log, reason="at t = 6.000 s: lost")
-    write_figures(dataclasses.replace(short_run, log=log), tmp_path)
-    assert drawn[0].title == "paper-constrained (aborted): position and attitude"
-    assert write_figures(empty_run, tmp_path) == [], "it has no control period"
-    assert page_figures([empty_run]) == []
-
-
 def test_a_comparison_names_every_run_and_shows_the_range_of_its_rotors(short_run: Run) -> None:
     figure = overview([short_run, named(short_run, "other $x$ <b>")])
+    assert to_png(figure, dpi=30) == to_png(figure, dpi=30)
     assert list(figure.labels) == ["reference, filtered", "paper-constrained", "other $x$ <b>"]
     (band, _) = figure.panels[-1].bands
     np.testing.assert_array_equal(band.high, short_run.log.control.speeds.max(axis=1))
-    assert to_png(figure, dpi=30)
-
-
-def test_a_scene_has_the_course_and_each_path(short_run: Run) -> None:
-    *_, scene = page_figures([short_run])
-    assert isinstance(scene, Scene)
-    course, flight = scene.paths
-    np.testing.assert_array_equal(course[0], short_run.log.control.reference[:, :3])
-    np.testing.assert_array_equal(flight[0][:, 2], short_run.log.plant.state[:, INDEX["z"]])
 
 
 @pytest.mark.parametrize("x_label", ["", "n"])
@@ -196,17 +137,6 @@ def test_both_libraries_draw_the_same_numbers(x_label: str) -> None:
     assert (bound["x"], bound["y"], bound["line"]["color"]) == ([1.0, 2.0], [5.0, 5.0], BOUND)
 
 
-def test_rounding_is_drawn_as_a_level_line(short_run: Run) -> None:
-    plant = dataclasses.replace(short_run.log.plant, state=1e-12 * np.ones_like(short_run.log.plant.state))
-    control = dataclasses.replace(short_run.log.control, reference=np.zeros_like(short_run.log.control.reference))
-    log = dataclasses.replace(short_run.log, plant=plant, control=control)
-    figure = states([dataclasses.replace(short_run, limits=(), log=log)])
-    assert draw(figure).axes[0].get_ylim() == (-0.005, 0.005)
-    layout = json.loads(to_plot(figure).json)["layout"]
-    assert layout["yaxis"]["autorangeoptions"]["include"] == [-0.005, 0.005]
-    assert panels(states([short_run]))["z [m]"].least_range is None, "it moves"
-
-
 def test_thinning_keeps_ends_extremes_and_gaps() -> None:
     values = np.random.default_rng(0).normal(size=10_007)
     values[[10, 5000]] = np.nan
@@ -215,12 +145,6 @@ def test_thinning_keeps_ends_extremes_and_gaps() -> None:
     assert np.all(np.diff(thinned) > 0)
     assert {0, 10, 5000, 10_006, int(np.nanargmin(values)), int(np.nanargmax(values))} <= set(thinned.tolist())
     np.testing.assert_array_equal(thin(values[:300], 300), np.arange(300))
-
-
-def test_a_place_that_cannot_be_written_is_reported(short_run: Run, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(OutputError, match="cannot write"):
-        write_figures(short_run, tmp_path / "file" / "figures")
 
 
 def test_a_run_among_obstacles_is_drawn_from_above_with_its_clearances(short_run: Run) -> None:

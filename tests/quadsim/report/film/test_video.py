@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import os
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +18,7 @@ import pytest
 
 from quadsim.errors import FileError, OutputError, RenderingUnavailableError
 from quadsim.flight.audit import Limit, audit
-from quadsim.flight.parquet import write_log
-from quadsim.flight.rundir import Run, load_run
-from quadsim.outputs import amend
+from quadsim.flight.rundir import Run
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
 from quadsim.report.film.frames import make_footage
@@ -30,6 +26,9 @@ from quadsim.report.film.painter import RED
 from quadsim.report.film.video import render_gif, render_video, rendering_backend
 from quadsim.rotation import body_to_world
 from quadsim.state import EULER, INDEX, POSITION
+from scenarios.flight import Outputs
+from scenarios.loading import load_scenario
+from scenarios.run import run_scenario
 
 
 @pytest.fixture(scope="module")
@@ -40,98 +39,44 @@ def backend() -> str:
         pytest.skip(str(error))
 
 
-@pytest.fixture(scope="module")
-def film(backend: str, short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[int, int]]]:
-    """A frame of each second, in two pieces, and the progress that was reported."""
-    path, reports = tmp_path_factory.mktemp("film") / "flight.mp4", []
-    before = dict(os.environ)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(video, "_FEWEST_FRAMES", 3)
-        render_video(
-            short_run.directory,
-            path,
-            workers=2,
-            fps=1,
-            progress=lambda done, total: reports.append((done, total)),
-        )
-    assert dict(os.environ) == before, "the caller's environment is left as it is"
-    return path, reports
-
-
-@contextlib.contextmanager
-def collecting() -> Iterator[None]:
-    """Ends what the block leaves in cycles, as imageio leaves ffmpeg's pipes, and looks through nothing older."""
+def decode(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    """All frames of an MP4, and its metadata by ffmpeg."""
     gc.freeze()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)
-        yield
-        gc.collect()
-
-
-def decode(path: Path) -> np.ndarray:
-    """All frames of an MP4."""
-    with collecting():
-        return iio.imread(path, plugin="FFMPEG")
-
-
-def metadata(path: Path) -> dict[str, Any]:
-    """Metadata of an MP4, by ffmpeg."""
-    with collecting():
+        warnings.simplefilter("ignore", ResourceWarning)  # imageio leaves ffmpeg's pipes in cycles
         reader = imageio_ffmpeg.read_frames(path)
         meta: dict[str, Any] = next(reader)
         reader.close()
         del reader
-    return meta
+        frames = iio.imread(path, plugin="FFMPEG")
+        gc.collect()
+    return frames, meta
 
 
-def rewrite(run: Run, directory: Path, rows: int, *, states: float = 1.0) -> Path:
-    """A copy of a run, aborted after `rows` control periods, its plant states multiplied by `states`."""
-    directory.mkdir()
-    control, plant = run.log.control, run.log.plant
-    cut = {
-        field.name: column[:rows]
-        for field in fields(control)
-        if field.name != "speeds_before" and (column := getattr(control, field.name)) is not None
-    }
-    last = np.searchsorted(plant.t, 0.05 * rows + 1e-9, side="right")
-    log = replace(
-        run.log,
-        control=replace(control, **cut),
-        timing=replace(run.log.timing, **{n: getattr(run.log.timing, n)[:rows] for n in ("t", "solve_ms", "step_ms")}),
-        plant=replace(plant, t=plant.t[:last], state=states * plant.state[:last], speeds=plant.speeds[:last]),
-        predicted=None if run.log.predicted is None else run.log.predicted[:rows],
-        reason="lost on purpose",
-    )
-    write_log(directory, log, plant_stride=1, metadata={})
-    amend(directory, {**run.summary, "status": "aborted", "reason": log.reason})
-    return directory
-
-
-def test_the_film_has_the_frames_requested(film: tuple[Path, list[tuple[int, int]]]):
-    path, _ = film
-    frames, meta = decode(path), metadata(path)
+def test_the_film_has_the_frames_requested(
+    backend: str, short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of each second, in two pieces."""
+    path, reports, before = tmp_path / "film" / "flight.mp4", list[tuple[int, int]](), dict(os.environ)
+    path.parent.mkdir()
+    monkeypatch.setattr(video, "_FEWEST_FRAMES", 3)
+    render_video(short_run.directory, path, workers=2, fps=1, progress=lambda *report: reports.append(report))
+    assert dict(os.environ) == before, "the caller's environment is left as it is"
+    assert reports == sorted(reports)
+    assert reports[-1] == (6, 6)
+    assert [entry.name for entry in path.parent.iterdir()] == ["flight.mp4"]
+    frames, meta = decode(path)
     assert frames.shape == (6, 720, 1280, 3)
-    assert meta["fps"] == 1.0
-    assert meta["codec"] == "h264"
-    assert meta["pix_fmt"].startswith("yuv420p")
+    assert (meta["fps"], meta["codec"], meta["pix_fmt"][:7]) == (1.0, "h264", "yuv420p")
     sky, ground = frames[:, 60:100, 500:780].mean(axis=(1, 2)), frames[:, 500:540, 500:780].mean(axis=(1, 2))
     assert (sky[:, 2] > sky[:, 0] + 15.0).all()  # a blue sky above a grey floor, in every frame of both pieces
     assert (np.ptp(ground, axis=1) < 40.0).all()
     assert ground.min() > 60.0
-    moved = np.abs(frames[5].astype(int) - frames[0]).mean()
-    assert moved > 2.0
+    assert np.abs(frames[5].astype(int) - frames[0]).mean() > 2.0
     assert path.stat().st_size < 2_000_000
 
 
-def test_progress_counts_up_to_all_frames_and_nothing_else_is_left(film: tuple[Path, list[tuple[int, int]]]):
-    path, reports = film
-    done = [count for count, _ in reports]
-    assert done == sorted(done)
-    assert reports[-1] == (6, 6)
-    assert [entry.name for entry in path.parent.iterdir()] == ["flight.mp4"]
-
-
-def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path):
+def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path) -> None:
     render_gif(short_run.directory, tmp_path / "film.gif")
     frames = iio.imread(tmp_path / "film.gif")
     assert frames.shape[:3] == (8, 270, 480)
@@ -139,19 +84,18 @@ def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path):
     assert (tmp_path / "film.gif").stat().st_size < 600_000
 
 
-def test_a_flight_of_one_period_that_is_lost_far_away_can_be_filmed(backend: str, short_run: Run, tmp_path: Path):
-    directory = rewrite(short_run, tmp_path / "aborted", 1, states=1e5)
-    render_video(directory, tmp_path / "film.mp4", width=320, height=180, fps=10, workers=1)
-    frames = decode(tmp_path / "film.mp4")
+def test_a_flight_of_one_period_far_away_can_be_filmed_and_of_none_cannot(
+    backend: str, empty_run: Run, tmp_path: Path
+) -> None:
+    far = load_scenario("paper-constrained", ["duration=0.05", "initial.position=[9e3, -9e3, 9e3]", "constraints=[]"])
+    run_scenario(far, tmp_path / "far", Outputs(video=False, recording=False, figures=False))
+    render_video(tmp_path / "far", tmp_path / "film.mp4", width=320, height=180, fps=10, workers=1)
+    frames, _ = decode(tmp_path / "film.mp4")
     assert frames.shape == (1, 180, 320, 3)
     assert frames.mean() > 30.0
-
-
-def test_a_flight_without_a_single_period_is_refused(short_run: Run, tmp_path: Path):
-    directory = rewrite(short_run, tmp_path / "empty", 0)
     with pytest.raises(FileError, match="nothing to film"):
-        render_video(directory, tmp_path / "film.mp4")
-    assert not (tmp_path / "film.mp4").exists()
+        render_video(empty_run.directory, tmp_path / "none.mp4")
+    assert not (tmp_path / "none.mp4").exists()
 
 
 @pytest.fixture
@@ -219,77 +163,50 @@ def test_footage_knows_its_period_and_the_worst_margin_so_far(short_run: Run):
     assert footage.period.tolist() == [0, 0, 1, 60, len(short_run.log.control.t) - 1]
     assert footage.turned[-1] == pytest.approx(np.sum(0.05 * short_run.log.control.speeds, axis=0), rel=1e-2)
     findings = audit(short_run.log, short_run.limits)
+    assert np.abs(footage.aim - footage.position).max() <= 0.6 * short_run.vehicle.arm_length + 1e-12
     for track, finding in zip(footage.margins, findings, strict=True):
         assert track.worst[-1] == pytest.approx(finding.worst_margin, nan_ok=True)
-
-
-def test_the_camera_is_smooth_and_never_far(short_run: Run):
-    times = np.arange(0.0, 6.0, 1 / 30)
-    footage = make_footage(short_run, times)
-    reach = np.abs(footage.aim - footage.position).max()
-    assert 0.0 < reach <= 0.6 * short_run.vehicle.arm_length + 1e-12
-
-
-def pixels(run: Run, colour: tuple[int, int, int], time: float = 1.0) -> int:
-    """How much of a frame the captions fill with a colour."""
-    footage = make_footage(run, np.array([time]))
-    blank = np.full((720, 1280, 3), 128, np.uint8)
-    picture = Overlay(run, footage, width=1280, height=720).draw(blank, 0)
-    return int(np.count_nonzero((picture == colour).all(axis=-1)))
 
 
 def test_the_last_second_shows_why_there_was_no_answer_and_that_the_fallback_went_on(short_run: Run) -> None:
     long = "cannot hold together: " + "; ".join(["roll upper at +0.15 s .. +0.40 s by 0.8 deg"] * 6)
     controller = {**short_run.summary["controller"], "unrecovered": 40}
-    found = {"sentence": long, "advice": "to try: more"}
-    run = replace(short_run, summary={**short_run.summary, "controller": controller, "diagnosis": found})
-    footage = make_footage(run, np.array([4.9, 5.0, 6.0]))
-    overlay = Overlay(run, footage, width=1280, height=720)
-    lines = [[text for text, _, _ in overlay._headlines(i)] for i in range(3)]
-    assert not [text for text in lines[0] if "recovered" in text]
-    shown = lines[2][lines[2].index("40 periods in fallback, never recovered") :]
-    assert lines[1][-len(shown) :] == shown
+    footage = make_footage(short_run, np.array([4.9, 5.0, 6.0]))
+
+    def headlines(sentence: str, advice: str, **size: Any) -> list[list[str]]:
+        found = {"sentence": sentence, "advice": advice}
+        run = replace(short_run, summary={**short_run.summary, "controller": controller, "diagnosis": found})
+        overlay = Overlay(run, footage, **{"width": 1280, "height": 720, **size})
+        return [[text for text, _, _ in overlay._headlines(i)] for i in range(3)]
+
+    before, first, last = headlines(long, "to try: more")
+    assert not [text for text in before if "recovered" in text]
+    shown = last[last.index("40 periods in fallback, never recovered") :]
+    assert first[-len(shown) :] == shown
     assert " ".join(shown[1:]) == f"{long} to try: more"
-    assert len(shown) == 5
-    overlay.draw(np.full((720, 1280, 3), 128, np.uint8), 2)
-    endless = {"sentence": "; ".join([long] * 20), "advice": ""}
-    much = Overlay(replace(run, summary={**run.summary, "diagnosis": endless}), footage, width=1280, height=720)
-    shown = [text for text, _, _ in much._headlines(2)]
-    assert shown[-1] == "... all of it is in summary.json"
-    assert 38 + 27 * (len(shown) + 2) < 720 - 150
-    small = Overlay(run, footage, width=480, height=270, compact=True)
-    assert len(small._headlines(2)) == 2
-
-
-def bounded(run: Run, *limits: Limit) -> Run:
-    """The run as if it had been held to these limits, before which stand seven that are met with metres to spare."""
-    wide = [Limit(name=f"wide_{j}", signal="z", upper=1000.0 + j) for j in range(7)]
-    return replace(run, limits=(*wide, *limits))
-
-
-def rows(run: Run, *times: float) -> list[tuple[list[str], str]]:
-    """Names of the limits, and the text about the others, in frames at these times."""
-    footage = make_footage(run, np.array(times))
-    ranked = sorted(footage.margins, key=lambda track: track.rank)
-    found = [margin_rows(ranked, i) for i in range(len(times))]
-    return [([track.limit.name for track in shown], rest) for shown, rest in found]
+    assert headlines("; ".join([long] * 20), "")[2][-1] == "... all of it is in summary.json"
+    assert len(headlines(long, "to try: more", width=480, height=270, compact=True)[2]) == 2
 
 
 def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many_more(short_run: Run) -> None:
-    """In the order of the file the one that is violated by metres stands eighth, and was never seen."""
-    run_mismatch = short_run.log.plant.state[-1, INDEX["z"]]
-    assert run_mismatch > 2.0
-    low = Limit(name="low", signal="z", upper=0.5)
-    near = Limit(name="near", signal="z", upper=1.01 * run_mismatch)
+    """In the order of the file the one that is violated by metres stands last, and was never seen."""
+    height = short_run.log.plant.state[-1, INDEX["z"]]
+    wide = [Limit(name=f"wide_{j}", signal="z", upper=1000.0 + j) for j in range(7)]
+    near = Limit(name="near", signal="z", upper=1.01 * height)
     reported = Limit(name="reported", signal="z", upper=0.01, required=False)
-    run = bounded(short_run, near, reported, low)
-    (shown, rest) = rows(run, 6.0)[0]
-    assert shown == ["low", "reported", "near", "wide_0", "wide_1", "wide_2"]
+    low = Limit(name="low", signal="z", upper=0.5)
+
+    def red(*limits: Limit) -> int:
+        """How many pixels of the last frame the captions paint red."""
+        run = replace(short_run, limits=limits)
+        overlay = Overlay(run, make_footage(run, np.array([6.0])), width=1280, height=720)
+        picture = overlay.draw(np.full((720, 1280, 3), 128, np.uint8), 0)
+        return int(np.count_nonzero((picture == RED).all(axis=-1)))
+
+    limits = (*wide, near, reported, low)
+    tracks = make_footage(replace(short_run, limits=limits), np.array([6.0])).margins
+    shown, rest = margin_rows(sorted(tracks, key=lambda track: track.rank), 0)
+    assert [track.limit.name for track in shown] == ["low", "reported", "near", "wide_0", "wide_1", "wide_2"]
     assert rest == "and 4 more"
-    assert pixels(bounded(short_run, near), RED, 6.0) == 0
-    assert pixels(run, RED, 6.0) > 0
-
-
-def test_a_run_that_is_not_one_is_refused(tmp_path: Path):
-    with pytest.raises(FileError, match="is not a run directory"):
-        load_run(tmp_path)
+    assert red(*wide, near) == 0
+    assert red(*limits) > 0

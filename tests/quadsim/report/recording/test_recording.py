@@ -16,7 +16,6 @@ from rerun.chunk import RrdReader
 
 import quadsim.report.recording as recording_module
 from quadsim.controller import SOLVED, UNCONSTRAINED
-from quadsim.errors import OutputError
 from quadsim.flight.audit import SIGNALS, margins_sampled
 from quadsim.flight.rundir import Run
 from quadsim.report.recording import open_viewer, world, write_recording
@@ -120,16 +119,16 @@ def test_the_flown_path_grows_piece_by_piece_without_gaps(content: Content, shor
     np.testing.assert_allclose(whole, position, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", SIGNALS)
-def test_signals_are_the_audited_ones(name: str, content: Content, short_run: Run) -> None:
-    signal, log = SIGNALS[name], short_run.log
-    t, expected = (
-        (log.control.t, signal.sampled(log.control)) if signal.plant is None else (log.plant.t, signal.plant(log.plant))
-    )
-    np.testing.assert_allclose(content.times(f"/signals/{name}"), t, atol=1e-9)
-    np.testing.assert_array_equal(content.rows(f"/signals/{name}", "scalars"), expected.reshape(len(t), -1))
-    assert all(signal.unit in label for label in content.rows(f"/signals/{name}", "names")[0])
-    assert sum(name in names for names in PANELS.values()) == 1
+def test_signals_are_the_audited_ones(content: Content, short_run: Run) -> None:
+    log = short_run.log
+    for name, signal in SIGNALS.items():
+        of_plant = signal.plant is not None
+        t = log.plant.t if of_plant else log.control.t
+        expected = signal.plant(log.plant) if signal.plant is not None else signal.sampled(log.control)
+        np.testing.assert_allclose(content.times(f"/signals/{name}"), t, atol=1e-9)
+        np.testing.assert_array_equal(content.rows(f"/signals/{name}", "scalars"), expected.reshape(len(t), -1))
+        assert all(signal.unit in label for label in content.rows(f"/signals/{name}", "names")[0])
+        assert sum(name in names for names in PANELS.values()) == 1
 
 
 def test_references_are_in_the_units_of_their_signals(record: Callable[[Run], Content], short_run: Run) -> None:
@@ -154,10 +153,6 @@ def test_bounds_margins_and_verdicts_of_the_scenario(content: Content, short_run
     assert all(before != after for before, after in itertools.pairwise(states))
 
 
-def test_an_ideal_flight_has_no_effects(content: Content) -> None:
-    assert not [entity for entity in content.entities if "effects" in entity or "external_force" in entity]
-
-
 def test_forces_torques_wind_and_lagging_rotors_have_their_curves(
     record: Callable[[Run], Content], short_run: Run
 ) -> None:
@@ -174,119 +169,11 @@ def test_forces_torques_wind_and_lagging_rotors_have_their_curves(
     vehicle = run.vehicle
     as_thrusts = vehicle.arm_length * 4.0 * wrench[:, :3] / (vehicle.mass * vehicle.gravity)
     np.testing.assert_allclose(arrows, world._FORCE_SCALE * as_thrusts, rtol=1e-5, atol=1e-9)
-    assert "Effects" in "".join(
-        str(column)
-        for chunk in content.reader.stream(store=content.reader.blueprints()[0]).to_chunks()
-        for column in chunk.to_record_batch().columns
-    )
-
-
-def test_events_report_each_change_of_the_solver_and_the_end(record: Callable[[Run], Content], short_run: Run) -> None:
-    control = short_run.log.control
-    status, fallback = [SOLVED] * control.t.size, control.fallback.copy()
-    status[20:30] = [UNCONSTRAINED] * 10
-    status[40:43], fallback[40:43] = ["infeasible"] * 3, [1, 1, 2]
-    by = ["piqp-dense"] * 20 + ["gain"] * 10 + ["active-set"] * 10 + ["fallback"] * 3
-    by += ["piqp-dense"] * (control.t.size - len(by))
-    changed = dataclasses.replace(control, status=tuple(status), answered_by=tuple(by), fallback=fallback)
-    log = dataclasses.replace(short_run.log, control=changed, reason="the battery fell off")
-    content = record(dataclasses.replace(short_run, log=log))
-    texts = [row[0] for row in content.rows("/events", "text")]
-    levels = [row[0] for row in content.rows("/events", "level")]
-    assert texts == [
-        "solved by piqp-dense, fallback 0",
-        "unconstrained by gain, fallback 0",
-        "solved by active-set, fallback 0",
-        "infeasible, fallback 1",
-        "infeasible, fallback 2",
-        "solved by piqp-dense, fallback 0",
-        "aborted: the battery fell off",
-    ]
-    assert levels == ["INFO", "INFO", "INFO", "WARN", "WARN", "INFO", "ERROR"]
-    times = [0.0, 1.0, 1.5, 2.0, 2.1, 2.15, log.plant.t[-1]]
-    np.testing.assert_allclose(content.times("/events"), times, atol=1e-9)
-
-
-def test_events_report_why_there_was_no_answer_and_when_the_fallback_began_for_good(
-    record: Callable[[Run], Content], short_run: Run
-) -> None:
-    control = short_run.log.control
-    fallback = control.fallback.copy()
-    fallback[-40:] = 2
-    log = dataclasses.replace(short_run.log, control=dataclasses.replace(control, fallback=fallback))
-    found = {"time": 1.0, "sentence": "cannot hold together: roll upper by 1 deg", "advice": "to try: more"}
-    controller = {**short_run.summary["controller"], "unrecovered": 40}
-    summary = {**short_run.summary, "diagnosis": found, "controller": controller}
-    content = record(dataclasses.replace(short_run, log=log, summary=summary))
-    levels = content.rows("/events", "level")
-    solver_events = {
-        row[0]: round(float(time), 9)
-        for time, row, level in zip(content.times("/events"), content.rows("/events", "text"), levels, strict=True)
-        if level == ["ERROR"]
-    }
-    assert solver_events == {
-        "cannot hold together: roll upper by 1 deg": 1.0,
-        "to try: more": 1.0,
-        "40 periods in fallback, never recovered": 4.0,
-    }
-    assert "cannot hold together: roll upper" in content.rows("/summary", "text")[0][0]
-
-
-def test_the_wind_is_an_arrow_that_meets_the_vehicle(record: Callable[[Run], Content], short_run: Run) -> None:
-    t = short_run.log.plant.t
-    wind = np.outer(1.0 + np.sin(t), [3.0, -4.0, 0.0])
-    plant = dataclasses.replace(short_run.log.plant, wind=wind)
-    content = record(dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant)))
-    vectors = np.array(content.rows("/world/vehicle/wind", "vectors"))[:, 0]
-    origins = np.array(content.rows("/world/vehicle/wind", "origins"))[:, 0]
-    longest = 1.5 * short_run.vehicle.arm_length
-    np.testing.assert_allclose(vectors, longest * wind / np.linalg.norm(wind, axis=1).max(), atol=1e-6)
-    tips = (origins + vectors)[:, :2]
-    np.testing.assert_allclose(tips, -0.3 * vectors[:, :2], atol=1e-6)
-
-
-def test_an_aborted_flight_is_recorded_with_its_reason(record: Callable[[Run], Content], aborted_run: Run) -> None:
-    content = record(aborted_run)
-    assert content.rows("/events", "level")[-1] == ["ERROR"]
-    assert aborted_run.log.reason is not None
-    assert aborted_run.log.reason in content.rows("/summary", "text")[0][0]
-
-
-def test_a_flight_without_predictions_or_finite_end_is_recorded(
-    record: Callable[[Run], Content], short_run: Run
-) -> None:
-    plant = short_run.log.plant
-    state = plant.state.copy()
-    state[-1] = math.nan
-    log = dataclasses.replace(short_run.log, predicted=None, plant=dataclasses.replace(plant, state=state))
-    content = record(dataclasses.replace(short_run, log=log))
-    assert "/world/horizon" not in content.entities
-    assert np.isfinite(world._overview(dataclasses.replace(short_run, log=log))).all()
-
-
-def test_the_layout_is_inside_and_shows_only_what_exists(content: Content, short_run: Run) -> None:
-    (blueprint,) = content.reader.blueprints()
-    (store,) = content.reader.recordings()
-    assert blueprint.application_id == store.application_id == "quadsim paper-constrained"
-    chunks = content.reader.stream(store=blueprint).to_chunks()
-    batches = [chunk.to_record_batch() for chunk in chunks]
-    shown = {
-        query.lstrip("+ ")
-        for batch in batches
-        for name in batch.schema.names
-        if name == "ViewContents:query"
-        for row in batch.column(name).to_pylist()
-        for query in row
-    }
-    unreached = {limit.name for limit in short_run.limits if limit.start > short_run.log.control.t[-1]}
-    for query in shown:
-        prefix = "/" + query.strip("/").removesuffix("/**")
-        known = any(entity.startswith(prefix) for entity in content.entities)
-        assert known or query.startswith("$origin") or prefix.split("/")[-1] in unreached, query
-    assert {f"signals/{name}" for name in SIGNALS} <= {query.lstrip("/") for query in shown}
-    texts = "".join(str(column) for batch in batches for column in batch.columns)
-    assert TIMELINE in texts
-    assert all(title in texts for title in ("Course", "Vehicle", "Summary", *PANELS))
+    gusts = np.array(content.rows("/world/vehicle/wind", "vectors"))[:, 0]
+    longest = 1.5 * vehicle.arm_length / np.linalg.norm(wind, axis=1).max()
+    np.testing.assert_allclose(gusts, longest * wind, atol=1e-6)
+    blueprint = content.reader.stream(store=content.reader.blueprints()[0]).to_chunks()
+    assert "Effects" in "".join(str(column) for chunk in blueprint for column in chunk.to_record_batch().columns)
 
 
 def rerun(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -301,37 +188,65 @@ def test_rerun_finds_nothing_wrong_with_the_file_and_the_layout_is_in_force(path
     assert path.stat().st_size < 2_000_000
 
 
-def test_a_place_that_cannot_be_written_is_reported(short_run: Run, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="Not a directory"):
-        write_recording(short_run, tmp_path / "file" / "flight.rrd")
-    with pytest.raises(OutputError, match="No such file or directory"):
-        write_recording(short_run, tmp_path / "missing" / "flight.rrd")
+def test_events_report_each_change_of_the_solver_why_it_failed_and_the_end(
+    record: Callable[[Run], Content], short_run: Run
+) -> None:
+    control = short_run.log.control
+    K = control.t.size
+    status, fallback = [SOLVED] * K, control.fallback.copy()
+    status[20:30] = [UNCONSTRAINED] * 10
+    status[40:43], fallback[40:43], fallback[-40:] = ["infeasible"] * 3, [1, 1, 2], 2
+    by = ["piqp-dense"] * 20 + ["gain"] * 10 + ["active-set"] * 10 + ["fallback"] * 3 + ["piqp-dense"] * (K - 43)
+    changed = dataclasses.replace(control, status=tuple(status), answered_by=tuple(by), fallback=fallback)
+    log = dataclasses.replace(short_run.log, control=changed, reason="the battery fell off")
+    found = {"time": 2.0, "sentence": "cannot hold together: roll upper by 1 deg", "advice": "to try: more"}
+    summary = {
+        **short_run.summary,
+        "diagnosis": found,
+        "controller": {**short_run.summary["controller"], "unrecovered": 40},
+    }
+    content = record(dataclasses.replace(short_run, log=log, summary=summary))
+    expected = [
+        (0.0, "INFO", "solved by piqp-dense, fallback 0"),
+        (1.0, "INFO", "unconstrained by gain, fallback 0"),
+        (1.5, "INFO", "solved by active-set, fallback 0"),
+        (2.0, "ERROR", "cannot hold together: roll upper by 1 deg"),
+        (2.0, "ERROR", "to try: more"),
+        (2.0, "WARN", "infeasible, fallback 1"),
+        (2.1, "WARN", "infeasible, fallback 2"),
+        (2.15, "INFO", "solved by piqp-dense, fallback 0"),
+        (4.0, "ERROR", "40 periods in fallback, never recovered"),
+        (4.0, "WARN", "solved, fallback 2"),
+        (6.0, "ERROR", "aborted: the battery fell off"),
+    ]
+    times = content.times("/events").round(9).tolist()
+    levels, texts = ([row[0] for row in content.rows("/events", name)] for name in ("level", "text"))
+    assert sorted(zip(times, levels, texts, strict=True)) == expected
+    assert "cannot hold together: roll upper" in content.rows("/summary", "text")[0][0]
 
 
-@pytest.fixture
-def viewer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[int], Path]:
-    """Puts in the viewer's place a program that notes its arguments and ends with a status."""
-    notes = tmp_path / "arguments"
-
-    def replace(status: int) -> Path:
-        program = (
-            f"import sys, pathlib; pathlib.Path({str(notes)!r}).write_text(' '.join(sys.argv[1:])); sys.exit({status})"
-        )
-        monkeypatch.setattr(recording_module, "_VIEWER", (sys.executable, "-c", program, *recording_module._VIEWER[4:]))
-        return notes
-
-    return replace
+def test_a_flight_without_predictions_or_finite_end_is_recorded(
+    record: Callable[[Run], Content], short_run: Run
+) -> None:
+    state = short_run.log.plant.state.copy()
+    state[-1] = math.nan
+    log = dataclasses.replace(
+        short_run.log, predicted=None, plant=dataclasses.replace(short_run.log.plant, state=state)
+    )
+    run = dataclasses.replace(short_run, log=log)
+    entities = record(run).entities
+    assert not [entity for entity in entities if any(word in entity for word in ("horizon", "effects", "force"))]
+    assert np.isfinite(world._overview(run)).all()
 
 
 def test_the_viewer_is_given_the_file_and_listens_to_this_machine_alone(
-    viewer: Callable[[int], Path], path: Path, monkeypatch: pytest.MonkeyPatch
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("DISPLAY", ":0")
-    notes = viewer(0)
-    open_viewer(path)
+    notes = tmp_path / "arguments"
+    program = f"import sys, pathlib; pathlib.Path({str(notes)!r}).write_text(' '.join(sys.argv[1:])); sys.exit(130)"
+    monkeypatch.setattr(recording_module, "_VIEWER", (sys.executable, "-c", program, *recording_module._VIEWER[4:]))
+    open_viewer(path)  # closed by Ctrl-C
     assert notes.read_text() == f"--bind=127.0.0.1 --port=auto {path}"
     open_viewer(path, web=True)
     assert "--web-viewer" in notes.read_text().split()
-    viewer(130)  # closed by Ctrl-C
-    open_viewer(path, web=True)
