@@ -10,13 +10,12 @@ import numpy as np
 
 from mpc.constraints import Bounds
 from mpc.ocp import Problem, Query, predicted
-from mpc.paper.condensed import row_maps
 from mpc.paper.prediction import prediction
 from mpc.qp import kkt_residuals
 from mpc.solvers import Answer
 from quadsim.controller import ACCEPTED, FALLBACK, Command
 from quadsim.errors import ParameterError
-from quadsim.state import Array, Indices, all_true
+from quadsim.state import Array, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 BOUND_TOLERANCE: Final = 1e-6
@@ -26,7 +25,7 @@ INFEASIBLE: Final = 1e-3
 INFEASIBLE_ANSWER: Final = "infeasible_answer"
 """Status of an answer whose plan violates a row by more."""
 LARGEST_MAP: Final = 2**20
-"""Entries of the map from inputs to rows of states up to which states are predicted by it, else step by step."""
+"""Entries of the map from inputs to states up to which states are predicted by it, else step by step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,20 +126,10 @@ class AnswerCheck:
         kkt_every: in every so many periods, and for every refused answer, the KKT residuals are computed.
     """
 
-    _maps: tuple[Indices | slice, Array, Array, Array] | None
-
     def __init__(self, problem: Problem, kkt_every: int) -> None:
         self._problem, self._every, self._periods = problem, kkt_every, 0
-        rows, entries = problem.rows, problem.horizon**2 * problem.model.nu
-        self._rest, self._maps = problem.rest, None
-        if rows.C.ndim == 2 and entries * np.count_nonzero(rows.on_states) <= LARGEST_MAP:
-            on_states = np.flatnonzero(rows.on_states)
-            part = rows.part(on_states, np.arange(problem.model.n), problem.model.nu)
-            maps = row_maps(part, prediction(problem.model, problem.horizon))
-            of_inputs, of_state = (np.concatenate(of) for of in (maps.of_inputs, maps.of_state))
-            first, last = (on_states[0], on_states[-1] + 1) if on_states.size else (0, 0)
-            at = slice(first, last) if last - first == on_states.size else on_states  # the former is much quicker
-            self._maps = at, of_inputs, of_state, part.C
+        small = problem.horizon**2 * problem.model.n * problem.model.nu <= LARGEST_MAP
+        self._map = prediction(problem.model, problem.horizon) if small else None
 
     def reset(self) -> None:
         """The next period is the first."""
@@ -167,17 +156,18 @@ class AnswerCheck:
     def _infeasibility(self, problem: Problem, query: Query, answer: Answer) -> float:
         """Largest violation of a row by the plan, a soft one's less its slack; 0 where there is none."""
         rows, plan = problem.rows, answer.plan
-        steps = plan - np.concatenate((query.u_before[None], plan[:-1]))
-        values = plan @ rows.D.T + steps @ rows.E.T
-        if self._maps is not None and problem is self._problem and query.steps is None:
-            x_s, u_s = query.rest or self._rest
-            on_states, of_inputs, of_state, C = self._maps
-            of_plan = of_inputs @ (plan - u_s).ravel() + of_state @ (query.state - x_s)
-            values[:, on_states] += of_plan.reshape(len(plan), -1) + C @ x_s
+        if self._map is not None and problem is self._problem and query.steps is None:
+            x_s, u_s = query.rest or problem.rest
+            moved = self._map.Phi @ (query.state - x_s) + self._map.Psi @ (plan - u_s).ravel()
+            states = x_s + moved.reshape(len(plan), -1)
         else:
             states = predicted(problem, query, plan)
-            before = np.concatenate((query.state[None], states[:-1]))
-            values += np.where(rows.of_states, *((rows.C @ x[:, :, None])[:, :, 0] for x in (states, before)))
+        steps = plan - np.concatenate((query.u_before[None], plan[:-1]))
+        before = np.concatenate((query.state[None], states[:-1]))
+        of_later, of_now = (
+            x @ rows.C.T if rows.C.ndim == 2 else (rows.C @ x[:, :, None])[..., 0] for x in (states, before)
+        )
+        values = np.where(rows.of_states, of_later, of_now) + plan @ rows.D.T + steps @ rows.E.T
         beyond = np.maximum(values - rows.upper, rows.lower - values)
         if rows.soft.size:
             beyond[:, rows.soft] -= answer.slacks[:, rows.slack[rows.soft]]
@@ -195,11 +185,6 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
     if beyond[beyond.argmax()] <= BOUND_TOLERANCE and all_true(np.isfinite(plan)):
         return None
     return "out_of_bounds" if np.isfinite(speeds).all() and np.isfinite(plan).all() else "not_finite"
-
-
-def free_command(answer: Answer) -> Command:
-    """The command of an optimum without constraints, which is within every bound or it would not be one."""
-    return command_of(answer.plan[0], answer.plan, answer.status, answer)
 
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:

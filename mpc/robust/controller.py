@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, AnswerCheck, command_of, free_command, refused, rejection
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
@@ -33,7 +33,7 @@ from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_we
 from mpc.qp import KKT_EVERY
 from mpc.robust.settings import LONGEST_SPAN
 from mpc.robust.settings import RobustSettings as RobustSettings
-from mpc.solvers import INVALID_DATA, Answer, Method, QPSolver
+from mpc.solvers import INVALID_DATA, Answer, QPSolver
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
 from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
@@ -171,14 +171,9 @@ class RobustMPC:
         if isinstance(query, Command):
             return query
         answer, problem = self._answer(now.time, query)
-        refused, free = None, answer.method is Method.FREE
-        if not free:
-            refused = rejection(answer.status, answer.plan[0], answer.plan, self._actuators, self._acting)
+        refused = rejection(answer.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         answer, refused = self._check(problem, query, answer, refused)
         self.answer = answer
-        if free and refused is None:
-            self._acting = answer.plan[0]
-            return free_command(answer)
         if refused is not None:
             if refused != INVALID_DATA and self.unanswered is None:
                 self.unanswered = Unanswered(
