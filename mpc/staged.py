@@ -296,7 +296,7 @@ class Staged:
         self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp
 
     def pose(self, query: Query, problem: Problem | None = None) -> Posed:
-        """See `mpc.qp.Formulation.pose`; `problem` differs in numbers of its constraints' rows alone."""
+        """The QP of a period; `problem` differs in numbers of its constraints' rows alone."""
         rest = query.rest or self._problem.rest
         if query.steps is None:
             A, B = self._problem.model.A, self._problem.model.B
@@ -348,11 +348,11 @@ class Staged:
         return Posed(qp, partial(self._states, matrices, c, state))
 
     def inputs(self, x: Array) -> Array:
-        """See `mpc.qp.Formulation.inputs`."""
+        """(N, nu) the planned inputs [rad/s] in a primal point."""
         return x[self._at.inputs]
 
     def slacks(self, x: Array) -> Array:
-        """See `mpc.qp.Formulation.slacks`."""
+        """(N, m_s) the slacks in a primal point."""
         return x[self._at.slacks]
 
     def _states(self, matrices: Matrices, c: Array, state: Array, x: Array) -> Array:
@@ -364,7 +364,7 @@ class Staged:
         return np.concatenate([first, later.reshape(-1, at.n), x[at.starts[-1:]]])
 
     def multipliers(self, solution: Solution) -> Array:
-        """See `mpc.qp.Formulation.multipliers`."""
+        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
         return self._rows.multipliers(solution.z, solution.z_box[self._at.inputs].ravel())
 
     def _offsets(self, matrices: Matrices, c: Array, state: Array) -> tuple[Array, Array]:

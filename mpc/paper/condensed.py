@@ -139,7 +139,7 @@ class Condensed:
         )
 
     def pose(self, query: Query) -> Posed:
-        """See `mpc.qp.Formulation.pose`."""
+        """The QP of a period; without `Query.steps`, its matrices are the very ones of `qp`."""
         if query.steps is not None:
             return self._pose_changed(query)
         terms, values, rows = self.cost, self._values, self._rows
@@ -196,15 +196,15 @@ class Condensed:
         return Posed(qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m])
 
     def inputs(self, x: Array) -> Array:
-        """See `mpc.qp.Formulation.inputs`."""
+        """(N, nu) the planned inputs [rad/s] in a primal point."""
         return x[: self._inputs].reshape(self._problem.horizon, -1)
 
     def slacks(self, x: Array) -> Array:
-        """See `mpc.qp.Formulation.slacks`."""
+        """(N, m_s) the slacks in a primal point."""
         return x[self._inputs :].reshape(self._problem.horizon, -1)
 
     def multipliers(self, solution: Solution) -> Array:
-        """See `mpc.qp.Formulation.multipliers`."""
+        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
         return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
 
     def solution(self, plan: Array, slacks: Array, multipliers: Array) -> Solution:

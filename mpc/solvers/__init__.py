@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from scipy.linalg import lapack
 
 from mpc.ocp import Problem, Query
 from mpc.paper.condensed import Condensed
-from mpc.qp import QP, Backend, Formulation, KKTResiduals, Solution
+from mpc.qp import QP, Backend, KKTResiduals, Solution
 from mpc.staged import Staged
 from quadsim.controller import ACCEPTED, GAIN, UNCONSTRAINED
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
+
+Formulation: TypeAlias = Condensed | Staged
+"""The ways to write an MPC's optimisation as a QP."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,11 +45,6 @@ class SolverEntry:
     def installed(self) -> bool:
         """Whether the package is there; importing it is left for later."""
         return importlib.util.find_spec(self.package) is not None
-
-    @property
-    def version(self) -> str:
-        """Version of the installed package."""
-        return importlib.metadata.version(self.package)
 
     @property
     def line(self) -> str:
@@ -183,20 +180,16 @@ class Solver(Protocol):
     @property
     def name(self) -> str:
         """Name of the QP solver; see `find_solver`."""
-        ...
 
     @property
     def formulation(self) -> Formulation:
         """The QP that its solutions are of."""
-        ...
 
     def reset(self) -> None:
         """Forget the last period's answer, where it is where the next one starts."""
-        ...
 
     def solve(self, query: Query) -> Answer:
         """The optimum for a query; whatever happens is in its status."""
-        ...
 
 
 class QPSolver:
@@ -262,5 +255,4 @@ def _usable(query: Query) -> bool:
     if steps is None:
         return math.isfinite(state.sum() + desired.sum() + u_before.sum())
     parts = (*steps, state, desired, u_before, *(() if rest is None else (rest.u,)))
-    # Nearly always the sum of their squares is not larger either, which is quicker.
-    return all(np.vdot(part, part) <= LARGEST**2 or np.abs(part).max() <= LARGEST for part in parts)
+    return all(np.abs(part).max() <= LARGEST for part in parts)
