@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -23,13 +23,6 @@ NEAR: Final = 1e-2
 """Distance from a half-space [m] within which a plan is taken to touch it."""
 SETTLED: Final = 1e-2
 """Change of all predicted positions [m] below which planes are not recomputed in the same period."""
-
-
-class Cleared(NamedTuple):
-    """An optimum among obstacles, with its `Answer.states`, and the problem it is of."""
-
-    answer: Answer
-    problem: Problem
 
 
 class Clearing:
@@ -56,8 +49,8 @@ class Clearing:
         self._forms: dict[int, tuple[Staged, PiqpMultistage]] = {}
         self._last: Array | None = None
 
-    def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> Cleared:
-        """The optimum for a query.
+    def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> tuple[Answer, Problem]:
+        """The optimum for a query, with its `Answer.states`, and the problem that it is of.
 
         Args:
             time: of its x(k) [s].
@@ -69,13 +62,14 @@ class Clearing:
         turn = np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         t = time + self._space.period * np.arange(1, self.problem.horizon + 1, dtype=np.float64)
         last, self._last = self._last, None
-        problem = self.problem
-        # Where the last plan touched half-spaces, this one is all but sure to: it is sought among them at once.
-        among = self._changing and along is not None and self._touched(t, along)
+        problem, among = self.problem, False
+        if self._changing and along is not None:
+            # Where the last plan touched half-spaces, this one is all but sure to: it is sought among them at once.
+            among = bool((_room(*self._space.half_spaces(t, along), along) < NEAR).any())
         if along is None or not among:
             answer = self._solver.solve(query)
             if answer.status not in ACCEPTED:
-                return Cleared(answer, problem)
+                return answer, problem
             answer, planned = self._predicted(query, answer, turn)
             if along is None:
                 along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
@@ -90,20 +84,17 @@ class Clearing:
             if answer.status not in ACCEPTED:
                 named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
                 constraints = (*self.problem.constraints, *named)
-                return Cleared(answer, replace(problem, constraints=constraints))
+                return answer, replace(problem, constraints=constraints)
             if np.abs(planned - along).max() < SETTLED:
                 break
             along = planned
         self._last = planned
-        return Cleared(answer, problem)
+        return answer, problem
 
     def _predicted(self, query: Query, answer: Answer, turn: Array) -> tuple[Answer, Array]:
         """The answer with its states, and their positions in the world (N, 3)."""
         states = predicted(self.problem, query, answer.plan)
         return answer._replace(states=states), states[:, self._space.positions] @ turn
-
-    def _touched(self, t: Array, along: Array) -> bool:
-        return bool((_room(*self._space.half_spaces(t, along), along) < NEAR).any())
 
     def _posed(self, normals: Array, bounds: Array) -> Problem:
         """The problem with chosen half-spaces (m, N, 3), (m, N) in the states' axes."""
