@@ -41,48 +41,30 @@ PRICED: Final = 1e-9
 
 
 class Side(NamedTuple):
-    """One of the two bounds of a row.
+    """One of the two bounds of a row."""
 
-    Attributes:
-        place: of its constraint among the problem's (`mpc.ocp.Problem.every_constraint`).
-        row: of the constraint.
-        upper: whether it is the upper bound.
-    """
-
-    place: int
-    row: int
-    upper: bool
+    place: int  # of its constraint among the problem's (`mpc.ocp.Problem.every_constraint`)
+    row: int  # of the constraint
+    upper: bool  # whether it is the upper bound
 
 
 @dataclass(frozen=True, kw_only=True)
 class Violation:
-    """A bound that has to be relaxed.
+    """A bound that has to be relaxed."""
 
-    Attributes:
-        amount: the most that it is violated by, in its row's own unit.
-        share: the same as a share of half of what lies between the row's bounds.
-        first, last: when that begins and ends, as whole periods after the instant of x(k).
-    """
-
-    amount: float
-    share: float
-    first: int
-    last: int
+    amount: float  # the most that it is violated by, in its row's own unit
+    share: float  # the same as a share of half of what lies between the row's bounds
+    first: int  # when that begins, as whole periods after the instant of x(k)
+    last: int  # and ends
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conflict:
-    """What cannot hold together; nothing where the problem has an answer, and its solver failed to find it.
+    """What cannot hold together; nothing where the problem has an answer, and its solver failed to find it."""
 
-    Attributes:
-        total: the sum of all violations, as shares.
-        violated: the bounds that have to be relaxed.
-        blocking: the bounds that hold, and without each of which less violation would do.
-    """
-
-    total: float
-    violated: Mapping[Side, Violation]
-    blocking: tuple[Side, ...]
+    total: float  # the sum of all violations, as shares
+    violated: Mapping[Side, Violation]  # the bounds that have to be relaxed
+    blocking: tuple[Side, ...]  # the bounds that hold, and without each of which less violation would do
 
     @property
     def feasible(self) -> bool:

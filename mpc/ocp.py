@@ -201,20 +201,13 @@ class Problem:
 
 
 class Query(NamedTuple):
-    """What a problem is solved for in one period.
+    """What a problem is solved for in one period."""
 
-    Attributes:
-        state: (n,) x(k).
-        desired: (N, n_r) y_d for x(k+1) .. x(k+N).
-        u_before: (nu,) u(k-1) [rad/s].
-        rest: where the model rests; None for the problem's.
-        steps: A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's about `rest`.
-    """
-
-    state: Array
-    desired: Array
-    u_before: Array
-    rest: Rest | None = None
+    state: Array  # (n,) x(k)
+    desired: Array  # (N, n_r) y_d for x(k+1) .. x(k+N)
+    u_before: Array  # (nu,) u(k-1) [rad/s]
+    rest: Rest | None = None  # where the model rests; None for the problem's
+    # A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's about `rest`
     steps: tuple[Array, Array, Array] | None = None
 
 
@@ -234,23 +227,14 @@ def predicted(problem: Problem, query: Query, plan: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Unanswered:
-    """The first problem of a flight that had no answer, or whose SQP did not converge; `mpc.diagnosis` explains why.
+    """The first problem of a flight that had no answer, or whose SQP did not converge; `mpc.diagnosis` explains why."""
 
-    Attributes:
-        problem: what was to be solved.
-        query: for what; its state and input are copied.
-        status: what spoke against the answer.
-        time: t_k, the period's begin [s].
-        delay: from there to the instant of x(k) [s].
-        converges: where sequential quadratic programming did not converge, whether it does within so many iterations.
-    """
-
-    problem: Problem
-    query: Query
-    status: str
-    time: float
-    delay: float = 0.0
-    converges: Callable[[int], bool] | None = None
+    problem: Problem  # what was to be solved
+    query: Query  # for what; its state and input are copied
+    status: str  # what spoke against the answer
+    time: float  # t_k, the period's begin [s]
+    delay: float = 0.0  # from there to the instant of x(k) [s]
+    converges: Callable[[int], bool] | None = None  # where SQP did not, whether it does within so many iterations
 
     def __post_init__(self) -> None:
         query = self.query

@@ -37,49 +37,30 @@ from quadsim.vehicle import Vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class GeometricSettings:
-    """What a geometric controller is made from; `geometric_settings` derives it from a vehicle and a period.
+    """What a geometric controller is made from; `geometric_settings` derives it from a vehicle and a period."""
 
-    Attributes:
-        period: tau_s [s].
-        k_x: gain of the position error [1/s^2], k_x / m of Lee et al. (2010).
-        k_v: gain of the velocity error [1/s], k_v / m there.
-        k_R: gain of the roll and pitch error [1/s^2], J^-1 k_R there.
-        k_Omega: gain of the roll and pitch rate error [1/s], J^-1 k_Omega there.
-        yaw_share: how fast the heading is corrected over how fast roll and pitch are: its k_Omega has this factor, its
-            k_R the square; reaction torques are weak.
-        k_i: gain of the integral of e_v + c_1 e_x [1/s^2]; 0 for none, as in Lee et al. (2010).
-        k_I: gain of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none.
-        c_1: weight of the position error in the first integral [1/s].
-        c_2: weight of the attitude error in the second [1/s].
-        sigma: largest acceleration of the first integral, each axis [m/s^2].
-        sigma_R: largest angular acceleration of the second, each axis [rad/s^2].
-        tilt_max: largest tilt of the wanted force [deg]; Lee et al. (2010) know none.
-        feedforward: whether the reference's jerk and snap are fed forward too, drag with them, and commands aimed at
-            the middle of the period that they are held for.
-        drag: d_x, d_y, d_z of the acceleration -R diag(d) R' v that is fed forward [1/s].
-        disturbance: the observer of what the model misses; None for none.
-        horizon: N, samples of preview; they give the reference's velocity and acceleration.
-        bounds: what commands are held to; None for the speeds that the rotors hold.
-    """
-
-    period: float
-    k_x: float
-    k_v: float
-    k_R: float
-    k_Omega: float
+    period: float  # tau_s [s]
+    k_x: float  # gain of the position error [1/s^2], k_x / m of Lee et al. (2010)
+    k_v: float  # gain of the velocity error [1/s], k_v / m there
+    k_R: float  # gain of the roll and pitch error [1/s^2], J^-1 k_R there
+    k_Omega: float  # gain of the roll and pitch rate error [1/s], J^-1 k_Omega there
     yaw_share: float = YAW_SHARE
-    k_i: float = 0.0
-    k_I: float = 0.0
-    c_1: float = 1.0
-    c_2: float = 1.0
-    sigma: float = 5.0
-    sigma_R: float = 5.0
-    tilt_max: float = 45.0
+    """How fast the heading is corrected over how fast roll and pitch are: its k_Omega has this factor, its k_R the
+    square; reaction torques are weak."""
+    k_i: float = 0.0  # gain of the integral of e_v + c_1 e_x [1/s^2]; 0 for none, as in Lee et al. (2010)
+    k_I: float = 0.0  # gain of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none
+    c_1: float = 1.0  # weight of the position error in the first integral [1/s]
+    c_2: float = 1.0  # weight of the attitude error in the second [1/s]
+    sigma: float = 5.0  # largest acceleration of the first integral, each axis [m/s^2]
+    sigma_R: float = 5.0  # largest angular acceleration of the second, each axis [rad/s^2]
+    tilt_max: float = 45.0  # largest tilt of the wanted force [deg]; Lee et al. (2010) know none
     feedforward: bool = False
-    drag: tuple[float, ...] = (0.0, 0.0, 0.0)
-    disturbance: RampSettings | None = None
-    horizon: int = 10
-    bounds: ActuatorBounds | None = None
+    """Whether the reference's jerk and snap are fed forward too, drag with them, and commands aimed at the middle of
+    the period that they are held for."""
+    drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # d of the acceleration -R diag(d) R' v that is fed forward [1/s]
+    disturbance: RampSettings | None = None  # of the observer of what the model misses; None for none
+    horizon: int = 10  # N, samples of preview; they give the reference's velocity and acceleration
+    bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
 
     def __post_init__(self) -> None:
         for name in ("period", "k_x", "k_v", "k_R", "k_Omega", "c_1", "c_2", "sigma", "sigma_R"):

@@ -36,27 +36,16 @@ _SHORTEST_LAG: Final = 1e-4  # [s]
 
 @dataclass(frozen=True, kw_only=True)
 class LQRSettings:
-    """What an LQR is made from.
+    """What an LQR is made from."""
 
-    Attributes:
-        period: tau_s [s].
-        objective: weights of one period of the infinite sum; `bryson_objective` gives some for any vehicle.
-        horizon: N, samples of preview; they give the reference's velocity, and N periods are planned.
-        heading_frame: whether errors are turned into axes along the measured yaw, so that any heading flies.
-        tilt_max: largest tilt that errors of x, y and their rates demand [deg], or None.  The law is linear: without a
-            limit a large error demands more tilt than the model, or the vehicle, tolerates.
-        bounds: what commands are held to, the law itself knowing none; None for the speeds that the rotors hold.
-
-    Raises:
-        ParameterError: the tilt is out of range.
-    """
-
-    period: float
-    objective: Objective
-    horizon: int = 10
-    heading_frame: bool = True
+    period: float  # tau_s [s]
+    objective: Objective  # weights of one period of the infinite sum; `bryson_objective` gives some for any vehicle
+    horizon: int = 10  # N, samples of preview; they give the reference's velocity, and N periods are planned
+    heading_frame: bool = True  # whether errors are turned into axes along the measured yaw, so that any heading flies
     tilt_max: float | None = 30.0
-    bounds: ActuatorBounds | None = None
+    """Largest tilt that errors of x, y and their rates demand [deg], or None.  The law is linear: without a limit a
+    large error demands more tilt than the model, or the vehicle, tolerates."""
+    bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
 
     def __post_init__(self) -> None:
         if self.tilt_max is not None:
