@@ -142,10 +142,6 @@ def _features(gyration: tuple[float, float, float]) -> Array:
     return read_only(F.reshape(11, -1))
 
 
-_PAIRS: Final = np.array([1, 0, 2, 0, 1, 2, 3, 2, 3, 1, 1, 2])
-_THRUST_AXIS: Final = np.array(
-    [[2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0], [0.0, 0.0, -2.0], [0.0, 0.0, -2.0]]
-)
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _EYE: Final = np.eye(3)
 _START: Final = np.eye(_TURNING, _TURNING + 2 * N_ROTORS + 1)
@@ -154,8 +150,8 @@ _HALF: Final = np.repeat([0.5, 0.0, 0.5], [4, 3, 3])
 
 def thrust_axis(q: Array) -> Array:
     """R(q) e_z (..., 3) of quaternions (..., 4) of any length."""
-    pairs = q.take(_PAIRS, axis=-1)
-    return np.asarray((pairs[..., :6] * pairs[..., 6:]) @ _THRUST_AXIS + _UP)
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    return np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
 
 
 def rotation(q: Array) -> Array:
@@ -202,11 +198,6 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
     Y[:, :, -1] = x[:, 3:N_BODY]
     Y, travelled = _integrate(model, _drives(model, x, u), Y)
     return _assemble(model, x, u, Y, travelled, frames)
-
-
-def defects(model: RigidBody, x: Array, u: Array) -> Array:
-    """(N, n) how far a plan's states x (N + 1, n) are from where its inputs u (N, 4) take each one before, signed."""
-    return x[1:] - advance_nodes(model, x[:-1], u)
 
 
 def _integrate(model: RigidBody, drives: Array, Y: Array) -> tuple[Array, Array]:
