@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from mpc.baselines.limits import require_positive
+from mpc.baselines.law import require_positive
 from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle
 

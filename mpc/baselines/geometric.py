@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -17,16 +17,16 @@ from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.attitude import (
     LEAST_LIFT,
     Measured,
+    Wanted,
     attitude_error,
     limit_force,
     motion_of,
     rate_error,
+    wanted_attitude,
 )
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for
-from mpc.baselines.law import FeedbackLaw
-from mpc.baselines.limits import require_positive, require_within
+from mpc.baselines.law import FeedbackLaw, require_positive, require_within
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
-from mpc.baselines.wanted import Wanted, wanted_attitude
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import within
 from quadsim.controller import Command, Moment, Phase
@@ -111,16 +111,9 @@ class Integrals:
     rotation: Array
 
 
-@dataclass(frozen=True)
-class Disturbance:
-    """What the model misses: an acceleration and its rate of change, world, and an angular one, body; (3,) each."""
-
-    acceleration: Array
-    change: Array
-    angular: Array
-
-
-UNDISTURBED: Final = Disturbance(*(read_only(np.zeros(3)) for _ in range(3)))
+Disturbance: TypeAlias = tuple[Array, Array, Array]
+"""What the model misses: an acceleration and its rate of change, world, and an angular one, body; (3,) each."""
+UNDISTURBED: Final[Disturbance] = (_NOTHING := read_only(np.zeros(3)), _NOTHING, _NOTHING)
 
 
 class GeometricController(FeedbackLaw):
@@ -140,7 +133,7 @@ class GeometricController(FeedbackLaw):
             if settings.disturbance is None
             else RampObserver(settings.disturbance, vehicle, settings.period, drag=settings.drag)
         )
-        super().__init__(vehicle, settings)
+        super().__init__(vehicle, settings.period, settings.horizon, settings.bounds)
         if settings.feedforward:
             self._operator = differentiator(settings.horizon, settings.period, degree=PREVIEW_DEGREE)
         self.k_R = settings.k_R * np.array([1.0, 1.0, settings.yaw_share**2])
@@ -188,7 +181,7 @@ class GeometricController(FeedbackLaw):
             self._observer.reset(before)
             return UNDISTURBED
         self._observer.update(now.time, motion.velocity, motion.attitude, motion.rates, before)
-        return Disturbance(*self._observer.foreseen(0.5 * self.settings.period))
+        return self._observer.foreseen(0.5 * self.settings.period)
 
     def wrench(
         self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
@@ -209,7 +202,7 @@ class GeometricController(FeedbackLaw):
         e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
         weight = np.array([0.0, 0.0, gravity])
         demanded = m * (-settings.k_x * e_x - settings.k_v * e_v - integrals.translation + weight + target.acceleration)
-        demanded -= m * disturbance.acceleration
+        demanded -= m * disturbance[0]
         A = limit_force(demanded, least=LEAST_LIFT * m * gravity, tilt=math.radians(settings.tilt_max))
         A1 = A2 = p1 = p2 = np.zeros(3)
         if np.array_equal(A, demanded):
@@ -223,7 +216,7 @@ class GeometricController(FeedbackLaw):
         )
         R_rel = R.T @ wanted.attitude
         e_R, e_Omega = attitude_error(R, wanted.attitude), rate_error(R, Omega, wanted.attitude, wanted.rates)
-        ahead = np.cross(Omega, R_rel @ wanted.rates) - R_rel @ wanted.acceleration + disturbance.angular
+        ahead = np.cross(Omega, R_rel @ wanted.rates) - R_rel @ wanted.acceleration + disturbance[2]
         moment = np.cross(Omega, J * Omega) - J * (self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
         if not settings.feedforward:
             return np.concatenate([[A @ R[:, 2]], moment]), wanted
@@ -253,15 +246,16 @@ class GeometricController(FeedbackLaw):
         The disturbance counts as one that changes steadily, drag along the body as one that turns with it.
         """
         m, R, Omega, k_x, k_v = self._vehicle.mass, motion.attitude, motion.rates, self.settings.k_x, self.settings.k_v
+        disturbing, change, _ = disturbance
         up, up1 = R[:, 2], R @ np.array([Omega[1], -Omega[0], 0.0])  # R e_3 and its derivative, R hat(Omega) e_3
         v_b = R.T @ motion.velocity
         v_d = R.T @ target.velocity
         f = max(float(A @ up) + m * self._drag[2] * v_d[2], 0.0)
         e_a = f / m * up - np.array([0.0, 0.0, self._vehicle.gravity]) - target.acceleration
-        e_a += disturbance.acceleration - R @ (self._drag * v_b)
-        A1 = -m * (k_x * e_v + k_v * e_a) + m * (target.jerk - disturbance.change)
+        e_a += disturbing - R @ (self._drag * v_b)
+        A1 = -m * (k_x * e_v + k_v * e_a) + m * (target.jerk - change)
         f1 = float(A1 @ up + A @ up1)
-        e_j = f1 / m * up + f / m * up1 - target.jerk + disturbance.change
+        e_j = f1 / m * up + f / m * up1 - target.jerk + change
         if self._drag.any():
             along = self._drag[2] * (target.acceleration @ up + target.velocity @ up1)
             v_b1 = R.T @ (e_a + target.acceleration) - np.cross(Omega, v_b)

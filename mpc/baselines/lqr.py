@@ -10,8 +10,7 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
-from mpc.baselines.law import FeedbackLaw
-from mpc.baselines.limits import require_within
+from mpc.baselines.law import FeedbackLaw, require_within
 from mpc.baselines.preview import wrapped
 from mpc.heading import turn_horizontally
 from mpc.model import LinearModel, continuous_model, discretise, hover_model, lqr
@@ -115,7 +114,7 @@ class LQR(FeedbackLaw):
     name: Final = "lqr"
 
     def __init__(self, vehicle: Vehicle, settings: LQRSettings) -> None:
-        super().__init__(vehicle, settings)
+        super().__init__(vehicle, settings.period, settings.horizon, settings.bounds)
         self.settings = settings
         self.gain = lqr_gain(self.model, settings.objective)
         self._allocation = make_allocation(vehicle)

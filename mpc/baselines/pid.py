@@ -15,8 +15,7 @@ from mpc.answer import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.attitude import LEAST_LIFT, Measured, attitude_for, limit_force, motion_of, prioritised_error
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
-from mpc.baselines.law import FeedbackLaw
-from mpc.baselines.limits import require_positive, require_within
+from mpc.baselines.law import FeedbackLaw, require_positive, require_within
 from mpc.baselines.preview import Target, target_of
 from mpc.handover import within
 from quadsim.controller import Command, Moment, Phase
@@ -87,7 +86,7 @@ class CascadedPID(FeedbackLaw):
 
     def __init__(self, vehicle: Vehicle, settings: PIDSettings) -> None:
         self.settings, self._vehicle, self._inertia = settings, vehicle, np.array(vehicle.inertia)
-        super().__init__(vehicle, settings)
+        super().__init__(vehicle, settings.period, settings.horizon, settings.bounds)
         self.allocation = make_allocation(vehicle)
         highest = float(self.bounds.u_max.min())
         self._largest = LARGEST_THRUST * 4.0 * vehicle.thrust_coefficient * highest**2  # thrust to command [N]

@@ -41,6 +41,7 @@ class Target:
     None where yaw gives it."""
 
 
+@lru_cache(maxsize=32)
 def differentiator(samples: int, period: float, *, degree: int = 2, first: int = 1) -> Array:
     """(degree + 1, N): value and derivatives at t_k of samples at t_{k + first} .. t_{k + first + N - 1}.
 
@@ -83,7 +84,7 @@ def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
     """
     samples = min(len(motion), MOTION_SAMPLES)
     degree = min(MOTION_DEGREE, samples - 1)
-    operator = _motion_operator(samples, degree, period)
+    operator = differentiator(samples, period, degree=degree, first=0)
     found = np.zeros((MOTION_DEGREE, 3))  # position to snap
     orders = min(degree + 1, MOTION_DEGREE)
     found[:orders] = operator[:orders] @ motion.position[:samples]
@@ -101,11 +102,6 @@ def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
         yaw_acceleration=float(yaw[2]),
         heading=heading,
     )
-
-
-@lru_cache(maxsize=32)
-def _motion_operator(samples: int, degree: int, period: float) -> Array:
-    return differentiator(samples, period, degree=degree, first=0)
 
 
 def wrapped(angle: float) -> float:
