@@ -111,9 +111,10 @@ class Integrals:
     rotation: Array
 
 
+_NOTHING: Final = read_only(np.zeros(3))
 Disturbance: TypeAlias = tuple[Array, Array, Array]
 """What the model misses: an acceleration and its rate of change, world, and an angular one, body; (3,) each."""
-UNDISTURBED: Final[Disturbance] = (_NOTHING := read_only(np.zeros(3)), _NOTHING, _NOTHING)
+UNDISTURBED: Final[Disturbance] = (_NOTHING, _NOTHING, _NOTHING)
 
 
 class GeometricController(FeedbackLaw):

@@ -174,8 +174,10 @@ def posed_problem(spec: BoundedSpec, vehicle: Vehicle, period: float) -> Problem
     Raises:
         InputError: it cannot be made from these numbers.
     """
+    from mpc.robust.controller import robust_problem
+
     if isinstance(spec, RobustSpec):
-        return _robust_problem(spec, vehicle, period)
+        return robust_problem(**_robust_parts(spec, vehicle, period))
     return make_problem(spec, vehicle, period)
 
 
@@ -361,14 +363,8 @@ def _robust_parts(spec: RobustSpec, vehicle: Vehicle, period: float) -> dict[str
     }
 
 
-def _robust_problem(spec: RobustSpec, vehicle: Vehicle, period: float) -> Problem:
-    from mpc.robust.controller import robust_problem
-
-    return robust_problem(**_robust_parts(spec, vehicle, period))
-
-
 def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
-    from mpc.robust.controller import RobustMPC
+    from mpc.robust.controller import RobustMPC, robust_problem
     from mpc.robust.tightening import position_margins
 
     margins = None  # by which half-spaces are tightened along x, y, z at each predicted state, (N, 3) [m]
@@ -376,7 +372,8 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[
         margins = position_margins(**_tightened(spec, vehicle, period))
     space = make_space(spec, vehicle, period, shapes, margins)
     parts = _robust_parts(spec, vehicle, period)
-    return RobustMPC(**parts, shortcut=spec.shortcut, space=space, kkt_every=spec.kkt_every)
+    options: dict[str, Any] = {"shortcut": spec.shortcut, "space": space, "kkt_every": spec.kkt_every}
+    return RobustMPC(vehicle, robust_problem(**parts), parts["settings"], **options)
 
 
 def tightening_margins(spec: RobustSpec, vehicle: Vehicle, period: float) -> Array | None:
