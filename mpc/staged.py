@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from mpc.ocp import Problem, Query, Rest
+from mpc.ocp import Problem, Query
 from mpc.paper.prediction import condense_stages
 from mpc.qp import QP, Posed, QPRows, Solution
 from quadsim.errors import ParameterError
@@ -38,11 +38,6 @@ ROUNDING: Final = 1e-14
 STEPS_OF_ONE_INPUT: Final = 10
 """M for one input; for more it falls with the root of their number.  Of stages of 1 to 25 steps, the resulting five of
 four rotors are the fastest for the paper's case."""
-
-
-def usual_steps(inputs: int) -> int:
-    """M for a problem of so many inputs."""
-    return max(round(STEPS_OF_ONE_INPUT / math.sqrt(inputs)), 1)
 
 
 class Pattern:
@@ -263,9 +258,9 @@ class Staged:
 
     Args:
         problem: with constraints.
-        steps_per_stage: M; None for `usual_steps`.  The first stage, which has no state among its variables, takes what
-            is left of the horizon, and where M > 1 as many more steps as there is room for in blocks of the others'
-            size.
+        steps_per_stage: M; None for what suits the inputs.  The first stage, which has no state among its variables,
+            takes what is left of the horizon, and where M > 1 as many more steps as there is room for in blocks of the
+            others' size.
         changing: whether the model's matrices will be others; then no entry is left out that might be needed.
 
     Attributes:
@@ -279,7 +274,8 @@ class Staged:
 
     def __init__(self, problem: Problem, *, steps_per_stage: int | None = None, changing: bool = False) -> None:
         model, N = problem.model, problem.horizon
-        steps = usual_steps(model.nu) if steps_per_stage is None else steps_per_stage
+        usual = max(round(STEPS_OF_ONE_INPUT / math.sqrt(model.nu)), 1)
+        steps = usual if steps_per_stage is None else steps_per_stage
         if not isinstance(steps, int) or steps < 1:
             raise ParameterError("controller", "steps_per_stage", steps, "a whole number >= 1")
         self._problem, self._rows, soft = problem, QPRows(problem), problem.rows.slacks
@@ -307,10 +303,6 @@ class Staged:
             matrices = self._builder.build(A, B)
         if problem is not None:
             matrices = self._builder.renew(matrices, QPRows(problem))
-        return self._pose(matrices, c, query, rest)
-
-    def _pose(self, matrices: Matrices, c: Array, query: Query, rest: Rest) -> Posed:
-        """The QP for c_i (N, n); at `rest` is what the cost pulls inputs to, and where the terminal weight is about."""
         state, desired, u_before = query[:3]
         at, rows, objective = self._at, matrices.own, self._problem.objective
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))

@@ -32,7 +32,7 @@ class SolverEntry:
     description: str  # one line
     package: str  # what it is imported as
     dense: bool = True  # whether it takes the condensed QP, else the staged one
-    steps_per_stage: int | None = None  # of the staged one; None for `mpc.staged.usual_steps`
+    steps_per_stage: int | None = None  # of the staged one; None for what suits the inputs
     extra: str = ""  # the extra of this project that installs the package; empty for one that is always there
 
     def formulate(self, problem: Problem, *, changing: bool = False) -> Formulation:
