@@ -29,10 +29,6 @@ def turn_horizontally(states: Array, angles: Array | float) -> Array:
     sine: Array | float
     if isinstance(angles, float):
         cosine, sine = math.cos(angles), math.sin(angles)
-        if states.ndim == 1:
-            x, vx, y, vy = states[:4].tolist()
-            turned[:4] = cosine * x - sine * y, cosine * vx - sine * vy, sine * x + cosine * y, sine * vx + cosine * vy
-            return turned
     else:
         cosine, sine = np.cos(angles)[..., None], np.sin(angles)[..., None]
     along, across = states[..., 0:2], states[..., 2:4]  # x and vx, y and vy

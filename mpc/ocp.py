@@ -56,12 +56,7 @@ class Objective:
 
     def desired(self, reference: Array) -> Array:
         """Desired outputs y_r^d (..., n_r) of a reference (..., 4) for x, y, z, yaw; other states are wanted at 0."""
-        return np.dot(reference, self._of_reference)
-
-    @cached_property
-    def _of_reference(self) -> Array:
-        """(4, n_r) what regulated outputs have of a reference."""
-        return self.C_r[:, REFERENCE_STATES].T
+        return np.dot(reference, self.C_r[:, REFERENCE_STATES].T)
 
     @cached_property
     def weights(self) -> tuple[Array, Array]:
@@ -73,10 +68,6 @@ class Objective:
     def terminal_weights(self) -> tuple[Array, Array]:
         """The same for the last state, where x_s is the origin."""
         return self.weights if self.P is None else (self.P, self.P @ np.linalg.pinv(self.C_r))
-
-    def terminal_target(self, desired: Array, x_s: Array) -> Array:
-        """(n,) x_s + C_r^+ (y_d - C_r x_s), which a P is about; any state with C_r x = y_d where there is none."""
-        return np.asarray(x_s + np.linalg.pinv(self.C_r) @ (desired - self.C_r @ x_s))
 
     @property
     def move_weight(self) -> Array:

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.equilibrium import Trim
-from mpc.fallback.hover import by_group, require_quadrotor
+from mpc.fallback.hover import require_quadrotor
+from mpc.fallback.settings import by_group
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
 from quadsim.controller import Moment

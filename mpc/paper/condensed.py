@@ -183,7 +183,9 @@ class Condensed:
         stacked = R.reshape(-1, m + 1)
         if root_end is not None:
             end = root_end @ S[N]
-            end[:, -1] -= root_end @ objective.terminal_target(desired[-1], rest.x)
+            # A last state's weight of its own is about x_s + C_r^+ (y_d - C_r x_s).
+            wanted = rest.x + np.linalg.pinv(objective.C_r) @ (desired[-1] - objective.C_r @ rest.x)
+            end[:, -1] -= root_end @ wanted
             stacked = np.concatenate([stacked, end])
         square = stacked.T @ stacked
         square *= 2.0
