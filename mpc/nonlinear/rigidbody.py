@@ -215,48 +215,31 @@ def _integrate(model: RigidBody, drives: Array, Y: Array) -> tuple[Array, Array]
     lagging, driven = model.rotor_lag is not None, slice(m - drives.shape[-1], m)
     h = model.step / model.substeps
     constant = model.acceleration - model.gravity * _UP
-    z, G = np.empty((M, 11)), np.zeros((M, _TURNING, m))
-    # Views are taken once: at ten nodes a step is made of calls, not of sums.
-    z_q, z_w, z_Tq, features = z[:, :4], z[:, 4:7], z[:, 7:], model.features
-    G_v, G_end, G_w = G[:, _v, driven], G[:, _v, -1], G[:, _w, driven]
 
     def slope(k: int, Y: Array) -> Array:
         state, drive = Y[:, :, -1], drives[k if lagging else 0]
         q = state[:, _q]
-        z_q[:], z_w[:] = q, state[:, _w]
-        np.multiply(q, drive[:, 0, -1:], out=z_Tq)
-        F = (z @ features).reshape(M, _TURNING, _TURNING)
-        np.multiply(thrust_axis(q)[:, :, None], drive[:, :1], out=G_v)
-        np.add(G_end, constant, out=G_end)
-        if lagging or k == 0:
-            G_w[:] = drive[:, 1:]
-        dragging = _drag(model, F, state) if model.drags else None
+        z = np.concatenate([q, state[:, _w], q * drive[:, 0, -1:]], axis=1)
+        F = (z @ model.features).reshape(M, _TURNING, _TURNING)
+        drag = _drag(model, F, state) if model.drags else 0.0
         K = F @ Y
         K[:, :, -1] *= _HALF
-        K += G
-        if dragging is not None:
-            K[:, _v, -1] += dragging
+        along = thrust_axis(q)[:, :, None] * drive[:, :1]
+        along[:, :, -1] += constant
+        K[:, _v, driven] += along
+        K[:, _w, driven] += drive[:, 1:]
+        K[:, _v, -1] += drag
         return np.asarray(K)
 
-    def ahead(K: Array, step: float) -> Array:
-        np.multiply(K, step, out=scratch)
-        return np.add(scratch, Y, out=scratch)
-
-    travelled, scratch = np.zeros((M, 3, m)), np.empty_like(Y)  # of position, without the straight motion
-    for s in range(model.substeps):
-        first = slope(4 * s, Y)
-        second = slope(4 * s + 1, ahead(first, 0.5 * h))
-        third = slope(4 * s + 2, ahead(second, 0.5 * h))
-        fourth = slope(4 * s + 3, ahead(third, h))
-        first += second
-        first += third
-        travelled += h * Y[:, _v] + (h * h / 6.0) * first[:, _v]
-        first += second
-        first += third
-        first += fourth
-        first *= h / 6.0
-        first += Y
-        Y = first
+    travelled = np.zeros((M, 3, m))  # of position, without the straight motion
+    for s in range(0, 4 * model.substeps, 4):
+        first = slope(s, Y)
+        second = slope(s + 1, Y + 0.5 * h * first)
+        third = slope(s + 2, Y + 0.5 * h * second)
+        fourth = slope(s + 3, Y + h * third)
+        total = first + second + third
+        travelled += h * Y[:, _v] + (h * h / 6.0) * total[:, _v]
+        Y = Y + h / 6.0 * (total + second + third + fourth)
     return Y, travelled
 
 
