@@ -111,12 +111,6 @@ class Problem:
         for name, matrix, shape in (("Q_d", self.objective.Q_d, (nu, nu)), ("P", self.objective.P, (n, n))):
             if matrix is not None:
                 _check_shape(name, matrix, shape)
-        if self.bounds is not None:
-            _check_shape("C_c", self.bounds.C_c, (self.bounds.y_min.size, n))
-            _check_shape("delta_min", self.bounds.delta_min, (nu,))
-            _check_shape("u_min", self.bounds.u_min, (nu,))
-            if self.bounds.margins is not None:
-                _check_shape("margins", self.bounds.margins, (self.horizon, self.bounds.y_min.size))
         for constraint in self.every_constraint:
             m = constraint.lower.shape[-1]
             for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):

@@ -121,12 +121,7 @@ class LQR(FeedbackLaw):
         self._tilt_demand = np.linalg.pinv(self.gain[:, TILT]) @ self.gain[:, HORIZONTAL]
 
     def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
-        """The law's command and the model's forecast of the next."""
-        plan = self._plan(state, reference, before)
-        return Command(speeds=plan[0].copy(), plan=plan)
-
-    def _plan(self, state: Array, reference: Array, before: Array) -> Array:
-        """(N, 4) commands: the law's now, held to the bounds, then those of the closed loop of the model."""
+        """The law's command now, held to the bounds, and then those of the closed loop of the model."""
         targets = self._targets(state, reference)
         xi = state
         if self.settings.heading_frame:
@@ -143,7 +138,7 @@ class LQR(FeedbackLaw):
             plan[i] = self._held(speeds, lower, upper) if i == 0 else np.clip(speeds, lower, upper)
             before = plan[i]
             xi = self.model.A @ xi + self.model.B @ (plan[i] - self.model.u_bar)
-        return plan
+        return Command(speeds=plan[0].copy(), plan=plan)
 
     def _targets(self, state: Array, reference: Array) -> Array:
         """(N, 12) reference states at t_k .. t_{k+N-1}, yaw at t_k less than half a turn from the measured one."""

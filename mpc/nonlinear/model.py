@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -166,20 +166,11 @@ def _weighted(first: Triple, second: Triple, third: Triple, fourth: Triple) -> T
 
 
 def _rotor_speeds(model: NonlinearModel, step: float, rotors: Array, inputs: Array) -> Array:
-    """(K, 4) speeds of rotors (4,) under inputs (4,) at the instants of `_instants`.
-
-    `step` is that of the Runge-Kutta method [s].
-    """
-    instants = _instants(model.substeps)
+    """(4 substeps, 4) speeds of rotors (4,) under inputs (4,) where Runge-Kutta's method needs them, of a step [s]."""
+    instants = (np.arange(model.substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel()
     if model.rotor_lag is None:
         return np.broadcast_to(inputs, (instants.size, *inputs.shape))
     return inputs + np.exp(-instants * step / model.rotor_lag)[:, None] * (rotors - inputs)
-
-
-@cache
-def _instants(substeps: int) -> Array:
-    """(4 substeps,) instants at which Runge-Kutta's method evaluates slopes, in steps."""
-    return read_only((np.arange(substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel())
 
 
 def _accelerations(

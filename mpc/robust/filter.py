@@ -72,7 +72,10 @@ class SafetyFilter:
         standing = _standing(mpc.problem)
         self.problem = _feasibility(mpc.problem, standing)
         self._actuators = ActuatorBounds.of_problem(self.problem)
-        self._nearest, self._softened = _Nearest(self.problem, standing), _Nearest(_softened(self.problem), standing)
+        # The same with all constraints on states soft, but for that on the plan's end.
+        parts = self.problem.constraints
+        soft = replace(self.problem, constraints=tuple(p if p.C is None or p.name == END else _soft(p) for p in parts))
+        self._nearest, self._softened = _Nearest(self.problem, standing), _Nearest(soft, standing)
         self.wanted = self.problem.model.u_bar.copy()
 
     @property
@@ -146,12 +149,6 @@ def _feasibility(problem: Problem, standing: Array) -> Problem:
         bound[-1] = STANDING
         constraints.append(Constraint(name=END, lower=-bound, upper=bound, C=standing))
     return replace(problem, objective=objective, bounds=None, constraints=tuple(constraints))
-
-
-def _softened(problem: Problem) -> Problem:
-    """The same with all constraints on states soft, but for that on the plan's end."""
-    soft = [part if part.C is None or part.name == END else _soft(part) for part in problem.constraints]
-    return replace(problem, constraints=tuple(soft))
 
 
 def _soft(part: Constraint) -> Constraint:

@@ -79,14 +79,9 @@ class Space:
                 self._regions.append((shape, slice(first, first + count)))
         self._of_solids = np.array(of_solids, np.intp)
 
-    @property
-    def count(self) -> int:
-        """S, half-spaces of one instant."""
-        return len(self._names)
-
     def half_spaces(self, t: Array, positions: Array) -> tuple[Array, Array]:
         """Normals (S, N, 3) and bounds (S, N) [m] of normal . p >= bound, at times (N,) along positions (N, 3)."""
-        normals, bounds = np.empty((self.count, len(t), 3)), np.empty((self.count, len(t)))
+        normals, bounds = np.empty((len(self._names), len(t), 3)), np.empty((len(self._names), len(t)))
         distance, normal = self._solids.clearances(t, positions)
         normals[self._of_solids], bounds[self._of_solids] = normal, (normal * positions).sum(axis=2) - distance
         for region, at in self._regions:
