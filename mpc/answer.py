@@ -119,11 +119,8 @@ class ActuatorBounds:
 class AnswerCheck:
     """What each answer is worth by the problem as it was posed, believing neither a solver nor the QP's form.
 
-    The plan's states are predicted anew, from the model and the period's state.
-
-    Args:
-        problem: whose queries mostly are answered; another one's are checked too, not as quickly.
-        kkt_every: in every so many periods, and for every refused answer, the KKT residuals are computed.
+    The plan's states are predicted anew, from the model and the period's state; another problem's too, not as quickly.
+    In every `kkt_every`-th period, and for every refused answer, the KKT residuals are computed.
     """
 
     def __init__(self, problem: Problem, kkt_every: int) -> None:

@@ -204,14 +204,10 @@ def _relaxed(
     elastic: Collection[Side],
     together: Mapping[Side, float] | None = None,
 ) -> _Relaxed | None:
-    """Solve the elastic problem; None where that fails, or cannot be.
+    """Solve the elastic problem of bounds over their rows' scales; None where that fails, or cannot be.
 
-    Args:
-        problem: whose model it is.
-        query: what it is solved for.
-        sides: the bounds, over their rows' scales.
-        elastic: those with slack.
-        together: their scales, where all have the same slack at all steps, in their own unit; it is what is minimised.
+    `together` has the scales of elastic bounds that all have the same slack at all steps, in their own unit; it is what
+    is minimised.
     """
     from scipy.optimize import linprog  # takes a tenth of a second, which flights without failures do not need
 

@@ -63,7 +63,10 @@ class RampSettings:
 
 
 class RampObserver:
-    """The six filters, an evolving state: three of the force, world axes, and three of the torque, body axes."""
+    """The six filters, an evolving state: three of the force, world axes, and three of the torque, body axes.
+
+    `drag` (3,) [1/s], and `quadratic_drag` (3,) [1/m] of each component's square, are what the model knows, body axes.
+    """
 
     def __init__(
         self,
@@ -74,15 +77,6 @@ class RampObserver:
         drag: ArrayLike = (0.0, 0.0, 0.0),
         quadratic_drag: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
-        """Set up.
-
-        Args:
-            settings: bandwidths and limits.
-            vehicle: the modelled vehicle.
-            period: tau_s [s].
-            drag: (3,) linear drag that the model knows, body axes [1/s].
-            quadratic_drag: (3,) the same of each component's square [1/m].
-        """
         force = FORCE_SHARE / period if settings.force is None else settings.force
         torque = TORQUE_SHARE / period if settings.torque is None else settings.torque
         pole = np.exp(-period * np.repeat([force, torque], 3))
@@ -115,12 +109,8 @@ class RampObserver:
     def update(self, time: float, velocity: Array, attitude: Array, rates: Array, speeds: Array) -> None:
         """Take note of a period's end; of one whose beginning was not seen only as a beginning.
 
-        Args:
-            time: of the measurement [s].
-            velocity: (3,) measured, world [m/s].
-            attitude: (3, 3) measured, body to world.
-            rates: (3,) measured, body [rad/s].
-            speeds: (4,) commanded rotor speeds in force over the period that ends [rad/s].
+        Measured are the velocity (3,), world, the attitude (3, 3), body to world, and the body rates (3,); the speeds
+        (4,) were commanded over the period that ends [rad/s].
         """
         period, J = self._period, np.array(self._vehicle.inertia)
         spun, squares = self._rotors, self._mean_squares(speeds)

@@ -56,10 +56,7 @@ def bryson_objective(vehicle: Vehicle, period: float | None = None) -> Objective
 
     The model knows no lag.  Where the vehicle's rotors lag so much that the loop of these weights would not be stable
     with `LAG_MARGIN` times their time constant, the deviation of the rotor speeds is halved until it is.
-
-    Args:
-        vehicle: the modelled vehicle.
-        period: tau_s [s]; None for no look at the lag.
+    Without a period [s] the lag counts for nothing.
     """
     deviations = np.array([LARGEST_DEVIATIONS[name] for name in STATE_NAMES])
     share = SPEED_SHARE

@@ -122,7 +122,7 @@ class StateCompletion:
         """The whole state (12,) now.
 
         Args:
-            measured: (12,) what was measured, in part perhaps not finite; of another shape, nothing was.
+            measured: (12,) in part perhaps not finite; of another shape, nothing was measured.
             acting: (4,) rotor speeds in force since the last state [rad/s].
             trim: what holds the vehicle at rest.
             free: whether the vehicle flies, so that the model predicts its motion; otherwise nothing counts as frozen.

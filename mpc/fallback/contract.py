@@ -64,14 +64,8 @@ class Guarded:
     commands pass unchanged.
 
     Attributes:
-        inner: the controller called first, through the protocol alone.
+        inner: the controller called first; one that falls back by itself does no harm.
         law: what levels 1 to 3 are made of.
-
-    Args:
-        inner: one that falls back by itself does no harm, as only its accepted answers are used.
-        model: the hover model of the control period; see `mpc.model.hover_model`.
-        bounds: hard bounds that every command keeps.
-        settings: when the next level takes over.
 
     Raises:
         ParameterError: the model is not a quadrotor's.

@@ -55,13 +55,11 @@ def require_quadrotor(model: LinearModel) -> None:
 
 
 class HoverLaw:
-    """The LQR of hover, set up once.
+    """The LQR of hover, set up once; `tilt` is the largest roll and pitch demanded together [rad].
 
     Attributes:
-        model: the hover model.
         gain: (4, 12) K, from errors in the heading frame to accelerations.
         slope: (4, 4) S; see `mpc.heading.slope`.
-        tilt: largest roll and pitch demanded together [rad].
 
     Raises:
         ParameterError: the model is not a quadrotor's, or the tilt is not between 0 and 90 deg.
@@ -92,13 +90,7 @@ class HoverLaw:
     ) -> Array:
         """The speeds (N, 4) [rad/s] of the next periods, as the model predicts them, turned by the present yaw.
 
-        Args:
-            state: (12,) now.
-            target: (12,) wanted now, level; its velocity moves it on.
-            before: (4,) command in force [rad/s].
-            bounds: that the speeds keep.
-            horizon: N.
-            trim: what holds the vehicle at rest.
+        The target (12,) is what is wanted now, level; its velocity moves it on.
         """
         model, yaw = anchored(self.model, trim), float(state[INDEX["yaw"]])
         A, B = model.A, model.B

@@ -180,12 +180,8 @@ _SLOPES: Final = _rotation_slopes()
 def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
     """A, B and the end x(k+1) of the map from M nodes' states x (M, n) under inputs u (M, 4).
 
-    Args:
-        model: what moves.
-        x: states.
-        u: inputs.
-        frames: (M + 1, 4, 4) orthogonal matrices, where A and B are to be for states whose quaternion is multiplied by
-            them, the first M of them at the beginning of the steps and the last M at the end; None for the states.
+    With `frames` (M + 1, 4, 4), orthogonal matrices, A and B are for states whose quaternion is multiplied by them, the
+    first M of them at the beginning of the steps and the last M at the end.
 
     Returns:
         (M, n, n), (M, n, 4) and (M, n): exact derivatives of the Runge-Kutta map; the end is not multiplied by frames.
@@ -201,15 +197,9 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
 
 
 def _integrate(model: RigidBody, drives: Array, Y: Array) -> tuple[Array, Array]:
-    """Take columns through the Runge-Kutta stages: derivatives of (q, v, omega), and last its value, or that alone.
+    """Take columns Y (M, 10, m) through the Runge-Kutta stages, and (M, 3, m) how far position has moved.
 
-    Args:
-        model: what moves.
-        drives: of `_drives`, for as many of the last columns as it has them.
-        Y: (M, 10, m) at the beginning.
-
-    Returns:
-        (M, 10, m) at the end, and (M, 3, m) how far position has moved.
+    They are derivatives of (q, v, omega), and last its value, or that alone; `drives` are of the last of them.
     """
     M, _, m = Y.shape
     lagging, driven = model.rotor_lag is not None, slice(m - drives.shape[-1], m)

@@ -56,8 +56,7 @@ class SafetyFilter:
     the QP is solved once more.  Where that has no answer either, the status reports it, for
     `mpc.fallback.contract.Guarded` to fly the last good plan.
 
-    Args:
-        mpc: whose model, observer and constraints are used, one without half-spaces; it solves nothing itself.
+    The robust MPC, one without half-spaces, lends its model, observer and constraints; it solves nothing itself.
 
     Attributes:
         problem: the constraints, all hard.

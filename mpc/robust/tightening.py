@@ -93,7 +93,7 @@ def margins(
 
     Args:
         vehicle: the modelled vehicle.
-        period: control period tau [s].
+        period: tau [s].
         horizon: N.
         bounds: of outputs of the 12 states.
         settings: stated bounds.

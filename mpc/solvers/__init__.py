@@ -195,11 +195,8 @@ class Solver(Protocol):
 class QPSolver:
     """A problem's QP, solved each period by a named solver.
 
-    Args:
-        name: see `find_solver`.
-        problem: with constraints.
-        changing: whether queries have models of their own (`mpc.ocp.Query.steps`).
-        shortcut: whether the unconstrained optimum of a condensed QP is tried first.
+    Queries of a `changing` one have models of their own (`mpc.ocp.Query.steps`); with the `shortcut`, the unconstrained
+    optimum of a condensed QP is tried first.
     """
 
     def __init__(self, name: str, problem: Problem, *, changing: bool = False, shortcut: bool = False) -> None:

@@ -32,11 +32,7 @@ class Clearing:
     clear.  Where it is not, the whole QP is solved with the tightest half-spaces of each instant, and with twice as
     many as long as the plan violates one that was left out.
 
-    Args:
-        problem: without half-spaces.
-        solver: solves it.
-        space: what makes the half-spaces.
-        changing: whether queries have steps of their own.
+    The problem and its solver know no half-spaces; queries of a `changing` one have steps of their own.
     """
 
     def __init__(self, problem: Problem, solver: Solver, space: Space, *, changing: bool = False) -> None:
