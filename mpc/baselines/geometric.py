@@ -158,10 +158,8 @@ class GeometricController(FeedbackLaw):
 
     def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
         """The law's wrench as rotor speeds; the integrals rest while bounds keep it from being given."""
-        if self.settings.feedforward or self._observer is not None:
-            motion = motion_of(state, now.attitude, now.body_rates)
-        else:  # the rounding of other flights stays as it is
-            motion = motion_of(state)
+        exact = self.settings.feedforward or self._observer is not None
+        motion = motion_of(state, now.attitude, now.body_rates) if exact else motion_of(state)
         target = target_of(reference, self._operator)
         if self.settings.feedforward and now.motion is not None:
             yaw = np.array([target.yaw, target.yaw_rate, target.yaw_acceleration])

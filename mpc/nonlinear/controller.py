@@ -150,12 +150,10 @@ class NonlinearMPC:
                 replace(settings.ramp, rotor_lag=lag),
                 vehicle,
                 period,
-                drag=np.array(settings.drag) / vehicle.mass,
-                quadratic_drag=np.array(settings.quadratic_drag) / vehicle.mass,
+                drag=self._model.drag / vehicle.mass,
+                quadratic_drag=self._model.quadratic_drag / vehicle.mass,
             )
         self._shift = settings.stride == 1 if settings.shift is None else settings.shift
-        self._difference = settings.attitude_error is AttitudeError.DIFFERENCE
-        self._C_r = self.problem.objective.C_r
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
 
     def _shares(self, speeds: Array) -> Array:
@@ -266,7 +264,6 @@ class NonlinearMPC:
         """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
         self._acting = np.array(speeds, float)
         self._rotors = self._rotors_before = self._shares(self._acting)
-        self._velocity = np.zeros(3)  # the reference's in the last period
         self._forget()
         if self._clearing is not None:
             self._clearing.reset()
@@ -459,11 +456,12 @@ class NonlinearMPC:
         inputs = self._model.shares(nodes.thrusts)
         start = np.hstack([nodes.states, np.vstack([inputs, inputs[-1:]])])[:, :n]
         wanted, s0 = start.copy(), measured.copy()
-        wanted[:, Q], s0[Q] = (1.0, 0.0, 0.0, 0.0) if self._difference else 0.0, frames[0] @ measured[Q]
+        wanted[:, Q], s0[Q] = 0.0, frames[0] @ measured[Q]
+        wanted[:, 3] = self.settings.attitude_error is AttitudeError.DIFFERENCE
         if self._tilted:
             wanted = np.hstack([wanted, np.zeros((len(wanted), 2))])
             s0 = np.append(s0, thrust_axis(measured[Q])[:2])
-        desired = wanted[1:] @ self._C_r.T
+        desired = wanted[1:] @ self.problem.objective.C_r.T
         if self._plan is None:
             self._plan = start, self._clip(inputs)
         elif self._shift:

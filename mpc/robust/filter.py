@@ -133,9 +133,7 @@ class _Nearest:
         if query.rest is not None:
             for side in (qp.h_l, qp.h_u):
                 side.reshape(self._horizon, -1)[-1, self._ends] += self._at_rest @ query.rest.x
-        solution = self._backend.solve(qp)
-        plan, slacks = self._form.inputs(solution.x), self._form.slacks(solution.x)
-        return Answer.of(qp, solution, plan.copy(), slacks, SafetyFilter.solver)
+        return Answer.of(self._form, qp, self._backend.solve(qp), SafetyFilter.solver)
 
 
 def _feasibility(problem: Problem, standing: Array) -> Problem:

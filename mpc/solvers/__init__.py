@@ -158,11 +158,11 @@ class Answer(NamedTuple):
     kkt: KKTResiduals | None = None
 
     @classmethod
-    def of(cls, qp: QP, solution: Solution, plan: Array, slacks: Array, answered_by: str) -> Answer:
+    def of(cls, form: Formulation, qp: QP, solution: Solution, answered_by: str) -> Answer:
         """A solver's solution of a QP, as a plan and slacks."""
         return cls(
-            plan,
-            slacks,
+            form.inputs(solution.x),
+            form.slacks(solution.x),
             solution.status,
             answered_by,
             iterations=solution.iterations,
@@ -224,7 +224,7 @@ class QPSolver:
         qp, states_of = form.pose(query)
         solution = (self._free(qp) if self._shortcut else None) or self._backend.solve(qp)
         by = GAIN if solution.status == UNCONSTRAINED else self.name
-        answer = Answer.of(qp, solution, form.inputs(solution.x), form.slacks(solution.x), by)
+        answer = Answer.of(form, qp, solution, by)
         if self._changing and solution.status in ACCEPTED and np.isfinite(answer.plan).all():
             return answer._replace(states=states_of(solution.x))
         return answer

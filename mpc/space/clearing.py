@@ -127,8 +127,7 @@ class Clearing:
             self._forms[count] = form, backend
         form, backend = self._forms[count]
         qp = form.pose(query, problem).qp
-        solution = backend.solve(qp)
-        return Answer.of(qp, solution, form.inputs(solution.x), form.slacks(solution.x), SOLVER)
+        return Answer.of(form, qp, backend.solve(qp), SOLVER)
 
 
 def _room(normals: Array, bounds: Array, positions: Array) -> Array:

@@ -19,8 +19,7 @@ from mpc.robust.tightening import TighteningSettings, position_margins
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers.piqp_backends import PiqpDense
 from mpc.space.clearing import Clearing
-from mpc.space.halfspaces import Shape, Space
-from mpc.space.settings import AvoidanceSettings
+from mpc.space.halfspaces import AvoidanceSettings, Shape, Space
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.space import Capsule, Corridor, Cylinder, Fence, Sphere
