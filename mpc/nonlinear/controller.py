@@ -314,7 +314,11 @@ class NonlinearMPC:
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
         last, self._last = self._last, None
-        self._turn(now)
+        before, self._called_at, self._rotors_before = self._called_at, now.time, self._rotors
+        if self.settings.rotor_lag and math.isfinite(before):  # the rotors have followed what was commanded
+            left = math.exp(-(now.time - before) / self.settings.rotor_lag)
+            commanded = self._shares(self._acting)
+            self._rotors = commanded + left * (self._rotors - commanded)
         if now.phase in GROUNDED:
             self._acting, _ = self._bounds.reach(self._acting)
             self._forget()
@@ -385,15 +389,6 @@ class NonlinearMPC:
             if measured is not None and np.isfinite(measured).all():
                 x[part] = measured
         return x
-
-    def _turn(self, now: Moment) -> None:
-        """Let the rotors follow what was commanded since the last period."""
-        before, self._called_at = self._called_at, now.time
-        self._rotors_before = self._rotors
-        if self.settings.rotor_lag and math.isfinite(before):
-            left = math.exp(-(now.time - before) / self.settings.rotor_lag)
-            commanded = self._shares(self._acting)
-            self._rotors = commanded + left * (self._rotors - commanded)
 
     def _learn(self, last: tuple[float, Array], time: float, measured: Array) -> None:
         """Compare the measured state with what was to be expected after the last one, disturbances included."""

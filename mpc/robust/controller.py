@@ -162,8 +162,7 @@ class RobustMPC:
         if self._clearing is None:
             answer = self._solver.solve(query)
         else:
-            turn = self._yaw if self.settings.heading else 0.0
-            answer, problem = self._clearing.solve(now.time + self.settings.delay, query, turn)
+            answer, problem = self._clearing.solve(now.time + self.settings.delay, query, self._yaw)
         reason = rejection(answer.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         answer, reason = self._check(problem, query, answer, reason)
         self.answer = answer
@@ -210,13 +209,22 @@ class RobustMPC:
         x0 = self._after(self.settings.delay, state, rotors)
         if not all_true(np.isfinite(x0)):
             return refused(self._acting, self.horizon, INVALID_DATA)
-        self._yaw = float(x0[_YAW])
+        self._yaw = float(x0[_YAW]) if self.settings.heading else 0.0  # by which the problem's axes are turned
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, which is nothing to learn from
             self._ahead = x0
         if self.settings.delay:  # the reference at the instants that the prediction is for, the delay later
             later = np.concatenate([reference[1:], reference[-1:]])
             reference = reference + self.settings.delay / self._period * (later - reference)
-        return self._query(np.concatenate([x0, self._rotors])[: self._model.n], reference)
+        x0 = np.concatenate([x0, self._rotors])[: self._model.n]
+        if self.settings.heading:
+            reference = with_nearest_yaw(reference, self._yaw, self.settings.largest_turn)
+            x0 = turn_horizontally(x0, -self._yaw)
+            x0[_YAW] = 0.0
+        u_s = self._balanced()
+        x_s = self.trim.state(self._yaw, self._model.n)
+        x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
+        desired = self.problem.objective.desired(seen_from(reference, self._yaw))
+        return Query(x0, desired, self._acting, Rest(x_s, u_s))
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`.
@@ -270,19 +278,6 @@ class RobustMPC:
         start = np.concatenate((state, rotors))[: self._model.n]
         acceleration = self._acceleration(thrust_axis(state.tolist()))
         return advance_disturbed(self._model, start, self._acting, time, self._effectiveness, acceleration)[:N_STATES]
-
-    def _query(self, x0: Array, reference: Array) -> Query:
-        yaw = float(x0[_YAW])
-        if not self.settings.heading:
-            yaw = 0.0
-        else:
-            reference = with_nearest_yaw(reference, yaw, self.settings.largest_turn)
-            x0 = turn_horizontally(x0, -yaw)
-            x0[_YAW] = 0.0
-        u_s = self._balanced()
-        x_s = self.trim.state(yaw, self._model.n)
-        x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
-        return Query(x0, self.problem.objective.desired(seen_from(reference, yaw)), self._acting, Rest(x_s, u_s))
 
     def _balanced(self) -> Array:
         """(4,) speeds at rest [rad/s] that also balance what thrust twists now, which the hover matrices leave out."""

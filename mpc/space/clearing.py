@@ -105,7 +105,9 @@ class Clearing:
         while True:
             at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
             problem = self._posed(normals[at] @ turn.T, bounds[at])
-            answer = self._solved(query, problem, len(at[0]))
+            form, backend = self._form(len(at[0]))
+            qp = form.pose(query, problem).qp
+            answer = Answer.of(form, qp, backend.solve(qp), SOLVER)
             if answer.status not in ACCEPTED:
                 return answer, problem, np.empty(0)
             answer, planned = self._predicted(query, answer, turn)
@@ -117,17 +119,15 @@ class Clearing:
             room[at] = -LOOSE  # what was there stays
             count *= 2
 
-    def _solved(self, query: Query, problem: Problem, count: int) -> Answer:
-        """The QP's answer with so many half-spaces at each instant."""
+    def _form(self, count: int) -> tuple[Staged, PiqpMultistage]:
+        """The QP with so many half-spaces at each instant, and what solves it."""
         if count not in self._forms:
-            normals = np.full((count, problem.horizon, 3), 3.0**-0.5)  # in general position
+            normals = np.full((count, self.problem.horizon, 3), 3.0**-0.5)  # in general position
             form = Staged(self._posed(normals, np.zeros(normals.shape[:2])), changing=self._changing)
             backend = PiqpMultistage(changing=True)
             backend.setup(form.qp)
             self._forms[count] = form, backend
-        form, backend = self._forms[count]
-        qp = form.pose(query, problem).qp
-        return Answer.of(form, qp, backend.solve(qp), SOLVER)
+        return self._forms[count]
 
 
 def _room(normals: Array, bounds: Array, positions: Array) -> Array:

@@ -150,7 +150,7 @@ def test_rows_are_added_until_all_half_spaces_are_satisfied(problem: Problem) ->
 
 
 def test_where_the_way_is_clear_the_answer_is_the_solver_s(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Clearing, "_solved", None)  # no QP of its own
+    monkeypatch.setattr(Clearing, "_form", None)  # no QP of its own
     calls: list[Answer] = []
     beside = replace(PILLAR, position=(0.9, 3.0, 0.0))
     assert clearing(problem, space(beside, FENCE), calls).solve(0.0, query(problem))[0].plan is calls[0].plan
