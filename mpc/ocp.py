@@ -143,20 +143,14 @@ class Problem:
         N, n, nu = self.horizon, self.model.n, self.model.nu
         parts = [(part, part.lower.shape[-1]) for part in constraints]
         differing = (N,) if any(part.C is not None and part.C.ndim == 3 for part in constraints) else ()
-        C, D, E = (
-            np.concatenate(
-                [
-                    np.broadcast_to(0.0 if (M := getattr(part, name)) is None else M, (*steps, m, size))
-                    for part, m in parts
-                ],
-                axis=-2,
-            )
-            for name, size, steps in (("C", n, differing), ("D", nu, ()), ("E", nu, ()))
-        )
-        lower, upper = (
-            np.concatenate([np.broadcast_to(getattr(part, side), (N, m)) for part, m in parts], axis=1)
-            for side in ("lower", "upper")
-        )
+
+        def stacked(name: str, columns: int, steps: tuple[int, ...] = ()) -> Array:
+            matrices = [(0.0 if getattr(part, name) is None else getattr(part, name), m) for part, m in parts]
+            return np.concatenate([np.broadcast_to(M, (*steps, m, columns)) for M, m in matrices], axis=-2)
+
+        C, D, E = stacked("C", n, differing), stacked("D", nu), stacked("E", nu)
+        lower = np.concatenate([np.broadcast_to(part.lower, (N, m)) for part, m in parts], axis=1)
+        upper = np.concatenate([np.broadcast_to(part.upper, (N, m)) for part, m in parts], axis=1)
         l1 = np.concatenate([np.full(m, math.inf) if part.penalty is None else part.penalty.l1 for part, m in parts])
         l2 = np.concatenate([np.zeros(m) if part.penalty is None else part.penalty.l2 for part, m in parts])
         names = [part.name for part, m in parts for _ in range(m)]

@@ -29,9 +29,10 @@ from mpc.baselines.law import FeedbackLaw, require_positive, require_within
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import within
+from mpc.nonlinear.model import zero
 from quadsim.controller import Command, Moment, Phase
 from quadsim.errors import ParameterError
-from quadsim.state import Array, read_only
+from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
 
@@ -111,10 +112,9 @@ class Integrals:
     rotation: Array
 
 
-_NOTHING: Final = read_only(np.zeros(3))
 Disturbance: TypeAlias = tuple[Array, Array, Array]
 """What the model misses: an acceleration and its rate of change, world, and an angular one, body; (3,) each."""
-UNDISTURBED: Final[Disturbance] = (_NOTHING, _NOTHING, _NOTHING)
+UNDISTURBED: Final[Disturbance] = (zero(), zero(), zero())
 
 
 class GeometricController(FeedbackLaw):

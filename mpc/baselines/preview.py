@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from mpc.nonlinear.model import zero
 from mpc.nonlinear.rigidbody import rotation
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
@@ -18,10 +19,6 @@ SMALLEST_PREVIEW: Final = 3  # samples that a parabola needs
 PREVIEW_DEGREE: Final = 4  # of the polynomial through a preview that gives jerk and snap
 MOTION_DEGREE: Final = 5  # of the one through a motion's next samples, which are exact
 MOTION_SAMPLES: Final = 7
-
-
-def _nothing() -> Array:
-    return read_only(np.zeros(3))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +31,8 @@ class Target:
     yaw: float  # [rad]
     yaw_rate: float  # [rad/s]
     yaw_acceleration: float  # [rad/s^2]
-    jerk: Array = field(default_factory=_nothing)  # (3,) [m/s^3]
-    snap: Array = field(default_factory=_nothing)  # (3,) [m/s^4]
+    jerk: Array = field(default_factory=zero)  # (3,) [m/s^3]
+    snap: Array = field(default_factory=zero)  # (3,) [m/s^4]
     heading: Array | None = None
     """(3, 3) rows: the direction near which body x is wanted, any length but zero, its rate of change and that of this;
     None where yaw gives it."""

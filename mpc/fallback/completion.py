@@ -80,11 +80,10 @@ def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) ->
     Euler angles are implausibly large; those of the body are not.
     """
     found = {**vars(now), "acting": acting, "unseen": unseen}
-    if unseen.any():
-        if unseen[ANGLES].any():
-            found["attitude"] = None
-        if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
-            found["body_rates"] = None
+    if unseen[ANGLES].any():
+        found["attitude"] = None
+    if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
+        found["body_rates"] = None
     return CompletedMoment(**found)
 
 

@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.errors import ParameterError
+from mpc.nonlinear.model import check_steps, zero
 from quadsim.state import Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -44,10 +44,6 @@ class Inputs(StrEnum):
     SPEED = "speed"
 
 
-def _nothing() -> Array:
-    return read_only(np.zeros(3))
-
-
 @dataclass(frozen=True, kw_only=True)
 class RigidBody:
     """x(k+1) = f(x(k), u(k)) over a time; see the module.  Another disturbance is a matter of `dataclasses.replace`."""
@@ -61,18 +57,13 @@ class RigidBody:
     substeps: int = 1  # Runge-Kutta steps in it
     inputs: Inputs = Inputs.THRUST
     rotor_lag: float | None = None  # time constant by which thrusts or speeds follow the inputs [s]; None for none
-    drag: Array = field(default_factory=_nothing)  # (3,) D_1, linear, body axes [N s/m]
-    quadratic_drag: Array = field(default_factory=_nothing)  # (3,) D_2, body axes [N s^2/m^2]
-    acceleration: Array = field(default_factory=_nothing)  # (3,) a of the disturbance, world frame [m/s^2]
-    angular_acceleration: Array = field(default_factory=_nothing)  # (3,) alpha of the disturbance, body frame [rad/s^2]
+    drag: Array = field(default_factory=zero)  # (3,) D_1, linear, body axes [N s/m]
+    quadratic_drag: Array = field(default_factory=zero)  # (3,) D_2, body axes [N s^2/m^2]
+    acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
+    angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha of the disturbance, body frame [rad/s^2]
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.step < math.inf:
-            raise ParameterError("controller", "node", self.step, "positive and finite")
-        if not isinstance(self.substeps, int) or self.substeps < 1:
-            raise ParameterError("controller", "substeps", self.substeps, "a whole number >= 1")
-        if self.rotor_lag is not None and not 0.0 < self.rotor_lag < math.inf:
-            raise ParameterError("controller", "rotor_lag", self.rotor_lag, "positive and finite, or None")
+        check_steps("node", self.step, self.substeps, self.rotor_lag)
 
     @cached_property
     def features(self) -> Array:
