@@ -10,12 +10,13 @@ import numpy as np
 
 from mpc.constraints import Bounds
 from mpc.ocp import Problem, Query, predicted
+from mpc.paper.condensed import row_maps
 from mpc.paper.prediction import prediction
 from mpc.qp import kkt_residuals
 from mpc.solvers import Answer
 from quadsim.controller import ACCEPTED, FALLBACK, Command
 from quadsim.errors import ParameterError
-from quadsim.state import Array, all_true
+from quadsim.state import Array, Indices, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 BOUND_TOLERANCE: Final = 1e-6
@@ -25,7 +26,7 @@ INFEASIBLE: Final = 1e-3
 INFEASIBLE_ANSWER: Final = "infeasible_answer"
 """Status of an answer whose plan violates a row by more."""
 LARGEST_MAP: Final = 2**20
-"""Entries of the map from inputs to states up to which states are predicted by it, else step by step."""
+"""Entries of the map from inputs to rows of states up to which states are predicted by it, else step by step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,8 +126,15 @@ class AnswerCheck:
 
     def __init__(self, problem: Problem, kkt_every: int) -> None:
         self._problem, self._every, self._periods = problem, kkt_every, 0
-        small = problem.horizon**2 * problem.model.n * problem.model.nu <= LARGEST_MAP
-        self._map = prediction(problem.model, problem.horizon) if small else None
+        self._map: tuple[Indices | slice, Array, Array, Array] | None = None
+        rows, N, n, nu = problem.rows, problem.horizon, problem.model.n, problem.model.nu
+        at = np.flatnonzero(rows.on_states)
+        if rows.C.ndim == 2 and at.size * N**2 * nu <= LARGEST_MAP:
+            part = rows.part(at, np.arange(n), nu)
+            maps = row_maps(part, prediction(problem.model, N))
+            rising = at.size > 0 and at[-1] - at[0] + 1 == at.size
+            there = slice(at[0], at[-1] + 1) if rising else at  # the former is much quicker
+            self._map = there, part.C, np.concatenate(maps.of_inputs), np.concatenate(maps.of_state)
 
     def reset(self) -> None:
         """The next period is the first."""
@@ -153,18 +161,16 @@ class AnswerCheck:
     def _infeasibility(self, problem: Problem, query: Query, answer: Answer) -> float:
         """Largest violation of a row by the plan, a soft one's less its slack; 0 where there is none."""
         rows, plan = problem.rows, answer.plan
+        steps = plan - np.concatenate((query.u_before[None], plan[:-1]))
+        values = plan @ rows.D.T + steps @ rows.E.T
         if self._map is not None and problem is self._problem and query.steps is None:
-            x_s, u_s = query.rest or problem.rest
-            moved = self._map.Phi @ (query.state - x_s) + self._map.Psi @ (plan - u_s).ravel()
-            states = x_s + moved.reshape(len(plan), -1)
+            (at, C, of_inputs, of_state), (x_s, u_s) = self._map, query.rest or problem.rest
+            of_plan = of_inputs @ (plan - u_s).ravel() + of_state @ (query.state - x_s)
+            values[:, at] += of_plan.reshape(len(plan), -1) + C @ x_s
         else:
             states = predicted(problem, query, plan)
-        steps = plan - np.concatenate((query.u_before[None], plan[:-1]))
-        before = np.concatenate((query.state[None], states[:-1]))
-        of_later, of_now = (
-            x @ rows.C.T if rows.C.ndim == 2 else (rows.C @ x[:, :, None])[..., 0] for x in (states, before)
-        )
-        values = np.where(rows.of_states, of_later, of_now) + plan @ rows.D.T + steps @ rows.E.T
+            before = np.concatenate((query.state[None], states[:-1]))
+            values += np.where(rows.of_states, *((rows.C @ x[:, :, None])[:, :, 0] for x in (states, before)))
         beyond = np.maximum(values - rows.upper, rows.lower - values)
         if rows.soft.size:
             beyond[:, rows.soft] -= answer.slacks[:, rows.slack[rows.soft]]
