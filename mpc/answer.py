@@ -132,8 +132,8 @@ class AnswerCheck:
         if rows.C.ndim == 2 and at.size * N**2 * nu <= LARGEST_MAP:
             part = rows.part(at, np.arange(n), nu)
             maps = row_maps(part, prediction(problem.model, N))
-            rising = at.size > 0 and at[-1] - at[0] + 1 == at.size
-            there = slice(at[0], at[-1] + 1) if rising else at  # the former is much quicker
+            contiguous = at.size > 0 and at[-1] - at[0] + 1 == at.size
+            there = slice(at[0], at[-1] + 1) if contiguous else at  # the former is much quicker
             self._map = there, part.C, np.concatenate(maps.of_inputs), np.concatenate(maps.of_state)
 
     def reset(self) -> None:
