@@ -120,27 +120,21 @@ class ActuatorBounds:
 class AnswerCheck:
     """What each answer is worth by the problem as it was posed, believing neither a solver nor the QP's form.
 
-    The plan's states are predicted anew, from the model and the period's state.
-
-    Args:
-        problem: whose queries mostly are answered; another one's are checked too, not as quickly.
-        kkt_every: in every so many periods, and for every refused answer, the KKT residuals are computed.
+    The plan's states are predicted anew, from the model and the period's state; another problem's too, not as quickly.
+    In every `kkt_every`-th period, and for every refused answer, the KKT residuals are computed.
     """
-
-    _maps: tuple[Indices | slice, Array, Array, Array] | None
 
     def __init__(self, problem: Problem, kkt_every: int) -> None:
         self._problem, self._every, self._periods = problem, kkt_every, 0
-        rows, entries = problem.rows, problem.horizon**2 * problem.model.nu
-        self._rest, self._maps = problem.rest, None
-        if rows.C.ndim == 2 and entries * np.count_nonzero(rows.on_states) <= LARGEST_MAP:
-            on_states = np.flatnonzero(rows.on_states)
-            part = rows.part(on_states, np.arange(problem.model.n), problem.model.nu)
-            maps = row_maps(part, prediction(problem.model, problem.horizon))
-            of_inputs, of_state = (np.concatenate(of) for of in (maps.of_inputs, maps.of_state))
-            first, last = (on_states[0], on_states[-1] + 1) if on_states.size else (0, 0)
-            at = slice(first, last) if last - first == on_states.size else on_states  # the former is much quicker
-            self._maps = at, of_inputs, of_state, part.C
+        self._map: tuple[Indices | slice, Array, Array, Array] | None = None
+        rows, N, n, nu = problem.rows, problem.horizon, problem.model.n, problem.model.nu
+        at = np.flatnonzero(rows.on_states)
+        if rows.C.ndim == 2 and at.size * N**2 * nu <= LARGEST_MAP:
+            part = rows.part(at, np.arange(n), nu)
+            maps = row_maps(part, prediction(problem.model, N))
+            contiguous = at.size > 0 and at[-1] - at[0] + 1 == at.size
+            there = slice(at[0], at[-1] + 1) if contiguous else at  # the former is much quicker
+            self._map = there, part.C, np.concatenate(maps.of_inputs), np.concatenate(maps.of_state)
 
     def reset(self) -> None:
         """The next period is the first."""
@@ -169,11 +163,10 @@ class AnswerCheck:
         rows, plan = problem.rows, answer.plan
         steps = plan - np.concatenate((query.u_before[None], plan[:-1]))
         values = plan @ rows.D.T + steps @ rows.E.T
-        if self._maps is not None and problem is self._problem and query.steps is None:
-            x_s, u_s = query.rest or self._rest
-            on_states, of_inputs, of_state, C = self._maps
+        if self._map is not None and problem is self._problem and query.steps is None:
+            (at, C, of_inputs, of_state), (x_s, u_s) = self._map, query.rest or problem.rest
             of_plan = of_inputs @ (plan - u_s).ravel() + of_state @ (query.state - x_s)
-            values[:, on_states] += of_plan.reshape(len(plan), -1) + C @ x_s
+            values[:, at] += of_plan.reshape(len(plan), -1) + C @ x_s
         else:
             states = predicted(problem, query, plan)
             before = np.concatenate((query.state[None], states[:-1]))
@@ -195,11 +188,6 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
     if beyond[beyond.argmax()] <= BOUND_TOLERANCE and all_true(np.isfinite(plan)):
         return None
     return "out_of_bounds" if np.isfinite(speeds).all() and np.isfinite(plan).all() else "not_finite"
-
-
-def free_command(answer: Answer) -> Command:
-    """The command of an optimum without constraints, which is within every bound or it would not be one."""
-    return command_of(answer.plan[0], answer.plan, answer.status, answer)
 
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:

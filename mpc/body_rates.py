@@ -23,14 +23,8 @@ STATUS: Final = "given"
 class BodyRateLoop:
     """The inner loop, see `quadsim.controller.InnerLoop`: its target is its own, not the commanded rotor speeds.
 
-    Args:
-        vehicle: what is flown.
-        rate: how often it is called [Hz].
-        bandwidth: k [1/s].
-        bounds: of the rotor speeds.
-
     Attributes:
-        rate: see above.
+        rate: how often it is called [Hz].
         thrust: collective thrust to be held [N].
         rates: (3,) body rates to be held [rad/s].
     """

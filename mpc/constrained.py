@@ -6,16 +6,16 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, AnswerCheck, command_of, free_command, rejection, shifted
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, rejection, shifted
 from mpc.exact.shortcut import with_shortcut
 from mpc.handover import resized, within
 from mpc.ocp import Problem, Query, Unanswered
 from mpc.paper.prediction import rollout
 from mpc.qp import KKT_EVERY
-from mpc.solvers import INVALID_DATA, Answer, Method, Solver
+from mpc.solvers import INVALID_DATA, Answer, Solver
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
-from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
+from quadsim.controller import GROUNDED, Command, Moment, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
 
@@ -38,7 +38,6 @@ class ConstrainedMPC:
 
     name: Final = "constrained"
     answer: Answer | None = None
-    _plan: Array | None
 
     def __init__(
         self,
@@ -53,13 +52,14 @@ class ConstrainedMPC:
         self._solver = with_shortcut(problem, solver) if shortcut else solver
         self._clearing = None if space is None else Clearing(problem, self._solver, space)
         self._bounds, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
-        self._before, self._plan, self._held = problem.model.u_bar, None, 0
-        self.unanswered: Unanswered | None = None
+        self.reset(problem.model.u_bar)
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s]."""
-        self._before, self._plan, self._held = np.array(speeds, float), None, 0
-        self.unanswered = None
+        self._before = np.array(speeds, float)
+        self._plan: Array | None = None
+        self._held = 0
+        self.unanswered: Unanswered | None = None
         self._solver.reset()
         self._check.reset()
         if self._clearing is not None:
@@ -82,43 +82,31 @@ class ConstrainedMPC:
         if now.acting is not None:
             self._before = now.acting
         if now.phase in GROUNDED:
-            return self._stop(now.phase)
+            self._before, self._plan, self._held = self._bounds.reach(self._before)[0], None, 0
+            return stopped(self._before.copy(), self.horizon, now.phase)
         query = Query(state, self.problem.objective.desired(reference), self._before)
         problem = self.problem
         if self._clearing is None:
             answer = self._solver.solve(query)
         else:
             answer, problem = self._clearing.solve(now.time, query)
-        refused = None
-        if answer.method is not Method.FREE:
-            refused = rejection(answer.status, answer.plan[0], answer.plan, self._bounds, self._before)
+        refused = rejection(answer.status, answer.plan[0], answer.plan, self._bounds, self._before)
         answer, refused = self._check(problem, query, answer, refused)
         self.answer = answer
-        if answer.method is not Method.FREE or refused is not None:
-            return self._follow(now.time, problem, query, answer, refused)
-        self._plan, self._held, self._before = answer.plan, 0, answer.plan[0]
-        return free_command(answer)
-
-    def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`."""
-        return rollout(self.problem.model, states, plans)
-
-    def _stop(self, phase: Phase) -> Command:
-        lower, _ = self._bounds.reach(self._before)
-        self._before, self._plan, self._held = lower, None, 0
-        return stopped(lower.copy(), self.horizon, phase)
-
-    def _follow(self, time: float, problem: Problem, query: Query, answer: Answer, refused: str | None) -> Command:
         if refused not in (None, INVALID_DATA) and self.unanswered is None:
-            self.unanswered = Unanswered(problem=problem, query=query, status=refused, time=time)
+            self.unanswered = Unanswered(problem=problem, query=query, status=refused, time=now.time)
         if refused is None:
             self._plan, self._held = answer.plan, 0
         elif self._plan is None or self._held + 1 >= self.horizon:
             held = f"after holding the last plan for {self._held} periods" if self._held else "with no plan to hold"
-            raise PlanExhaustedError(f"the solver answered {refused!r} {held}", time=time)
+            raise PlanExhaustedError(f"the solver answered {refused!r} {held}", time=now.time)
         else:
             self._held += 1
         self._before = self._bounds.clip(self._plan[self._held], self._before)
         if refused is None:
             return command_of(self._before, self._plan, answer.status, answer)
         return command_of(self._before, shifted(self._plan, self._held), refused, answer, fallback=1)
+
+    def predict(self, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Controller.predict`."""
+        return rollout(self.problem.model, states, plans)

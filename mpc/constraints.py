@@ -116,12 +116,11 @@ class Bounds:
     @property
     def constraints(self) -> tuple[Constraint, ...]:
         """The same as values: outputs, slews, inputs."""
-        nu = self.u_min.size
         outputs = Constraint(name="outputs", lower=self.y_min, upper=self.y_max, C=self.C_c, penalty=self.penalty)
         return (
             outputs if self.margins is None else tightened(outputs, self.margins),
-            Constraint(name="slews", lower=self.delta_min, upper=self.delta_max, E=np.eye(nu)),
-            Constraint(name="inputs", lower=self.u_min, upper=self.u_max, D=np.eye(nu)),
+            Constraint(name="slews", lower=self.delta_min, upper=self.delta_max, E=np.eye(self.delta_min.size)),
+            Constraint(name="inputs", lower=self.u_min, upper=self.u_max, D=np.eye(self.u_min.size)),
         )
 
 

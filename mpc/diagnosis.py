@@ -41,48 +41,30 @@ PRICED: Final = 1e-9
 
 
 class Side(NamedTuple):
-    """One of the two bounds of a row.
+    """One of the two bounds of a row."""
 
-    Attributes:
-        place: of its constraint among the problem's (`mpc.ocp.Problem.every_constraint`).
-        row: of the constraint.
-        upper: whether it is the upper bound.
-    """
-
-    place: int
-    row: int
-    upper: bool
+    place: int  # of its constraint among the problem's (`mpc.ocp.Problem.every_constraint`)
+    row: int  # of the constraint
+    upper: bool  # whether it is the upper bound
 
 
 @dataclass(frozen=True, kw_only=True)
 class Violation:
-    """A bound that has to be relaxed.
+    """A bound that has to be relaxed."""
 
-    Attributes:
-        amount: the most that it is violated by, in its row's own unit.
-        share: the same as a share of half of what lies between the row's bounds.
-        first, last: when that begins and ends, as whole periods after the instant of x(k).
-    """
-
-    amount: float
-    share: float
-    first: int
-    last: int
+    amount: float  # the most that it is violated by, in its row's own unit
+    share: float  # the same as a share of half of what lies between the row's bounds
+    first: int  # when that begins, as whole periods after the instant of x(k)
+    last: int  # and ends
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conflict:
-    """What cannot hold together; nothing where the problem has an answer, and its solver failed to find it.
+    """What cannot hold together; nothing where the problem has an answer, and its solver failed to find it."""
 
-    Attributes:
-        total: the sum of all violations, as shares.
-        violated: the bounds that have to be relaxed.
-        blocking: the bounds that hold, and without each of which less violation would do.
-    """
-
-    total: float
-    violated: Mapping[Side, Violation]
-    blocking: tuple[Side, ...]
+    total: float  # the sum of all violations, as shares
+    violated: Mapping[Side, Violation]  # the bounds that have to be relaxed
+    blocking: tuple[Side, ...]  # the bounds that hold, and without each of which less violation would do
 
     @property
     def feasible(self) -> bool:
@@ -92,9 +74,9 @@ class Conflict:
 
 def find_conflict(unanswered: Unanswered) -> Conflict | None:
     """Which constraints cannot hold together; None where the elastic problem cannot be solved either."""
-    problem, query = unanswered.problem, unanswered.query
+    problem, query, parts = unanswered.problem, unanswered.query, unanswered.problem.every_constraint
     sides, scales = _sides(problem), _scales(problem)
-    of_inputs = {side for side in sides if not _of_states(problem.every_constraint[side.place])}
+    of_inputs = {side for side in sides if (C := parts[side.place].C) is None or not C.any()}
     total, violated, held = 0.0, dict[Side, Violation](), set[Side]()
     for elastic in filter(None, (of_inputs, sides.keys() - of_inputs)):
         present = {side: one for side, one in sides.items() if side in of_inputs or side in elastic}
@@ -107,14 +89,16 @@ def find_conflict(unanswered: Unanswered) -> Conflict | None:
         giving = {side: slack for side, slack in found.slacks.items() if (slack > FEASIBLE).any()}
         for side, slack in giving.items():
             steps, share = np.flatnonzero(slack > FEASIBLE), float(slack.max())
-            later = int(_of_states_alone(problem.every_constraint[side.place], side.row))
+            of_inputs_too = (parts[side.place].D, parts[side.place].E)
+            later = int(not any(matrix is not None and matrix[side.row].any() for matrix in of_inputs_too))
             violated[side] = Violation(
                 amount=share * float(scales[side.place][side.row]),
                 share=share,
                 first=int(steps[0]) + later,
                 last=int(steps[-1]) + later,
             )
-            sides[side] = _moved(sides[side], share + FEASIBLE)  # for what comes next, as wide as it has to be
+            one, wider = sides[side], share + FEASIBLE  # for what comes next, as wide as it has to be
+            sides[side] = replace(one, lower=one.lower - wider, upper=one.upper + wider)
         held |= _needed(problem, query, present, elastic, found, giving)
     return Conflict(total=total, violated=violated, blocking=tuple(sorted(held - violated.keys())))
 
@@ -160,14 +144,6 @@ class _Relaxed(NamedTuple):
     priced: set[Side]
 
 
-def _of_states(constraint: Constraint) -> bool:
-    return constraint.C is not None and bool(constraint.C.any())
-
-
-def _of_states_alone(constraint: Constraint, row: int) -> bool:
-    return not any(matrix is not None and matrix[row].any() for matrix in (constraint.D, constraint.E))
-
-
 def _scales(problem: Problem) -> list[Array]:
     """Of each constraint's rows (m,): half of what lies between the bounds; of one bound alone its size, or 1."""
     scales = []
@@ -195,11 +171,6 @@ def _sides(problem: Problem) -> dict[Side, Constraint]:
                     lower, higher = (none, bound) if upper else (bound, none)
                     sides[Side(place, row, upper)] = Constraint(name=part.name, lower=lower, upper=higher, **matrices)
     return sides
-
-
-def _moved(side: Constraint, share: float) -> Constraint:
-    """A bound moved outwards."""
-    return replace(side, lower=side.lower - share, upper=side.upper + share)
 
 
 def _needed(
@@ -233,14 +204,10 @@ def _relaxed(
     elastic: Collection[Side],
     together: Mapping[Side, float] | None = None,
 ) -> _Relaxed | None:
-    """Solve the elastic problem; None where that fails, or cannot be.
+    """Solve the elastic problem of bounds over their rows' scales; None where that fails, or cannot be.
 
-    Args:
-        problem: whose model it is.
-        query: what it is solved for.
-        sides: the bounds, over their rows' scales.
-        elastic: those with slack.
-        together: their scales, where all have the same slack at all steps, in their own unit; it is what is minimised.
+    `together` has the scales of elastic bounds that all have the same slack at all steps, in their own unit; it is what
+    is minimised.
     """
     from scipy.optimize import linprog  # takes a tenth of a second, which flights without failures do not need
 

@@ -7,7 +7,7 @@ The mean acceleration over a period that the model misses,
 and the angular one likewise, are each followed by two states, the disturbance and its rate of change, with both poles
 of the error at exp(-bandwidth tau_s): the critically damped g-h filter (Morrison, "Introduction to Sequential Smoothing
 and Prediction", 1969).  A disturbance that changes steadily is met without lag, as that of drag on a curved path nearly
-is; the constant one of `mpc.robust.observer` comes late by its time constant.
+is; the constant one of `mpc.observer` comes late by its time constant.
 
 Rotors that lag have their vehicle's rotor inertia: the torque that turns them faster acts on the body, and their
 momentum is turned with it.  On a Hummingbird, over a period of 25 ms, a change of commands turns the body more by this
@@ -63,7 +63,10 @@ class RampSettings:
 
 
 class RampObserver:
-    """The six filters, an evolving state: three of the force, world axes, and three of the torque, body axes."""
+    """The six filters, an evolving state: three of the force, world axes, and three of the torque, body axes.
+
+    `drag` (3,) [1/s], and `quadratic_drag` (3,) [1/m] of each component's square, are what the model knows, body axes.
+    """
 
     def __init__(
         self,
@@ -74,15 +77,6 @@ class RampObserver:
         drag: ArrayLike = (0.0, 0.0, 0.0),
         quadratic_drag: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
-        """Set up.
-
-        Args:
-            settings: bandwidths and limits.
-            vehicle: the modelled vehicle.
-            period: tau_s [s].
-            drag: (3,) linear drag that the model knows, body axes [1/s].
-            quadratic_drag: (3,) the same of each component's square [1/m].
-        """
         force = FORCE_SHARE / period if settings.force is None else settings.force
         torque = TORQUE_SHARE / period if settings.torque is None else settings.torque
         pole = np.exp(-period * np.repeat([force, torque], 3))
@@ -115,12 +109,8 @@ class RampObserver:
     def update(self, time: float, velocity: Array, attitude: Array, rates: Array, speeds: Array) -> None:
         """Take note of a period's end; of one whose beginning was not seen only as a beginning.
 
-        Args:
-            time: of the measurement [s].
-            velocity: (3,) measured, world [m/s].
-            attitude: (3, 3) measured, body to world.
-            rates: (3,) measured, body [rad/s].
-            speeds: (4,) commanded rotor speeds in force over the period that ends [rad/s].
+        Measured are the velocity (3,), world, the attitude (3, 3), body to world, and the body rates (3,); the speeds
+        (4,) were commanded over the period that ends [rad/s].
         """
         period, J = self._period, np.array(self._vehicle.inertia)
         spun, squares = self._rotors, self._mean_squares(speeds)
@@ -150,7 +140,8 @@ class RampObserver:
         value = predicted + self._gain * surprise
         self._value = np.clip(value, -self._largest, self._largest)
         self._change = np.where(value == self._value, self._change + self._gain_of_change * surprise, 0.0)
-        self._fit(v_b, attitude.T @ self.foreseen(0.0)[0])
+        d_b = attitude.T @ self.foreseen(0.0)[0]
+        self._products, self._squares = self._decay * self._products + d_b * v_b, self._decay * self._squares + v_b**2
 
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
         """What is missed so long [s] after the last measurement, (3,) each.
@@ -168,10 +159,6 @@ class RampObserver:
         The least squares of d_b + diag(drag) v_b, older samples with less weight; zero while the vehicle is slow.
         """
         return np.maximum(-self._products / (self._squares + self._ballast), 0.0)
-
-    def _fit(self, v_b: Array, d_b: Array) -> None:
-        self._products = self._decay * self._products + d_b * v_b
-        self._squares = self._decay * self._squares + v_b**2
 
     def _mean_squares(self, speeds: Array) -> Array:
         """(4,) mean squares of the rotor speeds over the period, which tend to `speeds` exponentially [rad^2/s^2]."""

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.nonlinear.model import NonlinearModel
+from mpc.nonlinear.model import NonlinearModel, zero
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
@@ -35,7 +35,7 @@ class Trim:
     speeds: Array  # (4,) of the rotors [rad/s]
     lift: Array  # (3,) along which thrust points, world frame, of any length; upwards
     # (3,) angular acceleration, body frame, over the acceleration by thrust that brings it about [1/m]
-    twist: Array = field(default_factory=lambda: np.zeros(3))
+    twist: Array = field(default_factory=zero)
 
     def __post_init__(self) -> None:
         if np.shape(self.speeds) != (N_ROTORS,) or not all_true(np.isfinite(self.speeds)):

@@ -18,7 +18,7 @@ import numpy as np
 
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
-from quadsim.rotation import multiply
+from quadsim.rotation import conjugate, multiply
 from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
 
@@ -96,8 +96,7 @@ def _carried(b: Array, yaw: float) -> Array:
 
 def _body_rates(attitude: Array, period: float) -> Array:
     """(K, 3) body rates 2 vec(q* Dq) [rad/s] along quaternions (K, 4), a period [s] apart."""
-    conjugate = attitude * np.array([1.0, -1.0, -1.0, -1.0])
-    rates: Array = 2.0 * multiply(conjugate, np.gradient(attitude, period, axis=0))[:, 1:]
+    rates: Array = 2.0 * multiply(conjugate(attitude), np.gradient(attitude, period, axis=0))[:, 1:]
     return rates
 
 

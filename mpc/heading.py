@@ -29,10 +29,6 @@ def turn_horizontally(states: Array, angles: Array | float) -> Array:
     sine: Array | float
     if isinstance(angles, float):
         cosine, sine = math.cos(angles), math.sin(angles)
-        if states.ndim == 1:
-            x, vx, y, vy = states[:4].tolist()
-            turned[:4] = cosine * x - sine * y, cosine * vx - sine * vy, sine * x + cosine * y, sine * vx + cosine * vy
-            return turned
     else:
         cosine, sine = np.cos(angles)[..., None], np.sin(angles)[..., None]
     along, across = states[..., 0:2], states[..., 2:4]  # x and vx, y and vy
@@ -68,12 +64,9 @@ def predict_in_heading_frame(model: LinearModel, states: Array, plans: Array, tr
     With a trim the model is one that is `anchored` there; otherwise at level hover.
     """
     yaws = states[:, _YAW]
-    seen = turn_horizontally(states, -yaws)
-    if trim is None:
-        predicted = rollout(model, seen, plans)
-    else:
-        rest = np.array([trim.state(yaw) for yaw in yaws.tolist()])
-        predicted = rollout(replace(model, u_bar=trim.speeds), seen - rest, plans) + rest[:, None]
+    seen, trim = turn_horizontally(states, -yaws), trim or Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
+    rest = np.array([trim.state(yaw) for yaw in yaws.tolist()])
+    predicted = rollout(replace(model, u_bar=trim.speeds), seen - rest, plans) + rest[:, None]
     return turn_horizontally(predicted, yaws[:, None])
 
 

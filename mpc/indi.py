@@ -72,14 +72,7 @@ class TorqueIncrement:
         self._last, self._filtered, self._slope = other._last, other._filtered, other._slope
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
-        """The rotor speeds to hold until the next call (4,) [rad/s].
-
-        Args:
-            time: when it is [s].
-            commanded: (4,) what the law demands [rad/s].
-            rates: (3,) measured body rates [rad/s].
-            rotors: (4,) measured rotor speeds [rad/s].
-        """
+        """The rotor speeds (4,) to hold until the next call, from those that the law demands and the measured ones."""
         M, J = self._allocation.M, self._inertia
         last, self._last = self._last, (time, rates.copy())
         if last is not None and time > last[0]:

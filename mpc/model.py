@@ -39,9 +39,7 @@ class LinearModel:
 def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0) -> tuple[Array, Array]:
     """Jacobians (A_c, B_c) of the nonlinear model of Sec. 2.2 at hover with zero yaw.
 
-    Args:
-        vehicle: the numbers.
-        rotor_lag: T of dw/dt = (u - w) / T [s], whose rotor speeds w are four more states; 0 for none.
+    With a rotor lag T [s], dw/dt = (u - w) / T, the rotor speeds w are four more states.
 
     Returns:
         (12, 12) and (12, 4): d(xi)/dt = A_c (xi - xi_bar) + B_c (u - u_bar); with lag (16, 16) and (16, 4).

@@ -73,10 +73,6 @@ class DisturbanceObserver:
 
     What is predicted starts from what was measured a period ago, so that the estimate of v itself is not stored: noise
     of a measurement enters twice, with opposite signs, and the gains are those for twice its variance.
-
-    Attributes:
-        gain: (6,) of the disturbances on the surprise in their velocities and rates [1/s].
-        largest: (6,) magnitude of an estimate.
     """
 
     def __init__(self, settings: ObserverSettings, period: float) -> None:
@@ -90,7 +86,7 @@ class DisturbanceObserver:
         _, torque = observer_gain(
             period, noise=doubled * settings.rate_noise, walk=settings.rate_walk, change=settings.torque_walk
         )
-        self.gain = np.repeat([force, torque], 3)
+        self.gain = np.repeat([force, torque], 3)  # (6,) on the surprise in velocities and rates [1/s]
         self.largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
         self.reset()
 

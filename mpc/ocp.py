@@ -56,12 +56,7 @@ class Objective:
 
     def desired(self, reference: Array) -> Array:
         """Desired outputs y_r^d (..., n_r) of a reference (..., 4) for x, y, z, yaw; other states are wanted at 0."""
-        return np.dot(reference, self._of_reference)
-
-    @cached_property
-    def _of_reference(self) -> Array:
-        """(4, n_r) what regulated outputs have of a reference."""
-        return self.C_r[:, REFERENCE_STATES].T
+        return np.dot(reference, self.C_r[:, REFERENCE_STATES].T)
 
     @cached_property
     def weights(self) -> tuple[Array, Array]:
@@ -73,10 +68,6 @@ class Objective:
     def terminal_weights(self) -> tuple[Array, Array]:
         """The same for the last state, where x_s is the origin."""
         return self.weights if self.P is None else (self.P, self.P @ np.linalg.pinv(self.C_r))
-
-    def terminal_target(self, desired: Array, x_s: Array) -> Array:
-        """(n,) x_s + C_r^+ (y_d - C_r x_s), which a P is about; any state with C_r x = y_d where there is none."""
-        return np.asarray(x_s + np.linalg.pinv(self.C_r) @ (desired - self.C_r @ x_s))
 
     @property
     def move_weight(self) -> Array:
@@ -120,12 +111,6 @@ class Problem:
         for name, matrix, shape in (("Q_d", self.objective.Q_d, (nu, nu)), ("P", self.objective.P, (n, n))):
             if matrix is not None:
                 _check_shape(name, matrix, shape)
-        if self.bounds is not None:
-            _check_shape("C_c", self.bounds.C_c, (self.bounds.y_min.size, n))
-            _check_shape("delta_min", self.bounds.delta_min, (nu,))
-            _check_shape("u_min", self.bounds.u_min, (nu,))
-            if self.bounds.margins is not None:
-                _check_shape("margins", self.bounds.margins, (self.horizon, self.bounds.y_min.size))
         for constraint in self.every_constraint:
             m = constraint.lower.shape[-1]
             for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
@@ -158,20 +143,14 @@ class Problem:
         N, n, nu = self.horizon, self.model.n, self.model.nu
         parts = [(part, part.lower.shape[-1]) for part in constraints]
         differing = (N,) if any(part.C is not None and part.C.ndim == 3 for part in constraints) else ()
-        C, D, E = (
-            np.concatenate(
-                [
-                    np.broadcast_to(0.0 if (M := getattr(part, name)) is None else M, (*steps, m, size))
-                    for part, m in parts
-                ],
-                axis=-2,
-            )
-            for name, size, steps in (("C", n, differing), ("D", nu, ()), ("E", nu, ()))
-        )
-        lower, upper = (
-            np.concatenate([np.broadcast_to(getattr(part, side), (N, m)) for part, m in parts], axis=1)
-            for side in ("lower", "upper")
-        )
+
+        def stacked(name: str, columns: int, steps: tuple[int, ...] = ()) -> Array:
+            matrices = [(0.0 if getattr(part, name) is None else getattr(part, name), m) for part, m in parts]
+            return np.concatenate([np.broadcast_to(M, (*steps, m, columns)) for M, m in matrices], axis=-2)
+
+        C, D, E = stacked("C", n, differing), stacked("D", nu), stacked("E", nu)
+        lower = np.concatenate([np.broadcast_to(part.lower, (N, m)) for part, m in parts], axis=1)
+        upper = np.concatenate([np.broadcast_to(part.upper, (N, m)) for part, m in parts], axis=1)
         l1 = np.concatenate([np.full(m, math.inf) if part.penalty is None else part.penalty.l1 for part, m in parts])
         l2 = np.concatenate([np.zeros(m) if part.penalty is None else part.penalty.l2 for part, m in parts])
         names = [part.name for part, m in parts for _ in range(m)]
@@ -201,20 +180,13 @@ class Problem:
 
 
 class Query(NamedTuple):
-    """What a problem is solved for in one period.
+    """What a problem is solved for in one period."""
 
-    Attributes:
-        state: (n,) x(k).
-        desired: (N, n_r) y_d for x(k+1) .. x(k+N).
-        u_before: (nu,) u(k-1) [rad/s].
-        rest: where the model rests; None for the problem's.
-        steps: A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's about `rest`.
-    """
-
-    state: Array
-    desired: Array
-    u_before: Array
-    rest: Rest | None = None
+    state: Array  # (n,) x(k)
+    desired: Array  # (N, n_r) y_d for x(k+1) .. x(k+N)
+    u_before: Array  # (nu,) u(k-1) [rad/s]
+    rest: Rest | None = None  # where the model rests; None for the problem's
+    # A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's about `rest`
     steps: tuple[Array, Array, Array] | None = None
 
 
@@ -234,23 +206,14 @@ def predicted(problem: Problem, query: Query, plan: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Unanswered:
-    """The first problem of a flight that had no answer, or whose SQP did not converge; `mpc.diagnosis` explains why.
+    """The first problem of a flight that had no answer, or whose SQP did not converge; `mpc.diagnosis` explains why."""
 
-    Attributes:
-        problem: what was to be solved.
-        query: for what; its state and input are copied.
-        status: what spoke against the answer.
-        time: t_k, the period's begin [s].
-        delay: from there to the instant of x(k) [s].
-        converges: where sequential quadratic programming did not converge, whether it does within so many iterations.
-    """
-
-    problem: Problem
-    query: Query
-    status: str
-    time: float
-    delay: float = 0.0
-    converges: Callable[[int], bool] | None = None
+    problem: Problem  # what was to be solved
+    query: Query  # for what; its state and input are copied
+    status: str  # what spoke against the answer
+    time: float  # t_k, the period's begin [s]
+    delay: float = 0.0  # from there to the instant of x(k) [s]
+    converges: Callable[[int], bool] | None = None  # where SQP did not, whether it does within so many iterations
 
     def __post_init__(self) -> None:
         query = self.query

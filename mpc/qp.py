@@ -10,7 +10,7 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 import numpy as np
 from scipy.sparse import csc_matrix
 
-from mpc.ocp import Problem, Query
+from mpc.ocp import Problem
 from quadsim.controller import SOLVED
 from quadsim.state import Array, Indices
 
@@ -128,41 +128,14 @@ class Posed(NamedTuple):
     states: Callable[[Array], Array]  # takes a primal point to the predicted states (N, n)
 
 
-class Formulation(Protocol):
-    """One way to write an MPC's optimisation as a QP."""
-
-    @property
-    def qp(self) -> QP:
-        """The QP of the problem's own model for a zero state."""
-        ...
-
-    def pose(self, query: Query) -> Posed:
-        """The QP of a period; without `Query.steps`, its matrices are the very ones of `qp`."""
-        ...
-
-    def inputs(self, x: Array) -> Array:
-        """(N, nu) the planned inputs [rad/s] in a primal point."""
-        ...
-
-    def slacks(self, x: Array) -> Array:
-        """(N, m_s) the slacks in a primal point."""
-        ...
-
-    def multipliers(self, solution: Solution) -> Array:
-        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
-        ...
-
-
 class Backend(Protocol):
     """A QP solver."""
 
     def setup(self, qp: QP) -> None:
         """Prepare for QPs of these matrices, or at least of their pattern."""
-        ...
 
     def solve(self, qp: QP) -> Solution:
         """Solve; whatever happens is in the solution's status."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)

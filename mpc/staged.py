@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
-from mpc.ocp import Problem, Query, Rest
+from mpc.ocp import Problem, Query
 from mpc.paper.prediction import condense_stages
 from mpc.qp import QP, Posed, QPRows, Solution
 from quadsim.errors import ParameterError
@@ -38,11 +38,6 @@ ROUNDING: Final = 1e-14
 STEPS_OF_ONE_INPUT: Final = 10
 """M for one input; for more it falls with the root of their number.  Of stages of 1 to 25 steps, the resulting five of
 four rotors are the fastest for the paper's case."""
-
-
-def usual_steps(inputs: int) -> int:
-    """M for a problem of so many inputs."""
-    return max(round(STEPS_OF_ONE_INPUT / math.sqrt(inputs)), 1)
 
 
 class Pattern:
@@ -128,21 +123,49 @@ class Matrices:
     own: QPRows  # what these are
 
 
-class MatrixBuilder:
-    """Fixes the pattern of the matrices once, then fills in their values."""
+def condense(at: Layout, start: Array, free: Array, *steps: Array) -> tuple[Array, Array]:
+    """The first stage from `start` and the others from `free` on; see `condense_stages`."""
+    head = condense_stages(start, *(part[None, : at.L] for part in steps))
+    return head, condense_stages(free, *(part[at.L :].reshape(len(free), at.M, *part.shape[1:]) for part in steps))
 
-    def __init__(self, problem: Problem, rows: QPRows, at: Layout, *, changing: bool) -> None:
-        self._at, self._rows, objective = at, rows, problem.objective
+
+class Staged:
+    """The partially condensed QP of a problem.
+
+    Args:
+        problem: with constraints.
+        steps_per_stage: M; None for what suits the inputs.  The first stage, which has no state among its variables,
+            takes what is left of the horizon, and where M > 1 as many more steps as there is room for in blocks of the
+            others' size.
+        changing: whether the model's matrices will be others; then no entry is left out that might be needed.
+
+    Attributes:
+        fixed: the matrices of the problem's model.
+        qp: of these, for xi(k) and y_d zero and u(k-1) = u_bar.
+
+    Raises:
+        ValueError: the problem has no constraints; it needs no QP.
+        ParameterError: the number of steps is not possible.
+    """
+
+    def __init__(self, problem: Problem, *, steps_per_stage: int | None = None, changing: bool = False) -> None:
+        model, N = problem.model, problem.horizon
+        usual = max(round(STEPS_OF_ONE_INPUT / math.sqrt(model.nu)), 1)
+        steps = usual if steps_per_stage is None else steps_per_stage
+        if not isinstance(steps, int) or steps < 1:
+            raise ParameterError("controller", "steps_per_stage", steps, "a whole number >= 1")
+        self._problem, self._rows, soft = problem, QPRows(problem), problem.rows.slacks
+        self._at = at = Layout(N, model.n, model.nu, soft.size, steps)
+        rows, objective = self._rows, problem.objective
         self._Q, self._Q_end = objective.weights[0], objective.terminal_weights[0]
         self._input_weight, self._move_weight = 2.0 * objective.Q_u, 2.0 * objective.move_weight
-        soft = problem.rows.slacks
         self._slack_weight = 2.0 * np.tile(problem.rows.l2[soft], at.N)[:, None, None]
         self._input_costs = {steps: self._input_cost(steps) for steps in (at.L, at.M)}
+        A, B = (np.broadcast_to(part, (N, *part.shape)) for part in (model.A, model.B))
+        fixed = A, B
         if changing:  # of numbers in general position an entry is zero only where it always is
             rng = np.random.default_rng(0)
-            A, B = (rng.normal(size=(at.N, at.n, width)) for width in (at.n, at.nu))
-        else:
-            A, B = (np.broadcast_to(part, (at.N, *part.shape)) for part in (problem.model.A, problem.model.B))
+            A, B = (rng.normal(size=(N, at.n, width)) for width in (at.n, at.nu))
         rounding = 0.0 if changing else ROUNDING
         head, tail = self._slopes(A, B)
         slack, numbers = at.slacks.reshape(-1, 1), np.arange(rows.lower.size).reshape(at.N, -1)
@@ -163,12 +186,16 @@ class MatrixBuilder:
             (numbers[cuts][:, now], at.lasts),
         ]
         self._G = Pattern((numbers.size, at.size), inequalities, self._inequalities(head, tail, rows), rounding)
+        self._linear = np.zeros(at.size)
+        self._linear[at.slacks] = problem.rows.l1[soft]
+        self.fixed = self._built(*fixed)
+        self._x_l, self._x_u = np.full(at.size, -math.inf), np.full(at.size, math.inf)
+        self._x_l[at.inputs], self._x_u[at.inputs] = self._rows.u_min, self._rows.u_max
+        self._x_l[at.slacks] = 0.0
+        nothing = np.zeros((N, len(problem.objective.C_r)))
+        self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp
 
-    def renew(self, matrices: Matrices, rows: QPRows) -> Matrices:
-        """The matrices with rows of the same pattern and other numbers."""
-        return replace(matrices, rows=self._G.matrix(self._inequalities(matrices.head, matrices.tail, rows)), own=rows)
-
-    def build(self, A: Array, B: Array) -> Matrices:
+    def _built(self, A: Array, B: Array) -> Matrices:
         """The matrices of A (N, n, n), B (N, n, nu)."""
         head, tail = self._slopes(A, B)
         return Matrices(
@@ -251,52 +278,8 @@ class MatrixBuilder:
         of_states[..., of_states.shape[-1] - steps * nu :] = by_step.reshape(*of_states.shape[:3], steps * nu)
         return of_states
 
-
-def condense(at: Layout, start: Array, free: Array, *steps: Array) -> tuple[Array, Array]:
-    """The first stage from `start` and the others from `free` on; see `condense_stages`."""
-    head = condense_stages(start, *(part[None, : at.L] for part in steps))
-    return head, condense_stages(free, *(part[at.L :].reshape(len(free), at.M, *part.shape[1:]) for part in steps))
-
-
-class Staged:
-    """The partially condensed QP of a problem.
-
-    Args:
-        problem: with constraints.
-        steps_per_stage: M; None for `usual_steps`.  The first stage, which has no state among its variables, takes what
-            is left of the horizon, and where M > 1 as many more steps as there is room for in blocks of the others'
-            size.
-        changing: whether the model's matrices will be others; then no entry is left out that might be needed.
-
-    Attributes:
-        fixed: the matrices of the problem's model.
-        qp: of these, for xi(k) and y_d zero and u(k-1) = u_bar.
-
-    Raises:
-        ValueError: the problem has no constraints; it needs no QP.
-        ParameterError: the number of steps is not possible.
-    """
-
-    def __init__(self, problem: Problem, *, steps_per_stage: int | None = None, changing: bool = False) -> None:
-        model, N = problem.model, problem.horizon
-        steps = usual_steps(model.nu) if steps_per_stage is None else steps_per_stage
-        if not isinstance(steps, int) or steps < 1:
-            raise ParameterError("controller", "steps_per_stage", steps, "a whole number >= 1")
-        self._problem, self._rows, soft = problem, QPRows(problem), problem.rows.slacks
-        self._at = at = Layout(N, model.n, model.nu, soft.size, steps)
-        self._builder = MatrixBuilder(problem, self._rows, at, changing=changing)
-        self._linear = np.zeros(at.size)
-        self._linear[at.slacks] = problem.rows.l1[soft]
-        A, B = np.broadcast_to(model.A, (N, *model.A.shape)), np.broadcast_to(model.B, (N, *model.B.shape))
-        self.fixed = self._builder.build(A, B)
-        self._x_l, self._x_u = np.full(at.size, -math.inf), np.full(at.size, math.inf)
-        self._x_l[at.inputs], self._x_u[at.inputs] = self._rows.u_min, self._rows.u_max
-        self._x_l[at.slacks] = 0.0
-        nothing = np.zeros((N, len(problem.objective.C_r)))
-        self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp
-
     def pose(self, query: Query, problem: Problem | None = None) -> Posed:
-        """See `mpc.qp.Formulation.pose`; `problem` differs in numbers of its constraints' rows alone."""
+        """The QP of a period; `problem` differs in numbers of its constraints' rows alone."""
         rest = query.rest or self._problem.rest
         if query.steps is None:
             A, B = self._problem.model.A, self._problem.model.B
@@ -304,13 +287,11 @@ class Staged:
             matrices, c = self.fixed, np.broadcast_to(offset, (self._at.N, offset.size))
         else:
             A, B, c = query.steps
-            matrices = self._builder.build(A, B)
+            matrices = self._built(A, B)
         if problem is not None:
-            matrices = self._builder.renew(matrices, QPRows(problem))
-        return self._pose(matrices, c, query, rest)
-
-    def _pose(self, matrices: Matrices, c: Array, query: Query, rest: Rest) -> Posed:
-        """The QP for c_i (N, n); at `rest` is what the cost pulls inputs to, and where the terminal weight is about."""
+            own = QPRows(problem)
+            G = self._G.matrix(self._inequalities(matrices.head, matrices.tail, own))
+            matrices = replace(matrices, rows=G, own=own)
         state, desired, u_before = query[:3]
         at, rows, objective = self._at, matrices.own, self._problem.objective
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))
@@ -348,11 +329,11 @@ class Staged:
         return Posed(qp, partial(self._states, matrices, c, state))
 
     def inputs(self, x: Array) -> Array:
-        """See `mpc.qp.Formulation.inputs`."""
+        """(N, nu) the planned inputs [rad/s] in a primal point."""
         return x[self._at.inputs]
 
     def slacks(self, x: Array) -> Array:
-        """See `mpc.qp.Formulation.slacks`."""
+        """(N, m_s) the slacks in a primal point."""
         return x[self._at.slacks]
 
     def _states(self, matrices: Matrices, c: Array, state: Array, x: Array) -> Array:
@@ -364,7 +345,7 @@ class Staged:
         return np.concatenate([first, later.reshape(-1, at.n), x[at.starts[-1:]]])
 
     def multipliers(self, solution: Solution) -> Array:
-        """See `mpc.qp.Formulation.multipliers`."""
+        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
         return self._rows.multipliers(solution.z, solution.z_box[self._at.inputs].ravel())
 
     def _offsets(self, matrices: Matrices, c: Array, state: Array) -> tuple[Array, Array]:

@@ -17,26 +17,15 @@ from quadsim.state import Array
 
 
 @dataclass(frozen=True, kw_only=True)
-class Gains:
-    """u_opt(k) = K_N xi(k) + G_N y_d + L_N u_bar.  Eq. (23)."""
-
-    K_N: Array  # (nu, n). Eq. (24)
-    G_N: Array  # (nu, N n_r). Eq. (25)
-    L_N: Array  # (nu, nu). Eq. (26); the identity, once F3 has its sign and the linearisation its offset
-
-
-@dataclass(frozen=True, kw_only=True)
 class SequenceGains:
-    """The whole optimal sequence u_opt = K xi(k) + G y_d + L u_bar of Eq. (22), all N steps."""
+    """The whole optimal sequence u_opt = K xi(k) + G y_d + L u_bar of Eq. (22), all N steps.
+
+    The first nu rows are K_N, G_N and L_N of Eqs. (23)-(26).
+    """
 
     K: Array  # (N nu, n)
     G: Array  # (N nu, N n_r)
-    L: Array  # (N nu, nu)
-
-    def first(self) -> Gains:
-        """The gains of the first action, by Pi_1."""
-        nu = self.L.shape[1]
-        return Gains(K_N=self.K[:nu], G_N=self.G[:nu], L_N=self.L[:nu])
+    L: Array  # (N nu, nu), in the first rows the identity, once F3 has its sign and the linearisation its offset
 
 
 def sequence_gains(problem: Problem) -> SequenceGains:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from mpc.baselines.limits import require_positive
+from mpc.baselines.law import require_positive
 from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle
 
@@ -16,23 +16,14 @@ YAW_SHARE: Final = 0.4  # bandwidth of heading over that of roll and pitch: abou
 
 @dataclass(frozen=True, kw_only=True)
 class Bandwidths:
-    """Bandwidths of the loops of a cascade [rad/s], each the gain from an error to the rate of change demanded.
+    """Bandwidths of the loops of a cascade [rad/s], each the gain from an error to the rate of change demanded."""
 
-    Attributes:
-        rate: of roll and pitch rate; an angular acceleration per rate error.
-        attitude: of roll and pitch; a rate per angle.
-        yaw_rate: of the yaw rate, which reaction torques alone can change.
-        yaw: of the heading.
-        velocity: an acceleration per velocity error.
-        position: a velocity per position error.
-    """
-
-    rate: float
-    attitude: float
-    yaw_rate: float
-    yaw: float
-    velocity: float
-    position: float
+    rate: float  # of roll and pitch rate; an angular acceleration per rate error
+    attitude: float  # of roll and pitch; a rate per angle
+    yaw_rate: float  # of the yaw rate, which reaction torques alone can change
+    yaw: float  # of the heading
+    velocity: float  # an acceleration per velocity error
+    position: float  # a velocity per position error
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -17,69 +17,51 @@ from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.attitude import (
     LEAST_LIFT,
     Measured,
+    Wanted,
     attitude_error,
     limit_force,
     motion_of,
     rate_error,
+    wanted_attitude,
 )
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for
-from mpc.baselines.law import FeedbackLaw
-from mpc.baselines.limits import require_positive, require_within
+from mpc.baselines.law import FeedbackLaw, require_positive, require_within
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
-from mpc.baselines.wanted import Wanted, wanted_attitude
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import within
+from mpc.nonlinear.model import zero
 from quadsim.controller import Command, Moment, Phase
 from quadsim.errors import ParameterError
-from quadsim.state import Array, read_only
+from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
 class GeometricSettings:
-    """What a geometric controller is made from; `geometric_settings` derives it from a vehicle and a period.
+    """What a geometric controller is made from; `geometric_settings` derives it from a vehicle and a period."""
 
-    Attributes:
-        period: tau_s [s].
-        k_x: gain of the position error [1/s^2], k_x / m of Lee et al. (2010).
-        k_v: gain of the velocity error [1/s], k_v / m there.
-        k_R: gain of the roll and pitch error [1/s^2], J^-1 k_R there.
-        k_Omega: gain of the roll and pitch rate error [1/s], J^-1 k_Omega there.
-        yaw_share: how fast the heading is corrected over how fast roll and pitch are: its k_Omega has this factor, its
-            k_R the square; reaction torques are weak.
-        k_i: gain of the integral of e_v + c_1 e_x [1/s^2]; 0 for none, as in Lee et al. (2010).
-        k_I: gain of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none.
-        c_1: weight of the position error in the first integral [1/s].
-        c_2: weight of the attitude error in the second [1/s].
-        sigma: largest acceleration of the first integral, each axis [m/s^2].
-        sigma_R: largest angular acceleration of the second, each axis [rad/s^2].
-        tilt_max: largest tilt of the wanted force [deg]; Lee et al. (2010) know none.
-        feedforward: whether the reference's jerk and snap are fed forward too, drag with them, and commands aimed at
-            the middle of the period that they are held for.
-        drag: d_x, d_y, d_z of the acceleration -R diag(d) R' v that is fed forward [1/s].
-        disturbance: the observer of what the model misses; None for none.
-        horizon: N, samples of preview; they give the reference's velocity and acceleration.
-        bounds: what commands are held to; None for the speeds that the rotors hold.
-    """
-
-    period: float
-    k_x: float
-    k_v: float
-    k_R: float
-    k_Omega: float
+    period: float  # tau_s [s]
+    k_x: float  # gain of the position error [1/s^2], k_x / m of Lee et al. (2010)
+    k_v: float  # gain of the velocity error [1/s], k_v / m there
+    k_R: float  # gain of the roll and pitch error [1/s^2], J^-1 k_R there
+    k_Omega: float  # gain of the roll and pitch rate error [1/s], J^-1 k_Omega there
     yaw_share: float = YAW_SHARE
-    k_i: float = 0.0
-    k_I: float = 0.0
-    c_1: float = 1.0
-    c_2: float = 1.0
-    sigma: float = 5.0
-    sigma_R: float = 5.0
-    tilt_max: float = 45.0
+    """How fast the heading is corrected over how fast roll and pitch are: its k_Omega has this factor, its k_R the
+    square; reaction torques are weak."""
+    k_i: float = 0.0  # gain of the integral of e_v + c_1 e_x [1/s^2]; 0 for none, as in Lee et al. (2010)
+    k_I: float = 0.0  # gain of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none
+    c_1: float = 1.0  # weight of the position error in the first integral [1/s]
+    c_2: float = 1.0  # weight of the attitude error in the second [1/s]
+    sigma: float = 5.0  # largest acceleration of the first integral, each axis [m/s^2]
+    sigma_R: float = 5.0  # largest angular acceleration of the second, each axis [rad/s^2]
+    tilt_max: float = 45.0  # largest tilt of the wanted force [deg]; Lee et al. (2010) know none
     feedforward: bool = False
-    drag: tuple[float, ...] = (0.0, 0.0, 0.0)
-    disturbance: RampSettings | None = None
-    horizon: int = 10
-    bounds: ActuatorBounds | None = None
+    """Whether the reference's jerk and snap are fed forward too, drag with them, and commands aimed at the middle of
+    the period that they are held for."""
+    drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # d of the acceleration -R diag(d) R' v that is fed forward [1/s]
+    disturbance: RampSettings | None = None  # of the observer of what the model misses; None for none
+    horizon: int = 10  # N, samples of preview; they give the reference's velocity and acceleration
+    bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
 
     def __post_init__(self) -> None:
         for name in ("period", "k_x", "k_v", "k_R", "k_Omega", "c_1", "c_2", "sigma", "sigma_R"):
@@ -130,16 +112,9 @@ class Integrals:
     rotation: Array
 
 
-@dataclass(frozen=True)
-class Disturbance:
-    """What the model misses: an acceleration and its rate of change, world, and an angular one, body; (3,) each."""
-
-    acceleration: Array
-    change: Array
-    angular: Array
-
-
-UNDISTURBED: Final = Disturbance(*(read_only(np.zeros(3)) for _ in range(3)))
+Disturbance: TypeAlias = tuple[Array, Array, Array]
+"""What the model misses: an acceleration and its rate of change, world, and an angular one, body; (3,) each."""
+UNDISTURBED: Final[Disturbance] = (zero(), zero(), zero())
 
 
 class GeometricController(FeedbackLaw):
@@ -159,7 +134,7 @@ class GeometricController(FeedbackLaw):
             if settings.disturbance is None
             else RampObserver(settings.disturbance, vehicle, settings.period, drag=settings.drag)
         )
-        super().__init__(vehicle, settings)
+        super().__init__(vehicle, settings.period, settings.horizon, settings.bounds)
         if settings.feedforward:
             self._operator = differentiator(settings.horizon, settings.period, degree=PREVIEW_DEGREE)
         self.k_R = settings.k_R * np.array([1.0, 1.0, settings.yaw_share**2])
@@ -183,10 +158,8 @@ class GeometricController(FeedbackLaw):
 
     def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
         """The law's wrench as rotor speeds; the integrals rest while bounds keep it from being given."""
-        if self.settings.feedforward or self._observer is not None:
-            motion = motion_of(state, now.attitude, now.body_rates)
-        else:  # the rounding of other flights stays as it is
-            motion = motion_of(state)
+        exact = self.settings.feedforward or self._observer is not None
+        motion = motion_of(state, now.attitude, now.body_rates) if exact else motion_of(state)
         target = target_of(reference, self._operator)
         if self.settings.feedforward and now.motion is not None:
             yaw = np.array([target.yaw, target.yaw_rate, target.yaw_acceleration])
@@ -207,7 +180,7 @@ class GeometricController(FeedbackLaw):
             self._observer.reset(before)
             return UNDISTURBED
         self._observer.update(now.time, motion.velocity, motion.attitude, motion.rates, before)
-        return Disturbance(*self._observer.foreseen(0.5 * self.settings.period))
+        return self._observer.foreseen(0.5 * self.settings.period)
 
     def wrench(
         self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
@@ -228,7 +201,7 @@ class GeometricController(FeedbackLaw):
         e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
         weight = np.array([0.0, 0.0, gravity])
         demanded = m * (-settings.k_x * e_x - settings.k_v * e_v - integrals.translation + weight + target.acceleration)
-        demanded -= m * disturbance.acceleration
+        demanded -= m * disturbance[0]
         A = limit_force(demanded, least=LEAST_LIFT * m * gravity, tilt=math.radians(settings.tilt_max))
         A1 = A2 = p1 = p2 = np.zeros(3)
         if np.array_equal(A, demanded):
@@ -242,7 +215,7 @@ class GeometricController(FeedbackLaw):
         )
         R_rel = R.T @ wanted.attitude
         e_R, e_Omega = attitude_error(R, wanted.attitude), rate_error(R, Omega, wanted.attitude, wanted.rates)
-        ahead = np.cross(Omega, R_rel @ wanted.rates) - R_rel @ wanted.acceleration + disturbance.angular
+        ahead = np.cross(Omega, R_rel @ wanted.rates) - R_rel @ wanted.acceleration + disturbance[2]
         moment = np.cross(Omega, J * Omega) - J * (self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
         if not settings.feedforward:
             return np.concatenate([[A @ R[:, 2]], moment]), wanted
@@ -272,15 +245,16 @@ class GeometricController(FeedbackLaw):
         The disturbance counts as one that changes steadily, drag along the body as one that turns with it.
         """
         m, R, Omega, k_x, k_v = self._vehicle.mass, motion.attitude, motion.rates, self.settings.k_x, self.settings.k_v
+        disturbing, change, _ = disturbance
         up, up1 = R[:, 2], R @ np.array([Omega[1], -Omega[0], 0.0])  # R e_3 and its derivative, R hat(Omega) e_3
         v_b = R.T @ motion.velocity
         v_d = R.T @ target.velocity
         f = max(float(A @ up) + m * self._drag[2] * v_d[2], 0.0)
         e_a = f / m * up - np.array([0.0, 0.0, self._vehicle.gravity]) - target.acceleration
-        e_a += disturbance.acceleration - R @ (self._drag * v_b)
-        A1 = -m * (k_x * e_v + k_v * e_a) + m * (target.jerk - disturbance.change)
+        e_a += disturbing - R @ (self._drag * v_b)
+        A1 = -m * (k_x * e_v + k_v * e_a) + m * (target.jerk - change)
         f1 = float(A1 @ up + A @ up1)
-        e_j = f1 / m * up + f / m * up1 - target.jerk + disturbance.change
+        e_j = f1 / m * up + f / m * up1 - target.jerk + change
         if self._drag.any():
             along = self._drag[2] * (target.acceleration @ up + target.velocity @ up1)
             v_b1 = R.T @ (e_a + target.acceleration) - np.cross(Omega, v_b)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -12,14 +13,29 @@ from mpc.baselines.preview import differentiator
 from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model
 from quadsim.controller import GROUNDED, Command, Moment, stopped
-from quadsim.errors import CommandError
+from quadsim.errors import CommandError, ParameterError
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
 
-if TYPE_CHECKING:
-    from mpc.baselines.geometric import GeometricSettings
-    from mpc.baselines.lqr import LQRSettings
-    from mpc.baselines.pid import PIDSettings
+
+def require_positive(name: str, value: float) -> None:
+    """A setting that has to be a positive, finite number.
+
+    Raises:
+        ParameterError: it is not.
+    """
+    if not 0.0 < value < math.inf:
+        raise ParameterError("controller", name, value, "positive and finite")
+
+
+def require_within(name: str, value: float, lower: float, upper: float) -> None:
+    """A setting that has to be between two numbers.
+
+    Raises:
+        ParameterError: it is not.
+    """
+    if not lower <= value <= upper:
+        raise ParameterError("controller", name, value, f"between {lower:g} and {upper:g}")
 
 
 class FeedbackLaw(ABC):
@@ -27,11 +43,11 @@ class FeedbackLaw(ABC):
 
     solver: Final = ""
 
-    def __init__(self, vehicle: Vehicle, settings: LQRSettings | PIDSettings | GeometricSettings) -> None:
-        self.bounds = ActuatorBounds.of_vehicle(vehicle) if settings.bounds is None else settings.bounds
-        self.model = hover_model(vehicle, settings.period)
-        self.horizon = settings.horizon
-        self._operator = differentiator(settings.horizon, settings.period)
+    def __init__(self, vehicle: Vehicle, period: float, horizon: int, bounds: ActuatorBounds | None) -> None:
+        self.bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
+        self.model = hover_model(vehicle, period)
+        self.horizon = horizon
+        self._operator = differentiator(horizon, period)
         self.reset(self.model.u_bar)
 
     def reset(self, speeds: Array) -> None:

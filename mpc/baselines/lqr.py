@@ -10,8 +10,7 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
-from mpc.baselines.law import FeedbackLaw
-from mpc.baselines.limits import require_within
+from mpc.baselines.law import FeedbackLaw, require_within
 from mpc.baselines.preview import wrapped
 from mpc.heading import turn_horizontally
 from mpc.model import LinearModel, continuous_model, discretise, hover_model, lqr
@@ -36,27 +35,16 @@ _SHORTEST_LAG: Final = 1e-4  # [s]
 
 @dataclass(frozen=True, kw_only=True)
 class LQRSettings:
-    """What an LQR is made from.
+    """What an LQR is made from."""
 
-    Attributes:
-        period: tau_s [s].
-        objective: weights of one period of the infinite sum; `bryson_objective` gives some for any vehicle.
-        horizon: N, samples of preview; they give the reference's velocity, and N periods are planned.
-        heading_frame: whether errors are turned into axes along the measured yaw, so that any heading flies.
-        tilt_max: largest tilt that errors of x, y and their rates demand [deg], or None.  The law is linear: without a
-            limit a large error demands more tilt than the model, or the vehicle, tolerates.
-        bounds: what commands are held to, the law itself knowing none; None for the speeds that the rotors hold.
-
-    Raises:
-        ParameterError: the tilt is out of range.
-    """
-
-    period: float
-    objective: Objective
-    horizon: int = 10
-    heading_frame: bool = True
+    period: float  # tau_s [s]
+    objective: Objective  # weights of one period of the infinite sum; `bryson_objective` gives some for any vehicle
+    horizon: int = 10  # N, samples of preview; they give the reference's velocity, and N periods are planned
+    heading_frame: bool = True  # whether errors are turned into axes along the measured yaw, so that any heading flies
     tilt_max: float | None = 30.0
-    bounds: ActuatorBounds | None = None
+    """Largest tilt that errors of x, y and their rates demand [deg], or None.  The law is linear: without a limit a
+    large error demands more tilt than the model, or the vehicle, tolerates."""
+    bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
 
     def __post_init__(self) -> None:
         if self.tilt_max is not None:
@@ -68,10 +56,7 @@ def bryson_objective(vehicle: Vehicle, period: float | None = None) -> Objective
 
     The model knows no lag.  Where the vehicle's rotors lag so much that the loop of these weights would not be stable
     with `LAG_MARGIN` times their time constant, the deviation of the rotor speeds is halved until it is.
-
-    Args:
-        vehicle: the modelled vehicle.
-        period: tau_s [s]; None for no look at the lag.
+    Without a period [s] the lag counts for nothing.
     """
     deviations = np.array([LARGEST_DEVIATIONS[name] for name in STATE_NAMES])
     share = SPEED_SHARE
@@ -126,19 +111,14 @@ class LQR(FeedbackLaw):
     name: Final = "lqr"
 
     def __init__(self, vehicle: Vehicle, settings: LQRSettings) -> None:
-        super().__init__(vehicle, settings)
+        super().__init__(vehicle, settings.period, settings.horizon, settings.bounds)
         self.settings = settings
         self.gain = lqr_gain(self.model, settings.objective)
         self._allocation = make_allocation(vehicle)
         self._tilt_demand = np.linalg.pinv(self.gain[:, TILT]) @ self.gain[:, HORIZONTAL]
 
     def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
-        """The law's command and the model's forecast of the next."""
-        plan = self._plan(state, reference, before)
-        return Command(speeds=plan[0].copy(), plan=plan)
-
-    def _plan(self, state: Array, reference: Array, before: Array) -> Array:
-        """(N, 4) commands: the law's now, held to the bounds, then those of the closed loop of the model."""
+        """The law's command now, held to the bounds, and then those of the closed loop of the model."""
         targets = self._targets(state, reference)
         xi = state
         if self.settings.heading_frame:
@@ -155,7 +135,7 @@ class LQR(FeedbackLaw):
             plan[i] = self._held(speeds, lower, upper) if i == 0 else np.clip(speeds, lower, upper)
             before = plan[i]
             xi = self.model.A @ xi + self.model.B @ (plan[i] - self.model.u_bar)
-        return plan
+        return Command(speeds=plan[0].copy(), plan=plan)
 
     def _targets(self, state: Array, reference: Array) -> Array:
         """(N, 12) reference states at t_k .. t_{k+N-1}, yaw at t_k less than half a turn from the measured one."""

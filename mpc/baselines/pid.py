@@ -15,8 +15,7 @@ from mpc.answer import ActuatorBounds
 from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.attitude import LEAST_LIFT, Measured, attitude_for, limit_force, motion_of, prioritised_error
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
-from mpc.baselines.law import FeedbackLaw
-from mpc.baselines.limits import require_positive, require_within
+from mpc.baselines.law import FeedbackLaw, require_positive, require_within
 from mpc.baselines.preview import Target, target_of
 from mpc.handover import within
 from quadsim.controller import Command, Moment, Phase
@@ -30,35 +29,20 @@ LARGEST_THRUST: Final = 0.85
 
 @dataclass(frozen=True, kw_only=True)
 class PIDSettings:
-    """What a cascade is made from; `pid_settings` derives it from a vehicle and a period.
+    """What a cascade is made from; `pid_settings` derives it from a vehicle and a period."""
 
-    Attributes:
-        period: tau_s [s].
-        bandwidths: proportional gains of the loops [1/s].
-        velocity_integral: integral over proportional gain of the velocity loop [1/s]; 0 for none.
-        rate_integral: the same of the rate loop [1/s].
-        velocity_derivative: share of the measured acceleration that is taken back.
-        rate_derivative: share of the measured angular acceleration that is taken back; late by a period, less than 1.
-        yaw_weight: share of the heading error corrected while turning the thrust; PX4's MC_YAW_WEIGHT.
-        tilt_max: largest tilt commanded [deg]; PX4's MPC_TILTMAX_AIR.
-        velocity_max: largest velocity commanded, horizontal and vertical [m/s]; PX4's MPC_XY_VEL_MAX.
-        rate_max: largest body rates commanded, roll, pitch, yaw [deg/s]; PX4's MC_ROLLRATE_MAX and so on.
-        horizon: N, samples of preview; they give the reference's velocity and acceleration.
-        bounds: what commands are held to; None for the speeds that the rotors hold.
-    """
-
-    period: float
-    bandwidths: Bandwidths
-    velocity_integral: float = 0.4
-    rate_integral: float = 0.5
-    velocity_derivative: float = 0.1
-    rate_derivative: float = 0.05
-    yaw_weight: float = 0.4
-    tilt_max: float = 45.0
-    velocity_max: float = 12.0
-    rate_max: tuple[float, float, float] = (220.0, 220.0, 200.0)
-    horizon: int = 10
-    bounds: ActuatorBounds | None = None
+    period: float  # tau_s [s]
+    bandwidths: Bandwidths  # proportional gains of the loops [1/s]
+    velocity_integral: float = 0.4  # integral over proportional gain of the velocity loop [1/s]; 0 for none
+    rate_integral: float = 0.5  # the same of the rate loop [1/s]
+    velocity_derivative: float = 0.1  # share of the measured acceleration that is taken back
+    rate_derivative: float = 0.05  # share of the measured angular acceleration; late by a period, less than 1
+    yaw_weight: float = 0.4  # share of the heading error corrected while turning the thrust; PX4's MC_YAW_WEIGHT
+    tilt_max: float = 45.0  # largest tilt commanded [deg]; PX4's MPC_TILTMAX_AIR
+    velocity_max: float = 12.0  # largest commanded, horizontal and vertical [m/s]; PX4's MPC_XY_VEL_MAX
+    rate_max: tuple[float, float, float] = (220.0, 220.0, 200.0)  # body rates commanded [deg/s]; PX4's MC_ROLLRATE_MAX
+    horizon: int = 10  # N, samples of preview; they give the reference's velocity and acceleration
+    bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
 
     def __post_init__(self) -> None:
         require_positive("period", self.period)
@@ -102,7 +86,7 @@ class CascadedPID(FeedbackLaw):
 
     def __init__(self, vehicle: Vehicle, settings: PIDSettings) -> None:
         self.settings, self._vehicle, self._inertia = settings, vehicle, np.array(vehicle.inertia)
-        super().__init__(vehicle, settings)
+        super().__init__(vehicle, settings.period, settings.horizon, settings.bounds)
         self.allocation = make_allocation(vehicle)
         highest = float(self.bounds.u_max.min())
         self._largest = LARGEST_THRUST * 4.0 * vehicle.thrust_coefficient * highest**2  # thrust to command [N]

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from mpc.nonlinear.model import zero
 from mpc.nonlinear.rigidbody import rotation
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
@@ -18,10 +19,6 @@ SMALLEST_PREVIEW: Final = 3  # samples that a parabola needs
 PREVIEW_DEGREE: Final = 4  # of the polynomial through a preview that gives jerk and snap
 MOTION_DEGREE: Final = 5  # of the one through a motion's next samples, which are exact
 MOTION_SAMPLES: Final = 7
-
-
-def _nothing() -> Array:
-    return read_only(np.zeros(3))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,13 +31,14 @@ class Target:
     yaw: float  # [rad]
     yaw_rate: float  # [rad/s]
     yaw_acceleration: float  # [rad/s^2]
-    jerk: Array = field(default_factory=_nothing)  # (3,) [m/s^3]
-    snap: Array = field(default_factory=_nothing)  # (3,) [m/s^4]
+    jerk: Array = field(default_factory=zero)  # (3,) [m/s^3]
+    snap: Array = field(default_factory=zero)  # (3,) [m/s^4]
     heading: Array | None = None
     """(3, 3) rows: the direction near which body x is wanted, any length but zero, its rate of change and that of this;
     None where yaw gives it."""
 
 
+@lru_cache(maxsize=32)
 def differentiator(samples: int, period: float, *, degree: int = 2, first: int = 1) -> Array:
     """(degree + 1, N): value and derivatives at t_k of samples at t_{k + first} .. t_{k + first + N - 1}.
 
@@ -83,7 +81,7 @@ def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
     """
     samples = min(len(motion), MOTION_SAMPLES)
     degree = min(MOTION_DEGREE, samples - 1)
-    operator = _motion_operator(samples, degree, period)
+    operator = differentiator(samples, period, degree=degree, first=0)
     found = np.zeros((MOTION_DEGREE, 3))  # position to snap
     orders = min(degree + 1, MOTION_DEGREE)
     found[:orders] = operator[:orders] @ motion.position[:samples]
@@ -101,11 +99,6 @@ def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
         yaw_acceleration=float(yaw[2]),
         heading=heading,
     )
-
-
-@lru_cache(maxsize=32)
-def _motion_operator(samples: int, degree: int, period: float) -> Array:
-    return differentiator(samples, period, degree=degree, first=0)
 
 
 def wrapped(angle: float) -> float:

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.equilibrium import Trim
-from mpc.fallback.hover import by_group, require_quadrotor
+from mpc.fallback.hover import require_quadrotor
+from mpc.fallback.settings import by_group
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
 from quadsim.controller import Moment
@@ -79,11 +80,10 @@ def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) ->
     Euler angles are implausibly large; those of the body are not.
     """
     found = {**vars(now), "acting": acting, "unseen": unseen}
-    if unseen.any():
-        if unseen[ANGLES].any():
-            found["attitude"] = None
-        if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
-            found["body_rates"] = None
+    if unseen[ANGLES].any():
+        found["attitude"] = None
+    if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
+        found["body_rates"] = None
     return CompletedMoment(**found)
 
 
@@ -121,7 +121,7 @@ class StateCompletion:
         """The whole state (12,) now.
 
         Args:
-            measured: (12,) what was measured, in part perhaps not finite; of another shape, nothing was.
+            measured: (12,) in part perhaps not finite; of another shape, nothing was measured.
             acting: (4,) rotor speeds in force since the last state [rad/s].
             trim: what holds the vehicle at rest.
             free: whether the vehicle flies, so that the model predicts its motion; otherwise nothing counts as frozen.

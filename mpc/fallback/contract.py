@@ -20,8 +20,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -63,14 +64,8 @@ class Guarded:
     commands pass unchanged.
 
     Attributes:
-        inner: the controller called first, through the protocol alone.
+        inner: the controller called first; one that falls back by itself does no harm.
         law: what levels 1 to 3 are made of.
-
-    Args:
-        inner: one that falls back by itself does no harm, as only its accepted answers are used.
-        model: the hover model of the control period; see `mpc.model.hover_model`.
-        bounds: hard bounds that every command keeps.
-        settings: when the next level takes over.
 
     Raises:
         ParameterError: the model is not a quadrotor's.
@@ -90,11 +85,6 @@ class Guarded:
         self._distance = settings.distance
         self._completion = StateCompletion(model)
         self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
-        self._good: tuple[Array, Array] | None  # the state (12,) of the last accepted answer, and its plan (N, 4)
-        self._foreseen: Array | None
-        self._target: Array | None
-        self._age: int  # periods in fallback
-        self._hovered: int  # of them on level 2 or 3
         self.reset(model.u_bar)
 
     def reset(self, speeds: Array) -> None:
@@ -104,6 +94,13 @@ class Guarded:
         self._completion.reset()
         self._forget()
         self.inner.reset(self._before.copy())
+
+    def _forget(self) -> None:
+        """Leave every fallback level."""
+        self._good: tuple[Array, Array] | None = None  # state (12,) of the last accepted answer, and its plan (N, 4)
+        self._foreseen: Array | None = None
+        self._target: Array | None = None
+        self._age = self._hovered = 0  # periods in fallback, and of them on level 2 or 3
 
     def adopt(self, previous: object) -> None:
         """Go on from the level of fallback, the state and the plan of the contract before, and hand over within it."""
@@ -134,7 +131,10 @@ class Guarded:
             command = self._fall_back(status, answer, known, acting)
         else:
             self._forget()
-            command = self._accept(answer, acting)
+            # Moved onto its bounds; so is what it plans for later, which may act without a call.
+            speeds = self._bounds.clip(answer.speeds, acting)
+            later = self._bounds.clip_plan(answer.plan[1:], speeds) if self.horizon > 1 else answer.plan[1:]
+            command = replace(answer, speeds=speeds, plan=np.concatenate([speeds[None], later]), fallback=0)
             self._good = known, command.plan
         self._before = command.speeds.copy()
         return command
@@ -142,12 +142,7 @@ class Guarded:
     @property
     def trim(self) -> Trim:
         """The equilibrium that the inner controller estimates; level hover where it has none."""
-        try:
-            trim = getattr(self.inner, "trim", None)
-        except _MISTAKES:
-            raise
-        except FAILURES:
-            trim = None
+        trim = _tried(lambda: getattr(self.inner, "trim", None))
         return trim if isinstance(trim, Trim) else self._level
 
     @property
@@ -158,20 +153,10 @@ class Guarded:
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; by the hover model where the inner controller cannot."""
-        try:
-            predicted = self.inner.predict(states, plans)
-        except _MISTAKES:
-            raise
-        except FAILURES:
-            predicted = np.empty(0)
+        predicted = _tried(lambda: self.inner.predict(states, plans))
         if np.shape(predicted) == (*plans.shape[:2], N_STATES):
             return predicted
         return predict_in_heading_frame(anchored(self._model, self.trim), states, plans, self.trim)
-
-    def _forget(self) -> None:
-        """Leave every fallback level."""
-        self._good, self._foreseen, self._age = None, None, 0
-        self._target, self._hovered = None, 0
 
     def _call(self, now: CompletedMoment, known: Array, reference: Array) -> tuple[str, Command | None]:
         """The inner controller's answer where one was given, and its status: an accepted one is good to fly."""
@@ -181,23 +166,14 @@ class Guarded:
         shape = (self.horizon, len(REFERENCE_STATES))
         if np.shape(reference) != shape or not all_true(np.abs(reference) <= PLAUSIBLE_REFERENCE):
             return "invalid_reference", None
-        try:
-            answer = self.inner.step(now, known.copy(), reference)
-        except _MISTAKES:
-            raise
-        except FAILURES as error:
-            return _snake_case(type(error).__name__), None
+        answer: Command | Exception = _tried(lambda: self.inner.step(now, known.copy(), reference))
+        if isinstance(answer, Exception):  # `PlanExhaustedError` as `plan_exhausted_error`
+            return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(answer).__name__).lower(), None
         if answer.status in ACCEPTED and (
             np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (self.horizon, N_ROTORS)
         ):
             return "wrong_shape", answer
         return rejection(answer.status, answer.speeds, answer.plan, self._bounds, now.acting) or answer.status, answer
-
-    def _accept(self, answer: Command, acting: Array) -> Command:
-        """A good answer, moved onto its bounds; so is what it plans for later, which may act without a call."""
-        speeds = self._bounds.clip(answer.speeds, acting)
-        later = self._bounds.clip_plan(answer.plan[1:], speeds) if self.horizon > 1 else answer.plan[1:]
-        return replace(answer, speeds=speeds, plan=np.concatenate([speeds[None], later]), fallback=0)
 
     def _fall_back(self, status: str, answer: Command | None, known: Array, acting: Array) -> Command:
         self._age += 1
@@ -243,6 +219,11 @@ class Guarded:
         return plan, 3 if sinking else 2
 
 
-def _snake_case(name: str) -> str:
-    """`PlanExhaustedError` as `plan_exhausted_error`."""
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
+def _tried(call: Callable[[], Any]) -> Any:
+    """What a call returns, or which of `FAILURES` it raises."""
+    try:
+        return call()
+    except _MISTAKES:
+        raise
+    except FAILURES as error:
+        return error

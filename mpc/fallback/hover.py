@@ -22,10 +22,11 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds
 from mpc.equilibrium import Trim
+from mpc.fallback.settings import by_group
 from mpc.heading import anchored, slope, turn_horizontally
 from mpc.model import LinearModel, lqr
 from quadsim.errors import ParameterError
-from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, VELOCITY, Array, read_only
+from quadsim.state import INDEX, N_STATES, POSITION, VELOCITY, Array, read_only
 from quadsim.vehicle import N_ROTORS
 
 ACCEPTABLE_ACCELERATION: Final = (2.0, 8.0, 8.0, 2.0)  # along z [m/s^2], about x, y and z [rad/s^2]
@@ -39,16 +40,6 @@ _VELOCITY: Final = list(VELOCITY)
 _SIDEWAYS: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 _TILTS: Final = [INDEX["roll"], INDEX["pitch"]]
 _ROLL_PITCH: Final = [1, 2]  # rows of an acceleration (4,)
-
-
-def by_group(position: float, velocity: float, angle: float, rate: float) -> Array:
-    """(12,) one value for positions, velocities, Euler angles and their rates each."""
-    channels = np.empty(N_STATES)
-    for group, value in ((POSITION, position), (VELOCITY, velocity), (EULER, angle), (EULER_RATE, rate)):
-        channels[list(group)] = value
-    return read_only(channels)
-
-
 ACCEPTABLE: Final = by_group(0.5, 1.0, 0.2, 1.0)  # [m], [m/s], [rad], yaw as well, [rad/s]
 
 
@@ -64,13 +55,11 @@ def require_quadrotor(model: LinearModel) -> None:
 
 
 class HoverLaw:
-    """The LQR of hover, set up once.
+    """The LQR of hover, set up once; `tilt` is the largest roll and pitch demanded together [rad].
 
     Attributes:
-        model: the hover model.
         gain: (4, 12) K, from errors in the heading frame to accelerations.
         slope: (4, 4) S; see `mpc.heading.slope`.
-        tilt: largest roll and pitch demanded together [rad].
 
     Raises:
         ParameterError: the model is not a quadrotor's, or the tilt is not between 0 and 90 deg.
@@ -101,13 +90,7 @@ class HoverLaw:
     ) -> Array:
         """The speeds (N, 4) [rad/s] of the next periods, as the model predicts them, turned by the present yaw.
 
-        Args:
-            state: (12,) now.
-            target: (12,) wanted now, level; its velocity moves it on.
-            before: (4,) command in force [rad/s].
-            bounds: that the speeds keep.
-            horizon: N.
-            trim: what holds the vehicle at rest.
+        The target (12,) is what is wanted now, level; its velocity moves it on.
         """
         model, yaw = anchored(self.model, trim), float(state[INDEX["yaw"]])
         A, B = model.A, model.B

@@ -11,10 +11,18 @@ from annotated_types import Gt, Lt, doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Positive
-from quadsim.state import EULER, EULER_RATE, N_STATES, POSITION, VELOCITY, Array
+from quadsim.state import EULER, EULER_RATE, N_STATES, POSITION, VELOCITY, Array, read_only
 
 USUAL_TILT: Final = 10.0
 """Largest tilt [deg] of the fallback where none is given."""
+
+
+def by_group(position: float, velocity: float, angle: float, rate: float) -> Array:
+    """(12,) one value for positions, velocities, Euler angles and their rates each."""
+    channels = np.empty(N_STATES)
+    for group, value in ((POSITION, position), (VELOCITY, velocity), (EULER, angle), (EULER_RATE, rate)):
+        channels[list(group)] = value
+    return read_only(channels)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,12 +59,4 @@ class FallbackSettings:
     @property
     def distance(self) -> Array:
         """(12,) largest distance from a plan's states [m], [m/s], [rad], [rad/s]."""
-        distance = np.empty(N_STATES)
-        for rows, size in (
-            (POSITION, self.position),
-            (VELOCITY, self.velocity),
-            (EULER, math.radians(self.angle)),
-            (EULER_RATE, math.radians(self.rate)),
-        ):
-            distance[list(rows)] = size
-        return distance
+        return by_group(self.position, self.velocity, math.radians(self.angle), math.radians(self.rate))

@@ -23,7 +23,7 @@ import scipy.linalg
 
 from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused
 from mpc.constraints import Constraint, Penalty
-from mpc.disturbance import RampObserver, RampSettings
+from mpc.disturbance import RampObserver
 from mpc.handover import observed, resized, within
 from mpc.model import LinearModel
 from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
@@ -35,7 +35,6 @@ from mpc.nonlinear.rigidbody import (
     V,
     W,
     advance_nodes,
-    defects,
     drag_acceleration,
     linearise_nodes,
     rigid_body,
@@ -87,21 +86,11 @@ _PLAUSIBLE: Final = 1e5
 _SAME_TIME: Final = 1e-6  # [s]
 
 
-def frames_of(quaternions: Array) -> Array:
+def frames_of(q: Array) -> Array:
     """(M, 4, 4) matrices that take q to q_r* q, of q_r (M, 4)."""
-    return (quaternions @ _LEFT).reshape(-1, 4, 4)
-
-
-_LEFT: Final = np.array(
-    [
-        [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
-        [[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1], [0, 0, -1, 0]],
-        [[0, 0, 1, 0], [0, 0, 0, -1], [-1, 0, 0, 0], [0, 1, 0, 0]],
-        [[0, 0, 0, 1], [0, 0, 1, 0], [0, -1, 0, 0], [-1, 0, 0, 0]],
-    ],
-    float,
-).reshape(4, 16)
-"""The left factor q_r* as a matrix, by each entry of q_r."""
+    w, x, y, z = q.T
+    rows = np.array([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
+    return np.ascontiguousarray(rows.transpose(2, 0, 1))
 
 
 class NonlinearMPC:
@@ -146,6 +135,7 @@ class NonlinearMPC:
         self._inverse = np.linalg.inv(self._model.effectiveness)
         self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
         self._tilted = settings.tilt is not None
+        self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         self.problem = self._problem(constraints)
         self._check = AnswerCheck(self.problem, kkt_every)
         small = self.problem.horizon * (N_ROTORS + self.problem.rows.slacks.size) <= LARGEST_CONDENSED
@@ -153,11 +143,17 @@ class NonlinearMPC:
         self._qp = QPSolver(self.solver, self.problem, changing=True, shortcut=True)
         self._clearing = None if space is None else Clearing(self.problem, self._qp, space, changing=True)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
-        self._ramp = None if settings.ramp is None else self._make_ramp(settings.ramp)
+        self._ramp: RampObserver | None = None
+        if settings.ramp is not None:
+            lag = settings.rotor_lag if settings.ramp.rotor_lag is None else settings.ramp.rotor_lag
+            self._ramp = RampObserver(
+                replace(settings.ramp, rotor_lag=lag),
+                vehicle,
+                period,
+                drag=self._model.drag / vehicle.mass,
+                quadratic_drag=self._model.quadratic_drag / vehicle.mass,
+            )
         self._shift = settings.stride == 1 if settings.shift is None else settings.shift
-        self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
-        self._difference = settings.attitude_error is AttitudeError.DIFFERENCE
-        self._C_r = self.problem.objective.C_r
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
 
     def _shares(self, speeds: Array) -> Array:
@@ -193,22 +189,28 @@ class NonlinearMPC:
             A, B = scipy.linalg.block_diag(linear.A, none), np.vstack([linear.B, np.zeros((2, N_ROTORS))])
             linear, P = replace(linear, A=A, B=B), scipy.linalg.block_diag(P, none)
             objective = replace(objective, C_r=np.hstack([objective.C_r, np.zeros((len(rows), 2))]))
-        lower, upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         return Problem(
             model=linear,
             horizon=settings.horizon,
             objective=replace(objective, P=P),
             constraints=(
-                Constraint(name="inputs", lower=lower, upper=upper, D=np.eye(N_ROTORS)),
-                *self._slews(),
-                *self._turning(linear.n),
+                Constraint(name="inputs", lower=self._lower, upper=self._upper, D=np.eye(N_ROTORS)),
+                *self._held(linear.n),
                 *(self._of_states(constraint, linear.n) for constraint in constraints),
             ),
         )
 
-    def _turning(self, n: int) -> Iterator[Constraint]:
-        """Bounds on tilt and body rates."""
-        settings = self.settings
+    def _held(self, n: int) -> Iterator[Constraint]:
+        """Bounds on steps of speeds, tilt and body rates, in a problem with n states."""
+        settings, bounds, largest = self.settings, self._bounds, self._vehicle.speed_max
+        if np.isfinite(bounds.delta_min).any() or np.isfinite(bounds.delta_max).any():
+            if settings.inputs is not Inputs.SPEED:
+                rule = 'left out where inputs = "thrust": a step of a speed is not linear in thrusts; inputs = "speed"'
+                raise ParameterError("controller", "input_bounds.slew", bounds.delta_max.tolist(), rule)
+            steps = np.full((settings.horizon, 1), float(settings.stride))  # periods from one node to the next,
+            steps[0] = 1.0  # but for the first, which follows the command in force
+            lower, upper = steps * bounds.delta_min / largest, steps * bounds.delta_max / largest
+            yield Constraint(name="slews", lower=lower, upper=upper, E=np.eye(N_ROTORS))
         if settings.tilt is not None:
             angles = math.tau / TILT_SIDES * np.arange(TILT_SIDES)
             rows = np.zeros((TILT_SIDES, n))
@@ -233,32 +235,18 @@ class NonlinearMPC:
         Raises:
             ParameterError: they are of what is not linear in those.
         """
-        parts = {name: np.zeros((constraint.lower.shape[-1], size)) for name, size in (("C", n), ("D", N_ROTORS))}
+        C, D = (np.zeros((constraint.lower.shape[-1], size)) for size in (n, N_ROTORS))
         if constraint.C is not None:
             if constraint.C[:, [*EULER, *EULER_RATE]].any():
                 rule = "without Euler angles and their rates; tilt and body_rate bound the attitude"
                 raise ParameterError("controller", constraint.name, "of those", rule)
-            parts["C"][:, P], parts["C"][:, V] = constraint.C[:, POSITIONS], constraint.C[:, VELOCITIES]
+            C[:, P], C[:, V] = constraint.C[:, POSITIONS], constraint.C[:, VELOCITIES]
         if constraint.D is not None and constraint.D.any():
             if self.settings.inputs is not Inputs.SPEED:
                 rule = 'without rotor speeds where inputs = "thrust", in which they are not linear: inputs = "speed"'
                 raise ParameterError("controller", constraint.name, "of those", rule)
-            parts["D"] = constraint.D * self._vehicle.speed_max
-        return replace(constraint, C=parts["C"], D=parts["D"])
-
-    def _slews(self) -> list[Constraint]:
-        """Bounds on steps of speeds: from one node to the next `stride` times those of a period, but for the first."""
-        bounds, settings = self._bounds, self.settings
-        if not (np.isfinite(bounds.delta_min).any() or np.isfinite(bounds.delta_max).any()):
-            return []
-        if settings.inputs is not Inputs.SPEED:
-            rule = 'left out where inputs = "thrust": a step of a speed is not linear in thrusts; inputs = "speed"'
-            raise ParameterError("controller", "input_bounds.slew", bounds.delta_max.tolist(), rule)
-        steps = np.full((settings.horizon, 1), float(settings.stride))
-        steps[0] = 1.0
-        largest = self._vehicle.speed_max
-        lower, upper = steps * bounds.delta_min / largest, steps * bounds.delta_max / largest
-        return [Constraint(name="slews", lower=lower, upper=upper, E=np.eye(N_ROTORS))]
+            D = constraint.D * self._vehicle.speed_max
+        return replace(constraint, C=C, D=D)
 
     def _riccati(self, linear: LinearModel, objective: Objective) -> Array:
         """P at hover, where the quaternion's scalar does not move, and costs nothing."""
@@ -276,16 +264,24 @@ class NonlinearMPC:
         """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
         self._acting = np.array(speeds, float)
         self._rotors = self._rotors_before = self._shares(self._acting)
-        self._plan: tuple[Array, Array] | None
-        self._quaternion: Array | None
-        self._last: tuple[float, Array] | None  # time and state of the last period
-        self._called_at: float
-        self._velocity = np.zeros(3)  # the reference's in the last period
         self._forget()
         if self._clearing is not None:
             self._clearing.reset()
         self._check.reset()
         self.unanswered: Unanswered | None = None
+
+    def _forget(self) -> None:
+        """Start without a plan, and assume no disturbance."""
+        self._plan: tuple[Array, Array] | None = None
+        self._quaternion: Array | None = None
+        self._last: tuple[float, Array] | None = None  # time and state of the last period
+        self._called_at = math.nan
+        if self._observer is not None:
+            self._observer.reset()
+        if self._ramp is not None:
+            self._ramp.reset(self._acting)
+            self._model = replace(self._model, drag=np.array(self.settings.drag))
+        self._believe(np.zeros(6))
 
     def adopt(self, previous: object) -> None:
         """Go on from what the law before knew: rotor speeds, disturbance, plan."""
@@ -308,8 +304,7 @@ class NonlinearMPC:
         estimate = observed(previous) if own is None else own.estimate
         if self._observer is not None and estimate is not None:
             self._observer.adopt(estimate)
-            found = self._observer.estimate
-            self._model = replace(self._model, acceleration=found[:3], angular_acceleration=found[3:])
+            self._believe(self._observer.estimate)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.
@@ -319,13 +314,23 @@ class NonlinearMPC:
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
         last, self._last = self._last, None
-        self._turn(now)
+        before, self._called_at, self._rotors_before = self._called_at, now.time, self._rotors
+        if self.settings.rotor_lag and math.isfinite(before):  # the rotors have followed what was commanded
+            left = math.exp(-(now.time - before) / self.settings.rotor_lag)
+            commanded = self._shares(self._acting)
+            self._rotors = commanded + left * (self._rotors - commanded)
         if now.phase in GROUNDED:
-            return self._stop(now.phase)
+            self._acting, _ = self._bounds.reach(self._acting)
+            self._forget()
+            return stopped(self._acting.copy(), self.horizon, now.phase)
         measured = self._measured(now, state)
         if not (np.abs(measured) <= _PLAUSIBLE).all() or not (np.abs(reference) <= _PLAUSIBLE).all():
-            return self._refuse(INVALID_DATA)
-        nodes = self._reference(now, reference)
+            return refused(self._acting, self.horizon, INVALID_DATA)
+        stride = self.settings.stride
+        if now.motion is not None:
+            nodes = nodes_of_motion(now.motion, self._nodes, stride)
+        else:
+            nodes = nodes_of_preview(reference, self._nodes, stride, self._period, self._hover)
         if self._quaternion is None:
             self._quaternion = nodes.states[0, Q]
         if measured[Q] @ self._quaternion < 0.0:
@@ -345,7 +350,7 @@ class NonlinearMPC:
             if status != INVALID_DATA and (self.unanswered is None or self.unanswered.converges is not None):
                 self.unanswered = Unanswered(problem=problem, query=query, status=status, time=now.time)
             self._plan = None
-            return self._refuse(status, answer)
+            return refused(self._acting, self.horizon, status, answer)
         assert sqp is not None
         status = answer.status
         if sqp.defect > CONVERGED:
@@ -357,17 +362,12 @@ class NonlinearMPC:
                 )
         speeds = self._speeds(self._clip(answer.plan))
         self._acting = speeds[0] = self._bounds.clip(speeds[0], self._acting)
-        plan = speeds if self.settings.stride == 1 else np.repeat(speeds, self.settings.stride, axis=0)
-        return replace(command_of(speeds[0], plan, status, answer), sqp=sqp)
+        return replace(command_of(speeds[0], np.repeat(speeds, stride, axis=0), status, answer), sqp=sqp)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the disturbance estimated last, and without rotor lag."""
         model = replace(self._model, step=self._period, rotor_lag=None, substeps=1)
-        x = np.zeros((len(states), N_BODY))
-        x[:, P], x[:, V] = states[:, POSITIONS], states[:, VELOCITIES]
-        x[:, Q] = euler_to_quaternion(states[:, ANGLES])
-        x[:, W] = euler_to_body_rates(states[:, ANGLES], states[:, ANGLE_RATES])
-        predicted = np.empty((*plans.shape[:2], N_STATES))
+        x, predicted = _body(states), np.empty((*plans.shape[:2], N_STATES))
         for i in range(plans.shape[1]):
             x = advance_nodes(model, x, self._shares(plans[:, i]))
             x[:, Q] /= np.linalg.norm(x[:, Q], axis=1, keepdims=True)
@@ -384,25 +384,11 @@ class NonlinearMPC:
 
     def _measured(self, now: Moment, state: Array) -> Array:
         """(n,) the model's state."""
-        x = np.empty(self._model.n)
-        x[P], x[V] = state[POSITIONS], state[VELOCITIES]
-        euler = state[ANGLES]
-        seen = now.attitude is not None and bool(np.isfinite(now.attitude).all())
-        x[Q] = now.attitude if seen else euler_to_quaternion(euler)
-        seen = now.body_rates is not None and bool(np.isfinite(now.body_rates).all())
-        x[W] = now.body_rates if seen else euler_to_body_rates(euler, state[ANGLE_RATES])
-        if x.size > N_BODY:
-            x[N_BODY:] = self._rotors
+        x = np.concatenate([_body(state), self._rotors])[: self._model.n]
+        for part, measured in ((Q, now.attitude), (W, now.body_rates)):
+            if measured is not None and np.isfinite(measured).all():
+                x[part] = measured
         return x
-
-    def _turn(self, now: Moment) -> None:
-        """Let the rotors follow what was commanded since the last period."""
-        before, self._called_at = self._called_at, now.time
-        self._rotors_before = self._rotors
-        if self.settings.rotor_lag and math.isfinite(before):
-            left = math.exp(-(now.time - before) / self.settings.rotor_lag)
-            commanded = self._shares(self._acting)
-            self._rotors = commanded + left * (self._rotors - commanded)
 
     def _learn(self, last: tuple[float, Array], time: float, measured: Array) -> None:
         """Compare the measured state with what was to be expected after the last one, disturbances included."""
@@ -415,18 +401,11 @@ class NonlinearMPC:
             x = np.concatenate([x[:N_BODY], self._rotors_before])
         expected = advance_nodes(model, x, self._shares(self._acting))
         self._observer.learn(np.concatenate([measured[V] - expected[V], measured[W] - expected[W]]))
-        estimate = self._observer.estimate
-        self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=estimate[3:])
+        self._believe(self._observer.estimate)
 
-    def _make_ramp(self, settings: RampSettings) -> RampObserver:
-        mass = self._vehicle.mass
-        return RampObserver(
-            settings if settings.rotor_lag is not None else replace(settings, rotor_lag=self.settings.rotor_lag),
-            self._vehicle,
-            self._period,
-            drag=np.array(self.settings.drag) / mass,
-            quadratic_drag=np.array(self.settings.quadratic_drag) / mass,
-        )
+    def _believe(self, estimate: Array) -> None:
+        """Predict with this disturbance (6,) from now on."""
+        self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=estimate[3:])
 
     def _follow(self, ramp: RampObserver, time: float, measured: Array) -> None:
         """Take what is observed for drag, as far as it follows the velocity, and for a constant force beyond."""
@@ -466,39 +445,18 @@ class NonlinearMPC:
         effort[:, 0], effort[:, 1:] = size[:-1] - total, -model.angular_acceleration
         return Nodes(states, thrusts + effort @ self._inverse.T)
 
-    def _forget(self) -> None:
-        """Start without a plan, and assume no disturbance."""
-        self._plan, self._quaternion, self._last, self._called_at = None, None, None, math.nan
-        if self._observer is not None:
-            self._observer.reset()
-            self._model = replace(self._model, acceleration=np.zeros(3), angular_acceleration=np.zeros(3))
-        if self._ramp is not None:
-            self._ramp.reset(self._acting)
-            drag = np.array(self.settings.drag)
-            self._model = replace(self._model, drag=drag, acceleration=np.zeros(3), angular_acceleration=np.zeros(3))
-
-    def _reference(self, now: Moment, reference: Array) -> Nodes:
-        stride = self.settings.stride
-        if now.motion is not None:
-            return nodes_of_motion(now.motion, self._nodes, stride)
-        return nodes_of_preview(reference, self._nodes, stride, self._period, self._hover)
-
     def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem, SQP | None]:
         """Steps of sequential quadratic programming from the stored plan; the last problem is that of the answer."""
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
         inputs = self._model.shares(nodes.thrusts)
-        wanted = nodes.states.copy()
-        wanted[:, Q] = (1.0, 0.0, 0.0, 0.0) if self._difference else 0.0
-        if n > N_BODY:
-            wanted = np.concatenate([wanted, np.concatenate([inputs, inputs[-1:]])], axis=1)
-        start = np.concatenate([nodes.states, wanted[:, N_BODY:]], axis=1)
+        start = np.hstack([nodes.states, np.vstack([inputs, inputs[-1:]])])[:, :n]
+        wanted, s0 = start.copy(), measured.copy()
+        wanted[:, Q], s0[Q] = 0.0, frames[0] @ measured[Q]
+        wanted[:, 3] = self.settings.attitude_error is AttitudeError.DIFFERENCE
         if self._tilted:
-            wanted = np.concatenate([wanted, np.zeros((len(wanted), 2))], axis=1)
-        desired = wanted[1:] @ self._C_r.T
-        s0 = measured.copy()
-        s0[Q] = frames[0] @ measured[Q]
-        if self._tilted:
+            wanted = np.hstack([wanted, np.zeros((len(wanted), 2))])
             s0 = np.append(s0, thrust_axis(measured[Q])[:2])
+        desired = wanted[1:] @ self.problem.objective.C_r.T
         if self._plan is None:
             self._plan = start, self._clip(inputs)
         elif self._shift:
@@ -535,7 +493,7 @@ class NonlinearMPC:
                 share = min(max(share / max(undone, SHORTEST), SHORTEST), largest)
                 last = step
                 self._plan = x + share * (found - x), u + share * (plan - u)
-        defect = np.abs(defects(self._model, found, plan)).max()
+        defect = np.abs(found[1:] - advance_nodes(self._model, found[:-1], plan)).max()
         return query, answer, problem, SQP(float(defect), float(moved))
 
     def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:
@@ -566,13 +524,14 @@ class NonlinearMPC:
             return None
         return "out_of_bounds" if np.isfinite(plan).all() else "not_finite"
 
-    def _stop(self, phase: Phase) -> Command:
-        self._acting, _ = self._bounds.reach(self._acting)
-        self._forget()
-        return stopped(self._acting.copy(), self.horizon, phase)
 
-    def _refuse(self, status: str, answer: Answer | None = None) -> Command:
-        return refused(self._acting, self.horizon, status, answer)
+def _body(states: Array) -> Array:
+    """(..., 13) the rigid body's states of states (..., 12)."""
+    x = np.empty((*states.shape[:-1], N_BODY))
+    x[..., P], x[..., V] = states[..., POSITIONS], states[..., VELOCITIES]
+    x[..., Q] = euler_to_quaternion(states[..., ANGLES])
+    x[..., W] = euler_to_body_rates(states[..., ANGLES], states[..., ANGLE_RATES])
+    return x
 
 
 def _converges(

@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -34,7 +34,8 @@ SUBSTEPS: Final = 2
 errors of 1e-5 rad, or 3e-4 rad with a rotor lag of 20 ms; one leaves ten times as much."""
 
 
-def _nothing() -> Array:
+def zero() -> Array:
+    """Three zeros, which nobody writes to."""
     return read_only(np.zeros(3))
 
 
@@ -48,16 +49,11 @@ class NonlinearModel:
     period: float  # tau_s [s]
     substeps: int = SUBSTEPS  # Runge-Kutta steps per period
     rotor_lag: float | None = None  # time constant tau_r of the rotor speeds [s]; None for speeds that are the inputs
-    acceleration: Array = field(default_factory=_nothing)  # (3,) a of the disturbance, world frame [m/s^2]
-    angular_acceleration: Array = field(default_factory=_nothing)  # (3,) alpha of the disturbance, body frame [rad/s^2]
+    acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
+    angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha of the disturbance, body frame [rad/s^2]
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.period < math.inf:
-            raise ParameterError("controller", "period", self.period, "positive and finite")
-        if not isinstance(self.substeps, int) or self.substeps < 1:
-            raise ParameterError("controller", "substeps", self.substeps, "a whole number >= 1")
-        if self.rotor_lag is not None and not 0.0 < self.rotor_lag < math.inf:
-            raise ParameterError("controller", "rotor_lag", self.rotor_lag, "positive and finite, or None")
+        check_steps("period", self.period, self.substeps, self.rotor_lag)
         for name in ("acceleration", "angular_acceleration"):
             value = getattr(self, name)
             if np.shape(value) != (3,) or not all(map(math.isfinite, value)):
@@ -72,6 +68,16 @@ class NonlinearModel:
     def allocation(self) -> Array:
         """(4, 4) the inverse of `effectiveness`."""
         return read_only(np.array(np.linalg.inv(self.effectiveness), float))
+
+
+def check_steps(name: str, step: float, substeps: int, rotor_lag: float | None) -> None:
+    """Refuse steps in time [s] that cannot be integrated over."""
+    if not 0.0 < step < math.inf:
+        raise ParameterError("controller", name, step, "positive and finite")
+    if not isinstance(substeps, int) or substeps < 1:
+        raise ParameterError("controller", "substeps", substeps, "a whole number >= 1")
+    if rotor_lag is not None and not 0.0 < rotor_lag < math.inf:
+        raise ParameterError("controller", "rotor_lag", rotor_lag, "positive and finite, or None")
 
 
 def nonlinear_model(
@@ -166,20 +172,11 @@ def _weighted(first: Triple, second: Triple, third: Triple, fourth: Triple) -> T
 
 
 def _rotor_speeds(model: NonlinearModel, step: float, rotors: Array, inputs: Array) -> Array:
-    """(K, 4) speeds of rotors (4,) under inputs (4,) at the instants of `_instants`.
-
-    `step` is that of the Runge-Kutta method [s].
-    """
-    instants = _instants(model.substeps)
+    """(4 substeps, 4) speeds of rotors (4,) under inputs (4,) where Runge-Kutta's method needs them, of a step [s]."""
+    instants = (np.arange(model.substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel()
     if model.rotor_lag is None:
         return np.broadcast_to(inputs, (instants.size, *inputs.shape))
     return inputs + np.exp(-instants * step / model.rotor_lag)[:, None] * (rotors - inputs)
-
-
-@cache
-def _instants(substeps: int) -> Array:
-    """(4 substeps,) instants at which Runge-Kutta's method evaluates slopes, in steps."""
-    return read_only((np.arange(substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel())
 
 
 def _accelerations(

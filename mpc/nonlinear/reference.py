@@ -8,7 +8,7 @@ import numpy as np
 
 from mpc.nonlinear.rigidbody import N_BODY, P, Q, V, W
 from quadsim.motion import Motion
-from quadsim.state import Array, Indices
+from quadsim.state import Array
 
 
 class Nodes(NamedTuple):
@@ -20,17 +20,10 @@ class Nodes(NamedTuple):
 
 def nodes_of_motion(motion: Motion, horizon: int, stride: int) -> Nodes:
     """The samples k, k + stride, ...; where these end, the last of them again, and of thrusts the last but one."""
-    at: slice | Indices
-    with_inputs: slice | Indices
     last = (len(motion) - 1) // stride
-    if last >= horizon:
-        at, with_inputs = slice(0, horizon * stride + 1, stride), slice(0, horizon * stride, stride)
-    else:
-        at = np.arange(0, horizon * stride + 1, stride)
-        there = at[: last + 1]
-        at = np.concatenate([there, np.full(at.size - there.size, there[-1])])
-        before = there[:-1] if there.size > 1 else there
-        with_inputs = np.concatenate([before, np.full(horizon - before.size, before[-1])])
+    at, with_inputs = (
+        stride * np.minimum(np.arange(count), end) for count, end in ((horizon + 1, last), (horizon, max(last - 1, 0)))
+    )
     states = np.empty((horizon + 1, N_BODY))
     states[:, P], states[:, Q], states[:, V] = motion.position[at], motion.attitude[at], motion.velocity[at]
     states[:, W] = motion.body_rates[at]

@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.errors import ParameterError
+from mpc.nonlinear.model import check_steps, zero
 from quadsim.state import Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -44,10 +44,6 @@ class Inputs(StrEnum):
     SPEED = "speed"
 
 
-def _nothing() -> Array:
-    return read_only(np.zeros(3))
-
-
 @dataclass(frozen=True, kw_only=True)
 class RigidBody:
     """x(k+1) = f(x(k), u(k)) over a time; see the module.  Another disturbance is a matter of `dataclasses.replace`."""
@@ -61,18 +57,13 @@ class RigidBody:
     substeps: int = 1  # Runge-Kutta steps in it
     inputs: Inputs = Inputs.THRUST
     rotor_lag: float | None = None  # time constant by which thrusts or speeds follow the inputs [s]; None for none
-    drag: Array = field(default_factory=_nothing)  # (3,) D_1, linear, body axes [N s/m]
-    quadratic_drag: Array = field(default_factory=_nothing)  # (3,) D_2, body axes [N s^2/m^2]
-    acceleration: Array = field(default_factory=_nothing)  # (3,) a of the disturbance, world frame [m/s^2]
-    angular_acceleration: Array = field(default_factory=_nothing)  # (3,) alpha of the disturbance, body frame [rad/s^2]
+    drag: Array = field(default_factory=zero)  # (3,) D_1, linear, body axes [N s/m]
+    quadratic_drag: Array = field(default_factory=zero)  # (3,) D_2, body axes [N s^2/m^2]
+    acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
+    angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha of the disturbance, body frame [rad/s^2]
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.step < math.inf:
-            raise ParameterError("controller", "node", self.step, "positive and finite")
-        if not isinstance(self.substeps, int) or self.substeps < 1:
-            raise ParameterError("controller", "substeps", self.substeps, "a whole number >= 1")
-        if self.rotor_lag is not None and not 0.0 < self.rotor_lag < math.inf:
-            raise ParameterError("controller", "rotor_lag", self.rotor_lag, "positive and finite, or None")
+        check_steps("node", self.step, self.substeps, self.rotor_lag)
 
     @cached_property
     def features(self) -> Array:
@@ -142,10 +133,6 @@ def _features(gyration: tuple[float, float, float]) -> Array:
     return read_only(F.reshape(11, -1))
 
 
-_PAIRS: Final = np.array([1, 0, 2, 0, 1, 2, 3, 2, 3, 1, 1, 2])
-_THRUST_AXIS: Final = np.array(
-    [[2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0], [0.0, 0.0, -2.0], [0.0, 0.0, -2.0]]
-)
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _EYE: Final = np.eye(3)
 _START: Final = np.eye(_TURNING, _TURNING + 2 * N_ROTORS + 1)
@@ -154,8 +141,8 @@ _HALF: Final = np.repeat([0.5, 0.0, 0.5], [4, 3, 3])
 
 def thrust_axis(q: Array) -> Array:
     """R(q) e_z (..., 3) of quaternions (..., 4) of any length."""
-    pairs = q.take(_PAIRS, axis=-1)
-    return np.asarray((pairs[..., :6] * pairs[..., 6:]) @ _THRUST_AXIS + _UP)
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    return np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
 
 
 def rotation(q: Array) -> Array:
@@ -184,12 +171,8 @@ _SLOPES: Final = _rotation_slopes()
 def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
     """A, B and the end x(k+1) of the map from M nodes' states x (M, n) under inputs u (M, 4).
 
-    Args:
-        model: what moves.
-        x: states.
-        u: inputs.
-        frames: (M + 1, 4, 4) orthogonal matrices, where A and B are to be for states whose quaternion is multiplied by
-            them, the first M of them at the beginning of the steps and the last M at the end; None for the states.
+    With `frames` (M + 1, 4, 4), orthogonal matrices, A and B are for states whose quaternion is multiplied by them, the
+    first M of them at the beginning of the steps and the last M at the end.
 
     Returns:
         (M, n, n), (M, n, 4) and (M, n): exact derivatives of the Runge-Kutta map; the end is not multiplied by frames.
@@ -204,68 +187,40 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
     return _assemble(model, x, u, Y, travelled, frames)
 
 
-def defects(model: RigidBody, x: Array, u: Array) -> Array:
-    """(N, n) how far a plan's states x (N + 1, n) are from where its inputs u (N, 4) take each one before, signed."""
-    return x[1:] - advance_nodes(model, x[:-1], u)
-
-
 def _integrate(model: RigidBody, drives: Array, Y: Array) -> tuple[Array, Array]:
-    """Take columns through the Runge-Kutta stages: derivatives of (q, v, omega), and last its value, or that alone.
+    """Take columns Y (M, 10, m) through the Runge-Kutta stages, and (M, 3, m) how far position has moved.
 
-    Args:
-        model: what moves.
-        drives: of `_drives`, for as many of the last columns as it has them.
-        Y: (M, 10, m) at the beginning.
-
-    Returns:
-        (M, 10, m) at the end, and (M, 3, m) how far position has moved.
+    They are derivatives of (q, v, omega), and last its value, or that alone; `drives` are of the last of them.
     """
     M, _, m = Y.shape
     lagging, driven = model.rotor_lag is not None, slice(m - drives.shape[-1], m)
     h = model.step / model.substeps
     constant = model.acceleration - model.gravity * _UP
-    z, G = np.empty((M, 11)), np.zeros((M, _TURNING, m))
-    # Views are taken once: at ten nodes a step is made of calls, not of sums.
-    z_q, z_w, z_Tq, features = z[:, :4], z[:, 4:7], z[:, 7:], model.features
-    G_v, G_end, G_w = G[:, _v, driven], G[:, _v, -1], G[:, _w, driven]
 
     def slope(k: int, Y: Array) -> Array:
         state, drive = Y[:, :, -1], drives[k if lagging else 0]
         q = state[:, _q]
-        z_q[:], z_w[:] = q, state[:, _w]
-        np.multiply(q, drive[:, 0, -1:], out=z_Tq)
-        F = (z @ features).reshape(M, _TURNING, _TURNING)
-        np.multiply(thrust_axis(q)[:, :, None], drive[:, :1], out=G_v)
-        np.add(G_end, constant, out=G_end)
-        if lagging or k == 0:
-            G_w[:] = drive[:, 1:]
-        dragging = _drag(model, F, state) if model.drags else None
+        z = np.concatenate([q, state[:, _w], q * drive[:, 0, -1:]], axis=1)
+        F = (z @ model.features).reshape(M, _TURNING, _TURNING)
+        drag = _drag(model, F, state) if model.drags else 0.0
         K = F @ Y
         K[:, :, -1] *= _HALF
-        K += G
-        if dragging is not None:
-            K[:, _v, -1] += dragging
+        along = thrust_axis(q)[:, :, None] * drive[:, :1]
+        along[:, :, -1] += constant
+        K[:, _v, driven] += along
+        K[:, _w, driven] += drive[:, 1:]
+        K[:, _v, -1] += drag
         return np.asarray(K)
 
-    def ahead(K: Array, step: float) -> Array:
-        np.multiply(K, step, out=scratch)
-        return np.add(scratch, Y, out=scratch)
-
-    travelled, scratch = np.zeros((M, 3, m)), np.empty_like(Y)  # of position, without the straight motion
-    for s in range(model.substeps):
-        first = slope(4 * s, Y)
-        second = slope(4 * s + 1, ahead(first, 0.5 * h))
-        third = slope(4 * s + 2, ahead(second, 0.5 * h))
-        fourth = slope(4 * s + 3, ahead(third, h))
-        first += second
-        first += third
-        travelled += h * Y[:, _v] + (h * h / 6.0) * first[:, _v]
-        first += second
-        first += third
-        first += fourth
-        first *= h / 6.0
-        first += Y
-        Y = first
+    travelled = np.zeros((M, 3, m))  # of position, without the straight motion
+    for s in range(0, 4 * model.substeps, 4):
+        first = slope(s, Y)
+        second = slope(s + 1, Y + 0.5 * h * first)
+        third = slope(s + 2, Y + 0.5 * h * second)
+        fourth = slope(s + 3, Y + h * third)
+        total = first + second + third
+        travelled += h * Y[:, _v] + (h * h / 6.0) * total[:, _v]
+        Y = Y + h / 6.0 * (total + second + third + fourth)
     return Y, travelled
 
 

@@ -59,49 +59,29 @@ _USUAL = Weights()
 
 @dataclass(frozen=True, kw_only=True)
 class NonlinearSettings:
-    """Horizon, cost and model; the units are those of the states, inputs are shares of the largest.
+    """Horizon, cost and model; the units are those of the states, inputs are shares of the largest."""
 
-    Attributes:
-        horizon: N, nodes.
-        stride: control periods from one node to the next.
-        iterations: most steps of sequential quadratic programming in a period; 1 is the real-time iteration.
-        tolerance: largest step of a state or an input that ends them.
-        shift: whether the plan is shifted by a node before it is linearised along; None: where the stride is 1.
-        substeps: Runge-Kutta steps from one node to the next.
-        inputs: what the inputs are shares of the largest of.
-        rotor_lag: time constant of the rotors' thrusts or speeds [s]; None for none.
-        drag: (3,) linear drag that the model knows, body axes [N s/m].
-        quadratic_drag: (3,) drag quadratic in each component of the velocity [N s^2/m^2].
-        attitude_error: what the weight of the attitude is of.
-        weights: what distances from the reference cost.
-        terminal: the last state's weight over that of the others, 0 for none; `lqr` for the Riccati equation's.
-        tilt: largest angle between thrust axis and vertical [rad], below pi/2; None for no bound.
-        largest_rates: (3,) largest magnitudes of the body rates [rad/s]; infinite for no bound.
-        soft: (l1, l2) of exceeding these by 1 rad or 1 rad/s; None for hard bounds.
-        observer: tuning of the disturbance observer; None for no offset-free tracking.
-        ramp: tuning of the one that follows changing forces, and fits drag to them; None for none.
-        solver: QP solver (`mpc.solvers.find_solver`); None for the one that is the fastest for the size.
-    """
-
-    horizon: int = 10
-    stride: int = 1
-    iterations: int = 1
-    tolerance: float = 1e-6
-    shift: bool | None = None
-    substeps: int = 1
-    inputs: Inputs = Inputs.THRUST
-    rotor_lag: float | None = None
-    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    quadratic_drag: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    attitude_error: AttitudeError = AttitudeError.ERROR_STATE
-    weights: Weights = _USUAL
-    terminal: float | str = 0.0
-    tilt: float | None = None
-    largest_rates: tuple[float, float, float] = (math.inf, math.inf, math.inf)
-    soft: tuple[float, float] | None = None
-    observer: ObserverSettings | None = None
-    ramp: RampSettings | None = None
-    solver: str | None = None
+    horizon: int = 10  # N, nodes
+    stride: int = 1  # control periods from one node to the next
+    iterations: int = 1  # most steps of sequential quadratic programming in a period; 1 is the real-time iteration
+    tolerance: float = 1e-6  # largest step of a state or an input that ends them
+    shift: bool | None = None  # whether the plan moves on by a node before it is linearised along; None: if stride is 1
+    substeps: int = 1  # Runge-Kutta steps from one node to the next
+    inputs: Inputs = Inputs.THRUST  # what the inputs are shares of the largest of
+    rotor_lag: float | None = None  # time constant of the rotors' thrusts or speeds [s]; None for none
+    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # linear, that the model knows, body axes [N s/m]
+    quadratic_drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # in each component of the velocity [N s^2/m^2]
+    attitude_error: AttitudeError = AttitudeError.ERROR_STATE  # what the weight of the attitude is of
+    weights: Weights = _USUAL  # what distances from the reference cost
+    terminal: float | str = (
+        0.0  # the last state's weight over the others', 0 for none; "lqr" for the Riccati equation's
+    )
+    tilt: float | None = None  # largest angle between thrust axis and vertical [rad], below pi/2; None for no bound
+    largest_rates: tuple[float, float, float] = (math.inf, math.inf, math.inf)  # body rates [rad/s]
+    soft: tuple[float, float] | None = None  # (l1, l2) of exceeding these by 1 rad or 1 rad/s; None for hard bounds
+    observer: ObserverSettings | None = None  # of the disturbance observer; None for no offset-free tracking
+    ramp: RampSettings | None = None  # of the one that follows changing forces, and fits drag to them; None for none
+    solver: str | None = None  # see `mpc.solvers.find_solver`; None for the fastest one for the size
 
     def __post_init__(self) -> None:
         for name in ("horizon", "stride", "iterations", "substeps"):

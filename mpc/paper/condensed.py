@@ -14,6 +14,7 @@ import scipy.linalg
 
 from mpc.constraints import Rows
 from mpc.ocp import Problem, Query, predicted
+from mpc.paper.constraints import slew_matrix
 from mpc.paper.cost import cost
 from mpc.paper.prediction import Prediction, prediction
 from mpc.qp import QP, Posed, QPRows, Solution
@@ -39,7 +40,7 @@ def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
     terms = cost(maps, objective)
     H, F_x, F_y, F_d = terms.H, terms.F1, terms.F2, np.zeros((N * nu, nu))
     if objective.Q_d is not None:
-        steps = np.kron(np.eye(N) - np.eye(N, k=-1), np.eye(nu))
+        steps = slew_matrix(N, nu)
         H = H + 2.0 * steps.T @ np.kron(np.eye(N), objective.Q_d) @ steps
         F_d[:nu] = -2.0 * objective.Q_d
     if objective.P is not None:
@@ -106,6 +107,10 @@ class Condensed:
         self._of_rest = self._values.of_inputs.reshape(N, len(rows.C), N, nu).sum(axis=2)  # of u_s throughout
         self._pull = self.cost.H.reshape(N * nu, N, nu).sum(axis=1)  # by u_s throughout
         size = self._inputs + N * m_s
+        later: list[Indices] = []
+        for entries in (nu, m_s, len(rows.C)):
+            own = sum(map(len, later)) + np.arange(N * entries)
+            later.append(np.concatenate([own[entries:], own[(N - 1) * entries :]]))
         self._blank = QP(
             P=np.asfortranarray(scipy.linalg.block_diag(self.cost.H, 2.0 * np.diag(l2)) if m_s else self.cost.H),
             c=np.zeros(size),
@@ -116,30 +121,33 @@ class Condensed:
             h_u=np.zeros(rows.lower.size),
             x_l=np.concatenate([rows.u_min.ravel(), np.zeros(N * m_s)]),
             x_u=np.concatenate([rows.u_max.ravel(), np.full(N * m_s, np.inf)]),
-            later=_one_step_later([nu, m_s, len(rows.C)], N),
+            later=np.concatenate(later),
         )
         nothing = np.zeros((N, problem.objective.C_r.shape[0]))
         self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp
 
     @cached_property
-    def _changing(self) -> _Changing:
-        """What does not change where the model does."""
-        objective, blank = self._problem.objective, self._blank
+    def _changing(self) -> tuple[Array, Array | None, Array, Array]:
+        """What does not change where the model does.
+
+        Returns:
+            (n_r, n_r) L' of Q_y = L L'; (r, n) the same of the last state's weight, None where that costs nothing;
+            (N nu, N nu) the Hessian of inputs and their changes; (N + 1, n + nu + 1, N nu + 1) each step's inputs and
+            1, as functions of all inputs and 1, below n zeros.
+        """
+        objective, model, N = self._problem.objective, self._problem.model, self._problem.horizon
+        n, nu = model.n, model.nu
+        steps = slew_matrix(N, nu)
+        moves = steps.T @ np.kron(np.eye(N), objective.move_weight) @ steps
+        S = np.zeros((N + 1, n + nu + 1, N * nu + 1))
+        S[:N, n:-1, :-1] = np.eye(N * nu).reshape(N, nu, N * nu)
+        S[:, -1, -1] = 1.0
+        H = 2.0 * (np.kron(np.eye(N), objective.Q_u) + moves)
         factor = np.asarray(np.linalg.cholesky(objective.Q_y).T, float)
-        return _Changing(
-            root=factor @ objective.C_r,
-            target=factor,
-            root_end=_root(objective.terminal_weights[0]),
-            H=_input_hessian(self._problem),
-            of_inputs=2.0 * objective.Q_u,
-            of_move=2.0 * objective.move_weight,
-            P=np.array(blank.P),
-            G=np.array(blank.G, order="C"),
-            S=_inputs_of_steps(self._problem),
-        )
+        return factor, _root(objective.terminal_weights[0]), H, S
 
     def pose(self, query: Query) -> Posed:
-        """See `mpc.qp.Formulation.pose`."""
+        """The QP of a period; without `Query.steps`, its matrices are the very ones of `qp`."""
         if query.steps is not None:
             return self._pose_changed(query)
         terms, values, rows = self.cost, self._values, self._rows
@@ -158,53 +166,54 @@ class Condensed:
         """The same in absolute states and inputs, with a model that changes."""
         assert query.steps is not None
         (A, B, c), (state, desired, u_before) = query.steps, query[:3]
-        rest = query.rest or self._problem.rest
+        rest, blank = query.rest or self._problem.rest, self._blank
         objective, rows, m = self._problem.objective, self._rows, self._inputs
         N, n, nu = B.shape
-        fixed, count = self._changing, len(rows.C)
+        (target, root_end, H, inputs), count, root = self._changing, len(rows.C), self._changing[0] @ objective.C_r
         # Columns are the inputs of all steps, and the last is what no input changes; below the states of each step are
         # its own inputs and 1, so that one product with [A B c] makes the next.
-        S, steps = np.empty_like(fixed.S), np.concatenate([A, B, c[:, :, None]], axis=2)
-        S[0, :n], S[:, n:] = 0.0, fixed.S[:, n:]
+        S, steps = np.empty_like(inputs), np.concatenate([A, B, c[:, :, None]], axis=2)
+        S[0, :n], S[:, n:] = 0.0, inputs[:, n:]
         S[0, :n, m] = state
         for t in range(N):
             np.dot(steps[t], S[t], out=S[t + 1, :n])
         S = S[:, :n]
-        R = fixed.root @ S[1:N]
-        R[:, :, -1] -= desired[:-1] @ fixed.target.T
+        R = root @ S[1:N]
+        R[:, :, -1] -= desired[:-1] @ target.T
         stacked = R.reshape(-1, m + 1)
-        if fixed.root_end is not None:
-            end = fixed.root_end @ S[N]
-            end[:, -1] -= fixed.root_end @ objective.terminal_target(desired[-1], rest.x)
+        if root_end is not None:
+            end = root_end @ S[N]
+            # A last state's weight of its own is about x_s + C_r^+ (y_d - C_r x_s).
+            wanted = rest.x + np.linalg.pinv(objective.C_r) @ (desired[-1] - objective.C_r @ rest.x)
+            end[:, -1] -= root_end @ wanted
             stacked = np.concatenate([stacked, end])
         square = stacked.T @ stacked
         square *= 2.0
-        P, gradient = fixed.P.copy(order="F"), self._linear.copy()
-        np.add(square.T[:m, :m], fixed.H.T, out=P[:m, :m])  # symmetric both
+        P, gradient = blank.P.copy(order="F"), self._linear.copy()
+        np.add(square.T[:m, :m], H.T, out=P[:m, :m])  # symmetric both
         gradient[:m] += square[:m, m]
-        gradient[:m].reshape(N, nu)[:] -= rest.u @ fixed.of_inputs
-        gradient[:nu] -= fixed.of_move @ u_before
-        blank = self._blank
+        gradient[:m].reshape(N, nu)[:] -= rest.u @ (2.0 * objective.Q_u)
+        gradient[:nu] -= 2.0 * objective.move_weight @ u_before
         G, h_l, h_u = blank.G, blank.h_l, blank.h_u
         if count:
             values = _row_values(rows, S)
             values[0, :, -1] -= rows.E @ u_before
-            filled, known = fixed.G.copy(), values[:, :, m]
+            filled, known = np.array(blank.G, order="C"), values[:, :, m]
             filled.reshape(N, count, -1)[:, :, :m] = values[:, :, :m]
             G, h_l, h_u = np.asfortranarray(filled), (rows.lower - known).ravel(), (rows.upper - known).ravel()
         qp = replace(blank, P=P, c=gradient, G=G, h_l=h_l, h_u=h_u)
         return Posed(qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m])
 
     def inputs(self, x: Array) -> Array:
-        """See `mpc.qp.Formulation.inputs`."""
+        """(N, nu) the planned inputs [rad/s] in a primal point."""
         return x[: self._inputs].reshape(self._problem.horizon, -1)
 
     def slacks(self, x: Array) -> Array:
-        """See `mpc.qp.Formulation.slacks`."""
+        """(N, m_s) the slacks in a primal point."""
         return x[self._inputs :].reshape(self._problem.horizon, -1)
 
     def multipliers(self, solution: Solution) -> Array:
-        """See `mpc.qp.Formulation.multipliers`."""
+        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
         return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
 
     def solution(self, plan: Array, slacks: Array, multipliers: Array) -> Solution:
@@ -221,42 +230,11 @@ class Condensed:
         return Solution(x, self._blank.b, z, z_box)
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Changing:
-    """The fixed parts of a QP whose model changes; copies of P and G are filled in each time."""
-
-    root: Array  # (n_r, n) of a state's cost |root x - target y_d|^2
-    target: Array  # (n_r, n_r)
-    root_end: Array | None  # (r, n) of the last state's; None where that costs nothing
-    H: Array  # (N nu, N nu) of inputs and their changes
-    of_inputs: Array  # (nu, nu) of an input's gradient
-    of_move: Array  # (nu, nu) of the first change's
-    P: Array  # (N nu + N m_s, N nu + N m_s)
-    G: Array  # (N m, N nu + N m_s)
-    S: Array  # (N + 1, n + nu + 1, N nu + 1) each step's inputs and 1, as functions of all inputs and 1, below n zeros
-
-
-def _inputs_of_steps(problem: Problem) -> Array:
-    N, n, nu = problem.horizon, problem.model.n, problem.model.nu
-    found = np.zeros((N + 1, n + nu + 1, N * nu + 1))
-    found[:N, n:-1, :-1] = np.eye(N * nu).reshape(N, nu, N * nu)
-    found[:, -1, -1] = 1.0
-    return found
-
-
 def _root(weight: Array) -> Array | None:
     """(r, n) whose square is a weight (n, n) of rank r; None for 0."""
     values, vectors = np.linalg.eigh(weight)
     there = values > 1e-14 * max(values[-1], 0.0)
     return (vectors[:, there] * np.sqrt(values[there])).T if there.any() else None
-
-
-def _input_hessian(problem: Problem) -> Array:
-    """Of inputs and their changes."""
-    objective, N, nu = problem.objective, problem.horizon, problem.model.nu
-    steps = np.kron(np.eye(N) - np.eye(N, k=-1), np.eye(nu))
-    moves = steps.T @ np.kron(np.eye(N), objective.move_weight) @ steps
-    return np.asarray(2.0 * (np.kron(np.eye(N), objective.Q_u) + moves))
 
 
 def _row_values(rows: QPRows, S: Array) -> Array:
@@ -268,13 +246,3 @@ def _row_values(rows: QPRows, S: Array) -> Array:
     by_step[range(1, N), :, range(N - 1)] -= rows.E
     values[:, :, :-1] = by_step.reshape(N, len(rows.C), -1)
     return values
-
-
-def _one_step_later(sizes: list[int], N: int) -> Indices:
-    """See `mpc.qp.QP.later`, of blocks that have so many entries for each of N steps."""
-    found, start = [], 0
-    for size in sizes:
-        own = start + np.arange(N * size)
-        found.append(np.concatenate([own[size:], own[-size:] if size else own]))
-        start += own.size
-    return np.concatenate(found)

@@ -31,18 +31,6 @@ class Inequalities:
         """B_ineq(k) (rows,) of Eq. (29)."""
         return self.G1 @ state + self.G2 @ u_before + self.G3 + self.G4 @ u_bar
 
-    @property
-    def upper_rows(self) -> Array:
-        """Indices of the rows that bound from above."""
-        n, m = self.n_outputs, self.A_ineq.shape[0] // 2 - self.n_outputs
-        return np.concatenate([np.arange(n), 2 * n + np.arange(m)])
-
-    @property
-    def lower_rows(self) -> Array:
-        """Indices of the rows that bound the same quantities from below, in the order of `upper_rows`."""
-        n, m = self.n_outputs, self.A_ineq.shape[0] // 2 - self.n_outputs
-        return np.concatenate([n + np.arange(n), 2 * n + m + np.arange(m)])
-
 
 def slew_matrix(horizon: int, nu: int) -> Array:
     """(N nu, N nu) matrix taking inputs to their steps u(k+i) - u(k+i-1), the upper half of Eq. (16)."""

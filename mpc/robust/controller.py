@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, AnswerCheck, command_of, free_command, refused, rejection
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.exact.shortcut import with_shortcut
@@ -33,7 +33,7 @@ from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_we
 from mpc.qp import KKT_EVERY
 from mpc.robust.settings import LONGEST_SPAN
 from mpc.robust.settings import RobustSettings as RobustSettings
-from mpc.solvers import INVALID_DATA, Answer, Method, QPSolver
+from mpc.solvers import INVALID_DATA, Answer, QPSolver
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
 from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
@@ -58,6 +58,8 @@ def robust_problem(
     constraints: tuple[Constraint, ...] = (),
 ) -> Problem:
     """The optimisation of the hover model, its states perhaps with the rotor speeds; see `RobustMPC`.
+
+    Objective, bounds and constraints are for the paper's 12 states.
 
     Raises:
         ParameterError: a number or a shape is not possible.
@@ -84,10 +86,10 @@ class RobustMPC:
     """One optimum per period; see the module.
 
     It holds no earlier plan: where nothing is solved, the status reports it, with the command in force, for
-    `mpc.fallback.contract.Guarded` to act on.  Objective, bounds and constraints are for the paper's 12 states.
+    `mpc.fallback.contract.Guarded` to act on.
 
     Attributes:
-        problem: the optimisation, its states perhaps with the rotor speeds.
+        problem: the optimisation, a `robust_problem` of these settings.
         trim: what holds the vehicle at rest against the disturbance that is estimated.
         unanswered: the first period since `reset` whose QP had no answer; None where all had.
         answer: of the last period that had one to solve; None before the first.
@@ -103,32 +105,18 @@ class RobustMPC:
     def __init__(
         self,
         vehicle: Vehicle,
-        *,
-        period: float,
-        horizon: int,
-        objective: Objective,
-        bounds: Bounds,
+        problem: Problem,
         settings: RobustSettings,
-        constraints: tuple[Constraint, ...] = (),
+        *,
         shortcut: bool = True,
         space: Space | None = None,
         kkt_every: int = KKT_EVERY,
     ) -> None:
-        self._vehicle, self.settings, self.horizon, self._period = vehicle, settings, horizon, period
+        self.problem, self.settings, self.horizon = problem, settings, problem.horizon
+        self._period = period = problem.model.period
         self._nominal = hover_model(vehicle, period)
         self._model = nonlinear_model(vehicle, period, rotor_lag=settings.rotor_lag or None)
-        self._undisturbed: Triple = (0.0, 0.0, 0.0)
         self._of_twist = np.ascontiguousarray(np.linalg.inv(slope(self._nominal))[:, 1:])
-        self._objective = objective
-        self.problem = problem = robust_problem(
-            vehicle,
-            period=period,
-            horizon=horizon,
-            objective=objective,
-            bounds=bounds,
-            settings=settings,
-            constraints=constraints,
-        )
         self._actuators, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
         whole = QPSolver(SOLVER, problem)
         self._solver = with_shortcut(problem, whole) if shortcut else whole
@@ -170,21 +158,20 @@ class RobustMPC:
         query = self.pose(now, state, reference)
         if isinstance(query, Command):
             return query
-        answer, problem = self._answer(now.time, query)
-        refused, free = None, answer.method is Method.FREE
-        if not free:
-            refused = rejection(answer.status, answer.plan[0], answer.plan, self._actuators, self._acting)
-        answer, refused = self._check(problem, query, answer, refused)
+        problem = self.problem
+        if self._clearing is None:
+            answer = self._solver.solve(query)
+        else:
+            answer, problem = self._clearing.solve(now.time + self.settings.delay, query, self._yaw)
+        reason = rejection(answer.status, answer.plan[0], answer.plan, self._actuators, self._acting)
+        answer, reason = self._check(problem, query, answer, reason)
         self.answer = answer
-        if free and refused is None:
-            self._acting = answer.plan[0]
-            return free_command(answer)
-        if refused is not None:
-            if refused != INVALID_DATA and self.unanswered is None:
+        if reason is not None:
+            if reason != INVALID_DATA and self.unanswered is None:
                 self.unanswered = Unanswered(
-                    problem=problem, query=query, status=refused, time=now.time, delay=self.settings.delay
+                    problem=problem, query=query, status=reason, time=now.time, delay=self.settings.delay
                 )
-            return self._refuse(refused, answer)
+            return refused(self._acting, self.horizon, reason, answer)
         plan = answer.plan.copy()
         self._acting = plan[0] = self._actuators.clip(plan[0], self._acting)
         return command_of(plan[0], plan, answer.status, answer)
@@ -206,9 +193,11 @@ class RobustMPC:
         self._rotors = spun(self._model, rotors, self._acting, self.settings.delay)
         self._ahead, self._called_at = None, now.time
         if now.phase in GROUNDED:
-            return self._stop(now.phase)
+            self._acting, _ = self._actuators.reach(self._acting)
+            self._forget()
+            return stopped(self._acting.copy(), self.horizon, now.phase)
         if not (all_true(np.abs(state) <= PLAUSIBLE) and all_true(np.abs(reference) <= PLAUSIBLE_REFERENCE)):
-            return self._refuse(INVALID_DATA)
+            return refused(self._acting, self.horizon, INVALID_DATA)
         if ahead is None or abs(now.time - called_at - self._period) > _SAME_TIME:
             self._measured = -math.inf
         span = self._span(now)
@@ -219,11 +208,23 @@ class RobustMPC:
                 self._believe()
         x0 = self._after(self.settings.delay, state, rotors)
         if not all_true(np.isfinite(x0)):
-            return self._refuse(INVALID_DATA)
-        self._yaw = float(x0[_YAW])
+            return refused(self._acting, self.horizon, INVALID_DATA)
+        self._yaw = float(x0[_YAW]) if self.settings.heading else 0.0  # by which the problem's axes are turned
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, which is nothing to learn from
             self._ahead = x0
-        return self._query(np.concatenate([x0, self._rotors])[: self._model.n], self._later(reference))
+        if self.settings.delay:  # the reference at the instants that the prediction is for, the delay later
+            later = np.concatenate([reference[1:], reference[-1:]])
+            reference = reference + self.settings.delay / self._period * (later - reference)
+        x0 = np.concatenate([x0, self._rotors])[: self._model.n]
+        if self.settings.heading:
+            reference = with_nearest_yaw(reference, self._yaw, self.settings.largest_turn)
+            x0 = turn_horizontally(x0, -self._yaw)
+            x0[_YAW] = 0.0
+        u_s = self._balanced()
+        x_s = self.trim.state(self._yaw, self._model.n)
+        x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
+        desired = self.problem.objective.desired(seen_from(reference, self._yaw))
+        return Query(x0, desired, self._acting, Rest(x_s, u_s))
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`.
@@ -244,24 +245,23 @@ class RobustMPC:
             self._observer.reset()
         self._believe()
 
+    @property
+    def _estimate(self) -> Array:
+        """(6,) see `mpc.observer.DisturbanceObserver.estimate`."""
+        return np.zeros(6) if self._observer is None else self._observer.estimate
+
     def _believe(self) -> None:
         """Rest against the disturbance that is estimated now."""
-        if self._observer is None:
-            self._effectiveness, self._resting = self._model.effectiveness, self._undisturbed
-            self.trim: Trim = equilibrium(self._model)
-            return
-        x, y, _ = self._observer.estimate[:3].tolist()
-        twist, gravity = self._observer.estimate[3:] / self._model.gravity, self._model.gravity
+        estimate, gravity = self._estimate, self._model.gravity
+        (x, y), twist = estimate[:2].tolist(), estimate[3:] / gravity
         lift = math.hypot(x, y, gravity)
         self._effectiveness = twisted(self._model.effectiveness, twist)
         self._resting = self._acceleration((-x / lift, -y / lift, gravity / lift))
-        self.trim = equilibrium(self._model, acceleration=self._resting, twist=twist)
+        self.trim: Trim = equilibrium(self._model, acceleration=self._resting, twist=twist)
 
     def _acceleration(self, axis: Triple) -> Triple:
         """What the estimated disturbance is, in the world frame [m/s^2], with thrust along an axis there."""
-        if self._observer is None:
-            return self._undisturbed
-        x, y, along = self._observer.estimate[:3].tolist()
+        x, y, along = self._estimate[:3].tolist()
         return along * axis[0] + x, along * axis[1] + y, along * axis[2]
 
     def _span(self, now: Moment) -> float:
@@ -271,14 +271,6 @@ class RobustMPC:
         span, self._measured = now.time - self._measured, now.time
         return span - _SAME_TIME
 
-    def _stop(self, phase: Phase) -> Command:
-        self._acting, _ = self._actuators.reach(self._acting)
-        self._forget()
-        return stopped(self._acting.copy(), self.horizon, phase)
-
-    def _refuse(self, status: str, answer: Answer | None = None) -> Command:
-        return refused(self._acting, self.horizon, status, answer)
-
     def _after(self, time: float, state: Array, rotors: Array) -> Array:
         """State (12,) some time [s] after a state (12,) with such rotor speeds (4,), under the command in force."""
         if time <= 1e-9:
@@ -286,32 +278,6 @@ class RobustMPC:
         start = np.concatenate((state, rotors))[: self._model.n]
         acceleration = self._acceleration(thrust_axis(state.tolist()))
         return advance_disturbed(self._model, start, self._acting, time, self._effectiveness, acceleration)[:N_STATES]
-
-    def _later(self, reference: Array) -> Array:
-        """The reference (N, 4) at the instants that the prediction is for, the delay later."""
-        if not self.settings.delay:
-            return reference
-        later = np.concatenate([reference[1:], reference[-1:]])
-        return reference + self.settings.delay / self._period * (later - reference)
-
-    def _answer(self, time: float, query: Query) -> tuple[Answer, Problem]:
-        """The optimum, and the problem that it is of."""
-        if self._clearing is None:
-            return self._solver.solve(query), self.problem
-        return self._clearing.solve(time + self.settings.delay, query, self._yaw if self.settings.heading else 0.0)
-
-    def _query(self, x0: Array, reference: Array) -> Query:
-        yaw = float(x0[_YAW])
-        if not self.settings.heading:
-            yaw = 0.0
-        else:
-            reference = with_nearest_yaw(reference, yaw, self.settings.largest_turn)
-            x0 = turn_horizontally(x0, -yaw)
-            x0[_YAW] = 0.0
-        u_s = self._balanced()
-        x_s = self.trim.state(yaw, self._model.n)
-        x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
-        return Query(x0, self._objective.desired(seen_from(reference, yaw)), self._acting, Rest(x_s, u_s))
 
     def _balanced(self) -> Array:
         """(4,) speeds at rest [rad/s] that also balance what thrust twists now, which the hover matrices leave out."""

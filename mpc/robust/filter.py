@@ -56,8 +56,7 @@ class SafetyFilter:
     the QP is solved once more.  Where that has no answer either, the status reports it, for
     `mpc.fallback.contract.Guarded` to fly the last good plan.
 
-    Args:
-        mpc: whose model, observer and constraints are used, one without half-spaces; it solves nothing itself.
+    The robust MPC, one without half-spaces, lends its model, observer and constraints; it solves nothing itself.
 
     Attributes:
         problem: the constraints, all hard.
@@ -72,7 +71,10 @@ class SafetyFilter:
         standing = _standing(mpc.problem)
         self.problem = _feasibility(mpc.problem, standing)
         self._actuators = ActuatorBounds.of_problem(self.problem)
-        self._nearest, self._softened = _Nearest(self.problem, standing), _Nearest(_softened(self.problem), standing)
+        # The same with all constraints on states soft, but for that on the plan's end.
+        parts = self.problem.constraints
+        soft = replace(self.problem, constraints=tuple(p if p.C is None or p.name == END else _soft(p) for p in parts))
+        self._nearest, self._softened = _Nearest(self.problem, standing), _Nearest(soft, standing)
         self.wanted = self.problem.model.u_bar.copy()
 
     @property
@@ -131,9 +133,7 @@ class _Nearest:
         if query.rest is not None:
             for side in (qp.h_l, qp.h_u):
                 side.reshape(self._horizon, -1)[-1, self._ends] += self._at_rest @ query.rest.x
-        solution = self._backend.solve(qp)
-        plan, slacks = self._form.inputs(solution.x), self._form.slacks(solution.x)
-        return Answer.of(qp, solution, plan.copy(), slacks, SafetyFilter.solver)
+        return Answer.of(self._form, qp, self._backend.solve(qp), SafetyFilter.solver)
 
 
 def _feasibility(problem: Problem, standing: Array) -> Problem:
@@ -146,12 +146,6 @@ def _feasibility(problem: Problem, standing: Array) -> Problem:
         bound[-1] = STANDING
         constraints.append(Constraint(name=END, lower=-bound, upper=bound, C=standing))
     return replace(problem, objective=objective, bounds=None, constraints=tuple(constraints))
-
-
-def _softened(problem: Problem) -> Problem:
-    """The same with all constraints on states soft, but for that on the plan's end."""
-    soft = [part if part.C is None or part.name == END else _soft(part) for part in problem.constraints]
-    return replace(problem, constraints=tuple(soft))
 
 
 def _soft(part: Constraint) -> Constraint:

@@ -17,31 +17,21 @@ LONGEST_SPAN: Final = 0.25
 
 @dataclass(frozen=True, kw_only=True)
 class RobustSettings:
-    """The parts of the robust controller; each absent or off unless given.
+    """The parts of the robust controller; each absent or off unless given."""
 
-    Attributes:
-        penalty: what leaving an output bound costs; None for hard output bounds.
-        rotor_lag: time constant of the rotor speeds that the prediction knows [s]; 0 for none.
-        delay: time from measurement to command that the prediction bridges [s].
-        observer: tuning of the disturbance observer; None for no offset-free tracking.
-        heading: whether the hover model is turned by the yaw.  The weights of x and y are then those forward and to the
-            left; where these differ, flights to different headings do.
-        largest_turn: how far the prediction may turn at once [rad], from the present yaw or from one period to
-            the next; it goes on from there.  Of no effect on the hover model without `heading`.
-        move_weight: Q_d (4, 4), of a command's change from one period to the next; None for none.
-        margins: (N, n_c) by which the output bounds are tightened; None for none.
-        terminal: whether the last state has the weight of the hover model's LQR (`mpc.ocp.lqr_terminal_weight`).
-    """
-
-    penalty: Penalty | None = None
-    rotor_lag: float = 0.0
-    delay: float = 0.0
-    observer: ObserverSettings | None = None
+    penalty: Penalty | None = None  # what leaving an output bound costs; None for hard output bounds
+    rotor_lag: float = 0.0  # time constant of the rotor speeds that the prediction knows [s]; 0 for none
+    delay: float = 0.0  # time from measurement to command that the prediction bridges [s]
+    observer: ObserverSettings | None = None  # of the disturbance observer; None for no offset-free tracking
     heading: bool = False
+    """Whether the hover model is turned by the yaw.  The weights of x and y are then those forward and to the left;
+    where these differ, flights to different headings do."""
     largest_turn: float = 0.5
-    move_weight: Array | None = None
-    margins: Array | None = None
-    terminal: bool = False
+    """How far the prediction may turn at once [rad], from the present yaw or from one period to the next; it goes on
+    from there.  Of no effect on the hover model without `heading`."""
+    move_weight: Array | None = None  # Q_d (4, 4), of a command's change from one period to the next; None for none
+    margins: Array | None = None  # (N, n_c) by which the output bounds are tightened; None for none
+    terminal: bool = False  # whether the last state has the weight of the hover model's LQR
 
     def __post_init__(self) -> None:
         for name in ("rotor_lag", "delay"):

@@ -93,7 +93,7 @@ def margins(
 
     Args:
         vehicle: the modelled vehicle.
-        period: control period tau [s].
+        period: tau [s].
         horizon: N.
         bounds: of outputs of the 12 states.
         settings: stated bounds.
@@ -107,8 +107,6 @@ def margins(
     """
     if 0.0 < rotor_lag < SHORTEST_LAG:
         raise ParameterError("controller", "rotor_lag", rotor_lag, f"0, or at least {SHORTEST_LAG:g} s")
-    A, B, E = disturbed_model(vehicle, rotor_lag)
-    C = np.hstack([bounds.C_c, np.zeros((len(bounds.C_c), len(A) - N_STATES))])
     if delay > period:
         raise ParameterError("controller", "delay", delay, f"at most the control period of {period} s")
     room = 0.5 * (bounds.y_max - bounds.y_min)
@@ -116,16 +114,13 @@ def margins(
         name, scale, _ = bounds.output(int(i))
         sides = [scale * float(bounds.y_min[i]), scale * float(bounds.y_max[i])]
         raise ParameterError("controller.output_bounds", name, sides, "finite on both sides, to be tightened")
-    largest = (2.0 if estimated else 1.0) * np.repeat([settings.acceleration, settings.angular_acceleration], 3)
-    basis = observed(A, C)
-    A, B, C, E = basis.T @ A @ basis, basis.T @ B, C @ basis, basis.T @ E
-    K = correction(*discretise(A, B, period), C / (ERROR_SHARE * room)[:, None], SPEED_SHARE * vehicle.hover_speed)
-    margins = growth(A, B, C, E * largest, K, period=period, horizon=horizon, delay=delay)
+    A, B, C, E, K = _corrected(vehicle, rotor_lag, period, bounds.C_c, ERROR_SHARE * room, settings, estimated)
+    margins = growth(A, B, C, E, K, period=period, horizon=horizon, delay=delay)
     passed = between_samples(settings.turning, period)
     margins += passed
     worst = int(np.argmax(np.round(margins[-1] / room, 9)))  # of equal ones, the first
     if margins[-1, worst] > LARGEST_SHARE * room[worst]:
-        turned = growth(A, B, C, E * largest * _TURNS, K, period=period, horizon=horizon, delay=delay)[-1, worst]
+        turned = growth(A, B, C, E * _TURNS, K, period=period, horizon=horizon, delay=delay)[-1, worst]
         shares = {
             "acceleration": margins[-1, worst] - turned - passed,
             "angular_acceleration": turned,
@@ -157,13 +152,28 @@ def position_margins(
     The correction weighs an error of `POSITION_ERROR` as it does one of `ERROR_SHARE` of an output's room.  Arguments
     and errors as of `margins`.
     """
+    rows, sizes = np.eye(N_STATES)[list(POSITION)], np.full(3, POSITION_ERROR)
+    A, B, C, E, K = _corrected(vehicle, rotor_lag, period, rows, sizes, settings, estimated)
+    return read_only(growth(A, B, C, E, K, period=period, horizon=horizon, delay=delay))
+
+
+def _corrected(
+    vehicle: Vehicle,
+    rotor_lag: float,
+    period: float,
+    rows: Array,
+    sizes: Array,
+    settings: TighteningSettings,
+    estimated: bool,
+) -> tuple[Array, ...]:
+    """A, B, C, E of what the rows (n_c, 12) observe, and K, which weighs errors of these sizes (n_c,) alike."""
     A, B, E = disturbed_model(vehicle, rotor_lag)
-    C = np.eye(len(A))[list(POSITION)]
-    largest = (2.0 if estimated else 1.0) * np.repeat([settings.acceleration, settings.angular_acceleration], 3)
+    C = np.hstack([rows, np.zeros((len(rows), len(A) - N_STATES))])
     basis = observed(A, C)
     A, B, C, E = basis.T @ A @ basis, basis.T @ B, C @ basis, basis.T @ E
-    K = correction(*discretise(A, B, period), C / POSITION_ERROR, SPEED_SHARE * vehicle.hover_speed)
-    return read_only(growth(A, B, C, E * largest, K, period=period, horizon=horizon, delay=delay))
+    K = correction(*discretise(A, B, period), C / sizes[:, None], SPEED_SHARE * vehicle.hover_speed)
+    largest = (2.0 if estimated else 1.0) * np.repeat([settings.acceleration, settings.angular_acceleration], 3)
+    return A, B, C, E * largest, K
 
 
 def between_samples(acceleration: float, period: float) -> float:

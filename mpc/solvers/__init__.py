@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import importlib.util
 import math
 import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from scipy.linalg import lapack
 
 from mpc.ocp import Problem, Query
 from mpc.paper.condensed import Condensed
-from mpc.qp import QP, Backend, Formulation, KKTResiduals, Solution
+from mpc.qp import QP, Backend, KKTResiduals, Solution
 from mpc.staged import Staged
 from quadsim.controller import ACCEPTED, GAIN, UNCONSTRAINED
 from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
+
+Formulation: TypeAlias = Condensed | Staged
+"""The ways to write an MPC's optimisation as a QP."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +32,7 @@ class SolverEntry:
     description: str  # one line
     package: str  # what it is imported as
     dense: bool = True  # whether it takes the condensed QP, else the staged one
-    steps_per_stage: int | None = None  # of the staged one; None for `mpc.staged.usual_steps`
+    steps_per_stage: int | None = None  # of the staged one; None for what suits the inputs
     extra: str = ""  # the extra of this project that installs the package; empty for one that is always there
 
     def formulate(self, problem: Problem, *, changing: bool = False) -> Formulation:
@@ -43,11 +45,6 @@ class SolverEntry:
     def installed(self) -> bool:
         """Whether the package is there; importing it is left for later."""
         return importlib.util.find_spec(self.package) is not None
-
-    @property
-    def version(self) -> str:
-        """Version of the installed package."""
-        return importlib.metadata.version(self.package)
 
     @property
     def line(self) -> str:
@@ -161,11 +158,11 @@ class Answer(NamedTuple):
     kkt: KKTResiduals | None = None
 
     @classmethod
-    def of(cls, qp: QP, solution: Solution, plan: Array, slacks: Array, answered_by: str) -> Answer:
+    def of(cls, form: Formulation, qp: QP, solution: Solution, answered_by: str) -> Answer:
         """A solver's solution of a QP, as a plan and slacks."""
         return cls(
-            plan,
-            slacks,
+            form.inputs(solution.x),
+            form.slacks(solution.x),
             solution.status,
             answered_by,
             iterations=solution.iterations,
@@ -183,30 +180,23 @@ class Solver(Protocol):
     @property
     def name(self) -> str:
         """Name of the QP solver; see `find_solver`."""
-        ...
 
     @property
     def formulation(self) -> Formulation:
         """The QP that its solutions are of."""
-        ...
 
     def reset(self) -> None:
         """Forget the last period's answer, where it is where the next one starts."""
-        ...
 
     def solve(self, query: Query) -> Answer:
         """The optimum for a query; whatever happens is in its status."""
-        ...
 
 
 class QPSolver:
     """A problem's QP, solved each period by a named solver.
 
-    Args:
-        name: see `find_solver`.
-        problem: with constraints.
-        changing: whether queries have models of their own (`mpc.ocp.Query.steps`).
-        shortcut: whether the unconstrained optimum of a condensed QP is tried first.
+    Queries of a `changing` one have models of their own (`mpc.ocp.Query.steps`); with the `shortcut`, the unconstrained
+    optimum of a condensed QP is tried first.
     """
 
     def __init__(self, name: str, problem: Problem, *, changing: bool = False, shortcut: bool = False) -> None:
@@ -234,7 +224,7 @@ class QPSolver:
         qp, states_of = form.pose(query)
         solution = (self._free(qp) if self._shortcut else None) or self._backend.solve(qp)
         by = GAIN if solution.status == UNCONSTRAINED else self.name
-        answer = Answer.of(qp, solution, form.inputs(solution.x), form.slacks(solution.x), by)
+        answer = Answer.of(form, qp, solution, by)
         if self._changing and solution.status in ACCEPTED and np.isfinite(answer.plan).all():
             return answer._replace(states=states_of(solution.x))
         return answer
@@ -262,5 +252,4 @@ def _usable(query: Query) -> bool:
     if steps is None:
         return math.isfinite(state.sum() + desired.sum() + u_before.sum())
     parts = (*steps, state, desired, u_before, *(() if rest is None else (rest.u,)))
-    # Nearly always the sum of their squares is not larger either, which is quicker.
-    return all(np.vdot(part, part) <= LARGEST**2 or np.abs(part).max() <= LARGEST for part in parts)
+    return all(np.abs(part).max() <= LARGEST for part in parts)

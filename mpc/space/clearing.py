@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -25,13 +25,6 @@ SETTLED: Final = 1e-2
 """Change of all predicted positions [m] below which planes are not recomputed in the same period."""
 
 
-class Cleared(NamedTuple):
-    """An optimum among obstacles, with its `Answer.states`, and the problem it is of."""
-
-    answer: Answer
-    problem: Problem
-
-
 class Clearing:
     """A solver's optimum where it keeps all half-spaces, and else the optimum with them.
 
@@ -39,11 +32,7 @@ class Clearing:
     clear.  Where it is not, the whole QP is solved with the tightest half-spaces of each instant, and with twice as
     many as long as the plan violates one that was left out.
 
-    Args:
-        problem: without half-spaces.
-        solver: solves it.
-        space: what makes the half-spaces.
-        changing: whether queries have steps of their own.
+    The problem and its solver know no half-spaces; queries of a `changing` one have steps of their own.
     """
 
     def __init__(self, problem: Problem, solver: Solver, space: Space, *, changing: bool = False) -> None:
@@ -56,8 +45,8 @@ class Clearing:
         self._forms: dict[int, tuple[Staged, PiqpMultistage]] = {}
         self._last: Array | None = None
 
-    def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> Cleared:
-        """The optimum for a query.
+    def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> tuple[Answer, Problem]:
+        """The optimum for a query, with its `Answer.states`, and the problem that it is of.
 
         Args:
             time: of its x(k) [s].
@@ -69,13 +58,14 @@ class Clearing:
         turn = np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         t = time + self._space.period * np.arange(1, self.problem.horizon + 1, dtype=np.float64)
         last, self._last = self._last, None
-        problem = self.problem
-        # Where the last plan touched half-spaces, this one is all but sure to: it is sought among them at once.
-        among = self._changing and along is not None and self._touched(t, along)
+        problem, among = self.problem, False
+        if self._changing and along is not None:
+            # Where the last plan touched half-spaces, this one is all but sure to: it is sought among them at once.
+            among = bool((_room(*self._space.half_spaces(t, along), along) < NEAR).any())
         if along is None or not among:
             answer = self._solver.solve(query)
             if answer.status not in ACCEPTED:
-                return Cleared(answer, problem)
+                return answer, problem
             answer, planned = self._predicted(query, answer, turn)
             if along is None:
                 along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
@@ -90,20 +80,17 @@ class Clearing:
             if answer.status not in ACCEPTED:
                 named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
                 constraints = (*self.problem.constraints, *named)
-                return Cleared(answer, replace(problem, constraints=constraints))
+                return answer, replace(problem, constraints=constraints)
             if np.abs(planned - along).max() < SETTLED:
                 break
             along = planned
         self._last = planned
-        return Cleared(answer, problem)
+        return answer, problem
 
     def _predicted(self, query: Query, answer: Answer, turn: Array) -> tuple[Answer, Array]:
         """The answer with its states, and their positions in the world (N, 3)."""
         states = predicted(self.problem, query, answer.plan)
         return answer._replace(states=states), states[:, self._space.positions] @ turn
-
-    def _touched(self, t: Array, along: Array) -> bool:
-        return bool((_room(*self._space.half_spaces(t, along), along) < NEAR).any())
 
     def _posed(self, normals: Array, bounds: Array) -> Problem:
         """The problem with chosen half-spaces (m, N, 3), (m, N) in the states' axes."""
@@ -118,7 +105,9 @@ class Clearing:
         while True:
             at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
             problem = self._posed(normals[at] @ turn.T, bounds[at])
-            answer = self._solved(query, problem, len(at[0]))
+            form, backend = self._form(len(at[0]))
+            qp = form.pose(query, problem).qp
+            answer = Answer.of(form, qp, backend.solve(qp), SOLVER)
             if answer.status not in ACCEPTED:
                 return answer, problem, np.empty(0)
             answer, planned = self._predicted(query, answer, turn)
@@ -130,18 +119,15 @@ class Clearing:
             room[at] = -LOOSE  # what was there stays
             count *= 2
 
-    def _solved(self, query: Query, problem: Problem, count: int) -> Answer:
-        """The QP's answer with so many half-spaces at each instant."""
+    def _form(self, count: int) -> tuple[Staged, PiqpMultistage]:
+        """The QP with so many half-spaces at each instant, and what solves it."""
         if count not in self._forms:
-            normals = np.full((count, problem.horizon, 3), 3.0**-0.5)  # in general position
+            normals = np.full((count, self.problem.horizon, 3), 3.0**-0.5)  # in general position
             form = Staged(self._posed(normals, np.zeros(normals.shape[:2])), changing=self._changing)
             backend = PiqpMultistage(changing=True)
             backend.setup(form.qp)
             self._forms[count] = form, backend
-        form, backend = self._forms[count]
-        qp = form.pose(query, problem).qp
-        solution = backend.solve(qp)
-        return Answer.of(qp, solution, form.inputs(solution.x), form.slacks(solution.x), SOLVER)
+        return self._forms[count]
 
 
 def _room(normals: Array, bounds: Array, positions: Array) -> Array:

@@ -18,12 +18,14 @@ collision checking").
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, TypeAlias
+from dataclasses import dataclass
+from typing import Annotated, Final, TypeAlias
 
 import numpy as np
+from annotated_types import Ge, Le, doc
 
 from mpc.constraints import Constraint, Penalty
-from mpc.space.settings import AvoidanceSettings
+from quadsim.fields import NonNegative
 from quadsim.space import AnyObstacle, Corridor, Fence, Obstacle, Solids
 from quadsim.state import POSITION, Array
 
@@ -31,6 +33,20 @@ Shape: TypeAlias = AnyObstacle | Corridor | Fence
 
 LOOSE: Final = 1e3
 """By how much [m] a half-space that is not in force is left open."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AvoidanceSettings:
+    """How obstacles, corridors and the fence are enforced, and how closely."""
+
+    margin: Annotated[NonNegative, doc("[m] added: planes change from instant to instant")] = 0.05
+    rows: Annotated[
+        int,
+        Ge(1),
+        Le(50),
+        doc("[-] half-spaces per predicted instant that the QP has, the tightest; more where it takes more"),
+    ] = 6
+    iterations: Annotated[int, Ge(1), Le(50), doc("[-] QPs per period at most, each along the last one's plan")] = 3
 
 
 class Space:
@@ -66,27 +82,16 @@ class Space:
         self._shapes, self._distance = tuple(shapes), radius + settings.margin
         self._margins = np.zeros((horizon, 3)) if margins is None else margins
         self._solids = Solids([shape for shape in self._shapes if isinstance(shape, Obstacle)])
-        self._names: list[str] = []
-        self._regions: list[tuple[Corridor | Fence, slice]] = []
-        of_solids: list[int] = []
-        for shape in self._shapes:
-            first = len(self._names)
-            count = len(shape.solids) if isinstance(shape, Obstacle) else len(shape.half_spaces[1])
-            self._names += [shape.name] * count
-            if isinstance(shape, Obstacle):
-                of_solids += range(first, first + count)
-            else:
-                self._regions.append((shape, slice(first, first + count)))
-        self._of_solids = np.array(of_solids, np.intp)
-
-    @property
-    def count(self) -> int:
-        """S, half-spaces of one instant."""
-        return len(self._names)
+        counts = [len(s.solids) if isinstance(s, Obstacle) else len(s.half_spaces[1]) for s in self._shapes]
+        places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        self._names = np.repeat(np.array([shape.name for shape in self._shapes], str), counts)
+        self._of_solids = np.repeat(np.array([isinstance(s, Obstacle) for s in self._shapes], bool), counts)
+        shaped = zip(self._shapes, places, strict=False)
+        self._regions = [(shape, at) for shape, at in shaped if not isinstance(shape, Obstacle)]
 
     def half_spaces(self, t: Array, positions: Array) -> tuple[Array, Array]:
         """Normals (S, N, 3) and bounds (S, N) [m] of normal . p >= bound, at times (N,) along positions (N, 3)."""
-        normals, bounds = np.empty((self.count, len(t), 3)), np.empty((self.count, len(t)))
+        normals, bounds = np.empty((len(self._names), len(t), 3)), np.empty((len(self._names), len(t)))
         distance, normal = self._solids.clearances(t, positions)
         normals[self._of_solids], bounds[self._of_solids] = normal, (normal * positions).sum(axis=2) - distance
         for region, at in self._regions:
@@ -113,12 +118,11 @@ class Space:
 
     def constraints(self, normals: Array, bounds: Array, states: int) -> tuple[Constraint, ...]:
         """All half-spaces, one constraint per obstacle or region, by its name."""
-        names = np.array(self._names)
-        return tuple(
-            self.constraint(normals[names == name], bounds[names == name], states, name=_titled(shape))
-            for shape in self._shapes
-            for name in [shape.name]
-        )
+        found = []
+        for shape in self._shapes:
+            at = self._names == shape.name
+            found.append(self.constraint(normals[at], bounds[at], states, name=_titled(shape)))
+        return tuple(found)
 
 
 def _titled(shape: Shape) -> str:

@@ -354,14 +354,21 @@ def _robust_parts(spec: RobustSpec, vehicle: Vehicle, period: float) -> dict[str
 
 
 def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
-    from mpc.robust.controller import RobustMPC
+    from mpc.robust.controller import RobustMPC, robust_problem
     from mpc.robust.tightening import position_margins
 
     margins = None  # by which half-spaces are tightened along x, y, z at each predicted state, (N, 3) [m]
     if spec.tightening is not None and spec.avoidance is not None:
         margins = position_margins(**_tightened(spec, vehicle, period))
     space, parts = make_space(spec, vehicle, period, shapes, margins), _robust_parts(spec, vehicle, period)
-    return RobustMPC(**parts, shortcut=spec.shortcut, space=space, kkt_every=spec.kkt_every)
+    return RobustMPC(
+        vehicle,
+        robust_problem(**parts),
+        parts["settings"],
+        shortcut=spec.shortcut,
+        space=space,
+        kkt_every=spec.kkt_every,
+    )
 
 
 def tightening_margins(spec: RobustSpec, vehicle: Vehicle, period: float) -> Array | None:

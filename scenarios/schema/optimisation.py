@@ -11,7 +11,7 @@ from annotated_types import Len, MaxLen, doc
 from pydantic import Field, model_validator
 
 from mpc.qp import KKT_EVERY
-from mpc.space.settings import AvoidanceSettings
+from mpc.space.halfspaces import AvoidanceSettings
 from quadsim.errors import UnknownNameError
 from quadsim.fields import NonNegative, Number, Weight
 from quadsim.flight.audit import TERMS

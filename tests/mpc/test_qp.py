@@ -13,8 +13,8 @@ from mpc.constraints import Constraint
 from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Query
 from mpc.paper.condensed import Condensed
-from mpc.qp import QP, Backend, Formulation, Solution, kkt_residuals
-from mpc.solvers import SOLVERS, QPSolver, make_backend
+from mpc.qp import QP, Backend, Solution, kkt_residuals
+from mpc.solvers import SOLVERS, Formulation, QPSolver, make_backend
 from mpc.solvers.piqp_backends import PiqpDense
 from mpc.staged import Staged
 from quadsim.controller import SOLVED

@@ -21,7 +21,7 @@ from mpc.constraints import Constraint, Penalty, tightened
 from mpc.exact.shortcut import Shortcut
 from mpc.model import LinearModel, continuous_model, discretise
 from mpc.ocp import Objective, Problem, Query, Rest, lqr_terminal_weight
-from mpc.robust.controller import RobustMPC, RobustSettings
+from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.solvers import SOLVERS, Method, QPSolver, find_solver, solver_entries
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment
 from quadsim.state import Array, make_state
@@ -284,17 +284,18 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
     problem = modelled(vehicle, settings, (row,))
     peer = ocp_peer.optimum(problem, given)
     assert peer.solution.status == SOLVED
-    bounds, small = paper_problem().bounds, paper_problem()
-    assert bounds is not None
-    controller = RobustMPC(
+    small = paper_problem()
+    assert small.bounds is not None
+    posed = robust_problem(
         vehicle,
         period=PERIOD,
         horizon=N,
         objective=small.objective,
-        bounds=bounds,
+        bounds=small.bounds,
         settings=settings,
         constraints=(row,),
     )
+    controller = RobustMPC(vehicle, posed, settings)
     controller.reset(hover)
     command = controller.step(Moment(acting=hover), state, reference)
     assert command.status == SOLVED

@@ -28,8 +28,8 @@ from mpc.constraints import Penalty
 from mpc.nonlinear.model import nonlinear_model
 from mpc.ocp import Problem, Query, Rest
 from mpc.paper.condensed import Condensed
-from mpc.qp import QP, Formulation, Solution, kkt_residuals
-from mpc.solvers import QPSolver
+from mpc.qp import QP, Solution, kkt_residuals
+from mpc.solvers import Formulation, QPSolver
 from mpc.solvers.daqp_dense import DaqpDense
 from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged

@@ -14,8 +14,7 @@ from mpc.exact.axes import axes
 from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Objective, Problem, Query, Rest, lqr_terminal_weight
 from mpc.paper.condensed import Condensed
-from mpc.qp import Formulation
-from mpc.solvers import Method, QPSolver
+from mpc.solvers import Formulation, Method, QPSolver
 from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged
 from quadsim.errors import ParameterError

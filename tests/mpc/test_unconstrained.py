@@ -23,7 +23,7 @@ def test_gain_converges_to_the_lqr_with_the_horizon() -> None:
     lqr = lqr_gain(problem.model.A, problem.model.B, problem.objective.Q_y, problem.objective.Q_u)
     differences = []
     for horizon in (10, 20, 40, 60, 80, 100):
-        K_N = sequence_gains(replace(problem, horizon=horizon)).first().K_N
+        K_N = sequence_gains(replace(problem, horizon=horizon)).K[:4]
         differences.append(np.linalg.norm(K_N - lqr) / np.linalg.norm(lqr))
     assert differences == sorted(differences, reverse=True)
     assert differences[-1] < 1e-3
@@ -37,13 +37,13 @@ def test_gain_equals_the_finite_horizon_riccati_recursion() -> None:
     for _ in range(problem.horizon):
         K = -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
         P = Q + A.T @ P @ (A + B @ K)
-    np.testing.assert_allclose(sequence_gains(problem).first().K_N, K, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(sequence_gains(problem).K[:4], K, rtol=1e-6, atol=1e-8)
 
 
 def test_feedforward_of_u_bar_is_the_identity() -> None:
     """What Eq. (26) is for; with F3 as printed it would be far from it."""
-    gains = sequence_gains(paper_problem("paper-unconstrained")).first()
-    np.testing.assert_allclose(gains.L_N, np.eye(4), atol=1e-7)
+    gains = sequence_gains(paper_problem("paper-unconstrained"))
+    np.testing.assert_allclose(gains.L[:4], np.eye(4), atol=1e-7)
 
 
 def test_weights_with_thirteen_entries_are_read_as_twelve() -> None:
@@ -58,10 +58,10 @@ def test_step_is_the_first_action_of_the_sequence() -> None:
     reference = paper_reference(300)[150:250]
     state = np.random.default_rng(0).normal(size=12) * 0.1
     command = controller.step(Moment(), state, reference)
-    gains = controller.gains.first()
+    gains = controller.gains
     desired = np.zeros((100, 12))
     desired[:, [0, 2, 4, 10]] = reference
-    expected = gains.K_N @ state + gains.G_N @ desired.ravel() + gains.L_N @ problem.model.u_bar
+    expected = (gains.K @ state + gains.G @ desired.ravel() + gains.L @ problem.model.u_bar)[:4]
     np.testing.assert_allclose(command.speeds, expected, rtol=1e-12)
     assert command.plan.shape == (100, 4)
     np.testing.assert_array_equal(command.plan[0], command.speeds)

@@ -102,7 +102,7 @@ def _state_weight(problem: Problem) -> Array:
 
 
 def _compare(problem: Problem) -> Comparison:
-    K_N = sequence_gains(problem).first().K_N
+    K_N = sequence_gains(problem).K[: problem.model.nu]
     H = cost(prediction(problem.model, problem.horizon), problem.objective).H
 
     def relative(other: Array) -> float:

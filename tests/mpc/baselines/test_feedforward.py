@@ -9,10 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import Measured, hat
+from mpc.baselines.attitude import Measured, Wanted, hat, wanted_attitude
 from mpc.baselines.geometric import GeometricController, Integrals, geometric_settings
 from mpc.baselines.preview import Target, target_of_motion
-from mpc.baselines.wanted import Wanted, wanted_attitude
 from mpc.flatness import motion_along
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle

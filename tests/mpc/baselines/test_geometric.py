@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import Measured, motion_of, vee
-from mpc.baselines.geometric import GeometricController, Integrals, Wanted
+from mpc.baselines.attitude import Measured, Wanted, motion_of, vee
+from mpc.baselines.geometric import GeometricController, Integrals
 from mpc.baselines.preview import Target
 from quadsim.assets import vehicle_path
 from quadsim.controller import Moment

@@ -11,9 +11,8 @@ from support import flight_queries, fly_once, paper_problem
 from mpc.constraints import Constraint, Penalty
 from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Problem, Query, Rest
-from mpc.qp import Formulation
 from mpc.robust.controller import RobustMPC
-from mpc.solvers import Answer, Method, QPSolver, Solver
+from mpc.solvers import Answer, Formulation, Method, QPSolver, Solver
 from quadsim.controller import ACCEPTED
 from scenarios.build import build_controller, build_plant
 from scenarios.courses.make import build_reference

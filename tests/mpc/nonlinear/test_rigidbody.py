@@ -18,7 +18,6 @@ from mpc.nonlinear.rigidbody import (
     V,
     W,
     advance_nodes,
-    defects,
     linearise_nodes,
     rigid_body,
     rotation,
@@ -60,7 +59,6 @@ def test_derivatives_are_those_of_the_map(
     x, u = points(model, np.random.default_rng(0))
     A, B, end = linearise_nodes(model, x, u)
     np.testing.assert_allclose(end, advance_nodes(model, x, u), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(defects(model, x, u[:-1]), x[1:] - end[:-1], rtol=1e-12, atol=1e-12)
     step = 1e-6
     for found, width, moved in (
         (A, model.n, lambda d: (advance_nodes(model, x + d, u), advance_nodes(model, x - d, u))),

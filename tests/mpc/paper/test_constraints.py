@@ -30,6 +30,8 @@ def test_shapes_and_pairs_of_the_paper() -> None:
     assert problem.bounds is not None
     rows = inequalities(prediction(problem.model, 50), problem.bounds)
     assert rows.A_ineq.shape == (2 * 50 * 2 + 2 * 50 * 4, 200)
-    np.testing.assert_array_equal(rows.A_ineq[rows.upper_rows], -rows.A_ineq[rows.lower_rows])
+    outputs, slews = np.split(rows.A_ineq, [2 * rows.n_outputs])
+    for upper, lower in (np.split(outputs, 2), np.split(slews, 2)):
+        np.testing.assert_array_equal(upper, -lower)
     np.testing.assert_array_equal(rows.G1[400 // 2 :], 0.0)  # slew rows do not see the state
     np.testing.assert_array_equal(rows.u_max, np.full(200, 250.0))

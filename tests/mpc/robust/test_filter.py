@@ -12,7 +12,7 @@ from support import paper_problem
 from mpc.constraints import Bounds
 from mpc.ocp import Objective, Query
 from mpc.paper.condensed import Condensed
-from mpc.robust.controller import RobustMPC, RobustSettings
+from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.robust.filter import STANDING, SafetyFilter
 from mpc.solvers import make_backend
 from quadsim.controller import UNCONSTRAINED, Command, Moment
@@ -36,15 +36,11 @@ def objective() -> Objective:
 
 
 def make_filter() -> SafetyFilter:
-    mpc = RobustMPC(
-        VEHICLE,
-        period=PERIOD,
-        horizon=HORIZON,
-        objective=objective(),
-        bounds=bounds(),
-        settings=RobustSettings(heading=True),
+    settings = RobustSettings(heading=True)
+    posed = robust_problem(
+        VEHICLE, period=PERIOD, horizon=HORIZON, objective=objective(), bounds=bounds(), settings=settings
     )
-    return SafetyFilter(mpc)
+    return SafetyFilter(RobustMPC(VEHICLE, posed, settings))
 
 
 def filtered(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER) -> Command:

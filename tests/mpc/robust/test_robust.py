@@ -19,7 +19,7 @@ from mpc.heading import turn_horizontally
 from mpc.model import continuous_model, discretise, hover_model
 from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
 from mpc.observer import ObserverSettings
-from mpc.robust.controller import RobustMPC, RobustSettings
+from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.solvers import QPSolver
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment, Phase
 from quadsim.sim.effects.rotors import RotorDynamics
@@ -49,14 +49,11 @@ def moving(velocity: tuple[float, float, float], **place: Any) -> Array:
 def robust(vehicle: Vehicle, *, horizon: int = 50, weight: float = 0.01, **settings: Any) -> RobustMPC:
     problem = paper_problem()
     assert problem.bounds is not None
-    return RobustMPC(
-        vehicle,
-        period=PERIOD,
-        horizon=horizon,
-        objective=replace(problem.objective, Q_u=weight * np.eye(4)),
-        bounds=problem.bounds,
-        settings=RobustSettings(**settings),
+    objective, parts = replace(problem.objective, Q_u=weight * np.eye(4)), RobustSettings(**settings)
+    posed = robust_problem(
+        vehicle, period=PERIOD, horizon=horizon, objective=objective, bounds=problem.bounds, settings=parts
     )
+    return RobustMPC(vehicle, posed, parts)
 
 
 def flown(

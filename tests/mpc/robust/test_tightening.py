@@ -17,7 +17,7 @@ from mpc.constraints import Bounds, Penalty
 from mpc.model import discretise
 from mpc.nonlinear.model import advance, derivative, nonlinear_model
 from mpc.observer import ObserverSettings
-from mpc.robust.controller import RobustMPC, RobustSettings
+from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.robust.tightening import (
     ERROR_SHARE,
     SHORTEST_LAG,
@@ -314,22 +314,20 @@ def robust(vehicle: Vehicle, drawn_in: Array | None, *, rotor_lag: float = 0.0, 
     """The paper's optimisation with every part."""
     problem = paper_problem()
     assert problem.bounds is not None
-    return RobustMPC(
-        vehicle,
-        period=PERIOD,
-        horizon=HORIZON,
-        objective=replace(problem.objective, Q_u=0.1 * np.eye(4)),
-        bounds=problem.bounds,
-        settings=RobustSettings(
-            penalty=Penalty(l1=np.full(2, 1e8), l2=np.full(2, 1e4)),
-            rotor_lag=rotor_lag,
-            delay=delay,
-            observer=ObserverSettings(),
-            heading=True,
-            move_weight=20.0 * np.eye(4),
-            margins=drawn_in,
-        ),
+    settings = RobustSettings(
+        penalty=Penalty(l1=np.full(2, 1e8), l2=np.full(2, 1e4)),
+        rotor_lag=rotor_lag,
+        delay=delay,
+        observer=ObserverSettings(),
+        heading=True,
+        move_weight=20.0 * np.eye(4),
+        margins=drawn_in,
     )
+    objective = replace(problem.objective, Q_u=0.1 * np.eye(4))
+    posed = robust_problem(
+        vehicle, period=PERIOD, horizon=HORIZON, objective=objective, bounds=problem.bounds, settings=settings
+    )
+    return RobustMPC(vehicle, posed, settings)
 
 
 def peak_tilt(vehicle: Vehicle, *sets: str, tight: bool = True, rotor_lag: float = 0.0) -> float:

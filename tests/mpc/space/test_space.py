@@ -19,8 +19,7 @@ from mpc.robust.tightening import TighteningSettings, position_margins
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers.piqp_backends import PiqpDense
 from mpc.space.clearing import Clearing
-from mpc.space.halfspaces import Shape, Space
-from mpc.space.settings import AvoidanceSettings
+from mpc.space.halfspaces import AvoidanceSettings, Shape, Space
 from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.space import Capsule, Corridor, Cylinder, Fence, Sphere
@@ -127,12 +126,12 @@ def test_regions_are_exact_and_hold_in_their_window() -> None:
 def test_the_optimum_is_that_of_a_dense_qp(problem: Problem) -> None:
     among, posed = space(PILLAR, FENCE, rows=7), query(problem)
     found = clearing(problem, among).solve(0.0, posed)
-    assert found.answer.status == SOLVED
+    assert found[0].status == SOLVED
     free = clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0))).solve(0.0, posed)
-    assert np.abs(found.answer.plan - free.answer.plan).max() > 1.0
-    normals, bounds = among.half_spaces(PERIOD * np.arange(1, N + 1), free.answer.states[:, list(POSITION)])
-    np.testing.assert_allclose(found.answer.plan, by_dense_qp(problem, posed, normals, bounds), atol=2e-3)
-    room = (normals * found.answer.states[:, list(POSITION)]).sum(axis=2) - bounds
+    assert np.abs(found[0].plan - free[0].plan).max() > 1.0
+    normals, bounds = among.half_spaces(PERIOD * np.arange(1, N + 1), free[0].states[:, list(POSITION)])
+    np.testing.assert_allclose(found[0].plan, by_dense_qp(problem, posed, normals, bounds), atol=2e-3)
+    room = (normals * found[0].states[:, list(POSITION)]).sum(axis=2) - bounds
     assert room.min() > -1e-5
     assert room.min() < 1e-3  # active
 
@@ -140,21 +139,21 @@ def test_the_optimum_is_that_of_a_dense_qp(problem: Problem) -> None:
 def test_rows_are_added_until_all_half_spaces_are_satisfied(problem: Problem) -> None:
     posed, few, many = query(problem), space(PILLAR, FENCE, rows=1), space(PILLAR, FENCE, rows=7)
     ours, whole = (clearing(problem, among).solve(0.0, posed) for among in (few, many))
-    np.testing.assert_allclose(ours.answer.plan, whole.answer.plan, atol=2e-3)
+    np.testing.assert_allclose(ours[0].plan, whole[0].plan, atol=2e-3)
     normals, bounds = few.half_spaces(
         PERIOD * np.arange(1, N + 1),
         clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0)))
-        .solve(0.0, posed)
-        .answer.states[:, list(POSITION)],
+        .solve(0.0, posed)[0]
+        .states[:, list(POSITION)],
     )
-    assert ((normals * ours.answer.states[:, list(POSITION)]).sum(axis=2) - bounds).min() > -1e-4
+    assert ((normals * ours[0].states[:, list(POSITION)]).sum(axis=2) - bounds).min() > -1e-4
 
 
 def test_where_the_way_is_clear_the_answer_is_the_solver_s(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Clearing, "_solved", None)  # no QP of its own
+    monkeypatch.setattr(Clearing, "_form", None)  # no QP of its own
     calls: list[Answer] = []
     beside = replace(PILLAR, position=(0.9, 3.0, 0.0))
-    assert clearing(problem, space(beside, FENCE), calls).solve(0.0, query(problem)).answer.plan is calls[0].plan
+    assert clearing(problem, space(beside, FENCE), calls).solve(0.0, query(problem))[0].plan is calls[0].plan
 
 
 def test_a_moving_obstacle_counts_where_it_will_be(problem: Problem) -> None:
@@ -162,16 +161,16 @@ def test_a_moving_obstacle_counts_where_it_will_be(problem: Problem) -> None:
     calls: list[Answer] = []
     gone = Sphere(name="gone", position=(1.0, 0.0, 0.0), radius=0.2, velocity=(0.0, 8.0, 0.0))
     found = clearing(problem, space(gone), calls).solve(0.0, query(problem))
-    assert found.answer.plan is calls[0].plan
+    assert found[0].plan is calls[0].plan
     meeting = 22
-    x = float(found.answer.states[meeting - 1, INDEX["x"]])
+    x = float(found[0].states[meeting - 1, INDEX["x"]])
     start = (x, 3.0 * meeting * PERIOD + 0.4, 0.0)
     comes = Sphere(name="comes", position=start, radius=0.2, velocity=(0.0, -3.0, 0.0))
     found = clearing(problem, space(replace(comes, velocity=(0.0, 0.0, 0.0))), calls).solve(0.0, query(problem))
-    assert found.answer.plan is calls[1].plan
+    assert found[0].plan is calls[1].plan
     found = clearing(problem, space(comes, soft=True, iterations=20), calls).solve(0.0, query(problem))
-    assert found.answer.plan is not calls[2].plan
-    t, positions = PERIOD * np.arange(1, N + 1), found.answer.states[:, list(POSITION)]
+    assert found[0].plan is not calls[2].plan
+    t, positions = PERIOD * np.arange(1, N + 1), found[0].states[:, list(POSITION)]
     assert comes.clearance(t, positions).min() > RADIUS - 1e-3
 
 
@@ -180,7 +179,7 @@ def test_axes_turned_by_a_yaw_make_no_difference(problem: Problem) -> None:
     turned = replace(PILLAR, position=(np.cos(yaw) - 0.45 * np.sin(yaw), np.sin(yaw) + 0.45 * np.cos(yaw), 0.0))
     plain = clearing(problem, space(PILLAR)).solve(0.0, posed)
     ours = clearing(problem, space(turned)).solve(0.0, posed, yaw)
-    np.testing.assert_allclose(ours.answer.plan, plain.answer.plan, atol=1e-4)
+    np.testing.assert_allclose(ours[0].plan, plain[0].plan, atol=1e-4)
 
 
 def test_steps_of_their_own_make_no_difference_where_they_are_the_model_s(problem: Problem) -> None:
@@ -188,20 +187,20 @@ def test_steps_of_their_own_make_no_difference_where_they_are_the_model_s(proble
     plain = clearing(problem, space(PILLAR)).solve(0.0, posed)
     steps = (np.tile(model.A, (N, 1, 1)), np.tile(model.B, (N, 1, 1)), np.tile(-model.B @ model.u_bar, (N, 1)))
     changing = clearing(problem, space(PILLAR), changing=True).solve(0.0, posed._replace(steps=steps))
-    np.testing.assert_allclose(changing.answer.plan, plain.answer.plan, atol=1e-3)
-    np.testing.assert_allclose(changing.answer.states, plain.answer.states, atol=1e-5)
+    np.testing.assert_allclose(changing[0].plan, plain[0].plan, atol=1e-3)
+    np.testing.assert_allclose(changing[0].states, plain[0].states, atol=1e-5)
 
 
 def test_soft_half_spaces_give_way_and_hard_ones_are_named(problem: Problem) -> None:
     around = Sphere(name="around", position=(0.0, 0.0, 0.0), radius=3.0)
     soft = clearing(problem, space(around, soft=True)).solve(0.0, query(problem))
-    assert soft.answer.status == SOLVED
-    assert soft.answer.slacks.max() > 1.0
+    assert soft[0].status == SOLVED
+    assert soft[0].slacks.max() > 1.0
     hard = clearing(problem, space(around, FENCE)).solve(0.0, query(problem))
-    assert hard.answer.status != SOLVED
-    assert [part.name for part in hard.problem.constraints] == ["obstacle around", "keep_in"]
-    assert hard.problem.constraints[0].C is not None
-    assert hard.problem.constraints[0].C.shape == (N, 1, 12)
+    assert hard[0].status != SOLVED
+    assert [part.name for part in hard[1].constraints] == ["obstacle around", "keep_in"]
+    assert hard[1].constraints[0].C is not None
+    assert hard[1].constraints[0].C.shape == (N, 1, 12)
 
 
 def test_what_takes_rows_for_the_same_at_all_steps_refuses_or_is_skipped(problem: Problem) -> None:
