@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import gc
 import os
 import pickle
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,6 @@ from support import draw_nothing, fly_here
 from quadsim.controller import Controller
 from quadsim.flight import rundir
 from quadsim.flight.rundir import Run
-from quadsim.report.recording import write_recording
 from quadsim.sim.effects import Force
 from quadsim.vehicle import Vehicle
 from scenarios.flight import Flight, Outputs
@@ -126,18 +124,6 @@ def short_run_directory(short_run: Run) -> Path:
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """See `support.draw_nothing`."""
     draw_nothing(monkeypatch)
-
-
-@pytest.fixture
-def recorded_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Recordings are written in this process, which imports rerun once, not in one of their own each."""
-
-    @contextlib.contextmanager
-    def recording(directory: Path, path: Path) -> Iterator[None]:
-        yield
-        write_recording(rundir.load_run(directory), path)
-
-    monkeypatch.setattr("quadsim.report.recording.recording_in_background", recording)
 
 
 @pytest.fixture

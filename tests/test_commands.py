@@ -109,7 +109,7 @@ def test_every_command_is_documented_and_every_documented_one_exists() -> None:
     assert {make_parser().parse_args(arguments_of(line)).command for line in QUADSIM} == set(COMMANDS)
 
 
-@pytest.mark.usefixtures("workplace", "undrawn", "recorded_here", "campaigns_here")
+@pytest.mark.usefixtures("workplace", "undrawn", "campaigns_here")
 @pytest.mark.parametrize("line", RUNNABLE)
 def test_documented_command_runs(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = arguments_of(line)

@@ -60,7 +60,7 @@ RENDERS = {"film", "draw_vehicle"}
 """Whose examples need a machine that renders."""
 
 
-@pytest.mark.usefixtures("undrawn", "recorded_here", "campaigns_here")
+@pytest.mark.usefixtures("undrawn", "campaigns_here")
 @pytest.mark.parametrize("name", [*quadsim.__all__, *(f"gym.{name}" for name in quadsim.gym.__all__)])
 def test_every_docstring_has_an_example_that_runs(
     name: str, fly_known: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

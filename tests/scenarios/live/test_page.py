@@ -134,7 +134,7 @@ def test_where_no_page_can_be_served_is_refused(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.usefixtures("undrawn", "recorded_here")
+@pytest.mark.usefixtures("undrawn")
 def test_an_interrupt_keeps_what_was_flown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
