@@ -38,48 +38,6 @@ def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0() -> None:
     assert (process.wait(timeout=60), output) == (EXIT_FAILED, b"")
 
 
-ITSELF = """
-import os, signal, sys, threading
-from scenarios.entry import main
-after, stop = float(sys.argv[1]), int(sys.argv[2])
-timers = [threading.Timer(after, os.kill, (os.getpid(), stop))]
-listen = signal.signal
-def listening(which, handler):
-    before = listen(which, handler)
-    if which == signal.SIGHUP and timers:  # the last that is listened to
-        timers.pop().start()
-    return before
-signal.signal = listening
-if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-    timers.pop().start()
-sys.argv[:] = ["quadsim", *sys.argv[3:]]
-sys.exit(main())
-"""
-
-
-@pytest.mark.parametrize(
-    ("stop", "delay"),
-    [
-        (signal.SIGINT, 0.0),
-        (signal.SIGTERM, 0.1),
-    ],
-)
-def test_a_signal_in_the_first_moments_ends_it_in_order(tmp_path: Path, stop: signal.Signals, delay: float) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", ITSELF, str(delay), str(int(stop)), "run", "hover", "--set", "duration=600"],
-        cwd=tmp_path,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        preexec_fn=listening,
-    )
-    assert done.returncode == EXIT_FAILED, done.stderr
-    assert "Traceback" not in done.stderr
-    assert "interrupted (Ctrl-C)" in done.stderr + done.stdout
-    assert {path.name for path in tmp_path.iterdir()} <= {"runs"}
-
-
 HELD = "import numpy as np\ndef held(now, state, reference):\n    import random\n    return np.full(4, 192.8)\n"
 
 
