@@ -241,7 +241,7 @@ def mismatch(data: Any) -> str:
     parts = []
     for key, form, title in (
         ("end_error", ".3f", 'Distance from the reference at the end [m]; "lost" with the time:'),
-        ("peak_tilt", ".3g", "Peak roll or pitch at the physics rate [deg]:"),
+        ("peak_tilt", "#.4g", "Peak roll or pitch at the physics rate [deg]:"),
     ):
         cells: dict[tuple[str, ...], str] = {
             (row["condition"], row["controller"]): row["fate"] or format(row[key], form) for row in _records(data)
