@@ -22,7 +22,7 @@ UNSOLVED: Final = "unsolved"
 """Status of a QP without a solution; qpsolvers does not say why."""
 
 SETTINGS: Final[dict[str, dict[str, Any]]] = {
-    "clarabel": {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-9},  # its own leave 5e-3 rad/s
+    "clarabel": {"tol_gap_abs": 1e-12, "tol_gap_rel": 1e-12, "tol_feas": 1e-9},  # its own leave 5e-3 rad/s
     "osqp": {"eps_abs": 1e-5, "eps_rel": 0.0, "max_iter": 10_000},  # at 1e-4 the first input is off by 1e-2 rad/s
     "proxqp": {"eps_abs": 1e-7, "eps_rel": 0.0, "max_iter": 1000},
 }
