@@ -37,9 +37,7 @@ def test_a_reference_one_sample_late_is_seen(problem: Problem, queries: tuple[Qu
     peer, ours = QpmpcController(problem), QPSolver(OURS, problem)
     late = [replace(query, desired=np.roll(query.desired, 1, axis=0)) for query in queries[::100]]
     differences = [
-        np.abs(
-            peer.speeds(peer.solve(wrong)) - ours.solve(query.posed).plan[0]
-        ).max()
+        np.abs(peer.speeds(peer.solve(wrong)) - ours.solve(query.posed).plan[0]).max()
         for wrong, query in zip(late, queries[::100], strict=True)
     ]
     assert max(differences) > 0.1
