@@ -76,6 +76,14 @@ class CompilerError(InputError):
     """There is no C compiler, or it did not compile what was exported."""
 
 
+class MissingCoreError(InputError):
+    """The compiled core was requested, and there is none here; the message says why."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"there is no core here: {reason}; or choose controller.solver = 'piqp'")
+        self.reason = reason
+
+
 class UnknownNameError(InputError):
     """A name of a kind that is not one of a known set.
 

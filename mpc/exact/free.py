@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
-from mpc.exact.axes import Axis
+from mpc.core.axes import Axis
 from mpc.ocp import Problem
 from quadsim.state import Array
 

@@ -11,8 +11,8 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from mpc.constraints import Rows
+from mpc.core.axes import Axis, axes
 from mpc.exact.activeset import FEASIBLE, Active, ActiveSet, Side
-from mpc.exact.axes import Axis, axes
 from mpc.exact.free import FreeOptimum
 from mpc.ocp import Problem, Query
 from mpc.paper.condensed import Condensed, row_maps
@@ -34,7 +34,7 @@ class Shortcut:
     The cost is strictly convex: the minimiser over fewer constraints, if it satisfies the others too, is the one and
     only solution of Eq. (27).  In turn,
 
-    1. no constraint at all: Eq. (22), a product for each axis of `mpc.exact.axes`; the status is then `unconstrained`;
+    1. no constraint at all: Eq. (22), a product for each axis of `mpc.core.axes`; the status is then `unconstrained`;
     2. rows of states alone, axis by axis, by their multipliers (`mpc.exact.activeset`), from the last period's;
     3. all rows, likewise;
     4. the whole QP by its solver, whose active set then leads to the exact optimum.

@@ -9,9 +9,9 @@ from typing import Final, Literal
 import numpy as np
 
 from mpc.answer import ActuatorBounds
+from mpc.core.tables import AxisTables, Tables, tables
 from mpc.equilibrium import LEAST_LIFT
 from mpc.export.ctext import NO_BOUND, bounded, lower_packed, number, reals, small_integers, structs
-from mpc.export.tables import AxisTables, Tables, tables
 from mpc.fallback.completion import PLAUSIBLE
 from mpc.heading import slope
 from mpc.model import hover_model

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.constrained import ConstrainedMPC
-from mpc.exact.axes import axes
+from mpc.core.axes import axes
+from mpc.core.tables import with_constraints
 from mpc.exact.free import FreeOptimum
-from mpc.export.tables import with_constraints
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.contract import Guarded
 from mpc.robust.controller import RobustMPC

@@ -10,11 +10,11 @@ import pytest
 import scipy.linalg
 
 import quadsim
-from mpc.exact.axes import axes
+from mpc.core.axes import axes
+from mpc.core.tables import AxisTables, tables
 from mpc.exact.free import FreeOptimum
 from mpc.export.ctext import number
 from mpc.export.source import DATA, HEADER, SOURCE
-from mpc.export.tables import AxisTables, tables
 from mpc.paper.condensed import Condensed
 from quadsim.errors import ExportError, OutputError, ParameterError
 from quadsim.state import REFERENCE_STATES, Array

@@ -10,7 +10,7 @@ import scipy.linalg
 from polish import polish
 from support import paper_problem, random_problem
 
-from mpc.exact.axes import axes
+from mpc.core.axes import axes
 from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Objective, Problem, Query, Rest, lqr_terminal_weight
 from mpc.paper.condensed import Condensed

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import random_axes
 
-from mpc.exact.axes import axes
+from mpc.core.axes import axes
 from mpc.exact.free import FreeOptimum
 from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Problem, Query, Rest, lqr_terminal_weight

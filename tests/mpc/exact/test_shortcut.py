@@ -291,7 +291,7 @@ def test_there_is_none_where_its_map_is_too_large(monkeypatch: pytest.MonkeyPatc
     def unfactorable(*_: object) -> None:
         raise np.linalg.LinAlgError
 
-    monkeypatch.setattr("mpc.exact.axes.condensed_cost", unfactorable)
+    monkeypatch.setattr("mpc.core.axes.condensed_cost", unfactorable)
     assert not tried(50)
 
 

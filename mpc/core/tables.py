@@ -1,6 +1,6 @@
 """The numbers that a problem's optimum is computed from without a linear algebra library.
 
-Axis by axis (`mpc.exact.axes`), the inputs u - u_s = T w fall into parts w that no cost ties together.  For each axis
+Axis by axis (`mpc.core.axes`), the inputs u - u_s = T w fall into parts w that no cost ties together.  For each axis
 
 - the optimum without rows of a linear-quadratic problem with any linear terms is one pass of dynamic programming
   backwards, with gains K_i that do not depend on them, and one forwards: O(N) numbers in place of the O(N^2) of
@@ -21,7 +21,7 @@ import numpy as np
 import scipy.linalg
 
 from mpc.constraints import Constraint, Rows
-from mpc.exact.axes import Axis, axes
+from mpc.core.axes import Axis, axes
 from mpc.ocp import Problem
 from mpc.paper.condensed import condensed_cost, row_maps
 from mpc.paper.prediction import prediction
@@ -48,6 +48,9 @@ class AxisTables:
     inputs: int  # m
     first: int  # where w is among all axes' inputs
     rows: list[int]  # which of the problem's rows have its states, o of them
+    regulated: list[int]  # its rows of C_r
+    W_r: Array  # (n, r) linear term of a state's cost by y_d - C_r x_s
+    W_r_end: Array
     targets: list[int]  # which of x, y, z, yaw of the reference it follows, r of them
     A: Array  # (n, n)
     B: Array  # (n, m)
@@ -215,6 +218,7 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
     targets = np.flatnonzero(of_reference.any(axis=0))
     still = np.diag([float(state not in REFERENCE_STATES) for state in part.states])
     V, V_end = W @ C_r @ still, W_end @ C_r @ still
+    W_r, W_r_end = W, W_end
     W, W_end = W @ of_reference[:, targets], W_end @ of_reference[:, targets]
     C = rows.C[np.ix_(part.outputs, part.states)]
     R, S = Q_u, np.zeros((m, n))
@@ -224,6 +228,7 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
         B = np.vstack([B, np.eye(m)])
         Q, Q_end = scipy.linalg.block_diag(Q, Q_d), scipy.linalg.block_diag(Q_end, np.zeros((m, m)))
         V, V_end = (scipy.linalg.block_diag(weight, np.zeros((m, m))) for weight in (V, V_end))
+        W_r, W_r_end = (np.vstack([weight, np.zeros((m, weight.shape[1]))]) for weight in (W_r, W_r_end))
         W, W_end, C = (
             np.vstack([W, np.zeros((m, W.shape[1]))]),
             np.vstack([W_end, np.zeros((m, W.shape[1]))]),
@@ -246,6 +251,9 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
         inputs=m,
         first=first,
         rows=part.outputs.tolist(),
+        regulated=part.regulated.tolist(),
+        W_r=W_r,
+        W_r_end=W_r_end,
         targets=targets.tolist(),
         A=A,
         B=B,
@@ -297,18 +305,15 @@ def _scale(found: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> 
     """(N, m) 1 over the root of each row's response to itself."""
     scale = np.zeros((N, len(rows)))
     for r, row in enumerate(rows):
-        for i in range(N):
-            total = 0.0
-            for g, part in enumerate(found):
-                width = part.inputs + len(part.rows)
-                slope = np.zeros(N * width)
-                if row.axis == g:
-                    slope[i * width + part.inputs + part.rows.index(r)] = 1.0
-                for coefficient, j, lag in row.terms:
-                    if i >= lag:
-                        at = (i - lag) * width
-                        slope[at : at + part.inputs] += coefficient * T[j, part.first : part.first + part.inputs]
-                there = np.flatnonzero(slope)
-                total += float(slope[there] @ part.responses[np.ix_(there, there)] @ slope[there])
-            scale[i, r] = 1.0 / math.sqrt(total) if total > 0.0 else 0.0
+        total = np.zeros(N)
+        for g, part in enumerate(found):
+            width = part.inputs + len(part.rows)
+            entries = [(1.0, part.inputs + part.rows.index(r), 0)] if row.axis == g else []
+            entries += [(c * T[j, part.first + a], a, lag) for c, j, lag in row.terms for a in range(part.inputs)]
+            for left, a, lag in entries:
+                for right, b, other in entries:
+                    first = max(lag, other)
+                    at = np.arange(first, N)
+                    total[first:] += left * right * part.responses[(at - lag) * width + a, (at - other) * width + b]
+        scale[:, r] = np.where(total > 0.0, 1.0 / np.sqrt(np.where(total > 0.0, total, 1.0)), 0.0)
     return scale

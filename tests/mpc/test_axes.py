@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import paper_problem, random_axes, random_problem
 
-from mpc.exact.axes import Axis, axes
+from mpc.core.axes import Axis, axes
 from mpc.ocp import Problem
 from quadsim.state import STATE_NAMES, Array
 

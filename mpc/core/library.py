@@ -1,0 +1,49 @@
+"""The compiled core, where there is one that belongs to these sources."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from typing import Final
+
+from mpc.core.build import FOLDER, NAME, source_hash
+from quadsim.errors import MissingCoreError
+
+MIRRORS: Final = ("quadsim_axis", "quadsim_row", "quadsim_term", "quadsim_problem", "quadsim_work")
+"""Structs that Python writes or reads, in the order of `quadsim_library_sizes`."""
+
+
+def load() -> ctypes.CDLL:
+    """The library, loaded once per process.
+
+    Raises:
+        MissingCoreError: it was not compiled, or is of other sources.
+    """
+    reason = why_missing()
+    if reason is not None:
+        raise MissingCoreError(reason)
+    library = _load()
+    assert isinstance(library, ctypes.CDLL)
+    return library
+
+
+def why_missing() -> str | None:
+    """Why there is no core here, in one line that says what to do; None where there is one."""
+    library = _load()
+    return library if isinstance(library, str) else None
+
+
+@cache
+def _load() -> ctypes.CDLL | str:
+    path = FOLDER / NAME
+    if not path.exists():
+        return "it was not compiled when quadsim was installed: install a C compiler, then quadsim again"
+    try:
+        library = ctypes.CDLL(str(path))
+        library.quadsim_library_source.restype = ctypes.c_char_p
+        of = library.quadsim_library_source().decode()
+    except (OSError, AttributeError) as error:
+        return f"{path.name} cannot be loaded ({error}): install quadsim again"
+    if of != source_hash():
+        return f"{path.name} was compiled from other sources: run python {FOLDER / 'build.py'}"
+    return library
