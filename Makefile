@@ -23,6 +23,7 @@ RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; re
 FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang cppcheck clang-tidy
 HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done && \
 	echo 'int LLVMFuzzerTestOneInput(void) { return 0; }' | clang -fsanitize=fuzzer -x c -o /dev/null -) >/dev/null 2>&1
+HAS_COMPILER := command -v $${CC:-cc} >/dev/null
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
 # $(call quietly,COMMAND,ADVICE): runs a command silently; if it fails, shows its last errors, then the advice.
@@ -37,7 +38,7 @@ apt = if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 help:  ## list these targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-14s %s\n", $$1, $$2 }' Makefile
 
-setup: $(VENV)/.installed $(VENV)/.renders  ## make .venv with everything pinned, ready for the others
+setup: $(VENV)/.installed $(VENV)/.core $(VENV)/.renders  ## make .venv with everything pinned, ready for the others
 
 demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIONS=--no-video to do without films)
 	@$(QUADSIM) run paper-unconstrained --out $(RUNS)/paper-unconstrained --overwrite $(OPTIONS)
@@ -113,13 +114,19 @@ $(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt
 	@echo "Installing quadsim and its packages into $(VENV); the first time takes a minute or two"
 	@$(call quietly,$(PIP_INSTALL) $$(grep '^pip==' constraints.txt) && \
 		$(PIP_INSTALL) --constraint constraints.txt --group dev && \
-		$(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable .,$(NOT_INSTALLED))
+		QUADSIM_NO_CORE=1 $(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable .,$(NOT_INSTALLED))
 	@touch $@
+
+$(VENV)/.core: $(VENV)/.installed mpc/core/build.py $(wildcard mpc/core/c/*)
+	@if $(HAS_COMPILER) || { { $(call apt,gcc libc6-dev); } && $(HAS_COMPILER); }; then \
+		$(call quietly,$(PY) mpc/core/build.py,The core could not be compiled: $(PY) mpc/core/build.py shows why.) && touch $@; \
+	elif [ -n "$$QUADSIM_NEED_CORE" ]; then false; \
+	else echo "Until then PIQP solves in place of the core, and the tests of the core are skipped." >&2; fi
 
 $(VENV)/.peers: $(VENV)/.installed
 	@echo "Installing the peers and the other QP solvers into $(VENV)"
 	@$(call quietly,$(PIP_INSTALL) --constraint constraints.txt --group peers && \
-		$(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable '.[solvers]',$(NOT_INSTALLED))
+		QUADSIM_NO_CORE=1 $(PIP_INSTALL) --constraint constraints.txt --no-build-isolation --editable '.[solvers]',$(NOT_INSTALLED))
 	@touch $@
 
 $(VENV)/.docs: $(VENV)/.installed

@@ -17,11 +17,13 @@ from pathlib import Path
 
 import pytest
 
+from mpc.core.build import NAME
+from mpc.core.library import why_missing
 from quadsim import __version__
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("quadsim", "mpc", "scenarios")
-DATA = ("*.py", "py.typed", "*.toml", "*.csv", "*.xml", "*.j2", "*.css", "*.js", "export/c/*")
+DATA = ("*.py", "py.typed", "*.toml", "*.csv", "*.xml", "*.j2", "*.css", "*.js", "export/c/*", "core/c/*")
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +64,7 @@ def test_wheel_holds_every_file_of_the_packages(dist: Path) -> None:
     files = {path for package in PACKAGES for pattern in DATA for path in (ROOT / package).rglob(pattern)}
     expected = {path.relative_to(ROOT).as_posix() for path in files}
     expected |= {f"quadsim/models/{path.name}" for path in (ROOT / "models").iterdir()}
+    expected |= {f"mpc/core/{NAME}"} if why_missing() is None else set()
     (file,) = dist.glob("*.whl")
     with zipfile.ZipFile(file) as wheel:
         held = {name for name in wheel.namelist() if ".dist-info/" not in name}
@@ -109,7 +112,8 @@ def test_version_is_the_same_everywhere(dist: Path) -> None:
     assert changes is not None
     assert citation is not None
     assert printed.stdout.strip() == f"quadsim {__version__}"
-    assert [file.name for file in dist.glob("*.whl")] == [f"quadsim-{__version__}-py3-none-any.whl"]
+    platform = re.sub(r"[.-]", "_", sysconfig.get_platform()) if why_missing() is None else "any"
+    assert [file.name for file in dist.glob("*.whl")] == [f"quadsim-{__version__}-py3-none-{platform}.whl"]
     assert (changes[1], citation[1]) == (__version__, __version__)
 
 
