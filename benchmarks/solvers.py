@@ -1,12 +1,14 @@
-"""Every installed QP solver on the periods of one flight: time of the whole controller step, failures, differences.
+"""Every installed QP solver on the periods of a flight: set-up, time of the controller step, failures, differences.
 
 A flight is recorded by the controller as its scenario has it.  Its measured states, references and commands before are
-then given to that controller again, and to the same one with each solver, which solves the whole QP in every period.
-Between two answers the plant flies a period, which leaves in the caches what it leaves there in a flight.
+then given to the same controller with each solver, and to the whole law in C.  All answer from the gain where the
+unconstrained optimum is feasible.  Between two answers the plant flies a period, which leaves in the caches what it
+leaves there in a flight.
 """
 
 from __future__ import annotations
 
+import time as clock
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +16,7 @@ import numpy as np
 from timing import Record, options, run, step_quantiles, time_in_turns
 
 from quadsim.controller import ACCEPTED, Command, Controller, Moment
-from quadsim.errors import FlightError, InputError, MissingPackageError
+from quadsim.errors import FlightError, InputError, MissingCoreError, MissingPackageError
 from quadsim.flight.log import ControlLog
 from quadsim.state import Array, make_state
 from scenarios.api import load
@@ -24,11 +26,14 @@ from scenarios.courses.make import build_reference
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario
 from scenarios.schema.controller import ConstrainedSpec
+from scenarios.schema.robust import RobustSpec
 from scenarios.schema.scenario import Scenario
 
 SEGMENT = 20
 """Consecutive periods that a solver answers before it is the next one's turn."""
-FLOWN = "as flown"
+LAW = "whole law in C"
+Answers = dict[int, Command | None]
+"""Commands by period; None where there was none."""
 
 
 class Replayed:
@@ -38,7 +43,7 @@ class Replayed:
         self._controller, self._log, self._reference = controller, log, reference
         self._before = np.vstack([log.speeds_before, log.speeds[:-1]])
         self._period = -2
-        self.commands: dict[int, Command | None] = {}  # by period; None where it gave none
+        self.commands: Answers = {}
 
     def prepare(self, period: int) -> None:
         """Look up a period's query; what is warm stays so, as in a flight, unless periods lie between."""
@@ -60,30 +65,34 @@ class Replayed:
 
 
 def entries(scenario: Scenario) -> dict[str, Scenario]:
-    """The scenario as it is, and with each installed solver and no shortcuts."""
-    entries = {FLOWN: scenario}
-    for name in catalogue().solvers:
-        changed = scenario.replace({"controller.solver": name, "controller.shortcut": False})
+    """The scenario with each installed solver, and with its whole law in C."""
+    entries = {name: scenario.replace({"controller.solver": name}) for name in catalogue().solvers}
+    entries[LAW] = scenario.replace({"controller.compiled": True})
+    found = {}
+    for name, changed in entries.items():
         try:
             build_controller(changed, build_vehicle(changed))
-        except MissingPackageError:
+        except (MissingPackageError, MissingCoreError):
             continue
-        entries[name] = changed
-    return entries
+        found[name] = changed
+    return found
 
 
 def measure(name: str, quick: bool) -> list[Record]:
-    """A record of each solver, the controller as it is flown first."""
+    """A record of each solver on a scenario."""
     scenario = load(name)
-    if not isinstance(scenario.controller, ConstrainedSpec):
-        raise InputError(f"{name} is flown without a QP; choose a scenario with a constrained controller")
+    if not isinstance(scenario.controller, ConstrainedSpec | RobustSpec):
+        raise InputError(f"{name} is flown by no MPC of fixed matrices; choose a constrained or a robust one")
     if quick:
         scenario = scenario.replace({"duration": 2.0, "controller.horizon": 10, "constraints": []})
     vehicle = build_vehicle(scenario)
     log = fly_scenario(scenario).log.control
     candidates: dict[str, Replayed] = {}
+    setup: dict[str, float] = {}
     for solver, each in entries(scenario).items():
-        controller = build_controller(each, vehicle)
+        started = clock.perf_counter()
+        controller = build_controller(each, vehicle)  # a second time: what can be shared within a process is there
+        setup[solver] = 1e3 * (clock.perf_counter() - started)
         reference = build_reference(each, log.t.size + controller.horizon)
         candidates[solver] = Replayed(controller, log, reference)
     segments = [range(start, min(start + SEGMENT, log.t.size)) for start in range(0, log.t.size, SEGMENT)]
@@ -102,18 +111,27 @@ def measure(name: str, quick: bool) -> list[Record]:
             repeats=1 if quick else 3,
             rng=np.random.default_rng(scenario.seed),
         )
-    return [_record(solver, each, times[solver], log) for solver, each in candidates.items()]
+    exact = candidates.get("core", next(iter(candidates.values()))).commands
+    return [
+        {
+            "scenario": name,
+            "solver": solver,
+            "setup_ms": setup[solver],
+            **step_quantiles(times[solver]),
+            **_answers(each.commands, exact),
+        }
+        for solver, each in candidates.items()
+    ]
 
 
-def _record(solver: str, replayed: Replayed, ms: Array, log: ControlLog) -> Record:
-    """Step times, and how far the accepted answers are from the commands flown, of which the optimum is unique."""
-    answered = {k: command for k, command in replayed.commands.items() if command and command.status in ACCEPTED}
-    differences = [float(np.abs(command.speeds - log.speeds[k]).max()) for k, command in answered.items()]
+def _answers(commands: Answers, exact: Answers) -> Record:
+    """Periods without an accepted answer, and how far the others are from the exact optimum, which is unique."""
+    answered = {k: command for k, command in commands.items() if command and command.status in ACCEPTED}
+    pairs = ((command, exact[k]) for k, command in answered.items())
+    differences = [float(np.abs(command.speeds - other.speeds).max()) for command, other in pairs if other]
     return {
-        "solver": solver,
-        "periods": len(replayed.commands),
-        "failures": len(replayed.commands) - len(answered),
-        **step_quantiles(ms),
+        "periods": len(commands),
+        "failures": len(commands) - len(answered),
         "largest_difference_rad_s": max(differences, default=None),
     }
 
@@ -122,21 +140,29 @@ def draw(records: Sequence[Record], path: Path) -> None:
     """Draw median, 99th percentile and maximum of each solver's step."""
     import matplotlib.pyplot as plt
 
-    ranked = sorted(records, key=lambda record: -record["p99_ms"])
-    figure, axes = plt.subplots(figsize=(8.0, 1.2 + 0.35 * len(ranked)), layout="constrained")
-    for key, marker in (("p50_ms", "|"), ("p99_ms", "D"), ("max_ms", ">")):
-        axes.plot([record[key] for record in ranked], range(len(ranked)), marker, label=key.removesuffix("_ms"))
-    axes.set_yticks(range(len(ranked)), [record["solver"] for record in ranked])
-    axes.set(xscale="log", xlabel="controller step [ms]")
-    axes.legend()
+    names = [*dict.fromkeys(record["scenario"] for record in records)]
+    rows = len(records) / len(names)
+    figure, panels = plt.subplots(
+        1, len(names), figsize=(4.0 + 4.0 * len(names), 1.4 + 0.35 * rows), layout="constrained", squeeze=False
+    )
+    for axes, name in zip(panels[0], names, strict=True):
+        ranked = sorted((r for r in records if r["scenario"] == name), key=lambda record: -record["p99_ms"])
+        for key, marker in (("p50_ms", "|"), ("p99_ms", "D"), ("max_ms", ">")):
+            axes.plot([record[key] for record in ranked], range(len(ranked)), marker, label=key.removesuffix("_ms"))
+        axes.set_yticks(range(len(ranked)), [record["solver"] for record in ranked])
+        axes.set(xscale="log", xlabel="controller step [ms]", title=name)
+    panels[0, 0].legend()
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
 
 def main() -> None:
     """Measure, print and write."""
-    chosen = options(__doc__, scenario={"default": "paper-constrained", "help": "default: %(default)s"})
-    records = run(lambda: measure(chosen.scenario, chosen.quick), f"QP solvers on {chosen.scenario}", chosen.json)
+    shipped = ["paper-constrained", "robust"]
+    chosen = options(__doc__, scenario={"nargs": "+", "default": shipped, "help": "default: %(default)s"})
+    records = run(
+        lambda: [r for name in chosen.scenario for r in measure(name, chosen.quick)], "QP solvers", chosen.json
+    )
     if chosen.json is not None:
         draw(records, chosen.json.with_suffix(".png"))
 
