@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Final, get_args
 
 import numpy as np
 
-from mpc.export.ctext import number
-from mpc.export.source import DATA, HEADER, SOURCE, Exportable, Precision, part, sources
+from mpc.export.ctext import CText, Precision
+from mpc.export.source import CORE, DATA, Exported, exported_data, part
 from mpc.export.targets import TARGETS, Target
-from quadsim.errors import ParameterError
+from quadsim.errors import MissingCoreError, ParameterError
 from quadsim.outputs import absolute, reserving, writing
 from quadsim.state import Array
 from scenarios.api import as_scenario
+from scenarios.export.reach import Reach, reach
 from scenarios.export.record import Recording, record
 from scenarios.parts.controllers import exportable
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
+
+FACTS: Final = "export.json"
+"""What an export takes, and how far its room suffices."""
 
 
 def export(
@@ -27,11 +33,12 @@ def export(
     overwrite: bool = False,
     precision: Precision = "double",
     target: str = "posix",
+    rows: int | None = None,
 ) -> Path:
     """Write a scenario's controller as self-contained C99, with the periods of the scenario's flight as test vectors.
 
     The same scenario gives the same bytes.  No compiler is needed; `make -C DIR check` then compiles it and runs the
-    recorded periods.
+    recorded periods.  `export.json` has its memory, and how far from the reference its room for active rows suffices.
 
     Args:
         scenario: it, or its name or file.
@@ -40,6 +47,8 @@ def export(
         precision: of all numbers, `double` or `float`.
         target: the machine that its programs are for: `posix`, or `cortex-m7` or `cortex-m4f` on a board that QEMU
             emulates.
+        rows: active rows that there is room for; memory grows with the square.  None for 2.56 per step of the
+            horizon, and at least 64.
 
     Returns:
         The directory.
@@ -56,23 +65,27 @@ def export(
     for name, value, allowed in (("precision", precision, get_args(Precision)), ("target", target, tuple(TARGETS))):
         if value not in allowed:
             raise ParameterError("", f"--{name}", value, f"one of {', '.join(allowed)}")
+    if rows is not None and rows < 1:
+        raise ParameterError("", "--rows", rows, "at least 1")
     scenario = as_scenario(scenario)
     with reserving(out, overwrite=overwrite) as directory:
-        files = controller_files(scenario, precision) | vector_files(record(scenario))
-        files |= {"README.md": _readme(scenario, precision), **programs(TARGETS[target])}
+        controller = c_controller(scenario, precision, rows)
+        facts = _facts(controller)
+        files = controller.files | programs(TARGETS[target], precision) | vector_files(record(scenario), precision)
+        files |= {"README.md": _readme(scenario, precision, room_sentence(facts)), FACTS: json.dumps(facts, indent=2) + "\n"}
         with writing(directory, overwrite=overwrite) as partial:
             for name, text in files.items():
                 (partial / name).write_text(text, encoding="utf-8")
     return absolute(out)
 
 
-def controller_files(scenario: Scenario, precision: Precision) -> dict[str, str]:
-    """The controller's own files, by name.
+def c_controller(scenario: Scenario, precision: Precision = "double", rows: int | None = None) -> CController:
+    """The controller's own files, with room for active `rows`; see `export`.
 
     Raises:
         ExportError: this controller cannot be exported.
     """
-    return sources(exported_law(scenario), precision=precision, title=_title(scenario))
+    return CController(law=exported_law(scenario), precision=precision, title=_title(scenario), asked=rows)
 
 
 def exported_law(scenario: Scenario) -> Exportable:
@@ -85,10 +98,24 @@ def exported_law(scenario: Scenario) -> Exportable:
     return exportable(scenario.controller, build_vehicle(scenario), scenario.control_period, shapes)
 
 
-def programs(target: Target) -> dict[str, str]:
+def _facts(controller: CController) -> dict[str, Any]:
+    found = None
+    with contextlib.suppress(MissingCoreError):
+        found = asdict(reach(controller.law.problem, controller.room, CHANGES))
+    facts = {"precision": controller.precision, "rows": controller.rows, "memory_bytes": controller.memory_bytes}
+    return facts | {"reach": found}
+
+
+def room_sentence(facts: Mapping[str, Any]) -> str:
+    """What the room for active rows costs, and how far from the reference it suffices."""
+    cost = f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory"
+    return f"{cost}; {Reach(**facts['reach']) if facts['reach'] else 'not tried by drawn states, for want of the core'}"
+
+
+def programs(target: Target, precision: Precision) -> dict[str, str]:
     """What runs the controller on a machine, by file name."""
     names = ("main.c", "serial.c", "target.h", *target.sources, "LICENSE")
-    return {name: part(name) for name in names} | {"Makefile": target.makefile + part("Makefile")}
+    return {name: part(name) for name in names} | {"Makefile": target.makefile(precision) + part("Makefile")}
 
 
 def _title(scenario: Scenario) -> str:
@@ -98,31 +125,30 @@ def _title(scenario: Scenario) -> str:
     return title.encode("ascii", "replace").decode().replace("\n", " ")
 
 
-def vector_files(recording: Recording) -> dict[str, str]:
+def vector_files(recording: Recording, precision: Precision) -> dict[str, str]:
     """The recorded periods as C, by file name."""
-    count = len(recording.state)
-    rows = [
-        f"    {{{_row(state)}, {_row(acting)}, {_row(command)}, {status}}}"
-        for state, acting, command, status in zip(
-            recording.state, recording.acting, recording.command, recording.status.tolist(), strict=True
-        )
-    ]
-    path = [f"    {_row(row)}" for row in recording.path]
+    text = CText(precision)
+
+    def row(numbers: Array) -> str:
+        return "{" + ", ".join(map(text.number, numbers.tolist())) + "}"
+
+    queries = zip(recording.state, recording.acting, recording.command, recording.status.tolist(), strict=True)
+    rows = [f"    {{{row(state)}, {row(acting)}, {row(command)}, {status}}}" for state, acting, command, status in queries]
+    path = [f"    {row(reference)}" for reference in recording.path]
     source = [
         '#include "vectors.h"\n',
-        "#ifdef QUADSIM_FLOAT\n#define R(number) number##F\n#else\n#define R(number) number\n#endif\n",
         "const int quadsim_vectors_count = QUADSIM_VECTORS;\n",
-        f"const quadsim_real quadsim_vectors_speeds[4] = {_row(recording.speeds)};\n",
+        f"const quadsim_real quadsim_vectors_speeds[4] = {row(recording.speeds)};\n",
         "const quadsim_real quadsim_vectors_path[QUADSIM_VECTORS_ROWS][4] = {",
         ",\n".join(path) + "\n};\n",
         "const struct quadsim_vector quadsim_vectors[QUADSIM_VECTORS] = {",
         ",\n".join(rows) + "\n};\n",
     ]
-    return {"vectors.h": part("vectors.h").replace("@COUNT@", str(count)), "vectors.c": "\n".join(source)}
-
-
-def _row(numbers: Array) -> str:
-    return "{" + ", ".join(map(number, np.ravel(numbers).tolist())) + "}"
+    sizes = {"@COUNT@": len(rows), "@ROWS@": len(path)}
+    header = part("vectors.h")
+    for name, size in sizes.items():
+        header = header.replace(name, str(size))
+    return {"vectors.h": header, "vectors.c": "\n".join(source)}
 
 
 def _readme(scenario: Scenario, precision: Precision) -> str:
