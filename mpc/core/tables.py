@@ -34,9 +34,9 @@ ROOM_PER_STEP: Final = 2.56
 """Active rows that there is room for, per step of the horizon."""
 LEAST_ROOM: Final = 64
 LARGEST: Final = 2**20
-"""Entries of all responses beyond which a problem is not exported: 8 MiB."""
+"""Entries of all responses beyond which a problem is not one for the core: 8 MiB."""
 LEAST_QUADRATIC: Final = 1e-9
-"""Share of l1 that replaces a quadratic penalty of zero; see `mpc.exact.activeset`."""
+"""Share of l1 that replaces a quadratic penalty of zero, for which a step has no length."""
 
 
 @dataclass(frozen=True, kw_only=True)

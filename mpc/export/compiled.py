@@ -19,7 +19,7 @@ from mpc.model import hover_model
 from mpc.paper.prediction import rollout
 from mpc.robust.settings import LONGEST_SPAN
 from quadsim.controller import (
-    ACTIVE_SET,
+    CORE,
     FALLBACK,
     GAIN,
     GROUNDED,
@@ -34,7 +34,7 @@ from quadsim.state import EULER, EULER_RATE, VELOCITY, Array
 
 STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before")
 """What `enum quadsim_status` is in a flight's log."""
-ANSWERERS: Final = (GAIN, ACTIVE_SET, ACTIVE_SET, FALLBACK, FALLBACK, FALLBACK)
+ANSWERERS: Final = (GAIN, CORE, CORE, FALLBACK, FALLBACK, FALLBACK)
 """Who answered."""
 LEVELS: Final = (0, 0, 0, 1, 2, 3)
 """And its fallback level."""

@@ -10,12 +10,13 @@ import pytest
 import scipy.linalg
 
 import quadsim
-from mpc.core.axes import axes
+from mpc.core.solver import Core
 from mpc.core.tables import AxisTables, tables
-from mpc.exact.free import FreeOptimum
 from mpc.export.ctext import number
 from mpc.export.source import DATA, HEADER, SOURCE
+from mpc.ocp import Query
 from mpc.paper.condensed import Condensed
+from mpc.solvers import Method
 from quadsim.errors import ExportError, OutputError, ParameterError
 from quadsim.state import REFERENCE_STATES, Array
 from scenarios.build import build_problem
@@ -168,11 +169,13 @@ def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None
     problem = build_problem(scenario, build_vehicle(scenario))
     found, rng = tables(problem), np.random.default_rng(0)
     state, reference = rng.normal(size=12), rng.normal(size=(problem.horizon, 4))
-    free = FreeOptimum(problem, axes(problem))
-    wanted = free.at(state, problem.objective.desired(reference), np.zeros(4))[free.inputs]
+    query = Query(1e-6 * state, problem.objective.desired(1e-6 * reference), problem.model.u_bar)
+    answer = Core(problem).solve(query)
+    assert answer.method is Method.FREE
+    wanted = found.T_inverse @ (answer.plan[0] - problem.model.u_bar) / 1e-6
     for axis in found.axes:
         w = optimum(axis, state[axis.states], reference)
-        np.testing.assert_allclose(w[:, 0], wanted[axis.first], atol=1e-9)
+        np.testing.assert_allclose(w[0], wanted[axis.first : axis.first + axis.inputs], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["paper-constrained", "robust", "polytopes"])

@@ -65,7 +65,7 @@ def test_data_that_is_not_finite_reaches_no_back_end(place: int, corrupted: floa
     answer = solver.solve(Query(*query))
     assert answer.status == "invalid_data"
     assert np.isnan(answer.plan).all()
-    controller = ConstrainedMPC(problem, solver, shortcut=False)
+    controller = ConstrainedMPC(problem, solver)
     controller.reset(problem.model.u_bar)
     with pytest.raises(PlanExhaustedError, match="invalid_data"):
         controller.step(Moment(), np.full(12, np.nan), paper_reference(51)[1:])

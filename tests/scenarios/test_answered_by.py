@@ -22,9 +22,9 @@ from scenarios.run import fly_scenario
 @pytest.mark.parametrize(
     ("name", "settings", "answered_by"),
     [
-        ("paper-constrained", (), {"gain": 607, "active-set": 592, "piqp-multistage": 1}),
-        ("robust", (), {"gain": 196, "active-set": 404}),
-        ("hover", ("controller.shortcut=false",), {"piqp-multistage": 200}),
+        ("paper-constrained", (), {"gain": 607, "piqp-multistage": 593}),
+        ("paper-constrained", ("controller.solver=core",), {"gain": 607, "core": 593}),
+        ("robust", ("controller.solver=core",), {"gain": 196, "core": 404}),
     ],
 )
 def test_as_many_periods_are_a_solvers_as_it_had_calls(
