@@ -10,15 +10,12 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mpc.core.solver import NO_BOUND, TINY
 from quadsim.state import Array
 
 Precision = Literal["double", "float"]
 LEAST_FLOAT: Final = 1.2e-38
 """Magnitude below which a number is 0: single precision would truncate it, which is an error of some compilers."""
-NO_BOUND: Final = 1e30
-"""In place of infinity."""
-TINY: Final = 1e-18
-"""Share of the largest number of a matrix below which one is taken for a product of rounding."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +35,10 @@ class CText:
             raise ValueError(f"{value} has no place in C")
         text = "0.0" if abs(value) < LEAST_FLOAT else repr(float(value))
         return text if self.precision == "double" else f"{text}F"
+
+    def vector(self, values: ArrayLike) -> str:
+        """An initialiser of an array of numbers, row by row."""
+        return "{" + ", ".join(map(self.number, np.ravel(np.asarray(values, float)).tolist())) + "}"
 
     def reals(self, name: str, values: ArrayLike) -> str:
         """A constant array of numbers, row by row; of one zero where there are none."""

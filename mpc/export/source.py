@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from functools import cached_property
 from importlib import resources
 from typing import Final
 
 import numpy as np
 
+from mpc.answer import ActuatorBounds
+from mpc.core.solver import MOST_STATES, NO_BOUND
 from mpc.core.tables import AxisTables, Tables, tables
+from mpc.equilibrium import LEAST_LIFT
 from mpc.export.ctext import CText, Precision, bounded, initialiser, lower_packed
+from mpc.fallback.completion import PLAUSIBLE
+from mpc.heading import slope
+from mpc.model import hover_model
+from mpc.nonlinear.model import SUBSTEPS, nonlinear_model
+from mpc.observer import UPRIGHT, DisturbanceObserver
 from mpc.ocp import Problem
 from mpc.robust.settings import RobustSettings
-from quadsim.vehicle import Vehicle
+from quadsim.state import REFERENCE_STATES, Array
+from quadsim.vehicle import N_ROTORS, Vehicle
 
 CORE: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_mpc.h", "quadsim_mpc.c")
 """Files of `mpc/core/c`, which are exported byte for byte."""
@@ -21,11 +31,96 @@ DATA: Final = "quadsim_data.h"
 """The generated file."""
 CHANGES: Final = 500
 """Of the active set in a search, after which it is given up."""
+ROWS_PER_STEP: Final = 2.56
+"""Active rows that there is room for, per step of the horizon."""
+LEAST_ROWS: Final = 64
 
 
 def part(name: str, package: str = "mpc.export") -> str:
     """A hand-written C source of a package."""
     return (resources.files(package) / "c" / name).read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exportable:
+    """What an exported controller is made from.
+
+    Attributes:
+        name: of the law.
+        problem: its optimisation.
+        vehicle: that modelled.
+        settings: the parts of the robust controller; None for the paper's controllers.
+    """
+
+    name: str
+    problem: Problem
+    vehicle: Vehicle
+    settings: RobustSettings | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CController:
+    """A controller as C.
+
+    Attributes:
+        law: what it is made from.
+        precision: of all numbers.
+        title: a line that identifies it, in ASCII.
+        asked: active rows that there is to be room for; None for 2.56 per step of the horizon, and at least 64.
+    """
+
+    law: Exportable
+    precision: Precision = "double"
+    title: str = ""
+    asked: int | None = None
+
+    @cached_property
+    def tables(self) -> Tables:
+        """The numbers of its problem.
+
+        Raises:
+            ParameterError: the problem is too large, or its rows differ from step to step.
+        """
+        return tables(self.law.problem)
+
+    @property
+    def rows(self) -> int:
+        """Active rows that there is room for."""
+        N = self.law.problem.horizon
+        usual = max(LEAST_ROWS, math.ceil(ROWS_PER_STEP * N))
+        return min(N * len(self.tables.rows), usual if self.asked is None else self.asked)
+
+    @property
+    def reals(self) -> int:
+        """Numbers of memory, as `quadsim_mpc_reals` has it."""
+        N, problem, room = self.law.problem.horizon, self.tables.problem, self.rows + 1
+        rows = N * len(self.tables.rows)
+        packed = 4 * room + 3 * rows  # bytes of integers
+        work = N * (5 * N_ROTORS + MOST_STATES) + 3 * rows + 6 * room + 1 + room * (room + 1) // 2
+        return work + packed // self.real_bytes + 1 + N * len(problem.objective.C_r)
+
+    @property
+    def real_bytes(self) -> int:
+        """Of a number."""
+        return 8 if self.precision == "double" else 4
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """Its C files, by name."""
+        return {name: part(name, "mpc.core") for name in CORE} | {DATA: self._data()}
+
+    def _data(self) -> str:
+        text = CText(self.precision, "quadsim_data_")
+        head = part(DATA).replace("@TITLE@", self.title).replace("@PERIOD@", f"{self.law.problem.model.period:g}")
+        for name, value in {
+            "@IFN@": "ifdef" if self.precision == "double" else "ifndef",
+            "@PRECISION@": self.precision,
+            "@HORIZON@": self.law.problem.horizon,
+            "@MEMORY@": self.reals,
+        }.items():
+            head = head.replace(name, str(value))
+        numbers = problem_data(text, self.tables, self.rows + 1)
+        return head.replace("@NUMBERS@\n", "\n".join([*numbers, *_controller(text, self.law, self.tables)]))
 
 
 def _axis(text: CText, g: int, axis: AxisTables) -> tuple[str, list[str]]:
@@ -97,3 +192,69 @@ def problem_data(text: CText, found: Tables, room: int) -> list[str]:
         **{name: text.prefix + name for name in ("axes", "rows", "terms", *reals)},
     )
     return [*blocks, f"static const quadsim_problem {text.prefix}problem = {members};\n"]
+
+
+def _controller(text: CText, law: Exportable, found: Tables) -> list[str]:
+    """The numbers besides those of the optimisation, the last of them the `quadsim_controller`."""
+    problem, hover = found.problem, found.problem.model.u_bar
+    bounds = ActuatorBounds.of_problem(law.problem) if law.problem.every_constraint else None
+    free = np.full(N_ROTORS, NO_BOUND)
+    limits = (-free, free, -free, free) if bounds is None else astuple(bounds)
+    blocks = [text.reals("C_r", problem.objective.C_r)]
+    if law.settings is not None:
+        robust = initialiser(**_robust(text, law.vehicle, problem.model.period, law.settings, found.modes))
+        blocks.append(f"static const quadsim_robust {text.prefix}robust = {robust};\n")
+    members = initialiser(
+        problem=f"&{text.prefix}problem",
+        robust="0" if law.settings is None else f"&{text.prefix}robust",
+        C_r=f"{text.prefix}C_r",
+        hover=text.vector(hover),
+        **{
+            name: text.vector(bounded(limit))
+            for name, limit in zip(("speed_min", "speed_max", "step_min", "step_max"), limits, strict=True)
+        },
+    )
+    return [*blocks, f"static const quadsim_controller QUADSIM_CONTROLLER = {members};\n"]
+
+
+def _robust(text: CText, vehicle: Vehicle, period: float, settings: RobustSettings, modes: Array) -> dict[str, object]:
+    """Members of the `quadsim_robust`."""
+    lag, delay = settings.rotor_lag, settings.delay
+    model = nonlinear_model(vehicle, period, rotor_lag=lag or None)
+    observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
+    instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
+
+    def decay(time: Array | float) -> Array:
+        """Share of rotor speeds that is left after a time [s]."""
+        return np.asarray(np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time)), float)
+
+    numbers = {
+        "gravity": model.gravity,
+        "least_lift": LEAST_LIFT,
+        "upright": UPRIGHT,
+        "delay": delay,
+        "delayed_share": delay / period,
+        "rest_of_period": period - delay,
+        "spun_delay": float(decay(delay)),
+        "spun_before": float(decay(period - delay)),
+        "largest_turn": settings.largest_turn,
+    }
+    arrays = {
+        "effectiveness": model.effectiveness,
+        "allocation": model.allocation,
+        "gyration": model.gyration,
+        "slope_inverse": np.linalg.inv(slope(hover_model(vehicle, period))),
+        "modes": modes,
+        "gain": np.zeros(6) if observer is None else observer.gain,
+        "largest": np.zeros(6) if observer is None else observer.largest,
+        "decay_before": decay(instants * (period - delay)),
+        "decay_delay": decay(instants * delay),
+        "plausible_state": PLAUSIBLE,
+        "plausible_reference": PLAUSIBLE[list(REFERENCE_STATES)],
+    }
+    return {
+        "observes": int(observer is not None),
+        "heading": int(settings.heading),
+        **{name: text.number(value) for name, value in numbers.items()},
+        **{name: text.vector(values) for name, values in arrays.items()},
+    }

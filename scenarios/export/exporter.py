@@ -127,11 +127,7 @@ def _title(scenario: Scenario) -> str:
 
 def vector_files(recording: Recording, precision: Precision) -> dict[str, str]:
     """The recorded periods as C, by file name."""
-    text = CText(precision)
-
-    def row(numbers: Array) -> str:
-        return "{" + ", ".join(map(text.number, numbers.tolist())) + "}"
-
+    row = CText(precision).vector
     queries = zip(recording.state, recording.acting, recording.command, recording.status.tolist(), strict=True)
     rows = [f"    {{{row(state)}, {row(acting)}, {row(command)}, {status}}}" for state, acting, command, status in queries]
     path = [f"    {row(reference)}" for reference in recording.path]
