@@ -49,6 +49,11 @@ class CText:
         """A constant array of integers of 0 to 255; of one zero where there are none."""
         return self._array("unsigned char", name, map(str, [*values] or [0]))
 
+    def struct(self, kind: str, name: str, **members: object) -> str:
+        """A constant struct, by names of members."""
+        lines = (textwrap.fill(f".{member} = {value},", 116, subsequent_indent="    ") for member, value in members.items())
+        return f"static const {kind} {name} = {{\n{textwrap.indent(chr(10).join(lines), '    ')}\n}};\n"
+
     def structs(self, kind: str, name: str, entries: Iterable[str]) -> str:
         """A constant array of structs, each an initialiser; of one of zeros where there are none."""
         listed = [*entries] or ["{0}"]

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds
-from mpc.core.solver import MOST_STATES, NO_BOUND
+from mpc.core.solver import NO_BOUND
 from mpc.core.tables import AxisTables, Tables, tables
 from mpc.equilibrium import LEAST_LIFT
 from mpc.export.ctext import CText, Precision, bounded, initialiser, lower_packed
@@ -96,7 +96,8 @@ class CController:
         N, problem, room = self.law.problem.horizon, self.tables.problem, self.rows + 1
         rows = N * len(self.tables.rows)
         packed = 4 * room + 3 * rows  # bytes of integers
-        work = N * (5 * N_ROTORS + MOST_STATES) + 3 * rows + 6 * room + 1 + room * (room + 1) // 2
+        widest = max(len(axis.B) for axis in self.tables.axes)
+        work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + 1 + room * (room + 1) // 2
         return work + packed // self.real_bytes + 1 + N * len(problem.objective.C_r)
 
     @property
@@ -123,8 +124,8 @@ class CController:
         return head.replace("@NUMBERS@\n", "\n".join([*numbers, *_controller(text, self.law, self.tables)]))
 
 
-def _axis(text: CText, g: int, axis: AxisTables) -> tuple[str, list[str]]:
-    """The initialiser of an axis, and its arrays."""
+def _axis(text: CText, g: int, axis: AxisTables, *, bounded: bool) -> tuple[str, list[str]]:
+    """The initialiser of an axis, and its arrays; its responses only where there are rows."""
     n, m = axis.B.shape
     integers = {"state": axis.states, "target": axis.regulated, "row": axis.rows}
     reals = {
@@ -135,7 +136,7 @@ def _axis(text: CText, g: int, axis: AxisTables) -> tuple[str, list[str]]:
         "W": axis.W_r,
         "W_end": axis.W_r_end,
         "C": axis.C,
-        "responses": lower_packed(axis.responses),
+        "responses": lower_packed(axis.responses) if bounded else [],
     }
     arrays = [text.small_integers(f"{name}_{g}", values) for name, values in integers.items()]
     arrays += [text.reals(f"{name}_{g}", values) for name, values in reals.items()]
@@ -175,11 +176,13 @@ def problem_data(text: CText, found: Tables, room: int) -> list[str]:
     }
     blocks, axes = [text.reals(name, values) for name, values in reals.items()], []
     for g, axis in enumerate(found.axes):
-        entry, arrays = _axis(text, g, axis)
+        entry, arrays = _axis(text, g, axis, bounded=bool(found.rows))
         axes.append(entry)
         blocks += arrays
     blocks += [text.structs("quadsim_axis", "axes", axes), *_rows(text, found)]
-    members = initialiser(
+    members = text.struct(
+        "quadsim_problem",
+        f"{text.prefix}problem",
         horizon=problem.horizon,
         states=problem.model.n,
         step_rows=len(found.rows),
@@ -191,7 +194,7 @@ def problem_data(text: CText, found: Tables, room: int) -> list[str]:
         mixed=int(any(row.axis >= 0 and row.terms for row in found.rows)),
         **{name: text.prefix + name for name in ("axes", "rows", "terms", *reals)},
     )
-    return [*blocks, f"static const quadsim_problem {text.prefix}problem = {members};\n"]
+    return [*blocks, members]
 
 
 def _controller(text: CText, law: Exportable, found: Tables) -> list[str]:
@@ -202,9 +205,11 @@ def _controller(text: CText, law: Exportable, found: Tables) -> list[str]:
     limits = (-free, free, -free, free) if bounds is None else astuple(bounds)
     blocks = [text.reals("C_r", problem.objective.C_r)]
     if law.settings is not None:
-        robust = initialiser(**_robust(text, law.vehicle, problem.model.period, law.settings, found.modes))
-        blocks.append(f"static const quadsim_robust {text.prefix}robust = {robust};\n")
-    members = initialiser(
+        robust = _robust(text, law.vehicle, problem.model.period, law.settings, found.modes)
+        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **robust))
+    members = text.struct(
+        "quadsim_controller",
+        "QUADSIM_CONTROLLER",
         problem=f"&{text.prefix}problem",
         robust="0" if law.settings is None else f"&{text.prefix}robust",
         C_r=f"{text.prefix}C_r",
@@ -214,7 +219,7 @@ def _controller(text: CText, law: Exportable, found: Tables) -> list[str]:
             for name, limit in zip(("speed_min", "speed_max", "step_min", "step_max"), limits, strict=True)
         },
     )
-    return [*blocks, f"static const quadsim_controller QUADSIM_CONTROLLER = {members};\n"]
+    return [*blocks, members]
 
 
 def _robust(text: CText, vehicle: Vehicle, period: float, settings: RobustSettings, modes: Array) -> dict[str, object]:

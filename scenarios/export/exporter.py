@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Final, get_args
-
-import numpy as np
+from typing import Any, Final, get_args
 
 from mpc.export.ctext import CText, Precision
-from mpc.export.source import CORE, DATA, Exported, exported_data, part
+from mpc.export.source import CHANGES, DATA, CController, Exportable, part
 from mpc.export.targets import TARGETS, Target
 from quadsim.errors import MissingCoreError, ParameterError
 from quadsim.outputs import absolute, reserving, writing
-from quadsim.state import Array
 from scenarios.api import as_scenario
 from scenarios.export.reach import Reach, reach
 from scenarios.export.record import Recording, record
@@ -101,8 +100,8 @@ def exported_law(scenario: Scenario) -> Exportable:
 def _facts(controller: CController) -> dict[str, Any]:
     found = None
     with contextlib.suppress(MissingCoreError):
-        found = asdict(reach(controller.law.problem, controller.room, CHANGES))
-    facts = {"precision": controller.precision, "rows": controller.rows, "memory_bytes": controller.memory_bytes}
+        found = asdict(reach(controller.law.problem, controller.rows + 1, CHANGES))
+    facts = {"precision": controller.precision, "rows": controller.rows, "memory_bytes": controller.reals * controller.real_bytes}
     return facts | {"reach": found}
 
 
@@ -147,7 +146,7 @@ def vector_files(recording: Recording, precision: Precision) -> dict[str, str]:
     return {"vectors.h": header, "vectors.c": "\n".join(source)}
 
 
-def _readme(scenario: Scenario, precision: Precision) -> str:
+def _readme(scenario: Scenario, precision: Precision, room: str) -> str:
     return f"""# {_title(scenario)}
 
 A model predictive controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
@@ -156,8 +155,10 @@ state, and of the C library `memcpy` and `memset`.
 
 | file | is |
 |---|---|
-| `{HEADER}` | the interface: state order, units, frames, and the sizes |
-| `{SOURCE}`, `{DATA}` | the controller and its numbers |
+| `quadsim_mpc.h` | the interface: state order, units, frames |
+| `quadsim_mpc.c`, `quadsim_core.h`, `quadsim_core.c` | the law and its solver, the same for every controller |
+| `{DATA}` | this controller's numbers, and the memory that it needs |
+| `{FACTS}` | what it takes, and how far its room for active rows suffices |
 | `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
 | `main.c`, `Makefile` | `make check` runs these periods and compares |
 | `serial.c` | the controller behind a serial line, with checksums and a watchdog: a start for an integration |
@@ -165,11 +166,16 @@ state, and of the C library `memcpy` and `memset`.
 
 ```c
 static quadsim_mpc mpc;
+static quadsim_real memory[QUADSIM_MEMORY];
+quadsim_mpc_start(&mpc, &QUADSIM_CONTROLLER, memory);
 quadsim_mpc_reset(&mpc, speeds);          /* the command in force */
 /* every {scenario.control_period:g} s: */
 status = quadsim_mpc_step(&mpc, state, reference, acting, command);
 ```
 
+{room[0].upper()}{room[1:]}.
+
 Solve once before take-off: the first step starts without an active set and takes the most changes of it.
-`mpc.changes` is the number in each step.  Compile with `-ffp-contract=off`, and every processor gives the same bits.
+`mpc.work.changes` is the number in each step.  Compile with `-ffp-contract=off`, and every processor gives the same
+bits{", and with `-DQUADSIM_FLOAT`, as the Makefile does" if precision == "float" else ""}.
 """

@@ -8,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from mpc.core.solver import WAYS, CoreProblem, Work, core_library
+from mpc.core.library import MIRRORS
+from mpc.core.solver import WAYS, CoreProblem, core_library
 from mpc.ocp import Problem
 from quadsim.state import N_STATES, POSITION, VELOCITY, Array
 
@@ -50,9 +51,11 @@ class _Search:
         self._library, self._shared = core_library(), shared
         self._problem = type(shared.struct).from_buffer_copy(shared.struct)
         self._problem.room, self._problem.changes = room, changes
-        at = ctypes.addressof(self._problem)
-        self._memory, self._work = np.zeros(self._library.quadsim_work_reals(at)), Work()
-        self._at = ctypes.addressof(self._work)
+        at, sizes = ctypes.addressof(self._problem), (ctypes.c_size_t * len(MIRRORS))()
+        self._library.quadsim_library_sizes(sizes)
+        self._memory = np.zeros(self._library.quadsim_work_reals(at))
+        self._work = np.zeros(sizes[MIRRORS.index("quadsim_work")], np.uint8)
+        self._at = self._work.ctypes.data
         self._library.quadsim_work_start(self._at, at, self._memory.ctypes.data)
 
     def solves(self, *arguments: Array) -> bool:
