@@ -25,7 +25,7 @@ from mpc.robust.settings import RobustSettings
 from quadsim.state import REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-CORE: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_mpc.h", "quadsim_mpc.c")
+CORE: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_math.h", "quadsim_mpc.h", "quadsim_mpc.c")
 """Files of `mpc/core/c`, which are exported byte for byte."""
 DATA: Final = "quadsim_data.h"
 """The generated file."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -12,7 +11,7 @@ from typing import Any, Final, get_args
 from mpc.export.ctext import CText, Precision
 from mpc.export.source import CHANGES, DATA, CController, Exportable, part
 from mpc.export.targets import TARGETS, Target
-from quadsim.errors import MissingCoreError, ParameterError
+from quadsim.errors import ParameterError
 from quadsim.outputs import absolute, reserving, writing
 from scenarios.api import as_scenario
 from scenarios.export.reach import Reach, reach
@@ -54,6 +53,7 @@ def export(
 
     Raises:
         ExportError: this controller cannot be exported; the message gives the reason.
+        MissingCoreError: there is no core here, which computes the exact answers.
         InputError: something else is wrong with the input.
         OutputError: the directory cannot be written.
 
@@ -98,17 +98,17 @@ def exported_law(scenario: Scenario) -> Exportable:
 
 
 def _facts(controller: CController) -> dict[str, Any]:
-    found = None
-    with contextlib.suppress(MissingCoreError):
-        found = asdict(reach(controller.law.problem, controller.rows + 1, CHANGES))
-    facts = {"precision": controller.precision, "rows": controller.rows, "memory_bytes": controller.reals * controller.real_bytes}
-    return facts | {"reach": found}
+    return {
+        "precision": controller.precision,
+        "rows": controller.rows,
+        "memory_bytes": controller.reals * controller.real_bytes,
+        "reach": asdict(reach(controller.law.problem, controller.rows + 1, CHANGES)),
+    }
 
 
 def room_sentence(facts: Mapping[str, Any]) -> str:
     """What the room for active rows costs, and how far from the reference it suffices."""
-    cost = f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory"
-    return f"{cost}; {Reach(**facts['reach']) if facts['reach'] else 'not tried by drawn states, for want of the core'}"
+    return f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory; {Reach(**facts['reach'])}"
 
 
 def programs(target: Target, precision: Precision) -> dict[str, str]:
