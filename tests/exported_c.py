@@ -32,12 +32,11 @@ class Reply:
 
 
 @functools.cache
-def library(scenario: str, precision: Precision, rows: int | None) -> ctypes.CDLL:
-    """The export of a scenario, as JSON, compiled."""
-    controller = c_controller(Scenario.model_validate_json(scenario), precision, rows)
+def library(files: tuple[tuple[str, str], ...], precision: Precision) -> ctypes.CDLL:
+    """A controller's files, compiled."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        for file, text in controller.files.items():
+        for file, text in files:
             (folder / file).write_text(text)
         define = ["-DQUADSIM_FLOAT"] if precision == "float" else []
         sources = [HOST, *sorted(folder.glob("*.c"))]
@@ -49,7 +48,8 @@ class Host:
     """One controller of a compiled library."""
 
     def __init__(self, scenario: Scenario, precision: Precision = "double", rows: int | None = None) -> None:
-        self.library, right = library(scenario.model_dump_json(), precision, rows), ctypes.c_int()
+        files, right = c_controller(scenario, precision, rows).files, ctypes.c_int()
+        self.library = library(tuple(files.items()), precision)
         self.library.host_size.restype = ctypes.c_size_t
         self.memory = np.zeros(self.library.host_size(ctypes.byref(right)) // 8 + 1)
         assert right.value, "the memory that the export states is not what the controller needs"

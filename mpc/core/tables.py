@@ -119,10 +119,9 @@ def tables(problem: Problem) -> Tables:
         found.append(_axis(problem, rows, part, first))
         first += part.T.shape[1]
     row_tables = [_row(rows, i, found) for i in range(rows.l1.size)]
-    N, m = rows.lower.shape
     alike = bool((rows.lower == rows.lower[0]).all() and (rows.upper == rows.upper[0]).all())
     steps = slice(0, 1) if alike else slice(None)
-    scale = _scale(found, row_tables, T, N)
+    scale = _scale(found, row_tables, T, problem.horizon)
     return Tables(
         problem=problem,
         axes=found,

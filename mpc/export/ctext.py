@@ -36,9 +36,11 @@ class CText:
         text = "0.0" if abs(value) < LEAST_FLOAT else repr(float(value))
         return text if self.precision == "double" else f"{text}F"
 
-    def vector(self, values: ArrayLike) -> str:
-        """An initialiser of an array of numbers, row by row."""
-        return "{" + ", ".join(map(self.number, np.ravel(np.asarray(values, float)).tolist())) + "}"
+    def value(self, value: float | Array) -> str:
+        """An initialiser of an integer, a number, or an array of these, row by row."""
+        if isinstance(value, np.ndarray):
+            return "{" + ", ".join(map(self.number, value.ravel().tolist())) + "}"
+        return str(value) if isinstance(value, int) else self.number(value)
 
     def reals(self, name: str, values: ArrayLike) -> str:
         """A constant array of numbers, row by row; of one zero where there are none."""
@@ -51,8 +53,9 @@ class CText:
 
     def struct(self, kind: str, name: str, **members: object) -> str:
         """A constant struct, by names of members."""
-        lines = (textwrap.fill(f".{member} = {value},", 116, subsequent_indent="    ") for member, value in members.items())
-        return f"static const {kind} {name} = {{\n{textwrap.indent(chr(10).join(lines), '    ')}\n}};\n"
+        wrap = textwrap.TextWrapper(120, initial_indent="    ", subsequent_indent="        ")
+        lines = [wrap.fill(f".{member} = {value},") for member, value in members.items()]
+        return "\n".join([f"static const {kind} {name} = {{", *lines, "};\n"])
 
     def structs(self, kind: str, name: str, entries: Iterable[str]) -> str:
         """A constant array of structs, each an initialiser; of one of zeros where there are none."""

@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
 from typing import Final
 
-import numpy as np
+from numpy.typing import ArrayLike
 
-from mpc.answer import ActuatorBounds
-from mpc.core.solver import NO_BOUND
+from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
 from mpc.core.tables import AxisTables, Tables, tables
-from mpc.equilibrium import LEAST_LIFT
 from mpc.export.ctext import CText, Precision, bounded, initialiser, lower_packed
-from mpc.fallback.completion import PLAUSIBLE
-from mpc.heading import slope
-from mpc.model import hover_model
-from mpc.nonlinear.model import SUBSTEPS, nonlinear_model
-from mpc.observer import UPRIGHT, DisturbanceObserver
-from mpc.ocp import Problem
-from mpc.robust.settings import RobustSettings
-from quadsim.state import REFERENCE_STATES, Array
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.vehicle import N_ROTORS
 
 CORE: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_math.h", "quadsim_mpc.h", "quadsim_mpc.c")
 """Files of `mpc/core/c`, which are exported byte for byte."""
@@ -39,23 +29,6 @@ LEAST_ROWS: Final = 64
 def part(name: str, package: str = "mpc.export") -> str:
     """A hand-written C source of a package."""
     return (resources.files(package) / "c" / name).read_text(encoding="utf-8")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Exportable:
-    """What an exported controller is made from.
-
-    Attributes:
-        name: of the law.
-        problem: its optimisation.
-        vehicle: that modelled.
-        settings: the parts of the robust controller; None for the paper's controllers.
-    """
-
-    name: str
-    problem: Problem
-    vehicle: Vehicle
-    settings: RobustSettings | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +70,7 @@ class CController:
         rows = N * len(self.tables.rows)
         packed = 4 * room + 3 * rows  # bytes of integers
         widest = max(len(axis.B) for axis in self.tables.axes)
-        work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + 1 + room * (room + 1) // 2
+        work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + room * (room - 1) // 2
         return work + packed // self.real_bytes + 1 + N * len(problem.objective.C_r)
 
     @property
@@ -128,7 +101,7 @@ def _axis(text: CText, g: int, axis: AxisTables, *, bounded: bool) -> tuple[str,
     """The initialiser of an axis, and its arrays; its responses only where there are rows."""
     n, m = axis.B.shape
     integers = {"state": axis.states, "target": axis.regulated, "row": axis.rows}
-    reals = {
+    reals: dict[str, ArrayLike] = {
         "B": axis.B,
         "closed": axis.closed,
         "K": axis.K,
@@ -146,7 +119,7 @@ def _axis(text: CText, g: int, axis: AxisTables, *, bounded: bool) -> tuple[str,
 
 
 def _rows(text: CText, found: Tables) -> list[str]:
-    terms, rows = [], []
+    terms, rows = list[str](), list[str]()
     for r, row in enumerate(found.rows):
         soft = math.isfinite(row.l1)
         place = {
@@ -199,67 +172,12 @@ def problem_data(text: CText, found: Tables, room: int) -> list[str]:
 
 def _controller(text: CText, law: Exportable, found: Tables) -> list[str]:
     """The numbers besides those of the optimisation, the last of them the `quadsim_controller`."""
-    problem, hover = found.problem, found.problem.model.u_bar
-    bounds = ActuatorBounds.of_problem(law.problem) if law.problem.every_constraint else None
-    free = np.full(N_ROTORS, NO_BOUND)
-    limits = (-free, free, -free, free) if bounds is None else astuple(bounds)
-    blocks = [text.reals("C_r", problem.objective.C_r)]
+    numbers, robust = controller_numbers(law), "NULL"
+    blocks = [text.reals("C_r", numbers.pop("C_r"))]
     if law.settings is not None:
-        robust = _robust(text, law.vehicle, problem.model.period, law.settings, found.modes)
-        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **robust))
-    members = text.struct(
-        "quadsim_controller",
-        "QUADSIM_CONTROLLER",
-        problem=f"&{text.prefix}problem",
-        robust="0" if law.settings is None else f"&{text.prefix}robust",
-        C_r=f"{text.prefix}C_r",
-        hover=text.vector(hover),
-        **{
-            name: text.vector(bounded(limit))
-            for name, limit in zip(("speed_min", "speed_max", "step_min", "step_max"), limits, strict=True)
-        },
-    )
-    return [*blocks, members]
-
-
-def _robust(text: CText, vehicle: Vehicle, period: float, settings: RobustSettings, modes: Array) -> dict[str, object]:
-    """Members of the `quadsim_robust`."""
-    lag, delay = settings.rotor_lag, settings.delay
-    model = nonlinear_model(vehicle, period, rotor_lag=lag or None)
-    observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
-    instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
-
-    def decay(time: Array | float) -> Array:
-        """Share of rotor speeds that is left after a time [s]."""
-        return np.asarray(np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time)), float)
-
-    numbers = {
-        "gravity": model.gravity,
-        "least_lift": LEAST_LIFT,
-        "upright": UPRIGHT,
-        "delay": delay,
-        "delayed_share": delay / period,
-        "rest_of_period": period - delay,
-        "spun_delay": float(decay(delay)),
-        "spun_before": float(decay(period - delay)),
-        "largest_turn": settings.largest_turn,
-    }
-    arrays = {
-        "effectiveness": model.effectiveness,
-        "allocation": model.allocation,
-        "gyration": model.gyration,
-        "slope_inverse": np.linalg.inv(slope(hover_model(vehicle, period))),
-        "modes": modes,
-        "gain": np.zeros(6) if observer is None else observer.gain,
-        "largest": np.zeros(6) if observer is None else observer.largest,
-        "decay_before": decay(instants * (period - delay)),
-        "decay_delay": decay(instants * delay),
-        "plausible_state": PLAUSIBLE,
-        "plausible_reference": PLAUSIBLE[list(REFERENCE_STATES)],
-    }
-    return {
-        "observes": int(observer is not None),
-        "heading": int(settings.heading),
-        **{name: text.number(value) for name, value in numbers.items()},
-        **{name: text.vector(values) for name, values in arrays.items()},
-    }
+        members = {name: text.value(value) for name, value in robust_numbers(law, found.modes).items()}
+        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **members))
+        robust = f"&{text.prefix}robust"
+    addresses = {"problem": f"&{text.prefix}problem", "robust": robust, "C_r": f"{text.prefix}C_r"}
+    limits = {name: text.value(value) for name, value in numbers.items()}
+    return [*blocks, text.struct("quadsim_controller", "QUADSIM_CONTROLLER", **addresses, **limits)]

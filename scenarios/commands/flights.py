@@ -138,9 +138,7 @@ def export(options: Namespace) -> int:
 
     scenario = load(options.scenario, options)
     machine = {"precision": options.precision, "target": options.target}
-    directory = write_export(
-        scenario, Path(options.out), overwrite=options.overwrite, rows=options.rows, **machine
-    )
+    directory = write_export(scenario, Path(options.out), overwrite=options.overwrite, rows=options.rows, **machine)
     print(f"{options.precision}: {room_sentence(json.loads((directory / FACTS).read_text()))}")
     print(f"Wrote {directory}: make -C {shlex.quote(str(directory))} check compiles it and runs its recorded periods")
     if not options.fly:

@@ -8,8 +8,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, get_args
 
+from mpc.core.numbers import Exportable
 from mpc.export.ctext import CText, Precision
-from mpc.export.source import CHANGES, DATA, CController, Exportable, part
+from mpc.export.source import CHANGES, DATA, CController, part
 from mpc.export.targets import TARGETS, Target
 from quadsim.errors import ParameterError
 from quadsim.outputs import absolute, reserving, writing
@@ -71,7 +72,8 @@ def export(
         controller = c_controller(scenario, precision, rows)
         facts = _facts(controller)
         files = controller.files | programs(TARGETS[target], precision) | vector_files(record(scenario), precision)
-        files |= {"README.md": _readme(scenario, precision, room_sentence(facts)), FACTS: json.dumps(facts, indent=2) + "\n"}
+        files["README.md"] = _readme(scenario, precision, room_sentence(facts))
+        files[FACTS] = json.dumps(facts, indent=2) + "\n"
         with writing(directory, overwrite=overwrite) as partial:
             for name, text in files.items():
                 (partial / name).write_text(text, encoding="utf-8")
@@ -126,9 +128,9 @@ def _title(scenario: Scenario) -> str:
 
 def vector_files(recording: Recording, precision: Precision) -> dict[str, str]:
     """The recorded periods as C, by file name."""
-    row = CText(precision).vector
+    row = CText(precision).value
     queries = zip(recording.state, recording.acting, recording.command, recording.status.tolist(), strict=True)
-    rows = [f"    {{{row(state)}, {row(acting)}, {row(command)}, {status}}}" for state, acting, command, status in queries]
+    rows = [f"    {{{', '.join(map(row, arrays))}, {status}}}" for *arrays, status in queries]
     path = [f"    {row(reference)}" for reference in recording.path]
     source = [
         '#include "vectors.h"\n',

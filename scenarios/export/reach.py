@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -87,6 +87,6 @@ def reach(problem: Problem, room: int, changes: int) -> Reach:
                 feasible += 1
                 lost += not own.solves(state, wanted, rest, speeds, speeds)
         if lost:
-            return Reach(distance=found.distance, drawn=found.drawn, feasible=found.feasible, beyond=distance, lost=lost)
+            return replace(found, beyond=distance, lost=lost)
         found = Reach(distance=distance, drawn=found.drawn + DRAWS, feasible=found.feasible + feasible)
     return found

@@ -11,6 +11,8 @@
 #ifndef QUADSIM_DATA_H
 #define QUADSIM_DATA_H
 
+#include <stddef.h>
+
 #include "quadsim_mpc.h"
 
 #@IFN@ QUADSIM_FLOAT
