@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import resources
 from typing import Final, Literal
 
 import numpy as np
 
 from mpc.answer import ActuatorBounds
+from mpc.core.numbers import Exportable
 from mpc.core.tables import AxisTables, Tables, tables
 from mpc.equilibrium import LEAST_LIFT
 from mpc.export.ctext import NO_BOUND, bounded, lower_packed, number, reals, small_integers, structs
@@ -17,7 +17,6 @@ from mpc.heading import slope
 from mpc.model import hover_model
 from mpc.nonlinear.model import SUBSTEPS, nonlinear_model
 from mpc.observer import UPRIGHT, DisturbanceObserver
-from mpc.ocp import Problem
 from mpc.robust.settings import RobustSettings
 from quadsim.state import REFERENCE_STATES, Array
 from quadsim.vehicle import Vehicle
@@ -31,23 +30,6 @@ DATA: Final = "quadsim_mpc_data.h"
 def part(name: str) -> str:
     """A hand-written C source of this package."""
     return (resources.files("mpc.export") / "c" / name).read_text(encoding="utf-8")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Exportable:
-    """What an exported controller is made from.
-
-    Attributes:
-        name: of the law.
-        problem: its optimisation.
-        vehicle: that modelled.
-        settings: the parts of the robust controller; None for the paper's controllers.
-    """
-
-    name: str
-    problem: Problem
-    vehicle: Vehicle
-    settings: RobustSettings | None = None
 
 
 def sources(law: Exportable, *, precision: Precision, title: str) -> dict[str, str]:

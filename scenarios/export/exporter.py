@@ -7,8 +7,9 @@ from typing import get_args
 
 import numpy as np
 
+from mpc.core.numbers import Exportable
 from mpc.export.ctext import number
-from mpc.export.source import DATA, HEADER, SOURCE, Exportable, Precision, part, sources
+from mpc.export.source import DATA, HEADER, SOURCE, Precision, part, sources
 from mpc.export.targets import TARGETS, Target
 from quadsim.errors import ParameterError
 from quadsim.outputs import absolute, reserving, writing

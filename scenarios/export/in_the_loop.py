@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mpc.answer import ActuatorBounds
-from mpc.export.compiled import ANSWERERS, LEVELS, STATUSES
+from mpc.core.law import ANSWERERS, LEVELS, STATUSES
 from mpc.export.source import Precision
 from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
