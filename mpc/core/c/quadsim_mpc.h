@@ -8,9 +8,9 @@
  * acting [4]        command in force up to now, u(k-1) [rad/s]
  * command [4]       rotor speeds to hold for the period [rad/s], rotors in the vehicle file's order
  *
- * A controller's numbers are a quadsim_controller, which is read only and may be shared.  All that a controller remembers
- * is in a quadsim_mpc and its memory of quadsim_mpc_reals(controller) numbers, both of the caller's.  Nothing is
- * allocated, nothing is shared: two structs are two controllers. */
+ * A controller's numbers are a quadsim_controller, which is read only and may be shared.  All that a controller
+ * remembers is in a quadsim_mpc and its memory of quadsim_mpc_reals(controller) numbers, both of the caller's.  Nothing
+ * is allocated, nothing is shared: two structs are two controllers. */
 #ifndef QUADSIM_MPC_H
 #define QUADSIM_MPC_H
 

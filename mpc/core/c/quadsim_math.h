@@ -1,0 +1,171 @@
+/* Arithmetic that the core and the controllers share. */
+#ifndef QUADSIM_MATH_H
+#define QUADSIM_MATH_H
+
+#include "quadsim_core.h"
+
+#if defined __FINITE_MATH_ONLY__ && __FINITE_MATH_ONLY__
+#error "compile without -ffast-math, which takes away the check that numbers are finite"
+#endif
+
+#ifdef QUADSIM_FLOAT
+#define R(number) number##F
+#else
+#define R(number) number
+#endif
+
+typedef quadsim_real real;
+
+enum { NU = QUADSIM_INPUTS };
+
+/* ---- numbers ---------------------------------------------------------------------------------------------------- */
+
+static inline int is_finite(const real *numbers, int count)
+{
+    real even = R(0.0), odd = R(0.0); /* sums of zeros, and of NaN where a number is none, or infinite */
+    int i;
+    for (i = 0; i + 1 < count; i += 2) {
+        even += numbers[i] * R(0.0);
+        odd += numbers[i + 1] * R(0.0);
+    }
+    if (count % 2 == 1) {
+        even += numbers[count - 1] * R(0.0);
+    }
+    return even + odd >= R(0.0);
+}
+
+static inline real magnitude(real number)
+{
+    return number < R(0.0) ? -number : number;
+}
+
+static inline real clipped(real number, real lower, real upper)
+{
+    const real least = number > lower ? number : lower;
+    return least < upper ? least : upper;
+}
+
+static inline real dot(const real *left, const real *right, int count)
+{
+    real sum[4] = {R(0.0), R(0.0), R(0.0), R(0.0)};
+    int i;
+    for (i = 0; i + 3 < count; i += 4) { /* four sums at a time, so that none waits for the one before */
+        sum[0] += left[i] * right[i];
+        sum[1] += left[i + 1] * right[i + 1];
+        sum[2] += left[i + 2] * right[i + 2];
+        sum[3] += left[i + 3] * right[i + 3];
+    }
+    for (; i < count; i++) {
+        sum[0] += left[i] * right[i];
+    }
+    return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+/* ---- elementary functions, by arithmetic alone: every processor has the same bits ------------------------------ */
+
+/* After FreeBSD's msun, by Sun Microsystems, 1993: permission to use, copy, modify, and distribute this software is
+ * freely granted, provided that this notice is preserved. */
+
+static const real HALF_PI = R(1.5707963267948966);
+
+/* sin and cos of a number of up to 1e5 [rad], as 1e-15 near; 1e-6 in single precision.  Beyond, 0 and 1; not a number
+ * where the angle is not finite. */
+static inline void sin_cos(real angle, real *sine, real *cosine)
+{
+    /* pi / 2 in three parts, the first two with so few bits that their products with quarters are exact. */
+#ifdef QUADSIM_FLOAT
+    static const real PART[3] = {1.5703125F, 4.837512969970703125e-4F, 7.54978995489188216e-8F};
+#else
+    static const real PART[3] = {1.57079632673412561417e+00, 6.07710050630396597660e-11, 2.02226624879595063154e-21};
+#endif
+    static const real SINE[6] = {R(-1.66666666666666324348e-01), R(8.33333333332248946124e-03),
+                                 R(-1.98412698298579493134e-04), R(2.75573137070700676789e-06),
+                                 R(-2.50507602534068634195e-08), R(1.58969099521155010221e-10)};
+    static const real COSINE[6] = {R(4.16666666666666019037e-02), R(-1.38888888888741095749e-03),
+                                   R(2.48015872894767294178e-05), R(-2.75573143513906633035e-07),
+                                   R(2.08757232129817482790e-09), R(-1.13596475577881948265e-11)};
+    const real turns = angle / HALF_PI, most = R(65536.0);
+    const int far = !(turns <= most && turns >= -most);
+    const int quarters = far ? 0 : (int)(turns < R(0.0) ? turns - R(0.5) : turns + R(0.5));
+    const real count = (real)quarters;
+    const real x = ((angle - count * PART[0]) - count * PART[1]) - count * PART[2], square = x * x;
+    real s = SINE[5], c = COSINE[5];
+    int i;
+    if (far) {
+        *sine = angle * R(0.0);
+        *cosine = R(1.0) + *sine;
+        return;
+    }
+    for (i = 4; i >= 0; i--) {
+        s = s * square + SINE[i];
+        c = c * square + COSINE[i];
+    }
+    s = x + x * square * s;
+    c = (R(1.0) - R(0.5) * square) + square * square * c;
+    *sine = quarters % 2 == 0 ? s : c;
+    *cosine = quarters % 2 == 0 ? c : s;
+    if (quarters % 4 == 2 || quarters % 4 == -2 || quarters % 4 == 3 || quarters % 4 == -1) {
+        *sine = -*sine;
+    }
+    if (quarters % 4 == 1 || quarters % 4 == -3 || quarters % 4 == 2 || quarters % 4 == -2) {
+        *cosine = -*cosine;
+    }
+}
+
+/* atan of a number that is not negative [rad]. */
+static inline real arc_tangent(real tangent)
+{
+    static const real SERIES[11] = {R(3.33333333333329318027e-01),  R(-1.99999999998764832476e-01),
+                                    R(1.42857142725034663711e-01),  R(-1.11111104054623557880e-01),
+                                    R(9.09088713343650656196e-02),  R(-7.69187620504482999495e-02),
+                                    R(6.66107313738753120669e-02),  R(-5.83357013379057348645e-02),
+                                    R(4.97687799461593236017e-02),  R(-3.65315727442169155270e-02),
+                                    R(1.62858201153657823623e-02)};
+    real base = R(0.0), x = tangent, square, sum = SERIES[10];
+    int i;
+    if (tangent > R(2.4375)) {
+        base = HALF_PI;
+        x = R(-1.0) / tangent;
+    } else if (tangent > R(0.4375)) { /* atan(1/2), or atan(1), or atan(3/2), and the rest */
+        const real middle = tangent < R(0.6875) ? R(0.5) : (tangent < R(1.1875) ? R(1.0) : R(1.5));
+        base = tangent < R(0.6875) ? R(0.4636476090008061)
+                                   : (tangent < R(1.1875) ? R(0.7853981633974483) : R(0.982793723247329));
+        x = (tangent - middle) / (R(1.0) + middle * tangent);
+    }
+    square = x * x;
+    for (i = 9; i >= 0; i--) {
+        sum = SERIES[i] + square * sum;
+    }
+    return base + (x - x * square * sum);
+}
+
+/* atan2 of y and a positive x [rad]. */
+static inline real angle_of(real y, real x)
+{
+    return y < R(0.0) ? -arc_tangent(-y / x) : arc_tangent(y / x);
+}
+
+/* The root of a number that is not negative, by Newton's method. */
+static inline real square_root(real number)
+{
+    real scaled = number, factor = R(1.0), root;
+    int i;
+    if (!(number > R(0.0)) || !is_finite(&number, 1)) {
+        return number > R(0.0) ? number : R(0.0);
+    }
+    while (scaled > R(4.0)) {
+        scaled *= R(0.25);
+        factor *= R(2.0);
+    }
+    while (scaled < R(1.0)) {
+        scaled *= R(4.0);
+        factor *= R(0.5);
+    }
+    root = R(0.5) + R(0.5) * scaled;
+    for (i = 0; i < 5; i++) {
+        root = R(0.5) * (root + scaled / root);
+    }
+    return factor * root;
+}
+
+#endif
