@@ -11,7 +11,8 @@ from typing import Final
 from numpy.typing import ArrayLike
 
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
-from mpc.core.tables import AxisTables, Tables, tables
+from mpc.core.solver import core_problem
+from mpc.core.tables import AxisTables, Tables
 from mpc.export.ctext import CText, Precision, bounded, initialiser, lower_packed
 from quadsim.vehicle import N_ROTORS
 
@@ -52,9 +53,9 @@ class CController:
         """The numbers of its problem.
 
         Raises:
-            ParameterError: the problem is too large, or its rows differ from step to step.
+            ParameterError: the problem is not one for the core.
         """
-        return tables(self.law.problem)
+        return core_problem(self.law.problem).tables
 
     @property
     def rows(self) -> int:
