@@ -11,7 +11,7 @@ from typing import Final, NoReturn
 
 import numpy as np
 
-from mpc.core.library import load
+from mpc.core.library import check_mirrors, load
 from mpc.core.tables import Tables, tables
 from mpc.ocp import Problem, Query
 from mpc.paper.condensed import Condensed
@@ -69,7 +69,9 @@ class _Problem(ctypes.Structure):
     ]
 
 
-class _Work(ctypes.Structure):
+class Work(ctypes.Structure):
+    """A `quadsim_work`."""
+
     _fields_ = [
         *(*_members(_AT, "p"), *_members(_INT, "changes refused")),
         *_members(_AT, "plan multiplier value shift last side start"),
@@ -86,10 +88,8 @@ def core_library() -> ctypes.CDLL:
     Raises:
         MissingCoreError: there is none here.
     """
-    library, sizes = load(), (ctypes.c_size_t * 5)()
-    library.quadsim_library_sizes(sizes)
-    mirrors = [ctypes.sizeof(each) for each in (_Axis, _Row, _Term, _Problem, _Work)]
-    assert [*sizes] == mirrors, f"structs of the library have {[*sizes]} bytes, those here {mirrors}"
+    library = load()
+    check_mirrors(quadsim_axis=_Axis, quadsim_row=_Row, quadsim_term=_Term, quadsim_problem=_Problem, quadsim_work=Work)
     library.quadsim_work_reals.restype, library.quadsim_work_reals.argtypes = ctypes.c_long, [_AT]
     library.quadsim_work_start.argtypes = [_AT, _AT, _AT]
     library.quadsim_work_reset.argtypes = [_AT]
@@ -246,7 +246,7 @@ class Core:
         )
         # The work points into this memory, and so do the views of it.
         self._memory = np.zeros(self._library.quadsim_work_reals(ctypes.addressof(p)))
-        self._work = _Work()
+        self._work = Work()
         self._at = ctypes.addressof(self._work)
         self._library.quadsim_work_start(self._at, ctypes.addressof(p), self._memory.ctypes.data)
         self._plan = self._view(self._work.plan, _REAL, N_ROTORS)

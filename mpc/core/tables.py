@@ -30,9 +30,6 @@ from quadsim.state import N_STATES, REFERENCE_STATES, Array
 
 ROUNDING: Final = 1e-13
 """Share of the largest number of a row of C_r, D, E, or T below which one is taken for a product of rounding."""
-ROOM_PER_STEP: Final = 2.56
-"""Active rows that there is room for, per step of the horizon."""
-LEAST_ROOM: Final = 64
 LARGEST: Final = 2**20
 """Entries of all responses beyond which a problem is not one for the core: 8 MiB."""
 LEAST_QUADRATIC: Final = 1e-9
@@ -94,7 +91,6 @@ class Tables:
     T: Array  # (nu, nu) u - u_s = T w
     T_inverse: Array
     modes: Array  # (nu, nu) takes rotor speeds that are states to the modes in their place, one of each axis
-    room: int  # active rows that there is room for
 
 
 def tables(problem: Problem) -> Tables:
@@ -123,11 +119,9 @@ def tables(problem: Problem) -> Tables:
         found.append(_axis(problem, rows, part, first))
         first += part.T.shape[1]
     row_tables = [_row(rows, i, found) for i in range(rows.l1.size)]
-    N, m = rows.lower.shape
     alike = bool((rows.lower == rows.lower[0]).all() and (rows.upper == rows.upper[0]).all())
     steps = slice(0, 1) if alike else slice(None)
-    scale = _scale(found, row_tables, T, N)
-    room = max(1, min(N * m, max(LEAST_ROOM, math.ceil(ROOM_PER_STEP * N))))
+    scale = _scale(found, row_tables, T, problem.horizon)
     return Tables(
         problem=problem,
         axes=found,
@@ -139,7 +133,6 @@ def tables(problem: Problem) -> Tables:
         T=T,
         T_inverse=T_inverse,
         modes=modes,
-        room=room,
     )
 
 

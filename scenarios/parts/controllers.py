@@ -20,7 +20,7 @@ from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.robust.tightening import SHORTEST_LAG
 from mpc.solvers import Solver, make_solver
 from quadsim.controller import CORE, Controller
-from quadsim.errors import ExportError, InputError, ParameterError
+from quadsim.errors import ExportError, InputError, MissingCoreError, ParameterError
 from quadsim.state import INDEX, N_STATES, POSITION, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.plugin import import_plugin, make_law
@@ -31,7 +31,7 @@ from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.robust import RobustSpec
 
 if TYPE_CHECKING:
-    from mpc.export.source import Exportable
+    from mpc.core.numbers import Exportable
     from mpc.robust.controller import RobustMPC
     from mpc.robust.filter import SafetyFilter
     from mpc.space.halfspaces import Shape, Space
@@ -181,7 +181,7 @@ def exportable(spec: ControllerSpec, vehicle: Vehicle, period: float, shapes: Se
         ExportError: it cannot be exported.
         InputError: it cannot be made from these numbers.
     """
-    from mpc.export.source import Exportable
+    from mpc.core.numbers import Exportable
     from mpc.robust.controller import robust_problem
 
     if not isinstance(spec, UnconstrainedSpec | ConstrainedSpec | RobustSpec):
@@ -200,13 +200,21 @@ def _compiled(
     period: float,
     shapes: Sequence[Shape] = (),
 ) -> Controller | None:
-    """The law as compiled C; None where it is to be flown in Python."""
+    """The law in C; None where it is to be flown in Python.
+
+    Raises:
+        MissingCoreError: there is no library.
+        ExportError: this law is not there in C.
+    """
     if not spec.compiled:
         return None
-    from scenarios.parts.compiler import compiled_controller
+    from mpc.core.law import CompiledLaw, CompiledMPC
+    from mpc.core.library import why_missing
 
-    key = spec.model_dump_json(), repr(vehicle), period, bool(shapes)
-    return compiled_controller(key, lambda: exportable(spec, vehicle, period, shapes))
+    reason = why_missing()
+    if reason is not None:
+        raise MissingCoreError(reason, instead="leave out controller.compiled")
+    return CompiledMPC(CompiledLaw(exportable(spec, vehicle, period, shapes)))
 
 
 def _bounded(
