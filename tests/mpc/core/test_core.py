@@ -1,4 +1,4 @@
-"""The core's optimum against the KKT conditions, DAQP, PIQP and a peer; what it refuses, and what PIQP has to answer."""
+"""The core's optimum against the KKT conditions, DAQP, PIQP and a peer; what it refuses and what PIQP answers."""
 
 from __future__ import annotations
 
@@ -232,31 +232,25 @@ def test_piqp_answers_what_is_infeasible_given_up_or_no_number(monkeypatch: pyte
     np.testing.assert_allclose(answer.plan[0], optimum.plan[0], atol=1e-3)
 
 
-def rows_of(count: int, **given: Any) -> tuple[Constraint, ...]:
-    C = np.zeros((count, 12))
+def with_rows(count: int, *, shared: bool = False) -> Problem:
+    """The paper's problem with so many more rows on x, perhaps with one slack for all."""
+    C, bound = np.zeros((count, 12)), np.full(count, 1e3)
     C[:, 0] = np.arange(1, count + 1)
-    return (Constraint(name="rows", C=C, lower=np.full(count, -1e3), upper=np.full(count, 1e3), **given),)
-
-
-def large() -> Problem:
-    """Of 21 states, all on one axis."""
-    problem = random_problem(np.random.default_rng(0), horizon=2, n=21, nu=4)
-    return problem
+    penalty = Penalty(l1=np.ones(count), l2=np.ones(count), largest=True) if shared else None
+    rows = Constraint(name="rows", C=C, lower=-bound, upper=bound, penalty=penalty)
+    return replace(paper_problem(), constraints=(rows,))
 
 
 @pytest.mark.parametrize(
     ("made", "rule"),
     [
         (lambda: random_problem(np.random.default_rng(0), horizon=3), "of 4 inputs; got '2 inputs'"),
-        (large, "such that there are at most 20; got '21 states of an axis'"),
-        (lambda: replace(paper_problem(), constraints=rows_of(20)), "at most 20; got \"21 rows on an axis's states\""),
-        (
-            lambda: replace(paper_problem(), bounds=None, constraints=rows_of(2, penalty=Penalty(l1=np.ones(2), l2=np.ones(2), largest=True))),
-            "each with its own; got 'soft rows that share a slack'",
-        ),
+        (lambda: random_problem(np.random.default_rng(0), horizon=2, n=21, nu=4), "at most 20; got '21 states of"),
+        (lambda: with_rows(20), 'at most 20; got "21 rows on'),
+        (lambda: with_rows(2, shared=True), "each with its own; got 'soft rows that share a slack'"),
         (lambda: paper_problem("paper-constrained", "controller.horizon=900"), "at most 1048576 numbers; they have "),
     ],
-)  # fmt: skip
+)
 def test_what_has_no_place_in_the_core_is_refused_with_the_number(made: Any, rule: str) -> None:
     with pytest.raises(ParameterError) as caught:
         make_solver(CORE, made())
