@@ -131,6 +131,8 @@ def make_parser() -> argparse.ArgumentParser:
     export.add_argument("--precision", default="double", help="of all numbers: double or float (default: double)")
     machine = "what its programs are for: posix, cortex-m7 or cortex-m4f (default: posix)"
     export.add_argument("--target", metavar="NAME", default="posix", help=machine)
+    rows = "room for so many active rows; memory grows with the square (default: 2.56 per step, at least 64)"
+    export.add_argument("--rows", **_NUMBER, help=rows)
     fly = "then fly the scenario with the exported controller on its target, emulated, into runs/SCENARIO-NAME"
     export.add_argument("--fly", action="store_true", help=fly)
     _add_settings(export)

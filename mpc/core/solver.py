@@ -120,7 +120,7 @@ class CoreProblem:
             axis.targets, axis.before = len(part.regulated), part.before
             axis.state, axis.target, axis.row = map(self._bytes, (part.states, part.regulated, part.rows))
             axis.B, axis.closed, axis.K, axis.inverse = map(self._reals, (part.B, part.closed, part.K, part.inverse))
-            axis.W, axis.W_end, axis.C = map(self._reals, (part.W_r, part.W_r_end, part.C))
+            axis.W, axis.W_end, axis.C = map(self._reals, (part.W, part.W_end, part.C))
             responses = part.responses[np.tril_indices(len(part.responses))]
             tiny = np.abs(responses) < TINY * np.abs(responses).max(initial=0.0)
             axis.responses = self._reals(np.where(tiny, 0.0, responses))

@@ -133,11 +133,13 @@ def view(options: Namespace) -> int:
 
 def export(options: Namespace) -> int:
     """`quadsim export`."""
+    from scenarios.export.exporter import FACTS, room_sentence
     from scenarios.export.exporter import export as write_export
 
     scenario = load(options.scenario, options)
     machine = {"precision": options.precision, "target": options.target}
-    directory = write_export(scenario, Path(options.out), overwrite=options.overwrite, **machine)
+    directory = write_export(scenario, Path(options.out), overwrite=options.overwrite, rows=options.rows, **machine)
+    print(f"{options.precision}: {room_sentence(json.loads((directory / FACTS).read_text()))}")
     print(f"Wrote {directory}: make -C {shlex.quote(str(directory))} check compiles it and runs its recorded periods")
     if not options.fly:
         return EXIT_DONE
