@@ -7,7 +7,7 @@ import math
 import time as clock
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, cached_property, lru_cache, partial
-from typing import Final, NoReturn
+from typing import Final, Generic, NoReturn, TypeVar
 
 import numpy as np
 
@@ -120,7 +120,7 @@ class CoreProblem:
             axis.targets, axis.before = len(part.regulated), part.before
             axis.state, axis.target, axis.row = map(self._bytes, (part.states, part.regulated, part.rows))
             axis.B, axis.closed, axis.K, axis.inverse = map(self._reals, (part.B, part.closed, part.K, part.inverse))
-            axis.W, axis.W_end, axis.C = map(self._reals, (part.W_r, part.W_r_end, part.C))
+            axis.W, axis.W_end, axis.C = map(self._reals, (part.W, part.W_end, part.C))
             responses = part.responses[np.tril_indices(len(part.responses))]
             tiny = np.abs(responses) < TINY * np.abs(responses).max(initial=0.0)
             axis.responses = self._reals(np.where(tiny, 0.0, responses))
@@ -190,12 +190,20 @@ def _refuse_large(found: Tables) -> None:
             raise ParameterError("controller", "problem", f"{count} {name}", f"such that there are at most {most}")
 
 
+Made = TypeVar("Made")
+
+
 @dataclass(frozen=True)
-class _Key:
-    """A problem by what it consists of."""
+class Key(Generic[Made]):
+    """Something made of dataclasses, by what it consists of."""
 
     content: object
-    problem: Problem = field(compare=False)
+    of: Made = field(compare=False)
+
+    @classmethod
+    def to(cls, value: Made) -> Key[Made]:
+        """The key of a value."""
+        return cls(_content(value), value)
 
 
 def _content(value: object) -> object:
@@ -212,12 +220,12 @@ def core_problem(problem: Problem) -> CoreProblem:
     Raises:
         ParameterError: the problem is not one for the core.
     """
-    return _core_problem(_Key(_content(problem), problem))
+    return _core_problem(Key.to(problem))
 
 
 @lru_cache(PROBLEMS)
-def _core_problem(key: _Key) -> CoreProblem:
-    return CoreProblem(key.problem)
+def _core_problem(key: Key[Problem]) -> CoreProblem:
+    return CoreProblem(key.of)
 
 
 class Core:

@@ -172,7 +172,7 @@ def test_numbers_that_are_none_are_refused(value: float) -> None:
 def optimum(axis: AxisTables, start: Array, reference: Array) -> Array:
     """W (N, m) by the passes that the C makes."""
     N, n = len(axis.K), len(axis.B)
-    pull = np.array([(axis.W if i < N - 1 else axis.W_end) @ row[axis.targets] for i, row in enumerate(reference)])
+    pull = np.array([(axis.W if i < N - 1 else axis.W_end) @ row[axis.regulated] for i, row in enumerate(reference)])
     w, slope = np.empty((N, axis.inputs)), pull[-1].reshape(n)
     for i in reversed(range(N)):
         w[i] = axis.inverse[i] @ axis.B.T @ slope
