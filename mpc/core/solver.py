@@ -267,8 +267,8 @@ class Core:
         self._arguments = self._at, *(part.ctypes.data for part in parts)
 
     def _view(self, address: int, kind: type[ctypes.c_double | ctypes.c_int8], columns: int) -> Array:
-        count = self._problem.horizon * columns
-        return np.ctypeslib.as_array((kind * count).from_address(address)).reshape(-1, columns)
+        shape = self._problem.horizon, columns
+        return np.ctypeslib.as_array((kind * math.prod(shape)).from_address(address)).reshape(shape)
 
     def __reduce__(self) -> NoReturn:
         """Addresses are of no use to a copy, or in another process."""
