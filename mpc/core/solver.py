@@ -24,8 +24,6 @@ from quadsim.vehicle import N_ROTORS
 
 MOST_STATES: Final = 20
 """Of an axis, with the inputs before where changes cost something; as in quadsim_core.h."""
-MOST_OUTPUTS: Final = 20
-"""Rows of an axis's states, likewise."""
 MOST_ROWS: Final = 256
 """Rows of a step, which are numbered in bytes."""
 MOST_CHANGES: Final = 3000
@@ -183,7 +181,6 @@ def _refuse_large(found: Tables) -> None:
         raise ParameterError("controller", "problem", f"{found.problem.model.nu} inputs", f"of {N_ROTORS} inputs")
     for name, count, most in (
         ("states of an axis", max(len(part.B) for part in found.axes), MOST_STATES),
-        ("rows on an axis's states", max(len(part.rows) for part in found.axes), MOST_OUTPUTS),
         ("rows of a step", len(found.rows), MOST_ROWS),
     ):
         if count > most:
@@ -270,8 +267,8 @@ class Core:
         self._arguments = self._at, *(part.ctypes.data for part in parts)
 
     def _view(self, address: int, kind: type[ctypes.c_double | ctypes.c_int8], columns: int) -> Array:
-        count = self._problem.horizon * columns
-        return np.ctypeslib.as_array((kind * count).from_address(address)).reshape(-1, columns)
+        shape = self._problem.horizon, columns
+        return np.ctypeslib.as_array((kind * math.prod(shape)).from_address(address)).reshape(shape)
 
     def __reduce__(self) -> NoReturn:
         """Addresses are of no use to a copy, or in another process."""
