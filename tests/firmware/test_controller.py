@@ -163,7 +163,7 @@ FLOATS = {
     "paper-constrained": (0.1, 0.0),
     "robust": (0.01, 0.0),
     "robust-lag50": (0.01, 0.0),
-    "yaw-180": (1.0, 0.02),
+    "yaw-180": (1.5, 0.02),
     "polytopes": (0.05, 0.1),
 }
 """How far floats may be from doubles [rad/s], and of how many states, as a share, the verdicts may differ."""
