@@ -1,24 +1,27 @@
 """Every installed QP solver on the periods of one flight: time of the whole controller step, failures, differences.
 
 A flight is recorded by the controller as its scenario has it.  Its measured states, references and commands before are
-then given to that controller again, and to the same one with each solver, which solves the whole QP in every period.
+then given to that controller again, to one that solves the whole QP by each solver in every period, and to the core's.
 Between two answers the plant flies a period, which leaves in the caches what it leaves there in a flight.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from timing import Record, options, run, step_quantiles, time_in_turns
 
-from quadsim.controller import ACCEPTED, Command, Controller, Moment
-from quadsim.errors import FlightError, InputError, MissingPackageError
+from mpc.constrained import ConstrainedMPC
+from mpc.solvers import QPSolver, make_solver
+from quadsim.controller import ACCEPTED, CORE, Command, Controller, Moment
+from quadsim.errors import FlightError, InputError, MissingCoreError, MissingPackageError
 from quadsim.flight.log import ControlLog
 from quadsim.state import Array, make_state
 from scenarios.api import load
-from scenarios.build import build_controller, build_plant
+from scenarios.build import build_controller, build_plant, build_problem
 from scenarios.catalogue import catalogue
 from scenarios.courses.make import build_reference
 from scenarios.parts.vehicle import build_vehicle
@@ -59,17 +62,15 @@ class Replayed:
         self.commands.setdefault(self._period, command)
 
 
-def entries(scenario: Scenario) -> dict[str, Scenario]:
-    """The scenario as it is, and with each installed solver and no shortcuts."""
-    entries = {FLOWN: scenario}
+def controllers(scenario: Scenario) -> dict[str, Controller]:
+    """The scenario's as it is, and by each solver that is there, without the unconstrained optimum tried first."""
+    vehicle = build_vehicle(scenario)
+    problem, found = build_problem(scenario, vehicle), {FLOWN: build_controller(scenario, vehicle)}
     for name in catalogue().solvers:
-        changed = scenario.replace({"controller.solver": name, "controller.shortcut": False})
-        try:
-            build_controller(changed, build_vehicle(changed))
-        except MissingPackageError:
-            continue
-        entries[name] = changed
-    return entries
+        with contextlib.suppress(MissingPackageError, MissingCoreError):
+            solver = make_solver(name, problem) if name == CORE else QPSolver(name, problem)
+            found[name] = ConstrainedMPC(problem, solver)
+    return found
 
 
 def measure(name: str, quick: bool) -> list[Record]:
@@ -82,9 +83,8 @@ def measure(name: str, quick: bool) -> list[Record]:
     vehicle = build_vehicle(scenario)
     log = fly_scenario(scenario).log.control
     candidates: dict[str, Replayed] = {}
-    for solver, each in entries(scenario).items():
-        controller = build_controller(each, vehicle)
-        reference = build_reference(each, log.t.size + controller.horizon)
+    for solver, controller in controllers(scenario).items():
+        reference = build_reference(scenario, log.t.size + controller.horizon)
         candidates[solver] = Replayed(controller, log, reference)
     segments = [range(start, min(start + SEGMENT, log.t.size)) for start in range(0, log.t.size, SEGMENT)]
     hover = make_state(position=(0.0, 0.0, 10.0))

@@ -13,7 +13,7 @@ import numpy as np
 from quadsim.motion import Motion
 from quadsim.state import Array
 
-SOLVED: Final = "solved"  # status of a period whose optimum a QP solver or the active-set method found
+SOLVED: Final = "solved"  # status of a period whose optimum a QP solver or the core found
 UNCONSTRAINED: Final = "unconstrained"
 """Status of a period whose unconstrained optimum satisfies every constraint, and so is the constrained one too."""
 COMMANDED: Final = "commanded"  # status of a period in which a law without a solver commanded
@@ -24,7 +24,7 @@ ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}  # the statuses whose command is flo
 MISSED: Final = "missed"
 """Status of a period whose command came after the next period's begin: the one before it went on acting."""
 GAIN: Final = "gain"  # who answered a period: the unconstrained optimum, a product with constant gains
-CORE: Final = "core"  # the active-set method of `mpc.core`, in C
+CORE: Final = "core"  # the exact optimum of `mpc.core`, compiled
 LAW: Final = "law"  # a law without a solver
 FALLBACK: Final = "fallback"  # an earlier plan or command, or the fallback contract
 STOPPED: Final = "stopped"  # nobody: rotors are off
@@ -226,6 +226,6 @@ def law_name(recorded: str) -> str:
 
 
 def counts(answered_by: Mapping[str, int]) -> str:
-    """Periods by who answered them, most first: `607 gain, 592 active-set, 1 piqp-multistage`; `280 commanded`."""
+    """Periods by who answered them, most first: `607 gain, 593 piqp-multistage`; `280 commanded`."""
     ranked = sorted(answered_by.items(), key=lambda entry: -entry[1])
     return ", ".join(f"{count} {COMMANDED if by == LAW else by}" for by, count in ranked)

@@ -35,8 +35,8 @@ def quick(name: str, tmp_path: Path) -> list[dict[str, Any]]:
 
 def test_solvers_agree_on_the_optimum(tmp_path: Path) -> None:
     records = {record["solver"]: record for record in quick("solvers", tmp_path)}
-    assert {"as flown", "piqp-dense", "daqp"} <= set(records)
-    for name in ("as flown", "piqp-dense", "daqp"):
+    assert {"as flown", "core", "piqp-dense", "daqp"} <= set(records)
+    for name in ("as flown", "core", "piqp-dense", "daqp"):
         assert not records[name]["failures"]
         assert records[name]["largest_difference_rad_s"] < 1e-3
         assert 0.0 < records[name]["p50_ms"] <= records[name]["p99_ms"] <= records[name]["max_ms"]

@@ -24,8 +24,6 @@ from quadsim.vehicle import N_ROTORS
 
 MOST_STATES: Final = 20
 """Of an axis, with the inputs before where changes cost something; as in quadsim_core.h."""
-MOST_OUTPUTS: Final = 20
-"""Rows of an axis's states, likewise."""
 MOST_ROWS: Final = 256
 """Rows of a step, which are numbered in bytes."""
 MOST_CHANGES: Final = 3000
@@ -183,7 +181,6 @@ def _refuse_large(found: Tables) -> None:
         raise ParameterError("controller", "problem", f"{found.problem.model.nu} inputs", f"of {N_ROTORS} inputs")
     for name, count, most in (
         ("states of an axis", max(len(part.B) for part in found.axes), MOST_STATES),
-        ("rows on an axis's states", max(len(part.rows) for part in found.axes), MOST_OUTPUTS),
         ("rows of a step", len(found.rows), MOST_ROWS),
     ):
         if count > most:

@@ -106,6 +106,7 @@ def test_without_an_optimum_the_last_plan_is_flown_to_its_end() -> None:
     after = ask(mpc, 10, tumbled)
     assert (after.status, after.fallback) == ("before", 3)
     assert np.array_equal(after.speeds, found.speeds)
+    assert ask(mpc, 11, np.zeros(N_STATES)).fallback == 0
     mpc.reset(planned.speeds)
     assert ask(mpc, 0, tumbled).status == "before"
 
