@@ -15,7 +15,7 @@ from quadsim.state import N_STATES, POSITION, VELOCITY, Array
 
 DISTANCES: Final = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 """Per axis [m], and speeds per axis [m/s]."""
-DRAWS: Final = 500
+DRAWS: Final = 200
 """States of each distance."""
 
 

@@ -79,7 +79,10 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         memmove(reference, reference + 4, sizeof(real) * (QUADSIM_HORIZON - 1) * 4);
         for (j = 0; j < 4; j++) {
             reference[(QUADSIM_HORIZON - 1) * 4 + j] = take(&data, &size, (manners >> 2) & 3, R(0.0), R(3.0));
-            acting[j] = (manners & 64) != 0 ? command[j] : take(&data, &size, (manners >> 4) & 3, own->hover[j], R(80.0));
+            acting[j] = command[j];
+            if ((manners & 64) == 0) {
+                acting[j] = take(&data, &size, (manners >> 4) & 3, own->hover[j], R(80.0));
+            }
         }
         if ((manners & 128) != 0) {
             quadsim_mpc_reset(mpc, acting);
@@ -90,11 +93,13 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         steps++;
         require(status >= QUADSIM_FREE && status <= QUADSIM_BEFORE, "a status");
         require(is_finite(command, 4), "a finite command");
-        require(mpc->work.changes >= 0 && mpc->work.changes <= 4 * own->problem->changes, "a limited number of changes");
+        require(mpc->work.changes >= 0, "a number of changes");
+        require(mpc->work.changes <= 4 * own->problem->changes, "a limited number of changes");
         for (j = 0; j < 4; j++) {
             require(command[j] >= own->speed_min[j] && command[j] <= own->speed_max[j], "bounds on speeds");
             if (before[j] >= own->speed_min[j] && before[j] <= own->speed_max[j]) {
-                require(command[j] - before[j] >= own->step_min[j] - R(1e-4) && command[j] - before[j] <= own->step_max[j] + R(1e-4),
+                const real step = command[j] - before[j];
+                require(step >= own->step_min[j] - R(1e-4) && step <= own->step_max[j] + R(1e-4),
                         "bounds on steps of speeds");
             }
         }

@@ -104,10 +104,10 @@ def test_no_compiler_warns(name: str, precision: Precision, tmp_path: Path) -> N
 
 
 @functools.cache
-def drawn() -> list[tuple[Array, Array, Array]]:
-    """1 000 states around the paper's flight, with references and commands in force; some have no answer."""
+def drawn(name: str = "paper-constrained") -> list[tuple[Array, Array, Array]]:
+    """1 000 states around a flight, with references and commands in force; some have no answer."""
     rng = np.random.default_rng(3)
-    flight, N = recording("paper-constrained"), load_scenario("paper-constrained").controller.horizon
+    flight, N = recording(name), load_scenario(name).controller.horizon
     spread = 0.75 * np.array([0.3, 0.5, 0.3, 0.5, 0.3, 0.5, 0.02, 0.15, 0.02, 0.15, 0.2, 0.3])
     found = []
     for k in rng.integers(0, len(flight.state), 1000):
@@ -156,6 +156,38 @@ def test_drawn_states_have_the_verdict_and_the_optimum_of_two_solvers(precision:
             nearest = min(np.abs(reply.command - first).max(), np.abs(reply.command - second).max())
             assert nearest <= (1e-7 if precision == "double" else 5e-2)
     assert 20 <= infeasible <= 500
+
+
+PRECISIONS: tuple[Precision, ...] = ("double", "float")
+FLOATS = {
+    "paper-constrained": (0.1, 0.0),
+    "robust": (0.01, 0.0),
+    "robust-lag50": (0.01, 0.0),
+    "yaw-180": (1.5, 0.02),
+    "polytopes": (0.05, 0.1),
+}
+"""How far floats may be from doubles [rad/s], and of how many states, as a share, the verdicts may differ."""
+
+
+@pytest.mark.parametrize("warm", [False, True], ids=["cold", "warm"])
+@pytest.mark.parametrize("name", FLOATS)
+def test_floats_are_near_doubles_in_drawn_states(name: str, warm: bool) -> None:
+    """Rows that nearly depend on each other are where floats are far off, or give up."""
+    hosts = [Host(load_scenario(name), precision, rows=200) for precision in PRECISIONS]
+    distances, differ, hover = list[float](), 0, np.full(4, 188.0)
+    for k, query in enumerate(drawn(name)):
+        if k == 0 or not warm:
+            for host in hosts:
+                host.reset(hover)
+        double, single = (host.step(*query) for host in hosts)
+        if double.status < REFUSED and single.status < REFUSED:
+            distances.append(float(np.abs(double.command - single.command).max()))
+        differ += (double.status < REFUSED) != (single.status < REFUSED)
+    p99, most = np.percentile(distances, [99, 100])
+    print(f"{name}: of {len(distances)} states p99 {p99:.1e}, most {most:.1e} rad/s; of {differ} no verdict in common")
+    largest, share = FLOATS[name]
+    assert most <= largest
+    assert differ <= share * len(drawn(name))
 
 
 def test_more_active_rows_than_there_is_room_for_end_as_defined() -> None:

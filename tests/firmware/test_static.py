@@ -44,6 +44,17 @@ def test_compilers_give_no_warning(precision: str, compiler: str, exported: Expo
         run(compiler, *machine, *DEFINES[precision], *WARNINGS, "-c", directory / name, "-o", tmp_path / "object.o")
 
 
+def test_files_of_two_precisions_do_not_make_a_program(exported: Export, run: Run, tmp_path: Path) -> None:
+    """Their memory differs: neither the numbers nor the core may be of the other."""
+    directory, core = exported("posix", "double"), tmp_path / "core.o"
+    done = run("gcc", "-DQUADSIM_FLOAT", "-c", directory / "main.c", "-o", tmp_path / "main.o", check=False)
+    assert "this export is of doubles" in done.stderr
+    run("gcc", "-DQUADSIM_FLOAT", "-c", directory / "quadsim_core.c", "-o", core)
+    sources = [directory / name for name in ("main.c", "vectors.c", "posix.c", "quadsim_mpc.c")]
+    done = run("gcc", *sources, core, "-o", tmp_path / "program", check=False)
+    assert "undefined reference to `quadsim_work_start'" in done.stderr
+
+
 def test_analysers_find_nothing(exported: Export, run: Run, tmp_path: Path) -> None:
     directory = exported("posix", "double")
     sources = [directory / name for name in (*CONTROLLER, "main.c", "serial.c", "posix.c")]

@@ -11,7 +11,7 @@ extern "C" {
 #define QUADSIM_VECTORS @COUNT@
 #define QUADSIM_VECTORS_ROWS @ROWS@
 #ifdef QUADSIM_FLOAT
-#define QUADSIM_VECTORS_TOLERANCE 2e-2F /* [rad/s] of a command from the exact optimum */
+#define QUADSIM_VECTORS_TOLERANCE 6e-2F /* [rad/s] of a command from the exact optimum */
 #define QUADSIM_VECTORS_ANY_OPTIMUM 1   /* whether the first three statuses count as one */
 #else
 #define QUADSIM_VECTORS_TOLERANCE 1e-8
