@@ -57,7 +57,7 @@ class SolverEntry:
             from mpc.core.library import why_missing
 
             reason = why_missing()
-            return "" if reason is None else f"not compiled: {reason}"
+            return "" if reason is None else f"no core: {reason}"
         found = importlib.util.find_spec(self.package)
         return f"not installed: pip install 'quadsim[{self.extra}]'" if found is None else ""
 

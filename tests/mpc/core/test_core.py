@@ -295,7 +295,7 @@ def test_a_core_is_neither_copied_nor_pickled() -> None:
 def test_without_a_library_the_reason_is_named_and_piqp(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "_load", lambda: "it was not compiled")
     monkeypatch.setattr(module, "core_library", core_library.__wrapped__)
-    assert solver_entries()[CORE].line == "not compiled: it was not compiled"
+    assert solver_entries()[CORE].line == "no core: it was not compiled"
     scenario = load_scenario("hover", [f"controller.solver={CORE}"])
     with pytest.raises(MissingCoreError, match=r"it was not compiled; or choose controller\.solver = 'piqp'"):
         build_controller(scenario, build_vehicle(scenario))
