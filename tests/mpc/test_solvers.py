@@ -76,8 +76,8 @@ def test_data_that_is_not_finite_reaches_no_back_end(place: int, corrupted: floa
     [
         ([], GAIN),
         (["controller.horizon=150"], GAIN),
-        (["controller.horizon=200"], "piqp"),  # its matrices are too large
-        (["controller.horizon=100", "controller.input_weights.speed=1e-6"], "piqp"),  # cond(H) forbids
+        (["controller.horizon=200"], "piqp-multistage"),  # its matrices are too large
+        (["controller.horizon=100", "controller.input_weights.speed=1e-6"], "piqp-multistage"),  # cond(H) forbids
     ],
 )
 def test_the_unconstrained_optimum_is_tried_first_unless_size_or_rounding_forbid(settings: list[str], by: str) -> None:
