@@ -21,6 +21,7 @@ Positive = Annotated[float, Gt(0.0), Le(1e6)]
 Fraction = Annotated[float, Ge(0.0), Le(1.0)]
 Weight = Annotated[float, Gt(0.0), Le(1e12)]  # of a cost function
 Vector = Annotated[tuple[Number, ...], Len(3, 3)]  # of three numbers, x, y, z
+Pair = Annotated[tuple[Number, ...], Len(2, 2)]
 Instant = Annotated[float, Ge(0.0), Le(1e6), doc("[s] when it happens")]  # of an event
 
 

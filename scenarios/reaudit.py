@@ -26,9 +26,9 @@ from quadsim.flight.summary import constraint_verdict, limit_to_json
 from quadsim.report.comparison import verdict
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.courses.make import build_course_steps
 from scenarios.limits import build_limits
 from scenarios.loading import parse_scenario
+from scenarios.reference import build_course_steps
 from scenarios.schema.bases import read_whole
 from scenarios.schema.events import RotorLagEvent
 from scenarios.schema.plugin import LAWS, is_plugin

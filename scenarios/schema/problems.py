@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import difflib
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -61,15 +62,12 @@ class Place:
         return tuple(dict.fromkeys(name for kind in self.kinds for name in kind.fields))
 
     @property
-    def exact_length(self) -> int | None:
-        """How long a list has to be, where that is one number."""
-        for kind in self.kinds:
-            notes = kind.metadata if kind.is_list else ()
-            shortest = {note.min_length for note in notes if isinstance(note, Len | MinLen)}
-            longest = {note.max_length for note in notes if isinstance(note, Len | MaxLen)}
-            if shortest and shortest == longest:
-                return int(shortest.pop())
-        return None
+    def lengths(self) -> tuple[int, float]:
+        """The least and the largest number of entries of a list."""
+        notes = [note for kind in self.kinds if kind.is_list for note in kind.metadata]
+        shortest = (note.min_length for note in notes if isinstance(note, Len | MinLen))
+        longest = (note.max_length for note in notes if isinstance(note, Len | MaxLen))
+        return next(shortest, 0), next(longest, None) or math.inf
 
     @property
     def entries(self) -> str:
@@ -180,9 +178,9 @@ def describe_all(
     unsaid: set[int] = set()
     for each in found:
         if each["type"] in ("too_short", "too_long"):
-            entries = [id(other) for other in found if other["loc"][:-1] == each["loc"]]
-            bounds = each["ctx"]
-            longer = len(each["input"]) > (bounds["max_length"] if "max_length" in bounds else bounds["min_length"])
+            place = each["loc"]
+            entries = [id(other) for other in found if other is not each and other["loc"][: len(place)] == place]
+            longer = len(each["input"]) > find(place, data, root).lengths[1]
             unsaid.update(entries if longer else [id(each)] if entries else [])
     return [describe(details, data, root, file=file) for details in found if id(details) not in unsaid]
 
@@ -221,8 +219,10 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseMode
         if isinstance(error, UnknownNameError):
             return f"{field}.{error.kind}: {error}"
         return ".".join([*place.names, str(error)])
-    if kind in ("too_short", "too_long") and place.exact_length is not None:
-        return f"{field} must be a list of {place.exact_length} {place.entries}; got {shown(given)}"
+    shortest, longest = place.lengths
+    if kind in ("too_short", "too_long") and shortest and longest < math.inf:
+        count = shortest if shortest == longest else f"{shortest} to {longest}"
+        return f"{field} must be a list of {count} {place.entries}; got {shown(given)}"
     if kind == "too_long":
         return f"{field} must be {_RULES[kind].format(**context)}; got {len(given)}"
     guess = ""

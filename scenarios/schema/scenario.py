@@ -22,10 +22,10 @@ from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from scenarios.courses.table import ReferenceTable
 from scenarios.schema import events as kinds
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec, NonlinearSpec, changed
-from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
@@ -173,7 +173,7 @@ class Scenario(Spec):
     actual: ActualSpec | None = None
     initial: InitialSpec = InitialSpec()
     plant: PlantSpec = PlantSpec()
-    reference: ReferenceSpec
+    reference: ReferenceTable
     controller: ControllerSpec
     effects: Effects = Effects()
     forces: Annotated[list[ForceSpec], MaxLen(MOST_ENTRIES)] = Field(

@@ -15,11 +15,11 @@ from mpc.robust.controller import RobustMPC
 from mpc.solvers import Answer, Formulation, Method, QPSolver, Solver
 from quadsim.controller import ACCEPTED
 from scenarios.build import build_controller, build_plant
-from scenarios.courses.make import build_reference
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.reference import build_reference
 
 
 class Recording:
