@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from pydantic import Discriminator, Tag
 
@@ -13,10 +13,12 @@ from scenarios.courses.minimum_snap import MinimumSnap
 from scenarios.courses.ramped import RampedCircle, RampedLemniscate
 from scenarios.courses.steps import Steps
 
+DEFAULT: Final = "steps"  # the type of a table that states none
+
 
 def _kind(value: object) -> str:
-    """The tag of a table or of what was made of one; a table without a type is one of steps."""
-    given = value.get("type", "steps") if isinstance(value, dict) else getattr(value, "type", "steps")
+    """The tag of a table or of what was made of one."""
+    given = value.get("type", DEFAULT) if isinstance(value, dict) else getattr(value, "type", DEFAULT)
     return given if isinstance(given, str) else repr(given)
 
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
-from scenarios.courses.table import ReferenceTable
+from scenarios.courses.table import DEFAULT, ReferenceTable
 from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import headline, is_absent, tables_in
@@ -45,6 +45,11 @@ class _SchemaOfToml(GenerateJsonSchema):
             if field.description:
                 found["properties"][name]["description"] = field.description
         return found
+
+    def field_is_required(self, field: Any, total: bool) -> bool:
+        """Whether a table has to state a field: its type too, although Python's default is its only value."""
+        named = field.get("name") == "type" and field["schema"].get("default") != DEFAULT
+        return named or super().field_is_required(field, total)
 
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> dict[str, Any]:
         """The same without a default where that is to be absent."""

@@ -18,14 +18,15 @@ from quadsim.fields import Positive
 from quadsim.flight.audit import Limit
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
+from quadsim.sim.effects.load import PayloadDrop, PayloadPickup
 from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.courses.table import ReferenceTable
-from scenarios.schema import events as kinds
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
 from scenarios.schema.controller import ControllerSpec, NonlinearSpec, changed
+from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
@@ -184,9 +185,7 @@ class Scenario(Spec):
     estimator: EstimatorSpec | None = Field(
         default=None, description="absent: the controller receives the sensors' samples as they arrive"
     )
-    events: Annotated[list[kinds.Event], MaxLen(kinds.MOST_EVENTS)] = Field(
-        default=[], description="what happens in flight"
-    )
+    events: Annotated[list[Event], MaxLen(MOST_EVENTS)] = Field(default=[], description="what happens in flight")
     lost: LostSpec = LostSpec()
     obstacles: Annotated[list[Annotated[AnyObstacle, Field(discriminator="type")]], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="what the vehicle, a ball of its extent, must not touch: a touch is a crash"
@@ -277,18 +276,18 @@ class Scenario(Spec):
         for i, event in sorted(enumerate(self.events), key=lambda entry: entry[1].at):
             if event.at >= self.duration:
                 raise ValueError(f"events.{i}.at must be before the flight's end, {self.duration} s; got {event.at}")
-            if isinstance(event, kinds.PayloadPickupEvent):
+            if isinstance(event, PayloadPickup):
                 carried += 1
-            elif isinstance(event, kinds.PayloadDropEvent):
+            elif isinstance(event, PayloadDrop):
                 if not carried:
                     raise ValueError(f"events.{i}.type must not be payload_drop at {event.at} s: nothing is carried")
                 carried = 0
-            elif isinstance(event, kinds.SensorFaultEvent) and self.estimator is not None:
+            elif isinstance(event, SensorFaultEvent) and self.estimator is not None:
                 present = [] if self.sensors is None else [str(name) for name in self.sensors.present()]
                 if event.sensor not in present:
                     rule = f"one that the estimator has, of {', '.join(present)}"
                     raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
-            elif isinstance(event, kinds.ControllerEvent):
+            elif isinstance(event, ControllerEvent):
                 try:
                     controller = changed(controller, event.fields)
                 except InputError as error:
@@ -315,7 +314,7 @@ class Scenario(Spec):
     def controller_changes(self) -> list[tuple[float, ControllerSpec]]:
         """Each controller that takes over from the one before it, and when [s], in order of time."""
         found: list[tuple[float, ControllerSpec]] = []
-        events = (event for event in self.events if isinstance(event, kinds.ControllerEvent))
+        events = (event for event in self.events if isinstance(event, ControllerEvent))
         for event in sorted(events, key=lambda event: event.at):
             found.append((event.at, changed(found[-1][1] if found else self.controller, event.fields)))
         return found
