@@ -65,7 +65,7 @@ def check_parts(scenario: Scenario) -> None:
 
 def _check_start(scenario: Scenario, vehicle: Vehicle) -> None:
     """Refuse a start below the floor, or one in the air with rotors at rest."""
-    shape, state, position = outline(vehicle), build_initial_state(scenario)[None, :], scenario.initial.position
+    shape, state, position = outline(vehicle), build_initial_state(scenario)[None, :], list(scenario.initial.position)
     feet = float(clearance(state, shape.feet, shape.foot_radius, shape.floor)[0])
     hull = float(clearance(state, shape.hull, 0.0, shape.floor)[0])
     lowest = min(feet, hull)
