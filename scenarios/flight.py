@@ -6,7 +6,7 @@ import contextlib
 import logging
 import time as clock
 from base64 import b64encode
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from html import escape
@@ -37,11 +37,13 @@ from scenarios.parts.effects import build_computation
 from scenarios.parts.events import story
 from scenarios.parts.vehicle import build_actual
 from scenarios.progress import Progress, silent
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result
 from scenarios.schema.scenario import Scenario, Verdict
 from scenarios.schema.settings import leaves
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    from rich.console import RenderableType
 
     from mpc.ocp import Unanswered
 
@@ -74,7 +76,7 @@ class Outputs:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flight:
+class Flight(Result):
     """A flown scenario.
 
     Arrays with one row per control period k, taken at t_k, are `time`, `state`, `measured`, `reference`, `command` and
@@ -317,6 +319,21 @@ class Flight:
         outputs.check()
         write_run(self, absolute(directory), outputs, progress, overwrite=overwrite)
         return Path(directory)
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`."""
+        return EXIT_DONE if self.outcome in ("satisfied", "incomplete") else EXIT_FAILED
+
+    def shown(self) -> Iterable[RenderableType]:
+        """See `Result.shown`."""
+        from scenarios.summary_tables import summary_tables
+
+        return summary_tables(self.to_json(), self.directory)
+
+    def to_json(self) -> dict[str, Any]:
+        """`summary.json`, as it is on disk where the flight is."""
+        return dict(self.summary) if self.directory is None else rundir.read_summary(self.directory)
 
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""

@@ -13,8 +13,8 @@ from mpc.export.targets import TARGETS, Target
 from quadsim.errors import ParameterError
 from quadsim.outputs import absolute, reserving, writing
 from quadsim.state import Array
-from scenarios.api import as_scenario
 from scenarios.export.record import Recording, record
+from scenarios.loading import as_scenario
 from scenarios.parts.controllers import exportable
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario

@@ -19,7 +19,7 @@ from mpc.paper.condensed import Condensed
 from quadsim.errors import ExportError, OutputError, ParameterError
 from quadsim.state import REFERENCE_STATES, Array
 from scenarios.build import build_problem
-from scenarios.catalogue import scenarios
+from scenarios.catalogue import read_catalogue
 from scenarios.cli import main
 from scenarios.export.exporter import controller_files, export, exported_law
 from scenarios.export.record import record
@@ -37,7 +37,7 @@ NOT_EXPORTED = {
 
 def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
     exported, refused, seen = 0, {}, set()
-    for name in scenarios():
+    for name in read_catalogue().scenarios:
         scenario = load_scenario(name)
         key = scenario.controller.model_dump_json(), repr(build_vehicle(scenario)), bool(scenario.obstacles)
         if key in seen:
