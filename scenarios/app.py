@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
@@ -97,8 +98,7 @@ def load(name: str | Path, changes: Changes = ()) -> Scenario:
 
     Args:
         name: a library name, or a path ending in `.toml`.
-        changes: fields to replace: values by dotted path, as `Scenario.replace` takes them, or texts
-            `dotted.path=value` as of `--set`.
+        changes: fields to replace: values by dotted path as `Scenario.replace` takes them, or texts as of `--set`.
 
     Raises:
         InputError: it is missing or malformed, or cannot be flown so.
@@ -121,8 +121,7 @@ def feasibility(scenario: ScenarioName) -> Feasibility:
         scenario: it, or its name or file.
 
     Returns:
-        Peaks of the course (`tilt` [deg], `velocity` [m/s], `rotor_max` [rad/s] and others), the `problems` where a
-        limit or a bound is passed, and all that as a `sentence`.
+        Peaks of the course, as `tilt` [deg], `problems` where a limit or a bound is passed, and a `sentence`.
 
     Raises:
         InputError: the course cannot be built.
@@ -192,26 +191,20 @@ def fly(
         InputError: the scenario cannot be flown, or the controller cannot be set up.
 
     Examples:
-        >>> import numpy as np
         >>> import quadsim
         >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
         >>> quadsim.fly(scenario).satisfied
         True
         >>> def full_throttle(now, state, reference):
-        ...     return np.full(4, 300.0)
-        >>> bool(quadsim.fly(scenario, controller=full_throttle).state["vz"][-1] > 1.0)
-        True
-        >>> def side_wind(time, state):
-        ...     return np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
-        >>> bool(quadsim.fly(scenario, forces=[side_wind]).state["x"][-1] > 0.01)
-        True
+        ...     return [300.0] * 4
+        >>> quadsim.fly(scenario, controller=full_throttle).state["vz"][-1].round()
+        np.float64(13.0)
     """
+    from scenarios import loading, user_code
     from scenarios import run as runs
-    from scenarios.loading import as_scenario
     from scenarios.progress import reporting
-    from scenarios.user_code import set_up
 
-    flown, law, own = set_up(as_scenario(scenario), controller, forces)
+    flown, law, own = user_code.set_up(loading.as_scenario(scenario), controller, forces)
     with reporting(progress) as report:
         return runs.fly_scenario(flown, report, law, own)
 
@@ -252,8 +245,7 @@ def run(
     Raises:
         InputError: the scenario cannot be flown, or the controller cannot be set up.
         RenderingUnavailableError: a video is asked for and cannot be made; nothing was flown.
-        OutputError: the directory cannot be written, and nothing was flown; or what was asked for failed: the tables
-            and the summary are there then, and the error's `result` is the flight.
+        OutputError: the directory cannot be written; or what was asked for by name: its `result` is the flight then.
 
     Examples:
         >>> import tempfile, quadsim
@@ -262,24 +254,30 @@ def run(
         ...     flown.outcome, flown.directory.name
         ('satisfied', 'run')
     """
-    from quadsim.outputs import reserving
+    from scenarios import loading, user_code
+    from scenarios import run as runs
     from scenarios.flight import Outputs
-    from scenarios.loading import as_scenario
     from scenarios.progress import reporting
-    from scenarios.run import run_scenario
-    from scenarios.user_code import set_up
 
-    flown, law, own = set_up(as_scenario(scenario, changes, seed), controller, forces)
+    flown, law, own = user_code.set_up(loading.as_scenario(scenario, changes, seed), controller, forces)
     _announce(flown, progress)
-    target, free = (Path("runs") / flown.name, not overwrite) if out is None else (Path(out), False)
     outputs = Outputs(video=video, recording=recording, figures=figures)
-    with reserving(target, overwrite=overwrite, free=free) as directory, reporting(progress) as report:
+    with run_directory(flown.name, out, overwrite=overwrite) as directory, reporting(progress) as report:
         try:
-            return run_scenario(flown, directory, outputs, report, law, own, overwrite=overwrite)
+            return runs.run_scenario(flown, directory, outputs, report, law, own, overwrite=overwrite)
         except OutputError as error:
             if error.path.parent == directory:  # a product that was asked for by name
                 error.result = read(directory)
             raise
+
+
+def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> AbstractContextManager[Path]:
+    """The directory of a run, reserved: `out`, or `runs/NAME`, or the next free name where that is not replaced."""
+    from quadsim.outputs import reserving
+
+    if out is not None:
+        return reserving(out, overwrite=overwrite)
+    return reserving(Path("runs") / name, overwrite=overwrite, free=not overwrite)
 
 
 def _announce(scenario: Scenario, progress: Watched) -> None:
@@ -323,11 +321,11 @@ def start(
         ...     started.flight().outcome
         'satisfied'
     """
-    from scenarios.loading import as_scenario
-    from scenarios.run import start as start_flight
-    from scenarios.user_code import set_up
+    from scenarios import loading, user_code
+    from scenarios import run as runs
 
-    return start_flight(*set_up(as_scenario(scenario), controller, forces), live=live, recorded=recorded)
+    parts = user_code.set_up(loading.as_scenario(scenario), controller, forces)
+    return runs.start(*parts, live=live, recorded=recorded)
 
 
 def read(directory: str | Path) -> Flight:
@@ -404,10 +402,9 @@ def check(
         >>> audited.satisfied, audited.notes
         (True, ())
     """
+    from scenarios import loading, reaudit
     from scenarios.campaign.manifest import is_campaign
     from scenarios.junit import junit_file, write_junit
-    from scenarios.loading import as_scenario
-    from scenarios.reaudit import Reaudit, reaudit
 
     file = None if junit is None else junit_file(junit)
     if isinstance(target, str | Path) and Path(target).is_dir():
@@ -419,14 +416,14 @@ def check(
                 f"{target} is a campaign, not a run: quadsim replay {target} --worst makes a run of its worst flight; "
                 "quadsim campaign --require judges them all"
             )
-        audited = reaudit(Path(target))
+        audited = reaudit.reaudit(Path(target))
         for note in audited.notes:
             _log.info("%s: %s", target, note)
     else:
-        scenario = as_scenario(target, changes, seed)
+        scenario = loading.as_scenario(target, changes, seed)
         _announce(scenario, progress)
         flight = fly(scenario, progress=progress)
-        audited = Reaudit(summary=dict(flight.summary), findings=flight.findings, satisfied=flight.satisfied)
+        audited = reaudit.Reaudit(summary=dict(flight.summary), findings=flight.findings, satisfied=flight.satisfied)
     if file is not None:
         write_junit(audited, file)
     return audited
@@ -525,15 +522,10 @@ def film(
         raise ParameterError("", "--workers", workers, "at least 1")
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
-
-    def render(file: Path, *, overwrite: bool) -> None:
-        if path.suffix == ".gif":
-            render_gif(directory, file, workers=workers, overwrite=overwrite)
-            return
-        watch = lambda done, total: report("video", done, total)  # noqa: E731
-        render_video(directory, file, workers=workers, progress=watch, overwrite=overwrite)
-
     with reporting(progress) as report:
+        render = partial(render_gif, directory, workers=workers)
+        if path.suffix == ".mp4":
+            render = partial(render_video, directory, workers=workers, progress=partial(report, "video"))
         if path.parent != directory:
             render(path, overwrite=overwrite)
         else:  # a product of the run, which its summary lists
@@ -814,7 +806,6 @@ def replay(
         Traceback (most recent call last):
         quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
     """
-    from quadsim.outputs import reserving
     from scenarios.campaign.replay import recorded_flight, replay_flight
     from scenarios.flight import Outputs
     from scenarios.progress import reporting
@@ -824,9 +815,8 @@ def replay(
     recorded = recorded_flight(Path(campaign), flight)
     for note in recorded.notes:
         _log.info(note)
-    target, free = (Path("runs") / recorded.scenario.name, not overwrite) if out is None else (Path(out), False)
     outputs = Outputs(video=video, recording=recording, figures=figures)
-    with reporting(progress) as report, reserving(target, overwrite=overwrite, free=free) as directory:
+    with reporting(progress) as report, run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
         return replay_flight(recorded, directory, outputs, report, overwrite=overwrite)
 
 
@@ -969,7 +959,6 @@ def export(
     """
     import shlex
 
-    from quadsim.outputs import reserving
     from scenarios import loading, results
     from scenarios.export import exporter, in_the_loop
 
@@ -980,7 +969,7 @@ def export(
     if not fly:
         return results.Document(f"{text}\n", {"directory": str(directory)})
     _log.info(text)
-    with reserving(Path("runs") / f"{flown.name}-{target}", free=True) as place:
+    with run_directory(f"{flown.name}-{target}", None, overwrite=False) as place:
         return in_the_loop.fly_exported(flown, place, **options)  # type: ignore[arg-type]
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Final, get_args
+from typing import Any, Final, get_args
 
 from mpc.solvers import solver_entries
 from quadsim.assets import read_toml, vehicle_names, vehicle_path
 from quadsim.vehicle import load_vehicle
-from scenarios.results import Result
+from scenarios.results import Result, Shown
 from scenarios.shipped import (
     CONTROLLERS,
     Group,
@@ -22,9 +22,6 @@ from scenarios.shipped import (
     tuning_names,
     tuning_path,
 )
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 _MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
 """The mark of a scenario that is to defeat its controller."""
@@ -51,7 +48,7 @@ class Catalogue(Result):
     papers: Mapping[str, str]  # for `reproduce`, by their titles
     solvers: Mapping[str, str]  # for `controller.solver`; those that are not installed are marked
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios import console
 

@@ -111,8 +111,17 @@ def _brief(message: str) -> str:
 
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
-    """Show the program's notices on stderr: which code of the user's was imported."""
-    logger, handler = logging.getLogger("quadsim"), _NoticeHandler()
+    """Show the program's notices on stderr, each once: which code of the user's was imported, and what failed."""
+    logger, handler, shown = logging.getLogger("quadsim"), logging.StreamHandler(), set[str]()
+
+    def shown_first(record: logging.LogRecord) -> bool:
+        record.msg, record.args = printable(record.getMessage()), ()
+        first = record.msg not in shown
+        shown.add(record.msg)
+        return first
+
+    handler.setFormatter(logging.Formatter("quadsim: %(message)s"))
+    handler.addFilter(shown_first)
     before = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
@@ -121,21 +130,6 @@ def _notices() -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.setLevel(before)
-
-
-class _NoticeHandler(logging.Handler):
-    """Shows the program's notices on stderr, each once."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.INFO)
-        self._shown: set[str] = set()
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """See `logging.Handler.emit`."""
-        text = record.getMessage()
-        if text not in self._shown:
-            self._shown.add(text)
-            print(f"quadsim: {printable(text)}", file=sys.stderr, flush=True)
 
 
 def _silence_stdout() -> None:

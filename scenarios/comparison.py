@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,13 +20,11 @@ from scenarios.flight import Flight, Outputs
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import reaudit
-from scenarios.results import Result
+from scenarios.results import Result, Shown
 from scenarios.run import run_scenario
 from scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
 
 _log: Final = logging.getLogger("quadsim")
@@ -52,7 +50,7 @@ class Comparison(Result):
 
         return to_markdown(self.rows, self.names)
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios import console
 

@@ -6,7 +6,7 @@ import contextlib
 import logging
 import time as clock
 from base64 import b64encode
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from html import escape
@@ -37,13 +37,12 @@ from scenarios.parts.effects import build_computation
 from scenarios.parts.events import story
 from scenarios.parts.vehicle import build_actual
 from scenarios.progress import Progress, silent
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario, Verdict
 from scenarios.schema.settings import leaves
 
 if TYPE_CHECKING:
     import pyarrow as pa
-    from rich.console import RenderableType
 
     from mpc.ocp import Unanswered
 
@@ -325,7 +324,7 @@ class Flight(Result):
         """See `Result.exit_status`."""
         return EXIT_DONE if self.outcome in ("satisfied", "incomplete") else EXIT_FAILED
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios.summary_tables import summary_tables
 

@@ -10,10 +10,10 @@ samples both saw the same numbers.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -29,15 +29,12 @@ from quadsim.vehicle import N_ROTORS
 from scenarios.courses.make import build_course_steps
 from scenarios.limits import build_limits
 from scenarios.loading import parse_scenario
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.bases import read_whole
 from scenarios.schema.events import RotorLagEvent
 from scenarios.schema.plugin import LAWS, is_plugin
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import leaves
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
 OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
@@ -67,7 +64,7 @@ class Reaudit(Result):
         """See `Result.exit_status`; 1 where a constraint was not reached too: not all were shown to hold."""
         return EXIT_DONE if self.satisfied and self.summary["satisfied"] else EXIT_FAILED
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios.summary_tables import summary_tables
 

@@ -6,12 +6,14 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from scenarios.schema.scenario import Scenario
+
+Shown: TypeAlias = "Iterable[RenderableType]"
 
 EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
 
@@ -24,7 +26,7 @@ class Result:
         """Of the command: 0, or 1 where a constraint, a requirement or a number does not hold."""
         return EXIT_DONE
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """Its tables and sentences, in order."""
         raise NotImplementedError
 
@@ -98,7 +100,7 @@ class ScenarioFile(Document):
 class Listing(dict[str, Mapping[str, str]], Result):
     """Names by section, each with a line."""
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios import console
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from quadsim.errors import ParameterError
 from scenarios.campaign.manifest import other_than_flew, read_manifest, stored_plan
@@ -17,12 +17,9 @@ from scenarios.campaign.statistics.estimates import worst_flight
 from scenarios.flight import Flight, Outputs
 from scenarios.many import MEMORY, TIMEOUT
 from scenarios.progress import Progress, silent
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.run import run_scenario
 from scenarios.schema.scenario import Scenario
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +76,7 @@ class Replay(Result):
         """See `Result.exit_status`; 1 where its numbers are not the campaign's."""
         return EXIT_FAILED if self.differing else EXIT_DONE
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios import console
 

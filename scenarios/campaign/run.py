@@ -6,11 +6,11 @@ import math
 import tempfile
 import time as clock
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -30,10 +30,7 @@ from scenarios.campaign.statistics.inference import proportion
 from scenarios.campaign.statistics.requirement import Judgement
 from scenarios.flight import to_pandas
 from scenarios.many import count_workers
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 
 REPORT_FILES: Final = ("index.html", "campaign.png")
 CHECK_EVERY: Final = 10
@@ -68,7 +65,7 @@ class CampaignResult(Result):
         """See `Result.exit_status`; 1 where the flights do not support a requirement."""
         return EXIT_DONE if all(judgement.holds for judgement in self.judgements) else EXIT_FAILED
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios.campaign.report.campaign_tables import campaign_lines
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -17,10 +17,7 @@ from quadsim.state import INDEX, Array
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import TorqueRange, authority, torque_ranges
 from scenarios.design.tuning import delay_margin, tune
-from scenarios.results import Result
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
+from scenarios.results import Result, Shown
 
 SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
 _RPM: Final = 60.0 / (2.0 * math.pi)
@@ -86,7 +83,7 @@ class VehicleReport(Result):
         given = ((name, getattr(self.vehicle, name), unit) for name, unit in VEHICLE_UNITS.items())
         return [(name, value, unit) for name, value, unit in given if value is not None]
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios import console
         from scenarios.design.vehicle_tables import vehicle_tables

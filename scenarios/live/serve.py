@@ -9,8 +9,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from quadsim.outputs import reserving
 from scenarios import console
+from scenarios.app import run_directory
 from scenarios.live.guard import LOOPBACK
 from scenarios.live.pacing import Pace
 from scenarios.live.session import Session, read_script
@@ -45,9 +45,8 @@ def fly_live(
         from scenarios.live.page import require_server
 
         require_server(place["host"], place["port"])
-    target, free = (Path("runs") / f"{scenario.name}-live", not overwrite) if out is None else (Path(out), False)
     with (
-        reserving(target, overwrite=overwrite, free=free) as directory,
+        run_directory(f"{scenario.name}-live", out, overwrite=overwrite) as directory,
         closing(Session(scenario, against)) as session,
     ):
         replaced = overwrite

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from quadsim.errors import InputError
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
 from scenarios.papers.paper import NumberSpec, Paper, scenario_of
 from scenarios.progress import Progress, silent
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.run import fly_scenario
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 HEAD: Final = ("number", "unit", "published", "ours", "difference", "tolerance", "reproduced")
 _RULE: Final = "measure must lead to a number of the flight's summary"
@@ -126,7 +123,7 @@ class Reproductions(tuple[Reproduction, ...], Result):
         """See `Result.exit_status`; 1 where a number is not reproduced."""
         return EXIT_DONE if all(paper.within for paper in self) else EXIT_FAILED
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios import console
 

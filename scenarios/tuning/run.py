@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -27,14 +27,11 @@ from scenarios.campaign.statistics.comparison import Comparison, compare
 from scenarios.campaign.statistics.inference import paired_difference
 from scenarios.campaign.statistics.requirement import judge
 from scenarios.many import count_workers
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario
 from scenarios.tuning.page import Summary, write_page
 from scenarios.tuning.plan import OWN, START, TuningPlan
 from scenarios.tuning.search import JOURNAL_FILE, Search, require_optuna
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 MANIFEST_FILE: Final = "manifest.json"
 _MAY_CHANGE: Final = {"trials", "fresh", "description"}  # where a tuning is resumed
@@ -68,7 +65,7 @@ class TuningResult(Result):
         """See `Result.exit_status`; 1 where the requirement does not hold."""
         return EXIT_DONE if self.holds else EXIT_FAILED
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios import console
         from scenarios.tuning.page import sentences, tables, verdict

@@ -6,10 +6,10 @@ far smaller differences than two campaigns side by side would.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -30,10 +30,7 @@ from scenarios.campaign.results.table import (
 from scenarios.campaign.statistics import inference
 from scenarios.campaign.statistics.estimates import FAILURE
 from scenarios.campaign.statistics.wording import p_value
-from scenarios.results import Result
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
+from scenarios.results import Result, Shown
 
 COMPARED: Final = (
     *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
@@ -115,7 +112,7 @@ class Comparison(Result):
             f"with {a} (McNemar's exact test, {p_value(failure.p)})."
         )
 
-    def shown(self) -> Iterable[RenderableType]:
+    def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios import console
         from scenarios.campaign.report.comparison_tables import comparison_tables, difference_table, pairing
