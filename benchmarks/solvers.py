@@ -1,39 +1,37 @@
-"""Every installed QP solver on the periods of a flight: set-up, time of the controller step, failures, differences.
+"""Every installed QP solver on the periods of one flight: time of the whole controller step, failures, differences.
 
 A flight is recorded by the controller as its scenario has it.  Its measured states, references and commands before are
-then given to the same controller with each solver, and to the whole law in C.  All answer from the gain where the
-unconstrained optimum is feasible.  Between two answers the plant flies a period, which leaves in the caches what it
-leaves there in a flight.
+then given to that controller again, to one that solves the whole QP by each solver in every period, and to the core's.
+Between two answers the plant flies a period, which leaves in the caches what it leaves there in a flight.
 """
 
 from __future__ import annotations
 
-import time as clock
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from timing import Record, options, run, step_quantiles, time_in_turns
 
-from quadsim.controller import ACCEPTED, Command, Controller, Moment
+from mpc.constrained import ConstrainedMPC
+from mpc.solvers import QPSolver, make_solver
+from quadsim.controller import ACCEPTED, CORE, Command, Controller, Moment
 from quadsim.errors import FlightError, InputError, MissingCoreError, MissingPackageError
 from quadsim.flight.log import ControlLog
 from quadsim.state import Array, make_state
 from scenarios.app import load
-from scenarios.build import build_controller, build_plant
+from scenarios.build import build_controller, build_plant, build_problem
 from scenarios.catalogue import read_catalogue
 from scenarios.courses.make import build_reference
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import fly_scenario
 from scenarios.schema.controller import ConstrainedSpec
-from scenarios.schema.robust import RobustSpec
 from scenarios.schema.scenario import Scenario
 
 SEGMENT = 20
 """Consecutive periods that a solver answers before it is the next one's turn."""
-LAW = "whole law in C"
-Answers = dict[int, Command | None]
-"""Commands by period; None where there was none."""
+FLOWN = "as flown"
 
 
 class Replayed:
@@ -43,7 +41,7 @@ class Replayed:
         self._controller, self._log, self._reference = controller, log, reference
         self._before = np.vstack([log.speeds_before, log.speeds[:-1]])
         self._period = -2
-        self.commands: Answers = {}
+        self.commands: dict[int, Command | None] = {}  # by period; None where it gave none
 
     def prepare(self, period: int) -> None:
         """Look up a period's query; what is warm stays so, as in a flight, unless periods lie between."""
@@ -64,36 +62,29 @@ class Replayed:
         self.commands.setdefault(self._period, command)
 
 
-def entries(scenario: Scenario) -> dict[str, Scenario]:
-    """The scenario with each installed solver, and with its whole law in C."""
-    entries = {name: scenario.replace({"controller.solver": name}) for name in read_catalogue().solvers}
-    entries[LAW] = scenario.replace({"controller.compiled": True})
-    found = {}
-    for name, changed in entries.items():
-        try:
-            build_controller(changed, build_vehicle(changed))
-        except (MissingPackageError, MissingCoreError):
-            continue
-        found[name] = changed
+def controllers(scenario: Scenario) -> dict[str, Controller]:
+    """The scenario's as it is, and by each solver that is there, without the unconstrained optimum tried first."""
+    vehicle = build_vehicle(scenario)
+    problem, found = build_problem(scenario, vehicle), {FLOWN: build_controller(scenario, vehicle)}
+    for name in read_catalogue().solvers:
+        with contextlib.suppress(MissingPackageError, MissingCoreError):
+            solver = make_solver(name, problem) if name == CORE else QPSolver(name, problem)
+            found[name] = ConstrainedMPC(problem, solver)
     return found
 
 
 def measure(name: str, quick: bool) -> list[Record]:
-    """A record of each solver on a scenario."""
+    """A record of each solver, the controller as it is flown first."""
     scenario = load(name)
-    if not isinstance(scenario.controller, ConstrainedSpec | RobustSpec):
-        raise InputError(f"{name} is flown by no MPC of fixed matrices; choose a constrained or a robust one")
+    if not isinstance(scenario.controller, ConstrainedSpec):
+        raise InputError(f"{name} is flown without a QP; choose a scenario with a constrained controller")
     if quick:
         scenario = scenario.replace({"duration": 2.0, "controller.horizon": 10, "constraints": []})
     vehicle = build_vehicle(scenario)
     log = fly_scenario(scenario).log.control
     candidates: dict[str, Replayed] = {}
-    setup: dict[str, float] = {}
-    for solver, each in entries(scenario).items():
-        started = clock.perf_counter()
-        controller = build_controller(each, vehicle)  # a second time: what can be shared within a process is there
-        setup[solver] = 1e3 * (clock.perf_counter() - started)
-        reference = build_reference(each, log.t.size + controller.horizon)
+    for solver, controller in controllers(scenario).items():
+        reference = build_reference(scenario, log.t.size + controller.horizon)
         candidates[solver] = Replayed(controller, log, reference)
     segments = [range(start, min(start + SEGMENT, log.t.size)) for start in range(0, log.t.size, SEGMENT)]
     hover = make_state(position=(0.0, 0.0, 10.0))
@@ -111,27 +102,18 @@ def measure(name: str, quick: bool) -> list[Record]:
             repeats=1 if quick else 3,
             rng=np.random.default_rng(scenario.seed),
         )
-    exact = candidates.get("core", next(iter(candidates.values()))).commands
-    return [
-        {
-            "scenario": name,
-            "solver": solver,
-            "setup_ms": setup[solver],
-            **step_quantiles(times[solver]),
-            **_answers(each.commands, exact),
-        }
-        for solver, each in candidates.items()
-    ]
+    return [_record(solver, each, times[solver], log) for solver, each in candidates.items()]
 
 
-def _answers(commands: Answers, exact: Answers) -> Record:
-    """Periods without an accepted answer, and how far the others are from the exact optimum, which is unique."""
-    answered = {k: command for k, command in commands.items() if command and command.status in ACCEPTED}
-    pairs = ((command, exact[k]) for k, command in answered.items())
-    differences = [float(np.abs(command.speeds - other.speeds).max()) for command, other in pairs if other]
+def _record(solver: str, replayed: Replayed, ms: Array, log: ControlLog) -> Record:
+    """Step times, and how far the accepted answers are from the commands flown, of which the optimum is unique."""
+    answered = {k: command for k, command in replayed.commands.items() if command and command.status in ACCEPTED}
+    differences = [float(np.abs(command.speeds - log.speeds[k]).max()) for k, command in answered.items()]
     return {
-        "periods": len(commands),
-        "failures": len(commands) - len(answered),
+        "solver": solver,
+        "periods": len(replayed.commands),
+        "failures": len(replayed.commands) - len(answered),
+        **step_quantiles(ms),
         "largest_difference_rad_s": max(differences, default=None),
     }
 
@@ -140,29 +122,21 @@ def draw(records: Sequence[Record], path: Path) -> None:
     """Draw median, 99th percentile and maximum of each solver's step."""
     import matplotlib.pyplot as plt
 
-    names = [*dict.fromkeys(record["scenario"] for record in records)]
-    rows = len(records) / len(names)
-    figure, panels = plt.subplots(
-        1, len(names), figsize=(4.0 + 4.0 * len(names), 1.4 + 0.35 * rows), layout="constrained", squeeze=False
-    )
-    for axes, name in zip(panels[0], names, strict=True):
-        ranked = sorted((r for r in records if r["scenario"] == name), key=lambda record: -record["p99_ms"])
-        for key, marker in (("p50_ms", "|"), ("p99_ms", "D"), ("max_ms", ">")):
-            axes.plot([record[key] for record in ranked], range(len(ranked)), marker, label=key.removesuffix("_ms"))
-        axes.set_yticks(range(len(ranked)), [record["solver"] for record in ranked])
-        axes.set(xscale="log", xlabel="controller step [ms]", title=name)
-    panels[0, 0].legend()
+    ranked = sorted(records, key=lambda record: -record["p99_ms"])
+    figure, axes = plt.subplots(figsize=(8.0, 1.2 + 0.35 * len(ranked)), layout="constrained")
+    for key, marker in (("p50_ms", "|"), ("p99_ms", "D"), ("max_ms", ">")):
+        axes.plot([record[key] for record in ranked], range(len(ranked)), marker, label=key.removesuffix("_ms"))
+    axes.set_yticks(range(len(ranked)), [record["solver"] for record in ranked])
+    axes.set(xscale="log", xlabel="controller step [ms]")
+    axes.legend()
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
 
 def main() -> None:
     """Measure, print and write."""
-    shipped = ["paper-constrained", "robust"]
-    chosen = options(__doc__, scenario={"nargs": "+", "default": shipped, "help": "default: %(default)s"})
-    records = run(
-        lambda: [r for name in chosen.scenario for r in measure(name, chosen.quick)], "QP solvers", chosen.json
-    )
+    chosen = options(__doc__, scenario={"default": "paper-constrained", "help": "default: %(default)s"})
+    records = run(lambda: measure(chosen.scenario, chosen.quick), f"QP solvers on {chosen.scenario}", chosen.json)
     if chosen.json is not None:
         draw(records, chosen.json.with_suffix(".png"))
 

@@ -7,7 +7,6 @@ from typing import Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds, AnswerCheck, command_of, rejection, shifted
-from mpc.exact.shortcut import with_shortcut
 from mpc.handover import resized, within
 from mpc.ocp import Problem, Query, Unanswered
 from mpc.paper.prediction import rollout
@@ -27,8 +26,8 @@ class ConstrainedMPC:
     then `unconstrained`.  Only an answer that is the optimum, finite, whose first action is within the hard input
     bounds and whose plan keeps the rows as posed (`mpc.answer.AnswerCheck`) is used.  Otherwise the previous plan,
     shifted by one step, is held (fallback level 1) for as long as it lasts, and then the flight is given up.
-    `shortcut`: whether to try less than the whole QP first (`mpc.exact.shortcut`); the commands are the same.
-    `space`: what to keep clear of.  `kkt_every`: see `mpc.answer.AnswerCheck`.
+    `solver`: the problem's, see `mpc.solvers.make_solver`.  `space`: what to keep clear of.  `kkt_every`: see
+    `mpc.answer.AnswerCheck`.
 
     Attributes:
         problem: as given.
@@ -44,12 +43,11 @@ class ConstrainedMPC:
         problem: Problem,
         solver: Solver,
         *,
-        shortcut: bool = True,
         space: Space | None = None,
         kkt_every: int = KKT_EVERY,
     ) -> None:
         self.problem, self.horizon, self.solver = problem, problem.horizon, solver.name
-        self._solver = with_shortcut(problem, solver) if shortcut else solver
+        self._solver = solver
         self._clearing = None if space is None else Clearing(problem, self._solver, space)
         self._bounds, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
         self.reset(problem.model.u_bar)

@@ -13,7 +13,7 @@ import numpy as np
 from quadsim.motion import Motion
 from quadsim.state import Array
 
-SOLVED: Final = "solved"  # status of a period whose optimum a QP solver or the active-set method found
+SOLVED: Final = "solved"  # status of a period whose optimum a QP solver or the core found
 UNCONSTRAINED: Final = "unconstrained"
 """Status of a period whose unconstrained optimum satisfies every constraint, and so is the constrained one too."""
 COMMANDED: Final = "commanded"  # status of a period in which a law without a solver commanded
@@ -24,11 +24,11 @@ ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}  # the statuses whose command is flo
 MISSED: Final = "missed"
 """Status of a period whose command came after the next period's begin: the one before it went on acting."""
 GAIN: Final = "gain"  # who answered a period: the unconstrained optimum, a product with constant gains
-ACTIVE_SET: Final = "active-set"  # the active-set method of `mpc.exact`
+CORE: Final = "core"  # the exact optimum of `mpc.core`, compiled
 LAW: Final = "law"  # a law without a solver
 FALLBACK: Final = "fallback"  # an earlier plan or command, or the fallback contract
 STOPPED: Final = "stopped"  # nobody: rotors are off
-NO_SOLVER: Final = frozenset({GAIN, ACTIVE_SET, LAW, FALLBACK, STOPPED})
+NO_SOLVER: Final = frozenset({GAIN, CORE, LAW, FALLBACK, STOPPED})
 """Who may answer besides QP solvers, which go by their names (`mpc.solvers.find_solver`)."""
 LAW_NAMES: Final = {
     "unconstrained": "unconstrained MPC",
@@ -112,7 +112,7 @@ class Command:
         plan: (N, 4) planned speeds, `plan[0]` being this period's [rad/s].
         status: `solved`, `unconstrained`, `commanded` or `not_converged` (`ACCEPTED`), `landed` or `crashed` where
             rotors are stopped, or what the back end calls what went wrong.
-        answered_by: who found `speeds`: `gain`, `active-set`, a QP solver by its name, `law`, `fallback` or `stopped`.
+        answered_by: who found `speeds`: `gain`, `core`, a QP solver by its name, `law`, `fallback` or `stopped`.
         iterations: those of whoever answered; of the refused answer in a fallback; 0 for a closed form.
         active: number of constraints active at the optimum.
         fallback: 0 when `speeds` is this period's optimum, higher = deeper; 1 = the shifted previous plan, or
@@ -226,6 +226,6 @@ def law_name(recorded: str) -> str:
 
 
 def counts(answered_by: Mapping[str, int]) -> str:
-    """Periods by who answered them, most first: `607 gain, 592 active-set, 1 piqp-multistage`; `280 commanded`."""
+    """Periods by who answered them, most first: `607 gain, 593 piqp-multistage`; `280 commanded`."""
     ranked = sorted(answered_by.items(), key=lambda entry: -entry[1])
     return ", ".join(f"{count} {COMMANDED if by == LAW else by}" for by, count in ranked)

@@ -74,15 +74,11 @@ class ExportError(InputError):
         self.reason = reason
 
 
-class CompilerError(InputError):
-    """There is no C compiler, or it did not compile what was exported."""
-
-
 class MissingCoreError(InputError):
     """The compiled core was requested, and there is none here; the message says why."""
 
-    def __init__(self, reason: str) -> None:
-        super().__init__(f"there is no core here: {reason}; or choose controller.solver = 'piqp'")
+    def __init__(self, reason: str, instead: str = "choose controller.solver = 'piqp'") -> None:
+        super().__init__(f"there is no core here: {reason}; or {instead}")
         self.reason = reason
 
 

@@ -941,6 +941,7 @@ def export(
     overwrite: Flag = False,
     precision: str = "double",
     target: str = "posix",
+    rows: Whole | None = None,
     fly: Flag = False,
     changes: Changes = (),
     seed: Whole | None = None,
@@ -953,22 +954,25 @@ def export(
         overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
         precision: of all numbers: double or float (default: double).
         target: what its programs are for: posix, cortex-m7 or cortex-m4f (default: posix).
+        rows: room for so many active rows; memory grows with the square (default: 2.56 per step, at least 64).
         fly: then fly the scenario with the exported controller on its target, emulated, into runs/SCENARIO-TARGET.
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
         seed: replace the seed, of everything random in it.
     """
+    import json
     import shlex
 
     from scenarios import loading, results
     from scenarios.export import exporter, in_the_loop
 
     flown, options = loading.as_scenario(scenario, changes, seed), {"precision": precision, "target": target}
-    directory = exporter.export(flown, out, overwrite=overwrite, **options)  # type: ignore[arg-type]  # checked there
+    directory = exporter.export(flown, out, overwrite=overwrite, rows=rows, **options)  # type: ignore[arg-type]
+    room = exporter.room_sentence(json.loads((directory / exporter.FACTS).read_text()))
     make = f"make -C {shlex.quote(str(directory))} check"
-    text = f"Wrote {directory}: {make} compiles it and runs its recorded periods"
+    text = f"{precision}: {room}\nWrote {directory}: {make} compiles it and runs its recorded periods"
     if not fly:
         return results.Document(f"{text}\n", {"directory": str(directory)})
-    _log.info(text)
+    _log.info(text.replace("\n", "; "))
     with run_directory(f"{flown.name}-{target}", None, overwrite=False) as place:
         return in_the_loop.fly_exported(flown, place, **options)  # type: ignore[arg-type]
 

@@ -60,7 +60,7 @@ def _rendering() -> str:
 
 def _try_solver(name: str) -> str:
     """Solve the first step of the paper's constrained flight."""
-    scenario = load_scenario("paper-constrained", [f"controller.solver={name}", "controller.shortcut=false"])
+    scenario = load_scenario("paper-constrained", [f"controller.solver={name}"])
     vehicle = build_vehicle(scenario)
     started = clock.perf_counter()
     controller = build_controller(scenario, vehicle)

@@ -48,7 +48,7 @@ LONG = (
     *("scenarios/test_nothing_lost.py", "mpc/robust/test_robust.py", "scenarios/papers/test_reproduction.py"),
     *("scenarios/test_any_scenario.py", "mpc/test_staged.py"),
     *("scenarios/test_run.py", "scenarios/test_cli.py", "scenarios/test_reaudit.py", "test_packaging.py"),
-    *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/exact/test_shortcut.py"),
+    *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/core/test_core.py"),
 )
 """Modules that take longest."""
 

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import ctypes
+import functools
+import subprocess
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from mpc.export.ctext import Precision
 from quadsim.state import Array
-from scenarios.export.exporter import controller_files
+from scenarios.export.exporter import c_controller
 from scenarios.export.record import Recording
-from scenarios.parts.compiler import compiled
 from scenarios.schema.scenario import Scenario
+
+HOST = Path(__file__).parent / "firmware" / "host.c"
+FLAGS = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
 
 
 @dataclass(frozen=True)
@@ -24,28 +31,42 @@ class Reply:
     plan: Array  # (N, 4)
 
 
-class Host:
-    """One controller struct of a compiled library."""
+@functools.cache
+def library(files: tuple[tuple[str, str], ...], precision: Precision) -> ctypes.CDLL:
+    """A controller's files, compiled."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, text in files:
+            (folder / file).write_text(text)
+        define = ["-DQUADSIM_FLOAT"] if precision == "float" else []
+        sources = [HOST, *sorted(folder.glob("*.c"))]
+        subprocess.run(["cc", *FLAGS, *define, "-I", folder, "-o", folder / "host.so", *sources], check=True)
+        return ctypes.CDLL(str(folder / "host.so"))
 
-    def __init__(self, scenario: Scenario, precision: str = "double", room: int | None = None) -> None:
-        self.library = ctypes.CDLL(str(compiled(controller_files(scenario, precision), room)))
-        self.library.quadsim_shim_size.restype = ctypes.c_size_t
-        self.library.quadsim_shim_step.restype = None
+
+class Host:
+    """One controller of a compiled library."""
+
+    def __init__(self, scenario: Scenario, precision: Precision = "double", rows: int | None = None) -> None:
+        files, right = c_controller(scenario, precision, rows).files, ctypes.c_int()
+        self.library = library(tuple(files.items()), precision)
+        self.library.host_size.restype = ctypes.c_size_t
+        self.memory = np.zeros(self.library.host_size(ctypes.byref(right)) // 8 + 1)
+        assert right.value, "the memory that the export states is not what the controller needs"
         self.horizon = scenario.controller.horizon
-        self.memory = ctypes.create_string_buffer(self.library.quadsim_shim_size())
-        self.inputs, self.answers = np.zeros(18 + 4 * self.horizon), np.zeros(18 + 4 * self.horizon)
-        self.inputs[-2:] = 1.0
+        self.inputs, self.answers = np.zeros(16 + 4 * self.horizon), np.zeros(6 + 4 * self.horizon)
 
     def reset(self, speeds: Array) -> None:
-        start = np.array(speeds, float)
-        self.library.quadsim_shim_reset(self.memory, ctypes.c_void_p(start.ctypes.data))
+        self._call(self.library.host_reset, np.array(speeds, float))
 
     def step(self, state: Array, reference: Array, acting: Array) -> Reply:
-        self.inputs[:12], self.inputs[12:16], self.inputs[16:-2] = state, acting, reference.ravel()
-        pointers = (ctypes.c_void_p(array.ctypes.data) for array in (self.inputs, self.answers))
-        self.library.quadsim_shim_step(self.memory, *pointers)
+        self.inputs[:12], self.inputs[12:16], self.inputs[16:] = state, acting, reference.ravel()
+        self._call(self.library.host_step, self.inputs, self.answers)
         found = self.answers.copy()
-        return Reply(int(found[0]), int(found[1]), found[4:8], found[8 : 8 + 4 * self.horizon].reshape(-1, 4))
+        return Reply(int(found[0]), int(found[1]), found[2:6], found[6:].reshape(-1, 4))
+
+    def _call(self, function: object, *arrays: Array) -> None:
+        function(*(ctypes.c_void_p(array.ctypes.data) for array in (self.memory, *arrays)))  # type: ignore[operator]
 
 
 def replay(host: Host, recording: Recording) -> list[Reply]:

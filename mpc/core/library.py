@@ -9,7 +9,10 @@ from typing import Final
 from mpc.core.build import FOLDER, NAME, source_hash
 from quadsim.errors import MissingCoreError
 
-MIRRORS: Final = ("quadsim_axis", "quadsim_row", "quadsim_term", "quadsim_problem", "quadsim_work")
+MIRRORS: Final = (
+    *("quadsim_axis", "quadsim_row", "quadsim_term", "quadsim_problem", "quadsim_work"),
+    *("quadsim_robust", "quadsim_controller", "quadsim_mpc"),
+)
 """Structs that Python writes or reads, in the order of `quadsim_library_sizes`."""
 
 
@@ -25,6 +28,15 @@ def load() -> ctypes.CDLL:
     library = _load()
     assert isinstance(library, ctypes.CDLL)
     return library
+
+
+def check_mirrors(**mirrors: type[ctypes.Structure]) -> None:
+    """Assert that structs named in `MIRRORS` are of the library's sizes."""
+    sizes = (ctypes.c_size_t * len(MIRRORS))()
+    load().quadsim_library_sizes(sizes)
+    theirs = dict(zip(MIRRORS, sizes, strict=True))
+    for name, mirror in mirrors.items():
+        assert ctypes.sizeof(mirror) == theirs[name], f"{name} has {theirs[name]} bytes, not {ctypes.sizeof(mirror)}"
 
 
 def why_missing() -> str | None:

@@ -26,17 +26,14 @@ from mpc.ocp import Problem
 from mpc.paper.condensed import condensed_cost, row_maps
 from mpc.paper.prediction import prediction
 from quadsim.errors import ParameterError
-from quadsim.state import N_STATES, REFERENCE_STATES, Array
+from quadsim.state import N_STATES, Array
 
 ROUNDING: Final = 1e-13
 """Share of the largest number of a row of C_r, D, E, or T below which one is taken for a product of rounding."""
-ROOM_PER_STEP: Final = 2.56
-"""Active rows that there is room for, per step of the horizon."""
-LEAST_ROOM: Final = 64
 LARGEST: Final = 2**20
-"""Entries of all responses beyond which a problem is not exported: 8 MiB."""
+"""Entries of all responses beyond which a problem is not one for the core: 8 MiB."""
 LEAST_QUADRATIC: Final = 1e-9
-"""Share of l1 that replaces a quadratic penalty of zero; see `mpc.exact.activeset`."""
+"""Share of l1 that replaces a quadratic penalty of zero, for which a step has no length."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,19 +45,14 @@ class AxisTables:
     inputs: int  # m
     first: int  # where w is among all axes' inputs
     rows: list[int]  # which of the problem's rows have its states, o of them
-    regulated: list[int]  # its rows of C_r
-    W_r: Array  # (n, r) linear term of a state's cost by y_d - C_r x_s
-    W_r_end: Array
-    targets: list[int]  # which of x, y, z, yaw of the reference it follows, r of them
+    regulated: list[int]  # its rows of C_r, r of them
     A: Array  # (n, n)
     B: Array  # (n, m)
     closed: Array  # (N, n, n) A - B K_i
     K: Array  # (N, m, n) w_i = k_i - K_i x_i
     inverse: Array  # (N, m, m) (R + B' P_{i+1} B)^-1
-    W: Array  # (n, r) linear term of a state's cost by the reference
+    W: Array  # (n, r) linear term of a state's cost by y_d - C_r x_s
     W_end: Array  # (n, r) of the last state's
-    V: Array  # (n, n) by its state at rest, states that are references left out
-    V_end: Array  # (n, n)
     C: Array  # (o, n) its rows
     responses: Array  # (N (m + o), N (m + o)) of inputs and outputs of each step to one another
 
@@ -94,7 +86,6 @@ class Tables:
     T: Array  # (nu, nu) u - u_s = T w
     T_inverse: Array
     modes: Array  # (nu, nu) takes rotor speeds that are states to the modes in their place, one of each axis
-    room: int  # active rows that there is room for
 
 
 def tables(problem: Problem) -> Tables:
@@ -123,11 +114,9 @@ def tables(problem: Problem) -> Tables:
         found.append(_axis(problem, rows, part, first))
         first += part.T.shape[1]
     row_tables = [_row(rows, i, found) for i in range(rows.l1.size)]
-    N, m = rows.lower.shape
     alike = bool((rows.lower == rows.lower[0]).all() and (rows.upper == rows.upper[0]).all())
     steps = slice(0, 1) if alike else slice(None)
-    scale = _scale(found, row_tables, T, N)
-    room = max(1, min(N * m, max(LEAST_ROOM, math.ceil(ROOM_PER_STEP * N))))
+    scale = _scale(found, row_tables, T, problem.horizon)
     return Tables(
         problem=problem,
         axes=found,
@@ -139,7 +128,6 @@ def tables(problem: Problem) -> Tables:
         T=T,
         T_inverse=T_inverse,
         modes=modes,
-        room=room,
     )
 
 
@@ -210,16 +198,9 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
     if n:
         A, B = part.problem.model.A, part.problem.model.B
         (Q, W), (Q_end, W_end) = part.problem.objective.weights, part.problem.objective.terminal_weights
-        C_r = part.problem.objective.C_r
-        of_reference = objective.C_r[part.regulated][:, REFERENCE_STATES]
     else:
         A, B, Q, Q_end = np.zeros((0, 0)), np.zeros((0, m)), np.zeros((0, 0)), np.zeros((0, 0))
-        W, W_end, C_r, of_reference = np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 0)), np.zeros((0, 4))
-    targets = np.flatnonzero(of_reference.any(axis=0))
-    still = np.diag([float(state not in REFERENCE_STATES) for state in part.states])
-    V, V_end = W @ C_r @ still, W_end @ C_r @ still
-    W_r, W_r_end = W, W_end
-    W, W_end = W @ of_reference[:, targets], W_end @ of_reference[:, targets]
+        W, W_end = np.zeros((0, 0)), np.zeros((0, 0))
     C = rows.C[np.ix_(part.outputs, part.states)]
     R, S = Q_u, np.zeros((m, n))
     if moves:
@@ -227,13 +208,8 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
         A = scipy.linalg.block_diag(A, np.zeros((m, m)))
         B = np.vstack([B, np.eye(m)])
         Q, Q_end = scipy.linalg.block_diag(Q, Q_d), scipy.linalg.block_diag(Q_end, np.zeros((m, m)))
-        V, V_end = (scipy.linalg.block_diag(weight, np.zeros((m, m))) for weight in (V, V_end))
-        W_r, W_r_end = (np.vstack([weight, np.zeros((m, weight.shape[1]))]) for weight in (W_r, W_r_end))
-        W, W_end, C = (
-            np.vstack([W, np.zeros((m, W.shape[1]))]),
-            np.vstack([W_end, np.zeros((m, W.shape[1]))]),
-            np.hstack([C, np.zeros((len(C), m))]),
-        )
+        W, W_end = (np.vstack([weight, np.zeros((m, weight.shape[1]))]) for weight in (W, W_end))
+        C = np.hstack([C, np.zeros((len(C), m))])
         R, S = Q_u + Q_d, np.hstack([S, -Q_d])
     K, inverse = _gains(A, B, Q, Q_end, R, S, N)
     if n:
@@ -252,9 +228,6 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
         first=first,
         rows=part.outputs.tolist(),
         regulated=part.regulated.tolist(),
-        W_r=W_r,
-        W_r_end=W_r_end,
-        targets=targets.tolist(),
         A=A,
         B=B,
         closed=A - B @ K,
@@ -262,8 +235,6 @@ def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
         inverse=inverse,
         W=W,
         W_end=W_end,
-        V=V,
-        V_end=V_end,
         C=C,
         responses=half.T @ half,
     )

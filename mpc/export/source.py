@@ -1,267 +1,184 @@
-"""The C files of a controller: the solver's sources and its numbers."""
+"""The C files of a controller: the core's, as they are, and one of its numbers."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import resources
-from typing import Final, Literal
+from typing import Final
 
-import numpy as np
+from numpy.typing import ArrayLike
 
-from mpc.answer import ActuatorBounds
-from mpc.core.tables import AxisTables, Tables, tables
-from mpc.equilibrium import LEAST_LIFT
-from mpc.export.ctext import NO_BOUND, bounded, lower_packed, number, reals, small_integers, structs
-from mpc.fallback.completion import PLAUSIBLE
-from mpc.heading import slope
-from mpc.model import hover_model
-from mpc.nonlinear.model import SUBSTEPS, nonlinear_model
-from mpc.observer import UPRIGHT, DisturbanceObserver
-from mpc.ocp import Problem
-from mpc.robust.settings import RobustSettings
-from quadsim.state import REFERENCE_STATES, Array
-from quadsim.vehicle import Vehicle
+from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
+from mpc.core.solver import core_problem
+from mpc.core.tables import AxisTables, Tables
+from mpc.export.ctext import CText, Precision, bounded, initialiser, lower_packed
+from quadsim.vehicle import N_ROTORS
 
-Precision = Literal["double", "float"]
-HEADER: Final = "quadsim_mpc.h"
-SOURCE: Final = "quadsim_mpc.c"
-DATA: Final = "quadsim_mpc_data.h"
+CORE: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_math.h", "quadsim_mpc.h", "quadsim_mpc.c")
+"""Files of `mpc/core/c`, which are exported byte for byte."""
+DATA: Final = "quadsim_data.h"
+"""The generated file."""
+CHANGES: Final = 500
+"""Of the active set in a search, after which it is given up."""
+ROWS_PER_STEP: Final = 2.56
+"""Active rows that there is room for, per step of the horizon."""
+LEAST_ROWS: Final = 64
 
 
-def part(name: str) -> str:
-    """A hand-written C source of this package."""
-    return (resources.files("mpc.export") / "c" / name).read_text(encoding="utf-8")
+def part(name: str, package: str = "mpc.export") -> str:
+    """A hand-written C source of a package."""
+    return (resources.files(package) / "c" / name).read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Exportable:
-    """What an exported controller is made from.
+class CController:
+    """A controller as C.
 
     Attributes:
-        name: of the law.
-        problem: its optimisation.
-        vehicle: that modelled.
-        settings: the parts of the robust controller; None for the paper's controllers.
-    """
-
-    name: str
-    problem: Problem
-    vehicle: Vehicle
-    settings: RobustSettings | None = None
-
-
-def sources(law: Exportable, *, precision: Precision, title: str) -> dict[str, str]:
-    """The controller's files, by name.
-
-    Args:
-        law: the controller.
+        law: what it is made from.
         precision: of all numbers.
         title: a line that identifies it, in ASCII.
-
-    Raises:
-        ParameterError: the problem is too large, or its rows differ from step to step.
+        asked: active rows that there is to be room for; None for 2.56 per step of the horizon, and at least 64.
     """
-    problem, settings = law.problem, law.settings
-    found = tables(problem)
-    bounds = ActuatorBounds.of_problem(problem) if problem.every_constraint else None
-    real = "double" if precision == "double" else "float"
-    head = part(HEADER).replace("@TITLE@", title).replace("@PERIOD@", f"{problem.model.period:g}")
-    head = head.replace("@REAL@", real).replace("@SIZES@", _sizes(found, precision))
-    numbers = data(found, bounds, rests=settings is not None)
-    parts = ["answer.c", "constrained.c"]
-    if settings is not None:
-        parts = ["elementary.c", "answer.c", "robust.c"]
-        numbers += robust_data(law.vehicle, problem.model.period, settings) + "\n" + reals("MODES", found.modes)
-    return {
-        HEADER: head.replace("@STATE@", "" if settings is None else ROBUST_STATE),
-        SOURCE: solver(found) + "".join(map(part, parts)),
-        DATA: numbers,
-    }
+
+    law: Exportable
+    precision: Precision = "double"
+    title: str = ""
+    asked: int | None = None
+
+    @cached_property
+    def tables(self) -> Tables:
+        """The numbers of its problem.
+
+        Raises:
+            ParameterError: the problem is not one for the core.
+        """
+        return core_problem(self.law.problem).tables
+
+    @property
+    def rows(self) -> int:
+        """Active rows that there is room for."""
+        N = self.law.problem.horizon
+        usual = max(LEAST_ROWS, math.ceil(ROWS_PER_STEP * N))
+        return min(N * len(self.tables.rows), usual if self.asked is None else self.asked)
+
+    @property
+    def reals(self) -> int:
+        """Numbers of memory, as `quadsim_mpc_reals` has it."""
+        N, problem, room = self.law.problem.horizon, self.tables.problem, self.rows + 1
+        rows = N * len(self.tables.rows)
+        packed = 4 * room + 3 * rows  # bytes of integers
+        widest = max(len(axis.B) for axis in self.tables.axes)
+        work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + room * (room - 1) // 2
+        return work + packed // self.real_bytes + 1 + N * len(problem.objective.C_r)
+
+    @property
+    def real_bytes(self) -> int:
+        """Of a number."""
+        return 8 if self.precision == "double" else 4
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """Its C files, by name."""
+        return {name: part(name, "mpc.core") for name in CORE} | {DATA: self._data()}
+
+    def _data(self) -> str:
+        text = CText(self.precision, "quadsim_data_")
+        head = part(DATA).replace("@TITLE@", self.title).replace("@PERIOD@", f"{self.law.problem.model.period:g}")
+        for name, value in {
+            "@IFN@": "ifdef" if self.precision == "double" else "ifndef",
+            "@PRECISION@": self.precision,
+            "@HORIZON@": self.law.problem.horizon,
+            "@MEMORY@": self.reals,
+        }.items():
+            head = head.replace(name, str(value))
+        numbers = problem_data(text, self.tables, self.rows + 1)
+        return head.replace("@NUMBERS@\n", "\n".join([*numbers, *_controller(text, self.law, self.tables)]))
 
 
-def solver(found: Tables) -> str:
-    """The solver's source, with the dynamic programming of each size of axis."""
-    shapes = _shapes(found)
-    text = [part("axis.c").replace("@n@", str(n)).replace("@m@", str(m)) for n, m in shapes]
-    cases = []
-    for shape, (n, m) in enumerate(shapes):
-        cases.append(f"    case {shape}:" if shape < len(shapes) - 1 else "    default:")
-        cases.append(f"        plan_backwards_{n}x{m}(axis, pull, push, w);")
-        cases.append(f"        plan_forwards_{n}x{m}(axis, start, w, values);")
-        cases.append("        break;")
-    plan = (
-        "\n/* The optimum w [N][m] of an axis without rows, from x(k), and the values [N][M] of its rows' C x. */\n"
-        "static void plan(const struct axis *axis, const real *pull, const real *push, const real *start, real *w,\n"
-        "                 real *values)\n{\n    switch (axis->shape) {\n" + "\n".join(cases) + "\n    }\n}\n"
-    )
-    return part("solver.c").replace("@AXES@\n", "".join([*text, plan]))
-
-
-def _shapes(found: Tables) -> list[tuple[int, int]]:
-    """The sizes (n, m) of axes, each once."""
-    return list(dict.fromkeys((len(axis.B), axis.inputs) for axis in found.axes))
-
-
-def _sizes(found: Tables, precision: Precision) -> str:
-    widest = max(axis.inputs for axis in found.axes)
-    sizes = {
-        "HORIZON": (found.problem.horizon, "N, periods of the reference and of the plan"),
-        "STATES": (found.problem.model.n, "of the prediction"),
-        "STEP_ROWS": (max(1, len(found.rows)), "rows of constraints in each step"),
-        "PARTS": (len(found.axes), "parts that the problem falls into"),
-        "AXIS_STATES": (max(1, *(len(axis.B) for axis in found.axes)), "of the largest axis"),
-        "AXIS_INPUTS": (widest, "likewise"),
-        "ENTRIES": (1 + widest * max((len(row.terms) for row in found.rows), default=0), "of the largest row"),
-    }
-    lines = [f"#define QUADSIM_{name} {value} /* {meaning} */" for name, (value, meaning) in sizes.items()]
-    room = f"#define QUADSIM_ROOM {found.room} /* active rows that there is room for; more take more memory */"
-    changes = "#define QUADSIM_CHANGES 500 /* of the active set in a search, after which it is given up */"
-    lines += ["#ifndef QUADSIM_ROOM", room, "#endif", "#ifndef QUADSIM_CHANGES", changes, "#endif"]
-    return "\n".join(["#define QUADSIM_FLOAT 1", *lines] if precision == "float" else lines)
-
-
-ROBUST_STATE: Final = """\
-    quadsim_real rotors[4];                      /* speeds at the instant from which the command acts [rad/s] */
-    int known;                                   /* whether the state there is known */
-    quadsim_real ahead[12];                      /* the state there */
-    quadsim_real estimate[6];                    /* disturbance: world x, y, along thrust [m/s^2], body [rad/s^2] */
-    quadsim_real trim[4];                        /* rotor speeds at rest against it [rad/s] */
-    quadsim_real lift[3];                        /* along which thrust points there, world axes */
-    quadsim_real twist[3];                       /* angular acceleration over that by thrust [1/m] */
-    quadsim_real effectiveness[16];              /* from squared speeds to U/m and I^-1 tau, so twisted */
-    quadsim_real reference[QUADSIM_HORIZON * 4]; /* as the prediction is given it */
-"""
-"""What the robust controller remembers besides."""
-
-
-def robust_data(vehicle: Vehicle, period: float, settings: RobustSettings) -> str:
-    """The numbers of the robust controller besides those of its problem."""
-    lag, delay = settings.rotor_lag, settings.delay
-    model = nonlinear_model(vehicle, period, rotor_lag=lag or None)
-    observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
-    instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
-
-    def decay(time: Array | float) -> Array:
-        """Share of rotor speeds that is left after a time [s]."""
-        return np.asarray(np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time)), float)
-
-    flags = {
-        "SUBSTEPS": (SUBSTEPS, "Runge-Kutta steps of a prediction"),
-        "OBSERVES": (int(observer is not None), "whether disturbances are estimated"),
-        "HEADING": (int(settings.heading), "whether the model is turned by the yaw"),
-    }
-    numbers = {
-        "GRAVITY": model.gravity,
-        "LEAST_LIFT": LEAST_LIFT,
-        "UPRIGHT": UPRIGHT,
-        "DELAY": delay,
-        "DELAYED_SHARE": delay / period,
-        "REST_OF_PERIOD": period - delay,
-        "SPUN_DELAY": float(decay(delay)),
-        "SPUN_BEFORE": float(decay(period - delay)),
-        "LARGEST_TURN": settings.largest_turn,
-    }
-    arrays = {
-        "EFFECTIVENESS": model.effectiveness,
-        "ALLOCATION": model.allocation,
-        "GYRATION": model.gyration,
-        "SLOPE_INVERSE": np.linalg.inv(slope(hover_model(vehicle, period))),
-        "GAIN": np.zeros(6) if observer is None else observer.gain,
-        "LARGEST": np.zeros(6) if observer is None else observer.largest,
-        "DECAY_BEFORE": decay(instants * (period - delay)),
-        "DECAY_DELAY": decay(instants * delay),
-        "PLAUSIBLE": PLAUSIBLE,
-        "PLAUSIBLE_REFERENCE": PLAUSIBLE[list(REFERENCE_STATES)],
-    }
-    return "\n".join(
-        [
-            "",
-            *(f"#define QUADSIM_{name} {value} /* {meaning} */" for name, (value, meaning) in flags.items()),
-            "",
-            *(f"static const real {name} = {number(value)};" for name, value in numbers.items()),
-            "",
-            *(reals(name, values) for name, values in arrays.items()),
-        ]
-    )
-
-
-def data(found: Tables, bounds: ActuatorBounds | None, *, rests: bool) -> str:
-    """The numbers, for either precision."""
-    if bounds is None:
-        nothing = np.full(found.problem.model.nu, -NO_BOUND)
-        speed_min, speed_max, step_min, step_max = nothing, -nothing, nothing, -nothing
-    else:
-        speed_min, speed_max, step_min, step_max = bounds.u_min, bounds.u_max, bounds.delta_min, bounds.delta_max
-    model = found.problem.model
-    mixed = any(row.axis >= 0 and row.terms for row in found.rows)
-    blocks = [
-        "/* The numbers of one controller, in one place. */\n",
-        f"#define QUADSIM_BOUNDS_DIFFER {int(len(found.lower) > 1)} /* whether steps have bounds of their own */",
-        f"#define QUADSIM_MIXED {int(mixed)} /* whether a row has both states and inputs */",
-        f"#define QUADSIM_RESTS {int(rests)} /* whether the model rests elsewhere than level */\n",
-        reals("T", found.T),
-        reals("T_INVERSE", found.T_inverse),
-        reals("HOVER", model.u_bar),
-        reals("SPEED_MIN", speed_min),
-        reals("SPEED_MAX", speed_max),
-        reals("STEP_MIN", bounded(step_min)),
-        reals("STEP_MAX", bounded(step_max)),
-        reals("LOWER", bounded(found.lower if found.rows else np.array(-NO_BOUND))),
-        reals("UPPER", bounded(found.upper if found.rows else np.array(NO_BOUND))),
-        reals("SCALE", found.scale if found.rows else np.ones(found.problem.horizon)),
-        reals("TOLERANCE", found.tolerance if found.rows else np.ones(1)),
-    ]
-    for g, axis in enumerate(found.axes):
-        blocks += _axis_arrays(g, axis, needed=bool(found.rows))
-    blocks += [
-        structs("axis", "AXES", (_axis(g, axis, _shapes(found)) for g, axis in enumerate(found.axes))),
-        *_rows(found),
-    ]
-    return "\n".join(blocks)
-
-
-def _axis_arrays(g: int, axis: AxisTables, *, needed: bool) -> list[str]:
-    """The arrays of an axis; its responses only where there are rows."""
-    responses: Array = _tidy(lower_packed(axis.responses)) if needed else np.zeros(1)
-    return [
-        small_integers(f"STATE_{g}", axis.states),
-        small_integers(f"TARGET_{g}", axis.targets),
-        small_integers(f"ROW_{g}", axis.rows),
-        reals(f"B_{g}", axis.B),
-        reals(f"CLOSED_{g}", axis.closed),
-        reals(f"K_{g}", axis.K),
-        reals(f"INVERSE_{g}", axis.inverse),
-        reals(f"W_{g}", axis.W),
-        reals(f"W_END_{g}", axis.W_end),
-        reals(f"V_{g}", axis.V),
-        reals(f"V_END_{g}", axis.V_end),
-        reals(f"C_{g}", axis.C),
-        reals(f"RESPONSES_{g}", responses),
-    ]
-
-
-def _tidy(values: Array) -> Array:
-    """Without what is a product of rounding."""
-    return np.where(np.abs(values) < 1e-18 * np.abs(values).max(initial=0.0), 0.0, values)
-
-
-def _axis(g: int, axis: AxisTables, shapes: list[tuple[int, int]]) -> str:
+def _axis(text: CText, g: int, axis: AxisTables, *, bounded: bool) -> tuple[str, list[str]]:
+    """The initialiser of an axis, and its arrays; its responses only where there are rows."""
     n, m = axis.B.shape
-    sizes = f"{n}, {m}, {axis.first}, {len(axis.rows)}, {len(axis.targets)}, {shapes.index((n, m))}, {int(axis.before)}"
-    names = ["STATE", "TARGET", "ROW", "B", "CLOSED", "K", "INVERSE", "W", "W_END", "V", "V_END", "C", "RESPONSES"]
-    return ", ".join([sizes, *(f"{name}_{g}" for name in names)])
+    integers = {"state": axis.states, "target": axis.regulated, "row": axis.rows}
+    reals: dict[str, ArrayLike] = {
+        "B": axis.B,
+        "closed": axis.closed,
+        "K": axis.K,
+        "inverse": axis.inverse,
+        "W": axis.W,
+        "W_end": axis.W_end,
+        "C": axis.C,
+        "responses": lower_packed(axis.responses) if bounded else [],
+    }
+    arrays = [text.small_integers(f"{name}_{g}", values) for name, values in integers.items()]
+    arrays += [text.reals(f"{name}_{g}", values) for name, values in reals.items()]
+    sizes = {"states": n, "inputs": m, "first": axis.first, "outputs": len(axis.rows), "targets": len(axis.regulated)}
+    names = {name: f"{text.prefix}{name}_{g}" for name in (*integers, *reals)}
+    return initialiser(**sizes, before=int(axis.before), **names), arrays
 
 
-def _rows(found: Tables) -> list[str]:
-    terms: list[str] = []
-    rows: list[str] = []
+def _rows(text: CText, found: Tables) -> list[str]:
+    terms, rows = list[str](), list[str]()
     for r, row in enumerate(found.rows):
-        first = len(terms)
-        terms += [f"{number(coefficient)}, {j}, {lag}" for coefficient, j, lag in row.terms]
-        output = found.axes[row.axis].rows.index(r) if row.axis >= 0 else 0
-        soft = np.isfinite(row.l1)
-        penalty = f"{int(soft)}, {number(row.l1 if soft else 0.0)}, {number(row.compliance)}"
-        place = f"{row.axis}, {output}, {int(row.later)}, {first}, {len(terms)}"
-        rows.append(f"{place}, {penalty}")
-    none = "-1, 0, 0, 0, 0, 0, R(0.0), R(0.0)"  # C has no arrays of nothing
-    return [structs("term", "TERMS", terms or ["R(0.0), 0, 0"]), structs("row", "ROWS", rows or [none])]
+        soft = math.isfinite(row.l1)
+        place = {
+            "axis": row.axis,
+            "output": found.axes[row.axis].rows.index(r) if row.axis >= 0 else 0,
+            "later": int(row.later),
+            "first": len(terms),
+            "past": len(terms) + len(row.terms),
+        }
+        penalty = {"l1": text.number(row.l1 if soft else 0.0), "compliance": text.number(row.compliance)}
+        rows.append(initialiser(**place, soft=int(soft), **penalty))
+        for coefficient, j, lag in row.terms:
+            terms.append(initialiser(coefficient=text.number(coefficient), input=j, lag=lag))
+    return [text.structs("quadsim_term", "terms", terms), text.structs("quadsim_row", "rows", rows)]
+
+
+def problem_data(text: CText, found: Tables, room: int) -> list[str]:
+    """The optimisation's numbers, the last of them its `quadsim_problem`."""
+    problem = found.problem
+    reals = {
+        "T": found.T,
+        "T_inverse": found.T_inverse,
+        "lower": bounded(found.lower),
+        "upper": bounded(found.upper),
+        "scale": found.scale,
+        "tolerance": found.tolerance,
+    }
+    blocks, axes = [text.reals(name, values) for name, values in reals.items()], []
+    for g, axis in enumerate(found.axes):
+        entry, arrays = _axis(text, g, axis, bounded=bool(found.rows))
+        axes.append(entry)
+        blocks += arrays
+    blocks += [text.structs("quadsim_axis", "axes", axes), *_rows(text, found)]
+    members = text.struct(
+        "quadsim_problem",
+        f"{text.prefix}problem",
+        horizon=problem.horizon,
+        states=problem.model.n,
+        step_rows=len(found.rows),
+        parts=len(axes),
+        regulated=len(problem.objective.C_r),
+        room=room,
+        changes=CHANGES,
+        bounds_differ=int(len(found.lower) > 1),
+        mixed=int(any(row.axis >= 0 and row.terms for row in found.rows)),
+        **{name: text.prefix + name for name in ("axes", "rows", "terms", *reals)},
+    )
+    return [*blocks, members]
+
+
+def _controller(text: CText, law: Exportable, found: Tables) -> list[str]:
+    """The numbers besides those of the optimisation, the last of them the `quadsim_controller`."""
+    numbers, robust = controller_numbers(law), "NULL"
+    blocks = [text.reals("C_r", numbers.pop("C_r"))]
+    if law.settings is not None:
+        members = {name: text.value(value) for name, value in robust_numbers(law, found.modes).items()}
+        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **members))
+        robust = f"&{text.prefix}robust"
+    addresses = {"problem": f"&{text.prefix}problem", "robust": robust, "C_r": f"{text.prefix}C_r"}
+    limits = {name: text.value(value) for name, value in numbers.items()}
+    return [*blocks, text.struct("quadsim_controller", "QUADSIM_CONTROLLER", **addresses, **limits)]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from mpc.export.ctext import Precision
+
 EMULATOR: Final = "qemu-system-arm"
 TICK: Final = 40
 """Instructions of the emulated processors between two ticks of their clock, with `-icount shift=0`."""
@@ -40,8 +42,7 @@ class Target:
         options = f"-M {self.board} -nographic -monitor none -semihosting -icount shift=0"
         return (EMULATOR, *options.split())
 
-    @property
-    def makefile(self) -> str:
+    def makefile(self, precision: Precision) -> str:
         """The first lines of the Makefile."""
         run = " ".join(["timeout 600", *self.emulation, "-serial none -kernel"]) if self.board else ""
         lines = {
@@ -50,6 +51,7 @@ class Target:
             "MACHINE_LINK": self.link,
             "TARGET": self.sources[0].replace(".c", ".o"),
             "RUN": run,
+            "PRECISION": "-DQUADSIM_FLOAT" if precision == "float" else "",
         }
         return "".join(f"{name} = {value}".rstrip() + "\n" for name, value in lines.items())
 

@@ -140,7 +140,7 @@ class NonlinearMPC:
         self._check = AnswerCheck(self.problem, kkt_every)
         small = self.problem.horizon * (N_ROTORS + self.problem.rows.slacks.size) <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
-        self._qp = QPSolver(self.solver, self.problem, changing=True, shortcut=True)
+        self._qp = QPSolver(self.solver, self.problem, changing=True, free_first=True)
         self._clearing = None if space is None else Clearing(self.problem, self._qp, space, changing=True)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self._ramp: RampObserver | None = None

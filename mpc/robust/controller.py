@@ -21,7 +21,6 @@ import numpy as np
 from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
-from mpc.exact.shortcut import with_shortcut
 from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE, CompletedMoment
 from mpc.handover import observed, within
 from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, with_nearest_yaw
@@ -33,7 +32,7 @@ from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_we
 from mpc.qp import KKT_EVERY
 from mpc.robust.settings import LONGEST_SPAN
 from mpc.robust.settings import RobustSettings as RobustSettings
-from mpc.solvers import INVALID_DATA, Answer, QPSolver
+from mpc.solvers import INVALID_DATA, Answer, Solver
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import Space
 from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
@@ -41,7 +40,6 @@ from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-SOLVER: Final = "piqp-multistage"  # solves what the shortcuts leave
 _SAME_TIME: Final = 1e-6  # [s]
 _YAW: Final = INDEX["yaw"]
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
@@ -88,8 +86,16 @@ class RobustMPC:
     It holds no earlier plan: where nothing is solved, the status reports it, with the command in force, for
     `mpc.fallback.contract.Guarded` to act on.
 
-    Attributes:
+    Args:
+        vehicle: that it flies.
         problem: the optimisation, a `robust_problem` of these settings.
+        settings: these.
+        solver: the problem's; see `mpc.solvers.make_solver`.
+        space: what to keep clear of.
+        kkt_every: see `mpc.answer.AnswerCheck`.
+
+    Attributes:
+        problem: as given.
         trim: what holds the vehicle at rest against the disturbance that is estimated.
         unanswered: the first period since `reset` whose QP had no answer; None where all had.
         answer: of the last period that had one to solve; None before the first.
@@ -99,7 +105,6 @@ class RobustMPC:
     """
 
     name: Final = "robust"
-    solver: Final = SOLVER
     answer: Answer | None = None
 
     def __init__(
@@ -107,8 +112,8 @@ class RobustMPC:
         vehicle: Vehicle,
         problem: Problem,
         settings: RobustSettings,
+        solver: Solver,
         *,
-        shortcut: bool = True,
         space: Space | None = None,
         kkt_every: int = KKT_EVERY,
     ) -> None:
@@ -118,8 +123,7 @@ class RobustMPC:
         self._model = nonlinear_model(vehicle, period, rotor_lag=settings.rotor_lag or None)
         self._of_twist = np.ascontiguousarray(np.linalg.inv(slope(self._nominal))[:, 1:])
         self._actuators, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
-        whole = QPSolver(SOLVER, problem)
-        self._solver = with_shortcut(problem, whole) if shortcut else whole
+        self._solver, self.solver = solver, solver.name
         self._clearing = None if space is None else Clearing(problem, self._solver, space)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))

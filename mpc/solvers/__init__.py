@@ -11,14 +11,14 @@ from enum import StrEnum
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
-from scipy.linalg import lapack
 
 from mpc.ocp import Problem, Query
 from mpc.paper.condensed import Condensed
 from mpc.qp import QP, Backend, KKTResiduals, Solution
+from mpc.solvers.free import FreeOptimum
 from mpc.staged import Staged
-from quadsim.controller import ACCEPTED, GAIN, UNCONSTRAINED
-from quadsim.errors import MissingPackageError, UnknownNameError
+from quadsim.controller import ACCEPTED, CORE, GAIN
+from quadsim.errors import MissingPackageError, ParameterError, UnknownNameError
 from quadsim.state import Array
 
 Formulation: TypeAlias = Condensed | Staged
@@ -44,12 +44,22 @@ class SolverEntry:
     @property
     def installed(self) -> bool:
         """Whether the package is there; importing it is left for later."""
-        return importlib.util.find_spec(self.package) is not None
+        return not self._missing
 
     @property
     def line(self) -> str:
         """The description, and how to install what is missing."""
-        return self.description if self.installed else f"not installed: pip install 'quadsim[{self.extra}]'"
+        return self._missing or self.description
+
+    @property
+    def _missing(self) -> str:
+        if self.package == CORE:
+            from mpc.core.library import why_missing
+
+            reason = why_missing()
+            return "" if reason is None else f"not compiled: {reason}"
+        found = importlib.util.find_spec(self.package)
+        return f"not installed: pip install 'quadsim[{self.extra}]'" if found is None else ""
 
 
 SOLVERS: Final = {
@@ -62,7 +72,12 @@ SOLVERS: Final = {
     "piqp-dense": SolverEntry(description="PIQP, dense Cholesky, on the paper's condensed matrices", package="piqp"),
     "daqp": SolverEntry(description="DAQP, dual active set, condensed, warm-started", package="daqp", extra="daqp"),
 }
-"""Solvers that are set up once, and told what changes from one period to the next."""
+"""QP solvers that are set up once, and told what changes from one period to the next."""
+
+COMPILED: Final = SolverEntry(
+    description="the compiled core: the exact optimum where matrices are fixed; PIQP answers what it gives up",
+    package=CORE,
+)
 
 ALIASES: Final = {"piqp": "piqp-multistage"}
 
@@ -75,29 +90,30 @@ LARGEST: Final = 1e6
 
 
 def find_solver(name: str) -> SolverEntry:
-    """The solver of a name, one of `SOLVERS` or, where it is installed, of qpsolvers.
+    """The solver of a name: the core, one of `SOLVERS` or, where it is installed, of qpsolvers.
 
     Raises:
         UnknownNameError: there is no such solver.
     """
     name = ALIASES.get(name, name)
-    if name in SOLVERS:
-        return SOLVERS[name]
+    if name in (CORE, *SOLVERS):
+        return SOLVERS.get(name, COMPILED)
     entries = solver_entries()
     if name not in entries:
-        hint = "" if len(entries) > len(SOLVERS) else "pip install 'quadsim[solvers]' adds those of qpsolvers"
+        hint = "" if len(entries) > len(SOLVERS) + 1 else "pip install 'quadsim[solvers]' adds those of qpsolvers"
         raise UnknownNameError("solver", name, entries, hint)
     return entries[name]
 
 
 def solver_entries() -> dict[str, SolverEntry]:
-    """All solvers by name: `SOLVERS`, and those of qpsolvers that are installed."""
+    """All solvers by name: `SOLVERS`, the core, and those of qpsolvers that are installed."""
+    entries = SOLVERS | {CORE: COMPILED}
     if importlib.util.find_spec("qpsolvers") is None:
-        return dict(SOLVERS)
+        return entries
     from qpsolvers import available_solvers  # imports every solver there is
 
-    others = sorted({*available_solvers} - {*SOLVERS, *ALIASES})
-    return SOLVERS | {
+    others = sorted({*available_solvers} - {*entries, *ALIASES})
+    return entries | {
         name: SolverEntry(
             description=f"{name} through qpsolvers, condensed, set up anew in each period",
             package="qpsolvers",
@@ -108,12 +124,14 @@ def solver_entries() -> dict[str, SolverEntry]:
 
 
 def make_backend(name: str, *, changing: bool = False) -> Backend:
-    """A fresh back end of a named solver, for matrices that are `changing` or not.
+    """A fresh back end of a named QP solver, for matrices that are `changing` or not.
 
     Raises:
-        UnknownNameError: there is no such solver.
+        UnknownNameError: there is no such QP solver.
         MissingPackageError: it needs a package that is not installed.
     """
+    if name == CORE:
+        raise UnknownNameError("QP solver", name, SOLVERS, "make_solver has it")
     entry = find_solver(name)
     if not entry.installed:
         raise MissingPackageError(f"the solver {name!r}", entry.package, extra=entry.extra)
@@ -131,7 +149,7 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
 
 
 class Method(StrEnum):
-    """How much of the QP had to be solved: see `mpc.exact.shortcut`."""
+    """How much of the QP had to be solved."""
 
     FREE = "the unconstrained optimum"
     AXES = "active rows of states alone"
@@ -144,14 +162,13 @@ class Answer(NamedTuple):
     plan: Array  # (N, nu) inputs [rad/s]; to be used only when the status is accepted
     slacks: Array  # (N, m_s) by how much soft rows are violated
     status: str  # `solved`, `unconstrained`, or what went wrong
-    answered_by: str  # `gain`, `active-set` or the QP solver's name; see `quadsim.controller.Command`
+    answered_by: str  # `gain`, `core` or the QP solver's name; see `quadsim.controller.Command`
     iterations: int = 0  # of whoever answered
     active: int = 0  # constraints active at the optimum
     solve_s: float = 0.0  # wall time [s]
     reported_primal: float = math.nan  # see `mpc.qp.Solution`, as the next
     reported_dual: float = math.nan
     method: Method = Method.WHOLE  # how much of the QP had to be solved
-    exact: bool = False  # whether a shortcut found it, or made a solver's answer exact
     states: Array | None = None  # (N, n) predicted, where the model changes and there is an optimum
     certificate: Callable[[], tuple[QP, Solution]] | None = None  # a QP and the solution; None where the data made none
     infeasibility: float = math.nan  # see `mpc.answer.AnswerCheck`, as the next; NaN where it is not computed
@@ -192,18 +209,41 @@ class Solver(Protocol):
         """The optimum for a query; whatever happens is in its status."""
 
 
+def make_solver(name: str, problem: Problem) -> Solver:
+    """A problem's solver by name: the core, or a QP solver that has the unconstrained optimum tried before it.
+
+    Raises:
+        UnknownNameError: there is no such solver.
+        MissingPackageError: it needs a package that is not installed.
+        MissingCoreError: the core was not compiled.
+        ParameterError: the core cannot take the problem.
+    """
+    if name != CORE:
+        return QPSolver(name, problem, free_first=True)
+    from mpc.core.solver import Core
+
+    try:
+        return Core(problem)
+    except ParameterError as error:
+        rule = f"a QP solver such as 'piqp' for this problem: {error}"
+        raise ParameterError("controller", "solver", CORE, rule) from error
+
+
 class QPSolver:
     """A problem's QP, solved each period by a named solver.
 
-    Queries of a `changing` one have models of their own (`mpc.ocp.Query.steps`); with the `shortcut`, the unconstrained
-    optimum of a condensed QP is tried first.
+    Queries of a `changing` one have models of their own (`mpc.ocp.Query.steps`).  With `free_first`, the unconstrained
+    optimum is tried before: where it satisfies every constraint, it is the optimum, and no QP is solved.  The staged QP
+    of a changing problem has none to try.
     """
 
-    def __init__(self, name: str, problem: Problem, *, changing: bool = False, shortcut: bool = False) -> None:
+    def __init__(self, name: str, problem: Problem, *, changing: bool = False, free_first: bool = False) -> None:
         self.name, self._changing = name, changing
         self.formulation = find_solver(name).formulate(problem, changing=changing)
-        self._inputs = problem.horizon * problem.model.nu
-        self._shortcut = shortcut and isinstance(self.formulation, Condensed)
+        self._free: tuple[Condensed, FreeOptimum] | None = None
+        if free_first and not (changing and isinstance(self.formulation, Staged)):
+            form = self.formulation if isinstance(self.formulation, Condensed) else Condensed(problem)
+            self._free = form, FreeOptimum(form, changing=changing)
         self.reset()
 
     def reset(self) -> None:
@@ -217,33 +257,30 @@ class QPSolver:
         Data that is not finite, or beyond `LARGEST` in a model that changes, is answered with the status
         `invalid_data`: no back end can be trusted to notice.
         """
-        form = self.formulation
         if not _usable(query):
+            form = self.formulation
             nowhere = np.full_like(form.qp.c, math.nan)
             return Answer(form.inputs(nowhere), form.slacks(nowhere), INVALID_DATA, self.name)
-        qp, states_of = form.pose(query)
-        solution = (self._free(qp) if self._shortcut else None) or self._backend.solve(qp)
-        by = GAIN if solution.status == UNCONSTRAINED else self.name
-        answer = Answer.of(form, qp, solution, by)
-        if self._changing and solution.status in ACCEPTED and np.isfinite(answer.plan).all():
-            return answer._replace(states=states_of(solution.x))
+        answer, states_of = self._solve(query)
+        if self._changing and answer.status in ACCEPTED and np.isfinite(answer.plan).all():
+            assert answer.certificate is not None
+            return answer._replace(states=states_of(answer.certificate()[1].x))
         return answer
 
-    def _free(self, qp: QP) -> Solution | None:
-        """The unconstrained optimum of a condensed QP, where it satisfies every constraint."""
-        started, m = clock.perf_counter(), self._inputs
-        _, u, failed = lapack.dposv(qp.P[:m, :m], -qp.c[:m])
-        if failed or (u < qp.x_l[:m]).any() or (u > qp.x_u[:m]).any():
-            return None
-        x = np.zeros(qp.c.size)
-        x[:m] = u
-        if qp.h_l.size:
-            values = qp.G @ x
-            if (values < qp.h_l).any() or (values > qp.h_u).any():
-                return None
-        z_box = np.concatenate([np.zeros(m), -qp.c[m:]])
-        spent_s = clock.perf_counter() - started
-        return Solution(x, np.zeros(0), np.zeros(qp.h_l.size), z_box, status=UNCONSTRAINED, solve_s=spent_s)
+    def _solve(self, query: Query) -> tuple[Answer, Callable[[Array], Array]]:
+        """The answer, and what takes its primal point to the predicted states."""
+        form, posed, spent_s = None, None, 0.0
+        if self._free is not None:
+            started, (form, free) = clock.perf_counter(), self._free
+            posed = form.pose(query)
+            solution, spent_s = free(posed.qp), clock.perf_counter() - started
+            if solution is not None:
+                answer = Answer.of(form, posed.qp, solution, GAIN)
+                return answer._replace(method=Method.FREE, solve_s=spent_s), posed.states
+        if posed is None or form is not self.formulation:
+            posed = self.formulation.pose(query)
+        answer = Answer.of(self.formulation, posed.qp, self._backend.solve(posed.qp), self.name)
+        return answer._replace(solve_s=spent_s + answer.solve_s), posed.states
 
 
 def _usable(query: Query) -> bool:

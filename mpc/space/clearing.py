@@ -28,9 +28,9 @@ SETTLED: Final = 1e-2
 class Clearing:
     """A solver's optimum where it keeps all half-spaces, and else the optimum with them.
 
-    The optimum of fewer constraints that satisfies all is the optimum: shortcuts of the solver hold wherever the way is
-    clear.  Where it is not, the whole QP is solved with the tightest half-spaces of each instant, and with twice as
-    many as long as the plan violates one that was left out.
+    The optimum of fewer constraints that satisfies all is the optimum: so is the solver's wherever the way is clear.
+    Where it is not, the whole QP is solved with the tightest half-spaces of each instant, and with twice as many as
+    long as the plan violates one that was left out.
 
     The problem and its solver know no half-spaces; queries of a `changing` one have steps of their own.
     """

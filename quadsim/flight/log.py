@@ -45,7 +45,7 @@ class ControlLog:
     status: tuple[str, ...]
     """K texts, one of `quadsim.controller.ACCEPTED` or what was instead; see `quadsim.controller.Command`."""
     answered_by: tuple[str, ...]
-    """K texts: `gain`, `active-set`, a QP solver's name, `law`, `fallback` or `stopped`."""
+    """K texts: `gain`, `core`, a QP solver's name, `law`, `fallback` or `stopped`."""
     phase: tuple[str, ...]  # K texts, where the flight stood with the ground; see `quadsim.controller.Phase`
     iterations: np.ndarray[Any, np.dtype[np.int64]]  # (K,) of whoever answered
     active: np.ndarray[Any, np.dtype[np.int64]]  # (K,) constraints active at the optimum

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import get_args
+from typing import Any, Final, get_args
 
-import numpy as np
-
-from mpc.export.ctext import number
-from mpc.export.source import DATA, HEADER, SOURCE, Exportable, Precision, part, sources
+from mpc.core.numbers import Exportable
+from mpc.export.ctext import CText, Precision
+from mpc.export.source import CHANGES, DATA, CController, part
 from mpc.export.targets import TARGETS, Target
 from quadsim.errors import ParameterError
 from quadsim.outputs import absolute, reserving, writing
-from quadsim.state import Array
+from scenarios.export.reach import Reach, reach
 from scenarios.export.record import Recording, record
 from scenarios.loading import as_scenario
 from scenarios.parts.controllers import exportable
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
+
+FACTS: Final = "export.json"
+"""What an export takes, and how far its room suffices."""
 
 
 def export(
@@ -27,11 +32,12 @@ def export(
     overwrite: bool = False,
     precision: Precision = "double",
     target: str = "posix",
+    rows: int | None = None,
 ) -> Path:
     """Write a scenario's controller as self-contained C99, with the periods of the scenario's flight as test vectors.
 
     The same scenario gives the same bytes.  No compiler is needed; `make -C DIR check` then compiles it and runs the
-    recorded periods.
+    recorded periods.  `export.json` has its memory, and how far from the reference its room for active rows suffices.
 
     Args:
         scenario: it, or its name or file.
@@ -40,12 +46,15 @@ def export(
         precision: of all numbers, `double` or `float`.
         target: the machine that its programs are for: `posix`, or `cortex-m7` or `cortex-m4f` on a board that QEMU
             emulates.
+        rows: active rows that there is room for; memory grows with the square.  None for 2.56 per step of the
+            horizon, and at least 64.
 
     Returns:
         The directory.
 
     Raises:
         ExportError: this controller cannot be exported; the message gives the reason.
+        MissingCoreError: there is no core here, which computes the exact answers.
         InputError: something else is wrong with the input.
         OutputError: the directory cannot be written.
 
@@ -56,23 +65,28 @@ def export(
     for name, value, allowed in (("precision", precision, get_args(Precision)), ("target", target, tuple(TARGETS))):
         if value not in allowed:
             raise ParameterError("", f"--{name}", value, f"one of {', '.join(allowed)}")
+    if rows is not None and rows < 1:
+        raise ParameterError("", "--rows", rows, "at least 1")
     scenario = as_scenario(scenario)
     with reserving(out, overwrite=overwrite) as directory:
-        files = controller_files(scenario, precision) | vector_files(record(scenario))
-        files |= {"README.md": _readme(scenario, precision), **programs(TARGETS[target])}
+        controller = c_controller(scenario, precision, rows)
+        facts = _facts(controller)
+        files = controller.files | programs(TARGETS[target], precision) | vector_files(record(scenario), precision)
+        files["README.md"] = _readme(scenario, precision, room_sentence(facts))
+        files[FACTS] = json.dumps(facts, indent=2) + "\n"
         with writing(directory, overwrite=overwrite) as partial:
             for name, text in files.items():
                 (partial / name).write_text(text, encoding="utf-8")
     return absolute(out)
 
 
-def controller_files(scenario: Scenario, precision: Precision) -> dict[str, str]:
-    """The controller's own files, by name.
+def c_controller(scenario: Scenario, precision: Precision = "double", rows: int | None = None) -> CController:
+    """The controller's own files, with room for active `rows`; see `export`.
 
     Raises:
         ExportError: this controller cannot be exported.
     """
-    return sources(exported_law(scenario), precision=precision, title=_title(scenario))
+    return CController(law=exported_law(scenario), precision=precision, title=_title(scenario), asked=rows)
 
 
 def exported_law(scenario: Scenario) -> Exportable:
@@ -85,10 +99,24 @@ def exported_law(scenario: Scenario) -> Exportable:
     return exportable(scenario.controller, build_vehicle(scenario), scenario.control_period, shapes)
 
 
-def programs(target: Target) -> dict[str, str]:
+def _facts(controller: CController) -> dict[str, Any]:
+    return {
+        "precision": controller.precision,
+        "rows": controller.rows,
+        "memory_bytes": controller.reals * controller.real_bytes,
+        "reach": asdict(reach(controller.law.problem, controller.rows + 1, CHANGES)),
+    }
+
+
+def room_sentence(facts: Mapping[str, Any]) -> str:
+    """What the room for active rows costs, and how far from the reference it suffices."""
+    return f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory; {Reach(**facts['reach'])}"
+
+
+def programs(target: Target, precision: Precision) -> dict[str, str]:
     """What runs the controller on a machine, by file name."""
     names = ("main.c", "serial.c", "target.h", *target.sources, "LICENSE")
-    return {name: part(name) for name in names} | {"Makefile": target.makefile + part("Makefile")}
+    return {name: part(name) for name in names} | {"Makefile": target.makefile(precision) + part("Makefile")}
 
 
 def _title(scenario: Scenario) -> str:
@@ -98,34 +126,29 @@ def _title(scenario: Scenario) -> str:
     return title.encode("ascii", "replace").decode().replace("\n", " ")
 
 
-def vector_files(recording: Recording) -> dict[str, str]:
+def vector_files(recording: Recording, precision: Precision) -> dict[str, str]:
     """The recorded periods as C, by file name."""
-    count = len(recording.state)
-    rows = [
-        f"    {{{_row(state)}, {_row(acting)}, {_row(command)}, {status}}}"
-        for state, acting, command, status in zip(
-            recording.state, recording.acting, recording.command, recording.status.tolist(), strict=True
-        )
-    ]
-    path = [f"    {_row(row)}" for row in recording.path]
+    row = CText(precision).value
+    queries = zip(recording.state, recording.acting, recording.command, recording.status.tolist(), strict=True)
+    rows = [f"    {{{', '.join(map(row, arrays))}, {status}}}" for *arrays, status in queries]
+    path = [f"    {row(reference)}" for reference in recording.path]
     source = [
         '#include "vectors.h"\n',
-        "#ifdef QUADSIM_FLOAT\n#define R(number) number##F\n#else\n#define R(number) number\n#endif\n",
         "const int quadsim_vectors_count = QUADSIM_VECTORS;\n",
-        f"const quadsim_real quadsim_vectors_speeds[4] = {_row(recording.speeds)};\n",
+        f"const quadsim_real quadsim_vectors_speeds[4] = {row(recording.speeds)};\n",
         "const quadsim_real quadsim_vectors_path[QUADSIM_VECTORS_ROWS][4] = {",
         ",\n".join(path) + "\n};\n",
         "const struct quadsim_vector quadsim_vectors[QUADSIM_VECTORS] = {",
         ",\n".join(rows) + "\n};\n",
     ]
-    return {"vectors.h": part("vectors.h").replace("@COUNT@", str(count)), "vectors.c": "\n".join(source)}
+    sizes = {"@COUNT@": len(rows), "@ROWS@": len(path)}
+    header = part("vectors.h")
+    for name, size in sizes.items():
+        header = header.replace(name, str(size))
+    return {"vectors.h": header, "vectors.c": "\n".join(source)}
 
 
-def _row(numbers: Array) -> str:
-    return "{" + ", ".join(map(number, np.ravel(numbers).tolist())) + "}"
-
-
-def _readme(scenario: Scenario, precision: Precision) -> str:
+def _readme(scenario: Scenario, precision: Precision, room: str) -> str:
     return f"""# {_title(scenario)}
 
 A model predictive controller as C99 in {precision} precision, exported from quadsim: {scenario.controller.type}, to be
@@ -134,8 +157,10 @@ state, and of the C library `memcpy` and `memset`.
 
 | file | is |
 |---|---|
-| `{HEADER}` | the interface: state order, units, frames, and the sizes |
-| `{SOURCE}`, `{DATA}` | the controller and its numbers |
+| `quadsim_mpc.h` | the interface: state order, units, frames |
+| `quadsim_mpc.c`, `quadsim_core.h`, `quadsim_core.c` | the law and its solver, the same for every controller |
+| `{DATA}` | this controller's numbers, and the memory that it needs |
+| `{FACTS}` | what it takes, and how far its room for active rows suffices |
 | `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |
 | `main.c`, `Makefile` | `make check` runs these periods and compares |
 | `serial.c` | the controller behind a serial line, with checksums and a watchdog: a start for an integration |
@@ -143,11 +168,16 @@ state, and of the C library `memcpy` and `memset`.
 
 ```c
 static quadsim_mpc mpc;
+static quadsim_real memory[QUADSIM_MEMORY];
+quadsim_mpc_start(&mpc, &QUADSIM_CONTROLLER, memory);
 quadsim_mpc_reset(&mpc, speeds);          /* the command in force */
 /* every {scenario.control_period:g} s: */
 status = quadsim_mpc_step(&mpc, state, reference, acting, command);
 ```
 
+{room[0].upper()}{room[1:]}.
+
 Solve once before take-off: the first step starts without an active set and takes the most changes of it.
-`mpc.changes` is the number in each step.  Compile with `-ffp-contract=off`, and every processor gives the same bits.
+`mpc.work.changes` is the number in each step.  Compile with `-ffp-contract=off`, and every processor gives the same
+bits{", and with `-DQUADSIM_FLOAT`, as the Makefile does" if precision == "float" else ""}.
 """

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from mpc.answer import ActuatorBounds
-from mpc.export.compiled import ANSWERERS, LEVELS, STATUSES
-from mpc.export.source import Precision
+from mpc.core.law import ANSWERERS, LEVELS, STATUSES
+from mpc.export.ctext import Precision
 from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Moment, stopped
@@ -19,7 +19,7 @@ from quadsim.outputs import absolute
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.export.emulation import Program, build, require_programs
-from scenarios.export.exporter import controller_files, exported_law, programs
+from scenarios.export.exporter import c_controller, exported_law, programs
 from scenarios.export.serial_line import SerialMPC
 from scenarios.flight import Flight, Outputs
 from scenarios.limits import with_bounds_stated
@@ -105,7 +105,7 @@ def fly_exported(
     """
     scenario = as_scenario(scenario)
     machine = TARGETS[target]
-    files = controller_files(scenario, precision) | programs(machine)
+    files = c_controller(scenario, precision).files | programs(machine, precision)
     require_programs(machine, "to fly an exported controller")
     problem = exported_law(scenario).problem
     if precision == "float" and problem.every_constraint:

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.constrained import ConstrainedMPC
-from mpc.core.axes import axes
+from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
-from mpc.exact.free import FreeOptimum
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.contract import Guarded
+from mpc.ocp import Query
 from mpc.robust.controller import RobustMPC
 from mpc.solvers import Method
 from mpc.unconstrained import UnconstrainedMPC
-from quadsim.controller import ACCEPTED, Command, Moment, Phase
+from quadsim.controller import ACCEPTED, CORE, GAIN, Command, Moment, Phase
 from quadsim.errors import ExportError, PlanExhaustedError
 from quadsim.state import Array
 from scenarios.build import build_controller
@@ -78,7 +78,7 @@ def record(scenario: Scenario) -> Recording:
     """Fly a scenario, record each period, and compute the answers of a controller that starts with the first."""
     scenario = scenario.replace({"controller.compiled": False})
     if isinstance(scenario.controller, BoundedSpec):
-        scenario = scenario.replace({"controller.shortcut": True})
+        scenario = scenario.replace({"controller.solver": CORE})
     law = build_controller(scenario, build_vehicle(scenario))
     inner = law.inner if isinstance(law, Guarded) else law
     assert isinstance(inner, MPC)
@@ -120,7 +120,7 @@ def _answers(
             if command.status in ACCEPTED:
                 assert law.answer is not None
                 answer = WAYS[law.answer.method], command.speeds
-                if not law.answer.exact:
+                if command.answered_by not in (GAIN, CORE):
                     break
         found.append(answer)
     status, commands = zip(*found, strict=True)
@@ -128,11 +128,6 @@ def _answers(
 
 
 def _free_commands(law: UnconstrainedMPC, queries: list[tuple[Array, Array, Array]]) -> Array:
-    """(K, 4) axis by axis: the one gain of Eq. (24) has lost half its digits at N = 100."""
-    problem = with_constraints(law.problem)
-    parts, u_bar = axes(problem), problem.model.u_bar
-    T, optimum = np.hstack([part.T for part in parts]), FreeOptimum(problem, parts)
-    desired, first = problem.objective.desired, (optimum.inputs, 0)
-    return np.array(
-        [u_bar + T @ optimum.at(state, desired(path), before - u_bar)[first] for state, before, path in queries]
-    )
+    """(K, 4) from the core: the one gain of Eq. (24) has lost half its digits at N = 100."""
+    core, desired = Core(with_constraints(law.problem)), law.problem.objective.desired
+    return np.array([core.solve(Query(state, desired(path), before)).plan[0] for state, before, path in queries])

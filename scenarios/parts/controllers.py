@@ -18,8 +18,9 @@ from mpc.fallback.settings import USUAL_TILT, FallbackSettings
 from mpc.model import hover_model
 from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.robust.tightening import SHORTEST_LAG
-from quadsim.controller import Controller
-from quadsim.errors import ExportError, InputError, ParameterError
+from mpc.solvers import Solver, make_solver
+from quadsim.controller import CORE, Controller
+from quadsim.errors import ExportError, InputError, MissingCoreError, ParameterError
 from quadsim.state import INDEX, N_STATES, POSITION, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.parts.plugin import import_plugin, make_law
@@ -30,7 +31,7 @@ from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.robust import RobustSpec
 
 if TYPE_CHECKING:
-    from mpc.export.source import Exportable
+    from mpc.core.numbers import Exportable
     from mpc.robust.controller import RobustMPC
     from mpc.robust.filter import SafetyFilter
     from mpc.space.halfspaces import Shape, Space
@@ -156,7 +157,7 @@ def make_filter(spec: RobustSpec, vehicle: Vehicle, period: float) -> tuple[Safe
         raise ParameterError(
             "controller", "avoidance", "given", "absent for a safety filter, which keeps no half-spaces"
         )
-    found = SafetyFilter(_robust(spec.model_copy(update={"shortcut": False}), vehicle, period))
+    found = SafetyFilter(_robust(spec.model_copy(update={"solver": SafetyFilter.solver}), vehicle, period))
     return found, _bounded(found, spec, spec.fallback, vehicle, period)
 
 
@@ -180,7 +181,7 @@ def exportable(spec: ControllerSpec, vehicle: Vehicle, period: float, shapes: Se
         ExportError: it cannot be exported.
         InputError: it cannot be made from these numbers.
     """
-    from mpc.export.source import Exportable
+    from mpc.core.numbers import Exportable
     from mpc.robust.controller import robust_problem
 
     if not isinstance(spec, UnconstrainedSpec | ConstrainedSpec | RobustSpec):
@@ -199,13 +200,21 @@ def _compiled(
     period: float,
     shapes: Sequence[Shape] = (),
 ) -> Controller | None:
-    """The law as compiled C; None where it is to be flown in Python."""
+    """The law in C; None where it is to be flown in Python.
+
+    Raises:
+        MissingCoreError: there is no library.
+        ExportError: this law is not there in C.
+    """
     if not spec.compiled:
         return None
-    from scenarios.parts.compiler import compiled_controller
+    from mpc.core.law import CompiledLaw, CompiledMPC
+    from mpc.core.library import why_missing
 
-    key = spec.model_dump_json(), repr(vehicle), period, bool(shapes)
-    return compiled_controller(key, lambda: exportable(spec, vehicle, period, shapes))
+    reason = why_missing()
+    if reason is not None:
+        raise MissingCoreError(reason, instead="leave out controller.compiled")
+    return CompiledMPC(CompiledLaw(exportable(spec, vehicle, period, shapes)))
 
 
 def _bounded(
@@ -307,11 +316,16 @@ def make_space(
 
 def _constrained(spec: ConstrainedSpec, vehicle: Vehicle, period: float, shapes: Sequence[Shape]) -> Controller:
     from mpc.constrained import ConstrainedMPC
-    from mpc.solvers import QPSolver
 
     problem, space = make_problem(spec, vehicle, period), make_space(spec, vehicle, period, shapes)
-    solver = QPSolver(spec.solver, problem)
-    return ConstrainedMPC(problem, solver, shortcut=spec.shortcut, space=space, kkt_every=spec.kkt_every)
+    return ConstrainedMPC(problem, _solver(spec, problem, space), space=space, kkt_every=spec.kkt_every)
+
+
+def _solver(spec: BoundedSpec, problem: Problem, space: Space | None) -> Solver:
+    if spec.solver == CORE and space is not None:
+        rule = "a QP solver such as 'piqp' with controller.avoidance: half-spaces differ from step to step"
+        raise ParameterError("controller", "solver", CORE, rule)
+    return make_solver(spec.solver, problem)
 
 
 def _unconstrained(problem: Problem) -> Controller:
@@ -361,14 +375,9 @@ def _robust(spec: RobustSpec, vehicle: Vehicle, period: float, shapes: Sequence[
     if spec.tightening is not None and spec.avoidance is not None:
         margins = position_margins(**_tightened(spec, vehicle, period))
     space, parts = make_space(spec, vehicle, period, shapes, margins), _robust_parts(spec, vehicle, period)
-    return RobustMPC(
-        vehicle,
-        robust_problem(**parts),
-        parts["settings"],
-        shortcut=spec.shortcut,
-        space=space,
-        kkt_every=spec.kkt_every,
-    )
+    problem = robust_problem(**parts)
+    solver = _solver(spec, problem, space)
+    return RobustMPC(vehicle, problem, parts["settings"], solver, space=space, kkt_every=spec.kkt_every)
 
 
 def tightening_margins(spec: RobustSpec, vehicle: Vehicle, period: float) -> Array | None:

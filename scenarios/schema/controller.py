@@ -17,8 +17,8 @@ from mpc.nonlinear.settings import Weights
 from mpc.observer import ObserverSettings
 from mpc.qp import KKT_EVERY
 from mpc.robust.tightening import SHORTEST_LAG
-from mpc.solvers import SOLVERS, find_solver
-from quadsim.errors import UnknownNameError
+from mpc.solvers import SOLVERS
+from quadsim.controller import CORE
 from quadsim.fields import NonNegative, Positive
 from scenarios.schema.base import MOST_ENTRIES, Horizon, Lag, Pair, Spec, require_ordered
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
@@ -30,6 +30,7 @@ from scenarios.schema.optimisation import (
     RotorBoundsSpec,
     SoftSpec,
     WeightedSpec,
+    require_solver,
 )
 from scenarios.schema.plugin import FORM, LAWS, PluginSpec, is_plugin
 from scenarios.schema.problems import ScenarioError, describe_all
@@ -53,19 +54,9 @@ class ConstrainedSpec(BoundedSpec):
     """The paper's constrained MPC, the optimum of a QP in every period (Sec. 5)."""
 
     type: Literal["constrained"] = Field(description="the control law, by its name in `quadsim list`")
-    solver: str = Field(
-        default="piqp-multistage",
-        description="QP solver, by its name in `quadsim list`",
-        json_schema_extra={"examples": [*SOLVERS]},
-    )
     fallback: FallbackSettings | None = Field(
         default=None, description="absent: the last plan is held, shifted, and then the flight is given up"
     )
-
-    @model_validator(mode="after")
-    def _check(self) -> ConstrainedSpec:
-        require_solver(self.solver)
-        return self
 
 
 class NonlinearSpec(Spec):
@@ -142,6 +133,8 @@ class NonlinearSpec(Spec):
     def _check(self) -> NonlinearSpec:
         if self.solver is not None:
             require_solver(self.solver)
+            if self.solver == CORE:
+                raise ValueError(f"solver must be a QP solver: the core takes no models that change; got {CORE!r}")
         if self.rotor_lag != "vehicle" and 0.0 < self.rotor_lag < SHORTEST_LAG:
             raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {self.rotor_lag:g}")
         if self.attitude_error == "difference" and not isinstance(self.weights.attitude, float):
@@ -162,14 +155,6 @@ class NonlinearSpec(Spec):
                 f'inputs = "speed"; got {self.input_bounds.slew}'
             )
         return self
-
-
-def require_solver(name: str) -> None:
-    """Refuse a QP solver that is not there."""
-    try:
-        find_solver(name)
-    except UnknownNameError as error:
-        raise ValueError(f"solver: {error}") from error
 
 
 COMPILED: Final = ("unconstrained", "constrained", "robust")

@@ -11,7 +11,9 @@ from annotated_types import Len, MaxLen, doc
 from pydantic import Field, model_validator
 
 from mpc.qp import KKT_EVERY
+from mpc.solvers import SOLVERS, find_solver
 from mpc.space.halfspaces import AvoidanceSettings
+from quadsim.controller import CORE
 from quadsim.errors import UnknownNameError
 from quadsim.fields import NonNegative, Number, Weight
 from quadsim.flight.audit import TERMS
@@ -170,10 +172,11 @@ class BoundedSpec(WeightedSpec):
     avoidance: AvoidanceSpec | None = Field(
         default=None, description="absent: it knows of no obstacles, corridors or fence, which are audited all the same"
     )
-    shortcut: bool = Field(
-        default=True, description="solve less than the whole QP where that yields its optimum; exact"
+    solver: str = Field(
+        default="piqp-multistage",
+        description="who solves what the unconstrained optimum does not, by its name in `quadsim list`",
+        json_schema_extra={"examples": [*SOLVERS, CORE]},
     )
-
     kkt_every: KktEvery = Field(
         default=KKT_EVERY,
         description="[periods] from one whose KKT residuals are computed and logged to the next; 1: all",
@@ -184,7 +187,16 @@ class BoundedSpec(WeightedSpec):
         require_states(self.output_bounds, "output_bounds")
         for name, pair in self.output_bounds.items():
             require_ordered(f"output_bounds.{name}", pair)
+        require_solver(self.solver)
         return self
+
+
+def require_solver(name: str) -> None:
+    """Refuse a solver that is not there."""
+    try:
+        find_solver(name)
+    except UnknownNameError as error:
+        raise ValueError(f"solver: {error}") from error
 
 
 def require_states(values: Mapping[str, object], name: str) -> None:

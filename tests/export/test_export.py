@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -10,24 +11,25 @@ import pytest
 import scipy.linalg
 
 import quadsim
-from mpc.core.axes import axes
+from mpc.core.solver import Core
 from mpc.core.tables import AxisTables, tables
-from mpc.exact.free import FreeOptimum
-from mpc.export.ctext import number
-from mpc.export.source import DATA, HEADER, SOURCE
+from mpc.export.ctext import CText
+from mpc.export.source import CORE, DATA
+from mpc.ocp import Query
 from mpc.paper.condensed import Condensed
+from mpc.solvers import Method
 from quadsim.errors import ExportError, OutputError, ParameterError
 from quadsim.state import REFERENCE_STATES, Array
 from scenarios.build import build_problem
 from scenarios.catalogue import read_catalogue
 from scenarios.cli import main
-from scenarios.export.exporter import controller_files, export, exported_law
+from scenarios.export.exporter import FACTS, c_controller, export, exported_law, room_sentence
 from scenarios.export.record import record
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 
 SHORT = {"duration": 1.0}
-NUMBER = re.compile(r"R\(([^)]*)\)")
+NUMBER = re.compile(r"(?<![\w.])-?(\d[\d.e+-]*)\b(?!F?\])")
 NOT_EXPORTED = {
     "nonlinear": "it is 'nonlinear'",
     "geometric": "it is 'geometric'",
@@ -44,15 +46,13 @@ def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
             continue
         seen.add(key)
         try:
-            files = controller_files(scenario, "double")
+            _, data = c_controller(scenario).files[DATA].split("static const", 1)
         except ExportError as error:
             refused[name] = error.reason
             continue
         exported += 1
-        sizes = [abs(float(text)) for text in NUMBER.findall(files[DATA])]
-        assert all(size == 0.0 or 1.2e-38 <= size <= 1e30 for size in sizes)
-        assert files[DATA].isascii()
-        assert not re.search(r"\b(nan|inf)\b", files[DATA])
+        assert data.isascii()
+        assert not re.search(r"\b(nan|inf)\b", data)
     assert exported >= 8
     assert not {"paper-constrained", "paper-unconstrained", "robust", "robust-lag50", "crazyflie-steps"} & set(refused)
     for reason in refused.values():
@@ -61,8 +61,17 @@ def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
 
 @pytest.mark.parametrize("horizon", [1, 10, 20, 100])
 def test_any_horizon_is_exported(horizon: int) -> None:
-    files = controller_files(load_scenario("paper-constrained", [f"controller.horizon={horizon}"]), "float")
-    assert f"#define QUADSIM_HORIZON {horizon} " in files[HEADER]
+    controller = c_controller(load_scenario("paper-constrained", [f"controller.horizon={horizon}"]), "float")
+    assert f"#define QUADSIM_HORIZON {horizon} " in controller.files[DATA]
+    assert f"#define QUADSIM_MEMORY {controller.reals} " in controller.files[DATA]
+
+
+def test_the_core_is_exported_byte_for_byte(tmp_path: Path) -> None:
+    directory = quadsim.export(quadsim.load("hover", SHORT), tmp_path / "c")
+    folder = Path(__file__).parents[2] / "mpc" / "core" / "c"
+    assert {path.name for path in folder.iterdir()} - {"library.c"} == set(CORE)
+    for name in CORE:
+        assert (directory / name).read_bytes() == (folder / name).read_bytes()
 
 
 def test_the_same_export_twice_is_the_same_bytes(tmp_path: Path) -> None:
@@ -74,11 +83,25 @@ def test_the_same_export_twice_is_the_same_bytes(tmp_path: Path) -> None:
 
 
 def test_both_precisions_have_the_same_numbers() -> None:
-    double, single = (controller_files(load_scenario("hover"), precision) for precision in ("double", "float"))
-    assert double[DATA] == single[DATA]
-    assert double[SOURCE] == single[SOURCE]
-    assert "typedef double quadsim_real;" in double[HEADER]
-    assert "typedef float quadsim_real;" in single[HEADER]
+    double, single = (c_controller(load_scenario("hover"), precision).files[DATA] for precision in ("double", "float"))
+    numbers = [text[text.index("static const") :].split() for text in (double, single)]
+    assert [re.sub(r"(\d)F\b", r"\1", word) for word in numbers[1]] == numbers[0]
+
+
+def test_room_is_what_was_asked_for_and_its_reach_is_stated(tmp_path: Path) -> None:
+    """More rows take more memory and reach farther."""
+    facts = []
+    for rows in (40, 128):
+        directory = quadsim.export(quadsim.load("paper-constrained", SHORT), tmp_path / str(rows), rows=rows)
+        facts.append(json.loads((directory / FACTS).read_text()))
+        assert f".room = {rows + 1}," in (directory / DATA).read_text()
+        assert room_sentence(facts[-1]) in (directory / "README.md").read_text().lower()
+    few, many = facts
+    assert few["memory_bytes"] < many["memory_bytes"]
+    assert 0.0 < few["reach"]["distance"] < many["reach"]["distance"]
+    for reach in (few["reach"], many["reach"]):
+        assert 0 < reach["lost"] <= 500
+        assert 500 <= reach["feasible"] <= reach["drawn"]
 
 
 def test_an_export_is_complete_and_replaces_an_earlier_one_on_request(tmp_path: Path) -> None:
@@ -88,7 +111,7 @@ def test_an_export_is_complete_and_replaces_an_earlier_one_on_request(tmp_path: 
         quadsim.export(scenario, directory)
     assert quadsim.export(scenario, directory, overwrite=True) == directory
     names = {path.name for path in directory.iterdir()}
-    assert {HEADER, SOURCE, DATA, "vectors.h", "vectors.c", "main.c", "Makefile", "README.md", "LICENSE"} <= names
+    assert {*CORE, DATA, FACTS, "vectors.h", "vectors.c", "main.c", "Makefile", "README.md", "LICENSE"} <= names
     assert f"#define QUADSIM_VECTORS {scenario.periods}" in (directory / "vectors.h").read_text()
     (directory / "main.o").write_text("built")
     with pytest.raises(OutputError, match=r"does not list main\.o; move that away first$"):
@@ -120,35 +143,36 @@ def test_what_cannot_be_exported_is_refused_with_its_reason(
     assert not (tmp_path / "c").exists()
 
 
-@pytest.mark.parametrize(("option", "value"), [("precision", "half"), ("target", "z80")])
-def test_unknown_options_are_refused(option: str, value: str, tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match=f"--{option} must be one of .*got '{value}'"):
+@pytest.mark.parametrize(("option", "value"), [("precision", "half"), ("target", "z80"), ("rows", 0)])
+def test_unknown_options_are_refused(option: str, value: object, tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match=f"--{option} must be .*got {value!r}"):
         export("hover", tmp_path / "c", **{option: value})
 
 
 def test_a_problem_with_too_many_numbers_is_refused() -> None:
     with pytest.raises(ParameterError, match="at most 1048576 numbers"):
-        controller_files(load_scenario("paper-constrained", ["controller.horizon=900"]), "double")
+        _ = c_controller(load_scenario("paper-constrained", ["controller.horizon=900"])).files
 
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(1.5, "R(1.5)"), (-0.1, "-R(0.1)"), (1e-39, "R(0.0)"), (-5e-324, "R(0.0)"), (1.2e-38, "R(1.2e-38)")],
+    [(1.5, "1.5"), (-0.1, "-0.1"), (1e-39, "0.0"), (-5e-324, "0.0"), (1.2e-38, "1.2e-38")],
 )
 def test_numbers_are_exact_and_none_is_denormal(value: float, text: str) -> None:
-    assert number(value) == text
+    assert CText("double").number(value) == text
+    assert CText("float").number(value) == f"{text}F"
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_numbers_that_are_none_are_refused(value: float) -> None:
     with pytest.raises(ValueError, match="no place in C"):
-        number(value)
+        CText("double").number(value)
 
 
 def optimum(axis: AxisTables, start: Array, reference: Array) -> Array:
     """W (N, m) by the passes that the C makes."""
     N, n = len(axis.K), len(axis.B)
-    pull = np.array([(axis.W if i < N - 1 else axis.W_end) @ row[axis.targets] for i, row in enumerate(reference)])
+    pull = np.array([(axis.W if i < N - 1 else axis.W_end) @ row[axis.regulated] for i, row in enumerate(reference)])
     w, slope = np.empty((N, axis.inputs)), pull[-1].reshape(n)
     for i in reversed(range(N)):
         w[i] = axis.inverse[i] @ axis.B.T @ slope
@@ -168,11 +192,13 @@ def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None
     problem = build_problem(scenario, build_vehicle(scenario))
     found, rng = tables(problem), np.random.default_rng(0)
     state, reference = rng.normal(size=12), rng.normal(size=(problem.horizon, 4))
-    free = FreeOptimum(problem, axes(problem))
-    wanted = free.at(state, problem.objective.desired(reference), np.zeros(4))[free.inputs]
+    query = Query(1e-6 * state, problem.objective.desired(1e-6 * reference), problem.model.u_bar)
+    answer = Core(problem).solve(query)
+    assert answer.method is Method.FREE
+    wanted = found.T_inverse @ (answer.plan[0] - problem.model.u_bar) / 1e-6
     for axis in found.axes:
         w = optimum(axis, state[axis.states], reference)
-        np.testing.assert_allclose(w[:, 0], wanted[axis.first], atol=1e-9)
+        np.testing.assert_allclose(w[0], wanted[axis.first : axis.first + axis.inputs], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["paper-constrained", "robust", "polytopes"])

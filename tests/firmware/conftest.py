@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from mpc.export.ctext import Precision
 from mpc.export.targets import TARGETS
 from scenarios.export.exporter import export
 from scenarios.loading import load_scenario
@@ -47,9 +48,9 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Export:
     """The export of a scenario with settings, for a target and in a precision; each is written once."""
 
     @functools.cache
-    def write(target: str, precision: str, *settings: str, scenario: str = "paper-constrained") -> Path:
+    def write(target: str, precision: Precision, *settings: str, scenario: str = "paper-constrained") -> Path:
         found = load_scenario(scenario, list(settings))
-        return export(found, tmp_path_factory.mktemp("export") / "c", precision=precision, target=target)  # type: ignore[arg-type]
+        return export(found, tmp_path_factory.mktemp("export") / "c", precision=precision, target=target)
 
     return write
 
@@ -59,7 +60,7 @@ def answers(exported: Export, run: Run, tmp_path_factory: pytest.TempPathFactory
     """What a target answers to all recorded periods, built with settings of its Makefile; each is run once."""
 
     @functools.cache
-    def check(target: str, precision: str, *make: str, scenario: str = "paper-constrained") -> list[Answer]:
+    def check(target: str, precision: Precision, *make: str, scenario: str = "paper-constrained") -> list[Answer]:
         directory = tmp_path_factory.mktemp("build") / "c"
         shutil.copytree(exported(target, precision, scenario=scenario), directory)
         if TARGETS[target].board:

@@ -4,7 +4,10 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-#include "quadsim_mpc.c"
+#include <string.h>
+
+#include "quadsim_data.h"
+#include "quadsim_math.h"
 
 #define STEPS 8 /* of an input at most, after a reset */
 
@@ -51,16 +54,18 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
     static const real scale[12] = {R(1.0), R(2.0), R(1.0), R(2.0), R(1.0), R(2.0),
                                    R(0.1), R(1.0), R(0.1), R(1.0), R(0.5), R(1.0)};
-    quadsim_mpc *mpc = malloc(sizeof *mpc);      /* on the heap, where the sanitizer sees both of its ends */
-    real *reference = malloc(sizeof(real) * N * 4);
+    const quadsim_controller *own = &QUADSIM_CONTROLLER;
+    quadsim_mpc *mpc = malloc(sizeof *mpc); /* on the heap, where the sanitizer sees both of its ends */
+    real *memory = malloc(sizeof(real) * QUADSIM_MEMORY);
+    real *reference = malloc(sizeof(real) * QUADSIM_HORIZON * 4);
     real command[4];
     int i, j;
     if (!registered) {
         registered = !atexit(report);
     }
-    memcpy(command, HOVER, sizeof command);
-    quadsim_mpc_reset(mpc, command);
-    for (i = 0; i < N * 4; i++) {
+    memcpy(command, own->hover, sizeof command);
+    quadsim_mpc_start(mpc, own, memory);
+    for (i = 0; i < QUADSIM_HORIZON * 4; i++) {
         reference[i] = R(0.0);
     }
     for (i = 0; i < STEPS && size > 0; i++) {
@@ -71,30 +76,31 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         for (j = 0; j < 12; j++) {
             state[j] = take(&data, &size, manners & 3, R(0.0), scale[j]);
         }
-        memmove(reference, reference + 4, sizeof(real) * (N - 1) * 4);
+        memmove(reference, reference + 4, sizeof(real) * (QUADSIM_HORIZON - 1) * 4);
         for (j = 0; j < 4; j++) {
-            reference[(N - 1) * 4 + j] = take(&data, &size, (manners >> 2) & 3, R(0.0), R(3.0));
-            acting[j] = (manners & 64) != 0 ? command[j] : take(&data, &size, (manners >> 4) & 3, HOVER[j], R(80.0));
+            reference[(QUADSIM_HORIZON - 1) * 4 + j] = take(&data, &size, (manners >> 2) & 3, R(0.0), R(3.0));
+            acting[j] = (manners & 64) != 0 ? command[j] : take(&data, &size, (manners >> 4) & 3, own->hover[j], R(80.0));
         }
         if ((manners & 128) != 0) {
             quadsim_mpc_reset(mpc, acting);
-            memcpy(command, HOVER, sizeof command); /* in force where acting is not finite */
+            memcpy(command, own->hover, sizeof command); /* in force where acting is not finite */
         }
         memcpy(before, is_finite(acting, 4) ? acting : command, sizeof before);
         status = quadsim_mpc_step(mpc, state, reference, acting, command);
         steps++;
         require(status >= QUADSIM_FREE && status <= QUADSIM_BEFORE, "a status");
         require(is_finite(command, 4), "a finite command");
-        require(mpc->changes >= 0 && mpc->changes <= 4 * MOST_CHANGES, "a limited number of changes");
+        require(mpc->work.changes >= 0 && mpc->work.changes <= 4 * own->problem->changes, "a limited number of changes");
         for (j = 0; j < 4; j++) {
-            require(command[j] >= SPEED_MIN[j] && command[j] <= SPEED_MAX[j], "bounds on speeds");
-            if (before[j] >= SPEED_MIN[j] && before[j] <= SPEED_MAX[j]) {
-                require(command[j] - before[j] >= STEP_MIN[j] - R(1e-4) && command[j] - before[j] <= STEP_MAX[j] + R(1e-4),
+            require(command[j] >= own->speed_min[j] && command[j] <= own->speed_max[j], "bounds on speeds");
+            if (before[j] >= own->speed_min[j] && before[j] <= own->speed_max[j]) {
+                require(command[j] - before[j] >= own->step_min[j] - R(1e-4) && command[j] - before[j] <= own->step_max[j] + R(1e-4),
                         "bounds on steps of speeds");
             }
         }
     }
     free(reference);
+    free(memory);
     free(mpc);
     return 0;
 }

@@ -1,4 +1,5 @@
 /* Prints how many bytes of stack, in hexadecimal, all recorded periods have touched below main. */
+#include "quadsim_data.h"
 #include "target.h"
 #include "vectors.h"
 
@@ -6,6 +7,7 @@
 #define PAINT 0xA5U
 
 static quadsim_mpc mpc;
+static quadsim_real memory[QUADSIM_MEMORY];
 
 int main(void)
 {
@@ -17,6 +19,7 @@ int main(void)
     for (byte = bottom; byte < top - 256; byte++) { /* not main's own frame */
         *byte = PAINT;
     }
+    quadsim_mpc_start(&mpc, &QUADSIM_CONTROLLER, memory);
     quadsim_mpc_reset(&mpc, quadsim_vectors_speeds);
     for (k = 0; k < quadsim_vectors_count; k++) {
         quadsim_real command[4];

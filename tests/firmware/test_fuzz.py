@@ -10,6 +10,7 @@ import pytest
 from firmware.conftest import Export, Run
 
 HERE = Path(__file__).parent
+CONTROLLER = ("quadsim_mpc.c", "quadsim_core.c")
 SANITIZERS = ["-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all"]
 SECONDS = 8
 """Of each controller; the variable FUZZ_RUNS has a number of inputs instead, of four steps or so each."""
@@ -32,8 +33,9 @@ def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Exp
     """A short horizon makes many steps; the whole one has the paths that only many active rows take."""
     scenario, *settings = CONTROLLERS[name]
     directory, program = exported("posix", *settings, scenario=scenario), tmp_path / "fuzz"
-    compile = ["clang", "-g", "-O3", "-std=c99", "-ffp-contract=off", *SANITIZERS, "-I", directory]
-    built = run(*compile, "-o", program, HERE / "fuzz.c", check=False)
+    define = ["-DQUADSIM_FLOAT"] if "float" in settings else []
+    compile = ["clang", "-g", "-O3", "-std=c99", "-ffp-contract=off", *SANITIZERS, *define, "-I", directory]
+    built = run(*compile, "-o", program, HERE / "fuzz.c", *(directory / name for name in CONTROLLER), check=False)
     if "cannot find" in built.stderr:
         pytest.skip("clang has no sanitizers: make firmware")
     assert built.returncode == 0, built.stderr
@@ -57,7 +59,8 @@ def test_a_command_out_of_bounds_is_found(exported: Export, run: Run, tmp_path: 
         text.replace(clip, "(void)upper, command[j] = mpc->before[j] = lower + speeds[j];")
     )
     compile = ["clang", "-O1", "-std=c99", *SANITIZERS, "-I", tmp_path, "-I", directory]
-    built = run(*compile, "-o", tmp_path / "fuzz", HERE / "fuzz.c", check=False)
+    sources = [HERE / "fuzz.c", tmp_path / "quadsim_mpc.c", directory / "quadsim_core.c"]
+    built = run(*compile, "-o", tmp_path / "fuzz", *sources, check=False)
     if "cannot find" in built.stderr:
         pytest.skip("clang has no sanitizers: make firmware")
     done = run(tmp_path / "fuzz", "-runs=2000", "-max_len=600", "-len_control=0", cwd=tmp_path, check=False)

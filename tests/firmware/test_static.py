@@ -25,11 +25,13 @@ TIDY = ",".join(
 CPPCHECK = ["--quiet", "--std=c99", "--enable=warning,style,performance,portability", "--error-exitcode=1"]
 CPPCHECK += ["--suppress=variableScope", "--suppress=unusedStructMember"]  # of members that other controllers use
 ALLOWED = {"memcpy", "memset"}
+DEFINES = {"double": [], "float": ["-DQUADSIM_FLOAT"]}
 EXPORTS = {
     "double": ("cortex-m7", "double"),
     "float": ("cortex-m4f", "float"),
 }
-PROGRAMS = ("main.c", "serial.c", "vectors.c", "quadsim_mpc.c")
+CONTROLLER = ("quadsim_mpc.c", "quadsim_core.c")
+PROGRAMS = (*CONTROLLER, "main.c", "serial.c", "vectors.c")
 
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang", "arm-none-eabi-gcc"])
@@ -39,23 +41,23 @@ def test_compilers_give_no_warning(precision: str, compiler: str, exported: Expo
     directory = exported(*EXPORTS[precision]) if bare else exported("posix", precision)
     machine = TARGETS[EXPORTS[precision][0]].machine.split() if bare else []
     for name in (*PROGRAMS, "startup.c" if bare else "posix.c"):
-        run(compiler, *machine, *WARNINGS, "-c", directory / name, "-o", tmp_path / "object.o")
+        run(compiler, *machine, *DEFINES[precision], *WARNINGS, "-c", directory / name, "-o", tmp_path / "object.o")
 
 
 def test_analysers_find_nothing(exported: Export, run: Run, tmp_path: Path) -> None:
     directory = exported("posix", "double")
-    sources = [directory / name for name in ("quadsim_mpc.c", "main.c", "serial.c", "posix.c")]
+    sources = [directory / name for name in (*CONTROLLER, "main.c", "serial.c", "posix.c")]
     for source in sources:
         run("gcc", *WARNINGS, "-O1", "-fanalyzer", "-c", source, "-o", tmp_path / "object.o")
-    sources.append(exported("posix", "double", scenario="robust") / "quadsim_mpc.c")  # -fanalyzer takes too long of it
     run("cppcheck", *CPPCHECK, *sources, exported("cortex-m7", "double") / "startup.c")
     run("clang-tidy", "-quiet", f"-checks={TIDY}", "-warnings-as-errors=*", *sources, "--", "-std=c99")
 
 
-def undefined(source: Path, board: str, run: Run, made: Path) -> set[str]:
-    """Undefined symbols of a source."""
-    target = TARGETS[board]
-    run(target.compiler, *target.machine.split(), "-std=c99", "-O3", "-c", source, "-o", made)
+def undefined(sources: list[Path], precision: str, run: Run, made: Path) -> set[str]:
+    """Undefined symbols of sources together."""
+    target = TARGETS[EXPORTS[precision][0]]
+    flags = [*target.machine.split(), *DEFINES[precision], "-std=c99", "-O3", "-nostdlib", "-r"]
+    run(target.compiler, *flags, *sources, "-o", made)
     return {line.split()[-1] for line in run("arm-none-eabi-nm", "-u", made).stdout.splitlines()}
 
 
@@ -64,8 +66,8 @@ def test_a_controller_needs_the_library_for_copies_only(
     precision: str, exported: Export, run: Run, tmp_path: Path
 ) -> None:
     """No malloc, no mathematics, and in float no emulated doubles, which a Cortex-M4F would need."""
-    board, _ = EXPORTS[precision]
-    assert undefined(exported(board, precision) / "quadsim_mpc.c", board, run, tmp_path / "needed.o") <= ALLOWED
+    directory = exported(*EXPORTS[precision])
+    assert undefined([directory / name for name in CONTROLLER], precision, run, tmp_path / "needed.o") <= ALLOWED
 
 
 PLANTED = """
@@ -101,14 +103,15 @@ def test_what_is_planted_is_found(fault: str, exported: Export, run: Run, tmp_pa
     source.write_text(PLANTED.format(body=body.format()))
     include = f"-I{header}"
     if tool == "nm":
-        shutil.copy(header / "quadsim_mpc.h", tmp_path)
-        assert any(name.startswith(finding) for name in undefined(source, "cortex-m4f", run, tmp_path / "planted.o"))
+        for name in ("quadsim_core.h", "quadsim_mpc.h"):
+            shutil.copy(header / name, tmp_path)
+        assert any(name.startswith(finding) for name in undefined([source], "float", run, tmp_path / "planted.o"))
         return
     commands = {
         "tidy": ["clang-tidy", "-quiet", f"-checks={TIDY}", "-warnings-as-errors=*", source, "--", "-std=c99", include],
         "cppcheck": ["cppcheck", *CPPCHECK, include, source],
     }
-    compile = [*tool.split(), *WARNINGS, include, "-c", source, "-o", tmp_path / "planted.o"]
+    compile = [*tool.split(), *DEFINES["float"], *WARNINGS, include, "-c", source, "-o", tmp_path / "planted.o"]
     done = run(*commands.get(tool, compile), check=False)
     assert done.returncode != 0
     assert finding in done.stdout + done.stderr

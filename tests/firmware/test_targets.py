@@ -22,6 +22,7 @@ OTHERS = {
     "host, unoptimised": ("posix", "CFLAGS=-O0 -std=c99"),
     "host, clang": ("posix", "CC=clang", "CFLAGS=-O3 -std=c99"),
 }
+DEFINES = {"double": [], "float": ["-DQUADSIM_FLOAT"]}
 CONTRACTED = "ALWAYS=-ffp-contract=fast"
 MEDIAN, RARE, WARM, COLD = 0.1e6, 3e6, 7e6, 27e6
 """Instructions of a step at most, of the Cortex-M7 in double and of both in float: p50, p99, warm, the first."""
@@ -93,18 +94,30 @@ def test_a_step_takes_few_instructions(board: str, precision: str, answers: Answ
 @pytest.mark.parametrize(
     ("board", "precision"), [("cortex-m7", "double"), ("cortex-m7", "float"), ("cortex-m4f", "float")]
 )
-def test_a_controller_fits(board: str, precision: str, exported: Export, run: Run, measured: Measured) -> None:
+def test_a_controller_fits(
+    board: str, precision: str, exported: Export, run: Run, measured: Measured, tmp_path: Path
+) -> None:
     directory, tools = exported(board, precision), "arm-none-eabi-size"
     run(TARGETS[board].compiler, "--version")
     build(directory, "vectors.elf")
-    flash, data, zeroed = map(int, run(tools, directory / "quadsim_mpc.o").stdout.splitlines()[1].split()[:3])
+    numbers = tmp_path / "numbers.c"
+    numbers.write_text('#include "quadsim_data.h"\nconst quadsim_controller *const used = &QUADSIM_CONTROLLER;\n')
+    flags = [*TARGETS[board].machine.split(), *DEFINES[precision], "-std=c99", "-I", directory]
+    run(TARGETS[board].compiler, *flags, "-c", numbers, "-o", tmp_path / "numbers.o")
+    objects = [directory / "quadsim_mpc.o", directory / "quadsim_core.o", tmp_path / "numbers.o"]
+    sizes = [line.split()[:3] for line in run(tools, *objects).stdout.splitlines()[1:]]
+    flash, data, zeroed = (sum(map(int, column)) for column in zip(*sizes, strict=True))
     assert flash <= FLASH[precision]
     assert (data, zeroed) == (0, 0)  # no state but the caller's
     symbols = run("arm-none-eabi-nm", "-S", directory / "main.o").stdout
-    (size,) = re.findall(r"^\S+ (\S+) \S mpc$", symbols, re.MULTILINE)
-    measured(board, precision, flash=flash, ram=int(size, 16))
-    assert int(size, 16) <= MEMORY[precision]
-    frames = [line.split("\t") for line in (directory / "quadsim_mpc.su").read_text().splitlines()]
+    ram = sum(int(size, 16) for size in re.findall(r"^\S+ (\S+) b (?:mpc|memory)$", symbols, re.MULTILINE))
+    measured(board, precision, flash=flash, ram=ram)
+    assert 0 < ram <= MEMORY[precision]
+    frames = [
+        line.split("\t")
+        for name in ("quadsim_mpc.su", "quadsim_core.su")
+        for line in (directory / name).read_text().splitlines()
+    ]
     assert {kind for _, _, kind in frames} == {"static"}
     assert max(int(size) for _, size, _ in frames) <= FRAME
 
@@ -114,8 +127,8 @@ def test_the_stack_is_small(board: str, precision: str, exported: Export, run: R
     """Painted below main, and looked at after all recorded periods."""
     directory = exported(board, precision)
     target, image = TARGETS[board], tmp_path / "stack.elf"
-    sources = [directory / name for name in ("quadsim_mpc.c", "vectors.c", "startup.c")]
-    flags = f"{target.machine} -O3 -std=gnu99 -ffp-contract=off -I {directory}".split()
+    sources = [directory / name for name in ("quadsim_mpc.c", "quadsim_core.c", "vectors.c", "startup.c")]
+    flags = f"{target.machine} {' '.join(DEFINES[precision])} -O3 -std=gnu99 -ffp-contract=off -I {directory}".split()
     link = f"-nostartfiles -T {directory / 'mps2.ld'} --specs=nano.specs".split()
     run(target.compiler, *flags, "-o", image, HERE / "stack.c", *sources, *link)
     done = run(*target.emulation, "-serial", "none", "-kernel", image)

@@ -23,8 +23,8 @@ def soft_problem() -> Problem:
     return replace(problem, bounds=replace(problem.bounds, penalty=Penalty(l1=np.ones(1), l2=np.ones(1))))
 
 
-def changing(problem: Problem, name: str = "piqp-multistage", *, shortcut: bool = False) -> QPSolver:
-    return QPSolver(name, problem, changing=True, shortcut=shortcut)
+def changing(problem: Problem, name: str = "piqp-multistage", *, free_first: bool = False) -> QPSolver:
+    return QPSolver(name, problem, changing=True, free_first=free_first)
 
 
 def solved(solver: QPSolver, now: Period) -> Answer:
@@ -97,13 +97,13 @@ def test_condensed_and_staged_forms_have_one_optimum(solver: str, terminal: floa
     Q_d = 0.3 * np.eye(problem.model.nu)
     objective = replace(problem.objective, Q_d=Q_d, P=terminal * problem.objective.weights[0])
     problem = replace(problem, objective=objective)
-    ways = changing(problem), changing(problem, solver), changing(problem, solver, shortcut=True)
+    ways = changing(problem), changing(problem, solver), changing(problem, solver, free_first=True)
     for _ in range(8):
         now = changing_period(rng, problem)
         u = now.rest.u + 0.2 * rng.normal(size=(problem.horizon, problem.model.nu))
         now = replace(now, rest=now.rest._replace(u=u))
-        staged, condensed, shortcut = (solved(way, now) for way in ways)
-        for other in (condensed, shortcut):
+        staged, condensed, free_first = (solved(way, now) for way in ways)
+        for other in (condensed, free_first):
             assert {staged.status, other.status} <= ACCEPTED
             np.testing.assert_allclose(other.plan, staged.plan, atol=1e-4)
             np.testing.assert_allclose(other.slacks, staged.slacks, atol=1e-4)
@@ -123,7 +123,7 @@ def test_the_unconstrained_optimum_is_answered_where_it_violates_nothing() -> No
     wide = replace(wide, u_min=centre - 1e4, u_max=centre + 1e4)
     problem = replace(problem, bounds=wide)
     now = changing_period(np.random.default_rng(3), problem)
-    way = changing(problem, "piqp-dense", shortcut=True)
+    way = changing(problem, "piqp-dense", free_first=True)
     answer = solved(way, now)
     assert answer.status == UNCONSTRAINED
     np.testing.assert_allclose(answer.plan, solved(changing(problem), now).plan, atol=1e-5)

@@ -41,7 +41,7 @@ class FaultySolver(QPSolver):
 
 def fly(faults: dict[int, str], periods: int, horizon: int = 50) -> list[Command]:
     solver = FaultySolver(faults, horizon)
-    controller = ConstrainedMPC(solver.problem, solver, shortcut=not faults)  # which might repair a corrupted plan
+    controller = ConstrainedMPC(solver.problem, solver)
     controller.reset(solver.problem.model.u_bar)
     reference = paper_reference(periods + horizon + 1)
     return [controller.step(Moment(time=0.05 * k), STATE, reference[k + 1 : k + 1 + horizon]) for k in range(periods)]
@@ -89,7 +89,7 @@ def test_a_failure_in_the_first_period_has_no_plan_to_hold() -> None:
 
 def test_reset_forgets_the_plan() -> None:
     solver = FaultySolver({1: "numerics"})
-    controller = ConstrainedMPC(solver.problem, solver, shortcut=False)  # which solves a first QP twice
+    controller = ConstrainedMPC(solver.problem, solver)
     reference = paper_reference(60)[1:51]
     controller.reset(solver.problem.model.u_bar)
     controller.step(Moment(), STATE, reference)

@@ -15,11 +15,11 @@ from mpc.constraints import Penalty
 from mpc.ocp import Query
 from mpc.paper.condensed import Condensed
 from mpc.qp import kkt_residuals
-from mpc.solvers import SOLVERS, Answer, QPSolver, find_solver, make_backend, solver_entries
+from mpc.solvers import SOLVERS, Answer, QPSolver, find_solver, make_backend, make_solver, solver_entries
 from mpc.solvers.daqp_dense import DaqpDense
 from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged
-from quadsim.controller import SOLVED, Moment
+from quadsim.controller import CORE, GAIN, SOLVED, Moment
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
@@ -65,10 +65,33 @@ def test_data_that_is_not_finite_reaches_no_back_end(place: int, corrupted: floa
     answer = solver.solve(Query(*query))
     assert answer.status == "invalid_data"
     assert np.isnan(answer.plan).all()
-    controller = ConstrainedMPC(problem, solver, shortcut=False)
+    controller = ConstrainedMPC(problem, solver)
     controller.reset(problem.model.u_bar)
     with pytest.raises(PlanExhaustedError, match="invalid_data"):
         controller.step(Moment(), np.full(12, np.nan), paper_reference(51)[1:])
+
+
+@pytest.mark.parametrize(
+    ("settings", "by"),
+    [
+        ([], GAIN),
+        (["controller.horizon=150"], GAIN),
+        (["controller.horizon=200"], "piqp"),  # its matrices are too large
+        (["controller.horizon=100", "controller.input_weights.speed=1e-6"], "piqp"),  # cond(H) forbids
+    ],
+)
+def test_the_unconstrained_optimum_is_tried_first_unless_size_or_rounding_forbid(settings: list[str], by: str) -> None:
+    """A little beside the reference; gain or not, it is the QP's optimum."""
+    problem = paper_problem("paper-constrained", *settings)
+    state = np.zeros(12)
+    state[[0, 2, 4, 6, 8]] = [0.02, -0.03, -0.05, 0.002, -0.003]
+    query = Query(1e-2 * state, np.zeros((problem.horizon, 4)), problem.model.u_bar)
+    answer, whole = make_solver("piqp", problem).solve(query), QPSolver("piqp", problem).solve(query)
+    assert answer.answered_by == by
+    assert answer.certificate is not None
+    assert kkt_residuals(*answer.certificate()).worst < 1e-5
+    np.testing.assert_allclose(answer.plan[0], whole.plan[0], atol=1e-3)
+    assert answer.solve_s > 0.0
 
 
 def test_equality_rows_and_multipliers() -> None:
@@ -131,6 +154,8 @@ def test_daqp_starts_from_the_active_set_one_step_earlier(constrained_flight: Fl
 def test_unknown_solver_lists_those_there_are() -> None:
     with pytest.raises(UnknownNameError, match=r"no solver named 'piqp-dens'; did you mean 'piqp-dense'"):
         QPSolver("piqp-dens", paper_problem())
+    with pytest.raises(UnknownNameError, match=r"no QP solver named 'core'.*make_solver has it"):
+        QPSolver(CORE, paper_problem())
     assert {"clarabel", "quadprog"} & {*solver_entries()} <= {*qpsolvers.available_solvers}
 
 

@@ -11,7 +11,6 @@ from polish import polish
 from support import paper_problem, random_problem
 
 from mpc.core.axes import axes
-from mpc.exact.shortcut import Shortcut
 from mpc.ocp import Objective, Problem, Query, Rest, lqr_terminal_weight
 from mpc.paper.condensed import Condensed
 from mpc.solvers import Formulation, Method, QPSolver
@@ -50,7 +49,7 @@ def gain(problem: Problem) -> Array:
 
 def first_inputs(problem: Problem, query: tuple[Array, Array, Array, Rest]) -> dict[str, Array]:
     """By the free optimum, the condensed QP and the staged one."""
-    answer = Shortcut(problem, QPSolver("piqp-multistage", problem)).solve(Query(*query))
+    answer = QPSolver("piqp-multistage", problem, free_first=True).solve(Query(*query))
     assert answer.method is Method.FREE
     found = {"free": answer.plan[0]}
     forms: tuple[Formulation, ...] = (Condensed(problem), Staged(problem, steps_per_stage=3))
@@ -98,7 +97,7 @@ def test_without_it_a_short_horizon_is_not_infinite() -> None:
     """What the tests above rest on."""
     problem = without_bounds(paper_problem("paper-constrained", "controller.horizon=7"))
     state = 0.01 * np.random.default_rng(0).normal(size=12)
-    solver = Shortcut(problem, QPSolver("piqp-multistage", problem))
+    solver = QPSolver("piqp-multistage", problem, free_first=True)
     answer = solver.solve(Query(state, np.zeros((7, 4)), problem.model.u_bar))
     assert np.abs(answer.plan[0] - problem.model.u_bar + gain(problem) @ state).max() > 0.1
 

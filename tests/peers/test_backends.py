@@ -53,6 +53,6 @@ def test_nothing_in_a_first_solve_is_printed(name: str, capfd: pytest.CaptureFix
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_scenario_names_its_solver(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    settings = (f"controller.solver={name}", "controller.shortcut=false", "duration=1.0")
+    settings = (f"controller.solver={name}", "duration=1.0")
     assert main(["check", "hover", *(word for setting in settings for word in ("--set", setting))]) == EXIT_DONE
     assert name in capsys.readouterr().out

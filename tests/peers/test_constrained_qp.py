@@ -25,7 +25,7 @@ def test_first_inputs_are_the_same(against_qpmpc: ConstrainedQP, hold: Callable[
         hold(check)
 
 
-def test_the_shortcut_was_taken_where_no_constraint_is_active(
+def test_no_qp_was_solved_where_no_constraint_is_active(
     against_qpmpc: ConstrainedQP, queries: tuple[Query, ...]
 ) -> None:
     taken = [query.status == UNCONSTRAINED for query in queries]

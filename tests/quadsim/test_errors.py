@@ -10,7 +10,6 @@ import pytest
 from quadsim import errors
 from quadsim.errors import (
     CommandError,
-    CompilerError,
     DivergenceError,
     ExportError,
     FileError,
@@ -19,6 +18,7 @@ from quadsim.errors import (
     InputError,
     InterruptedFlightError,
     LostError,
+    MissingCoreError,
     MissingPackageError,
     MissingProgramError,
     OutputError,
@@ -39,7 +39,7 @@ SAMPLES: list[QuadsimError] = [
     FileError("a/b.toml", "no such file"),
     MissingPackageError("solver 'daqp'", "daqp", extra="daqp"),
     MissingProgramError("to compile", "make", packages="make gcc"),
-    CompilerError("a"),
+    MissingCoreError("it was not compiled", instead="wait"),
     ExportError("its matrices change"),
     OutputError("a/b.toml", "the disk is full"),
     RenderingUnavailableError({"egl": "no libEGL"}),

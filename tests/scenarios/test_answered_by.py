@@ -22,9 +22,9 @@ from scenarios.run import fly_scenario
 @pytest.mark.parametrize(
     ("name", "settings", "answered_by"),
     [
-        ("paper-constrained", (), {"gain": 607, "active-set": 592, "piqp-multistage": 1}),
-        ("robust", (), {"gain": 196, "active-set": 404}),
-        ("hover", ("controller.shortcut=false",), {"piqp-multistage": 200}),
+        ("paper-constrained", (), {"gain": 607, "piqp-multistage": 593}),
+        ("paper-constrained", ("controller.solver=core",), {"gain": 607, "core": 593}),
+        ("robust", ("controller.solver=core",), {"gain": 196, "core": 404}),
     ],
 )
 def test_as_many_periods_are_a_solvers_as_it_had_calls(
@@ -50,7 +50,7 @@ def test_a_period_in_fallback_or_too_late_is_answered_by_the_fallback() -> None:
 
 @pytest.mark.parametrize("every", [1, 7, KKT_EVERY])
 def test_kkt_residuals_are_computed_as_often_as_stated(every: int) -> None:
-    settings = ["duration=5", f"controller.kkt_every={every}"]
+    settings = ["duration=5", "controller.solver=core", f"controller.kkt_every={every}"]
     control = fly_scenario(load_scenario("paper-constrained", settings)).log.control
     expected = np.arange(control.t.size) % every == 0
     for name in ("kkt_stationarity", "kkt_complementarity", "kkt_dual"):

@@ -1,5 +1,7 @@
-/* What Python loads: the core as one unit, of which sources it is, and how large the structs are that Python mirrors. */
+/* What Python loads: the core and the controllers as one unit, of which sources they are, and how large the structs are
+ * that Python mirrors. */
 #include "quadsim_core.c"
+#include "quadsim_mpc.c"
 
 #ifndef QUADSIM_SOURCE
 #define QUADSIM_SOURCE ""
@@ -18,4 +20,7 @@ void quadsim_library_sizes(size_t *sizes)
     sizes[2] = sizeof(quadsim_term);
     sizes[3] = sizeof(quadsim_problem);
     sizes[4] = sizeof(quadsim_work);
+    sizes[5] = sizeof(quadsim_robust);
+    sizes[6] = sizeof(quadsim_controller);
+    sizes[7] = sizeof(quadsim_mpc);
 }

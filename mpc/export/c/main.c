@@ -1,10 +1,12 @@
 /* Answers the recorded periods.  Prints of each, in hexadecimal digits, its number, its status, the changes of the active
  * set, the bits of the four commands, and the ticks that it took.  Exit status 1 where a status is not the recorded one,
  * or a command is farther from the exact optimum than it may be. */
+#include "quadsim_data.h"
 #include "target.h"
 #include "vectors.h"
 
 static quadsim_mpc mpc;
+static quadsim_real memory[QUADSIM_MEMORY];
 
 /* Write a value's bytes, the most significant first, and a blank; returns what follows. */
 static char *put(char *line, const void *value, size_t bytes)
@@ -22,6 +24,11 @@ static char *put(char *line, const void *value, size_t bytes)
 int main(void)
 {
     int k, j, failed = 0;
+    if (quadsim_mpc_reals(&QUADSIM_CONTROLLER) != QUADSIM_MEMORY) {
+        target_print("wrong: the controller needs another amount of memory\n");
+        return 1;
+    }
+    quadsim_mpc_start(&mpc, &QUADSIM_CONTROLLER, memory);
     quadsim_mpc_reset(&mpc, quadsim_vectors_speeds);
     for (k = 0; k < quadsim_vectors_count; k++) {
         const struct quadsim_vector *recorded = &quadsim_vectors[k];
@@ -38,7 +45,7 @@ int main(void)
         int wrong = optimal ? !same || status >= (int)QUADSIM_CLIPPED : status < (int)QUADSIM_CLIPPED;
         end = put(end, &k, sizeof k);
         end = put(end, &status, sizeof status);
-        end = put(end, &mpc.changes, sizeof mpc.changes);
+        end = put(end, &mpc.work.changes, sizeof mpc.work.changes);
         for (j = 0; j < 4; j++) {
             const quadsim_real off = command[j] - recorded->command[j];
             end = put(end, &command[j], sizeof command[j]);

@@ -6,7 +6,7 @@
  * QUADSIM_BEFORE, and so each 100 ms until one comes. */
 #include <string.h>
 
-#include "quadsim_mpc.h"
+#include "quadsim_data.h"
 #include "target.h"
 
 #ifndef WATCHDOG_MS
@@ -32,6 +32,7 @@ struct answer {
 };
 
 static quadsim_mpc mpc;
+static quadsim_real memory[QUADSIM_MEMORY];
 static quadsim_real window[4 * N];
 static struct answer answer; /* the last one; its mark is 0 before there is one */
 static int flying;           /* whether a state has come since the start */
@@ -108,6 +109,7 @@ int main(void)
 {
     static struct question question;
     uint32_t fresh = target_ticks();
+    quadsim_mpc_start(&mpc, &QUADSIM_CONTROLLER, memory);
     for (;;) {
         if (receive(&question)) {
             if (solve(&question)) {

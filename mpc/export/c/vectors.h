@@ -9,7 +9,7 @@ extern "C" {
 #endif
 
 #define QUADSIM_VECTORS @COUNT@
-#define QUADSIM_VECTORS_ROWS (QUADSIM_VECTORS + QUADSIM_HORIZON - 1)
+#define QUADSIM_VECTORS_ROWS @ROWS@
 #ifdef QUADSIM_FLOAT
 #define QUADSIM_VECTORS_TOLERANCE 2e-2F /* [rad/s] of a command from the exact optimum */
 #define QUADSIM_VECTORS_ANY_OPTIMUM 1   /* whether the first three statuses count as one */

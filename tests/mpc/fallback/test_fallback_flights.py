@@ -76,7 +76,7 @@ def fly_paper(
     reference = paper_reference(first + periods + 51)[first:].copy()
     if height is not None:
         reference[:, 2] = height
-    controller: Any = ConstrainedMPC(problem(), FaultySolver(solver or {}), shortcut=not solver)
+    controller: Any = ConstrainedMPC(problem(), FaultySolver(solver or {}))
     if guarded:
         controller = Guarded(controller, model(), bounds=bounds(), settings=LEVEL)
     rng = np.random.default_rng(0)

@@ -14,7 +14,7 @@ from mpc.ocp import Objective, Query
 from mpc.paper.condensed import Condensed
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.robust.filter import STANDING, SafetyFilter
-from mpc.solvers import make_backend
+from mpc.solvers import make_backend, make_solver
 from quadsim.controller import UNCONSTRAINED, Command, Moment
 from quadsim.state import INDEX, Array
 from scenarios.loading import load_scenario
@@ -40,7 +40,7 @@ def make_filter() -> SafetyFilter:
     posed = robust_problem(
         VEHICLE, period=PERIOD, horizon=HORIZON, objective=objective(), bounds=bounds(), settings=settings
     )
-    return SafetyFilter(RobustMPC(VEHICLE, posed, settings))
+    return SafetyFilter(RobustMPC(VEHICLE, posed, settings, make_solver("piqp", posed)))
 
 
 def filtered(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER) -> Command:

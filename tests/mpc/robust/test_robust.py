@@ -20,7 +20,7 @@ from mpc.model import continuous_model, discretise, hover_model
 from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
 from mpc.observer import ObserverSettings
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
-from mpc.solvers import QPSolver
+from mpc.solvers import QPSolver, make_solver
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment, Phase
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
@@ -53,7 +53,7 @@ def robust(vehicle: Vehicle, *, horizon: int = 50, weight: float = 0.01, **setti
     posed = robust_problem(
         vehicle, period=PERIOD, horizon=horizon, objective=objective, bounds=problem.bounds, settings=parts
     )
-    return RobustMPC(vehicle, posed, parts)
+    return RobustMPC(vehicle, posed, parts, make_solver("piqp", posed))
 
 
 def flown(

@@ -30,6 +30,7 @@ from mpc.robust.tightening import (
     margins,
     observed,
 )
+from mpc.solvers import make_solver
 from quadsim.controller import ACCEPTED, Moment
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
@@ -327,7 +328,7 @@ def robust(vehicle: Vehicle, drawn_in: Array | None, *, rotor_lag: float = 0.0, 
     posed = robust_problem(
         vehicle, period=PERIOD, horizon=HORIZON, objective=objective, bounds=problem.bounds, settings=settings
     )
-    return RobustMPC(vehicle, posed, settings)
+    return RobustMPC(vehicle, posed, settings, make_solver("piqp", posed))
 
 
 def peak_tilt(vehicle: Vehicle, *sets: str, tight: bool = True, rotor_lag: float = 0.0) -> float:

@@ -10,18 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import paper_problem
 
-from mpc.exact.shortcut import with_shortcut
 from mpc.ocp import Problem, Query
 from mpc.paper.condensed import Condensed
 from mpc.paper.prediction import prediction
 from mpc.qp import kkt_residuals
 from mpc.robust.tightening import TighteningSettings, position_margins
-from mpc.solvers import Answer, QPSolver
+from mpc.solvers import Answer, QPSolver, make_solver
 from mpc.solvers.piqp_backends import PiqpDense
 from mpc.space.clearing import Clearing
 from mpc.space.halfspaces import AvoidanceSettings, Shape, Space
-from mpc.staged import Staged
 from quadsim.controller import SOLVED
+from quadsim.errors import ParameterError
 from quadsim.space import Capsule, Corridor, Cylinder, Fence, Sphere
 from quadsim.state import INDEX, POSITION, Array
 from quadsim.vehicle import Vehicle
@@ -54,7 +53,7 @@ def query(problem: Problem, *, goal: float = 2.0, speed: float = 0.8) -> Query:
 
 
 def clearing(problem: Problem, among: Space, calls: list[Answer] | None = None, *, changing: bool = False) -> Clearing:
-    solver = with_shortcut(problem, QPSolver("piqp-multistage", problem))
+    solver = QPSolver("piqp-multistage", problem, free_first=True)
     find = solver.solve
 
     def solve(posed: Query) -> Answer:
@@ -203,15 +202,14 @@ def test_soft_half_spaces_give_way_and_hard_ones_are_named(problem: Problem) -> 
     assert hard[1].constraints[0].C.shape == (N, 1, 12)
 
 
-def test_what_takes_rows_for_the_same_at_all_steps_refuses_or_is_skipped(problem: Problem) -> None:
+def test_what_takes_rows_for_the_same_at_all_steps_refuses(problem: Problem) -> None:
     among = space(PILLAR)
     normals, bounds = among.half_spaces(np.zeros(N), np.zeros((N, 3)))
     constrained = replace(problem, constraints=among.constraints(normals, bounds, 12))
     with pytest.raises(ValueError, match="same at all steps"):
         Condensed(constrained)
-    whole = QPSolver("piqp-multistage", constrained)
-    assert with_shortcut(constrained, whole) is whole
-    assert isinstance(whole.formulation, Staged)
+    with pytest.raises(ParameterError, match=r"must be a QP solver .* for this problem: .*the same at all steps"):
+        make_solver("core", constrained)
 
 
 def test_margins_grow_with_the_stated_disturbance(vehicle: Vehicle) -> None:

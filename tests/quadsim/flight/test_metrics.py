@@ -114,7 +114,7 @@ def test_the_controllers_counts_and_times() -> None:
         fallback=np.array([0, 1, 0, 0]),
         iterations=np.array([3, 100, 4, 5]),
         active=np.array([0, 0, 7, 2]),
-        answered_by=("piqp-dense", "fallback", "active-set", "piqp-dense"),
+        answered_by=("piqp-dense", "fallback", "core", "piqp-dense"),
         reported_primal=np.array([1e-9, math.inf, math.nan, 0.0]),
         infeasibility=np.array([2e-9, 0.1, 3e-9, 0.0]),
         kkt_dual=np.full(4, math.nan),
@@ -123,10 +123,10 @@ def test_the_controllers_counts_and_times() -> None:
     numbers = metrics.controller(log, timing, deadline_ms=50.0)
     assert numbers["statuses"] == {"max_iterations": 1, "solved": 2, "unconstrained": 1}
     assert numbers["fallbacks"] == {"0": 3, "1": 1}
-    assert numbers["answered_by"] == {"active-set": 1, "fallback": 1, "piqp-dense": 2}
+    assert numbers["answered_by"] == {"core": 1, "fallback": 1, "piqp-dense": 2}
     assert numbers["iterations"] == {"mean": 4.0, "max": 5}  # of the QP solver alone
     assert numbers["iterations_by"] == {
-        "active-set": {"mean": 4.0, "max": 4},
+        "core": {"mean": 4.0, "max": 4},
         "fallback": {"mean": 100.0, "max": 100},
         "piqp-dense": {"mean": 4.0, "max": 5},
     }
@@ -138,7 +138,7 @@ def test_the_controllers_counts_and_times() -> None:
     assert numbers["residuals"]["infeasibility"] == {"max": 3e-9, "periods": 3}
     assert numbers["residuals"]["kkt_dual"] == {"max": None, "periods": 0}  # absent, not 0
     json.dumps(numbers, allow_nan=False)
-    several = replace(log, answered_by=("piqp-dense", "fallback", "active-set", "daqp"))
+    several = replace(log, answered_by=("piqp-dense", "fallback", "core", "daqp"))
     assert metrics.controller(several, timing, deadline_ms=50.0)["iterations"] is None
 
 

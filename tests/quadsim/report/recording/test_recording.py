@@ -196,7 +196,7 @@ def test_events_report_each_change_of_the_solver_why_it_failed_and_the_end(
     status, fallback = [SOLVED] * K, control.fallback.copy()
     status[20:30] = [UNCONSTRAINED] * 10
     status[40:43], fallback[40:43], fallback[-40:] = ["infeasible"] * 3, [1, 1, 2], 2
-    by = ["piqp-dense"] * 20 + ["gain"] * 10 + ["active-set"] * 10 + ["fallback"] * 3 + ["piqp-dense"] * (K - 43)
+    by = ["piqp-dense"] * 20 + ["gain"] * 10 + ["core"] * 10 + ["fallback"] * 3 + ["piqp-dense"] * (K - 43)
     changed = dataclasses.replace(control, status=tuple(status), answered_by=tuple(by), fallback=fallback)
     log = dataclasses.replace(short_run.log, control=changed, reason="the battery fell off")
     found = {"time": 2.0, "sentence": "cannot hold together: roll upper by 1 deg", "advice": "to try: more"}
@@ -209,7 +209,7 @@ def test_events_report_each_change_of_the_solver_why_it_failed_and_the_end(
     expected = [
         (0.0, "INFO", "solved by piqp-dense, fallback 0"),
         (1.0, "INFO", "unconstrained by gain, fallback 0"),
-        (1.5, "INFO", "solved by active-set, fallback 0"),
+        (1.5, "INFO", "solved by core, fallback 0"),
         (2.0, "ERROR", "cannot hold together: roll upper by 1 deg"),
         (2.0, "ERROR", "to try: more"),
         (2.0, "WARN", "infeasible, fallback 1"),

@@ -1,14 +1,76 @@
+/* Arithmetic that the core and the controllers share. */
+#ifndef QUADSIM_MATH_H
+#define QUADSIM_MATH_H
 
-/* ---- elementary functions, by arithmetic alone: every processor has the same bits ------------------------------------- */
+#include "quadsim_core.h"
+
+#if defined __FINITE_MATH_ONLY__ && __FINITE_MATH_ONLY__
+#error "compile without -ffast-math, which takes away the check that numbers are finite"
+#endif
+
+#ifdef QUADSIM_FLOAT
+#define R(number) number##F
+#else
+#define R(number) number
+#endif
+
+typedef quadsim_real real;
+
+enum { NU = QUADSIM_INPUTS };
+
+/* ---- numbers ---------------------------------------------------------------------------------------------------- */
+
+static inline int is_finite(const real *numbers, int count)
+{
+    real even = R(0.0), odd = R(0.0); /* sums of zeros, and of NaN where a number is none, or infinite */
+    int i;
+    for (i = 0; i + 1 < count; i += 2) {
+        even += numbers[i] * R(0.0);
+        odd += numbers[i + 1] * R(0.0);
+    }
+    if (count % 2 == 1) {
+        even += numbers[count - 1] * R(0.0);
+    }
+    return even + odd >= R(0.0);
+}
+
+static inline real magnitude(real number)
+{
+    return number < R(0.0) ? -number : number;
+}
+
+static inline real clipped(real number, real lower, real upper)
+{
+    const real least = number > lower ? number : lower;
+    return least < upper ? least : upper;
+}
+
+static inline real dot(const real *left, const real *right, int count)
+{
+    real sum[4] = {R(0.0), R(0.0), R(0.0), R(0.0)};
+    int i;
+    for (i = 0; i + 3 < count; i += 4) { /* four sums at a time, so that none waits for the one before */
+        sum[0] += left[i] * right[i];
+        sum[1] += left[i + 1] * right[i + 1];
+        sum[2] += left[i + 2] * right[i + 2];
+        sum[3] += left[i + 3] * right[i + 3];
+    }
+    for (; i < count; i++) {
+        sum[0] += left[i] * right[i];
+    }
+    return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+/* ---- elementary functions, by arithmetic alone: every processor has the same bits ------------------------------ */
 
 /* After FreeBSD's msun, by Sun Microsystems, 1993: permission to use, copy, modify, and distribute this software is
  * freely granted, provided that this notice is preserved. */
 
 static const real HALF_PI = R(1.5707963267948966);
 
-/* sin and cos of a number of up to 1e5 [rad], as 1e-15 near; 1e-6 in single precision.  Beyond, 0 and 1; not a number where
- * the angle is not finite. */
-static void sin_cos(real angle, real *sine, real *cosine)
+/* sin and cos of a number of up to 1e5 [rad], as 1e-15 near; 1e-6 in single precision.  Beyond, 0 and 1; not a number
+ * where the angle is not finite. */
+static inline void sin_cos(real angle, real *sine, real *cosine)
 {
     /* pi / 2 in three parts, the first two with so few bits that their products with quarters are exact. */
 #ifdef QUADSIM_FLOAT
@@ -51,7 +113,7 @@ static void sin_cos(real angle, real *sine, real *cosine)
 }
 
 /* atan of a number that is not negative [rad]. */
-static real arc_tangent(real tangent)
+static inline real arc_tangent(real tangent)
 {
     static const real SERIES[11] = {R(3.33333333333329318027e-01),  R(-1.99999999998764832476e-01),
                                     R(1.42857142725034663711e-01),  R(-1.11111104054623557880e-01),
@@ -78,13 +140,13 @@ static real arc_tangent(real tangent)
 }
 
 /* atan2 of y and a positive x [rad]. */
-static real angle_of(real y, real x)
+static inline real angle_of(real y, real x)
 {
     return y < R(0.0) ? -arc_tangent(-y / x) : arc_tangent(y / x);
 }
 
 /* The root of a number that is not negative, by Newton's method. */
-static real square_root(real number)
+static inline real square_root(real number)
 {
     real scaled = number, factor = R(1.0), root;
     int i;
@@ -105,3 +167,5 @@ static real square_root(real number)
     }
     return factor * root;
 }
+
+#endif

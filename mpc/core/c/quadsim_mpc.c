@@ -1,0 +1,496 @@
+#include "quadsim_mpc.h"
+
+#include <stddef.h>
+#include <string.h>
+
+#include "quadsim_math.h"
+
+enum { MOST_STATES = 16 }; /* of a problem: 12, and 4 rotor speeds where these lag */
+enum { X = 0, VX = 1, Y = 2, VY = 3, Z = 4, VZ = 5, ROLL = 6, PITCH = 8, YAW = 10 };
+
+/* ---- what is answered -------------------------------------------------------------------------------------------- */
+
+/* Speeds within what the bounds on them and on their steps leave after acting [rad/s]; where these leave nothing,
+ * within those on the speeds. */
+static void put_command(quadsim_mpc *mpc, const real *speeds, const real *acting, real *command)
+{
+    const quadsim_controller *c = mpc->controller;
+    int j;
+    for (j = 0; j < NU; j++) {
+        const real lower = clipped(acting[j] + c->step_min[j], c->speed_min[j], c->speed_max[j]);
+        const real upper = clipped(acting[j] + c->step_max[j], c->speed_min[j], c->speed_max[j]);
+        command[j] = mpc->before[j] = clipped(speeds[j], lower, upper);
+    }
+}
+
+/* The command of an optimum, or the fallback without one. */
+static enum quadsim_status answer(quadsim_mpc *mpc, enum quadsim_status status, const real *acting, real *command)
+{
+    const real *plan = mpc->work.plan, *axes = mpc->work.axes;
+    const int N = mpc->work.p->horizon;
+    if (status <= QUADSIM_WHOLE && is_finite(plan, N * NU)) {
+        mpc->age = 0;
+        put_command(mpc, plan, acting, command);
+        return status;
+    }
+    if (mpc->age >= 0 && mpc->age < N) {
+        mpc->age++;
+    }
+    if (status == QUADSIM_CLIPPED && is_finite(axes, NU)) {
+        put_command(mpc, axes, acting, command);
+        return status;
+    }
+    if (status <= QUADSIM_SHIFTED && mpc->age >= 0 && mpc->age < N && is_finite(plan, N * NU)) {
+        put_command(mpc, plan + mpc->age * NU, acting, command);
+        return QUADSIM_SHIFTED;
+    }
+    put_command(mpc, acting, acting, command);
+    return QUADSIM_BEFORE;
+}
+
+/* ---- what is wanted ---------------------------------------------------------------------------------------------- */
+
+/* wanted [N][n_r] = -C_r x_s */
+static void want_rest(quadsim_mpc *mpc, const real *rest)
+{
+    const quadsim_problem *p = mpc->controller->problem;
+    int i, r;
+    for (r = 0; r < p->regulated; r++) {
+        const real at_rest = dot(mpc->controller->C_r + r * p->states, rest, p->states);
+        for (i = 0; i < p->horizon; i++) {
+            mpc->wanted[i * p->regulated + r] = -at_rest;
+        }
+    }
+}
+
+/* wanted [n_r] += y_d of a row of the reference; states besides these four are wanted at 0. */
+static void want(const quadsim_controller *c, const real row[4], real *wanted)
+{
+    const int n = c->problem->states;
+    int r;
+    for (r = 0; r < c->problem->regulated; r++) {
+        const real *C = c->C_r + r * n;
+        wanted[r] += C[X] * row[0] + C[Y] * row[1] + C[Z] * row[2] + C[YAW] * row[3];
+    }
+}
+
+/* Level rest at a state's place and yaw. */
+static void rest_at(const real *state, real *rest)
+{
+    memset(rest, 0, MOST_STATES * sizeof(real));
+    rest[X] = state[X];
+    rest[Y] = state[Y];
+    rest[Z] = state[Z];
+    rest[YAW] = state[YAW];
+}
+
+/* The optimum for what is wanted, as the work's plan, and how it was found. */
+static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const real *rest, const real *speeds,
+                                    const real *acting)
+{
+    switch (quadsim_optimise(&mpc->work, state, mpc->wanted, rest, speeds, acting)) {
+    case QUADSIM_FOUND_FREE:
+        return QUADSIM_FREE;
+    case QUADSIM_FOUND_AXES:
+        return QUADSIM_AXES;
+    case QUADSIM_FOUND_WHOLE:
+        return QUADSIM_WHOLE;
+    case QUADSIM_NOT_WHOLE:
+        return QUADSIM_CLIPPED;
+    case QUADSIM_NOT_AXES:
+        return QUADSIM_SHIFTED;
+    default:
+        return QUADSIM_BEFORE;
+    }
+}
+
+/* ---- the vehicle's model ----------------------------------------------------------------------------------------- */
+
+static void sines_of(const real *state, real sine[3], real cosine[3])
+{
+    sin_cos(state[ROLL], &sine[0], &cosine[0]);
+    sin_cos(state[PITCH], &sine[1], &cosine[1]);
+    sin_cos(state[YAW], &sine[2], &cosine[2]);
+}
+
+/* The unit vector along which rotors push, world axes. */
+static void thrust_axis(const real *state, real axis[3])
+{
+    real s[3], c[3];
+    sines_of(state, s, c);
+    axis[0] = c[2] * (c[0] * s[1]) + s[2] * s[0];
+    axis[1] = s[2] * (c[0] * s[1]) - c[2] * s[0];
+    axis[2] = c[0] * c[1];
+}
+
+/* Body rates (p, q, r) of Euler angles and their rates. */
+static void body_rates(const real *state, real rates[3])
+{
+    const real a = state[ROLL + 1], b = state[PITCH + 1], c = state[YAW + 1];
+    real s[3], k[3];
+    sines_of(state, s, k);
+    rates[0] = a - c * s[1];
+    rates[1] = b * k[0] + c * k[1] * s[0];
+    rates[2] = c * k[1] * k[0] - b * s[0];
+}
+
+/* Rates of change of a state, of U/m and I^-1 tau (4,) and a constant acceleration (3,).  Sec. 2.2. */
+static void slopes(const quadsim_robust *robust, const real *state, const real *drive, const real *disturbance,
+                   real *rates)
+{
+    const real a = state[ROLL + 1], b = state[PITCH + 1], c = state[YAW + 1];
+    real s[3], k[3], p, q, r, dp, dq, dr, yaw, turn, level, side;
+    int i;
+    sines_of(state, s, k);
+    for (i = 0; i < 12; i += 2) {
+        rates[i] = state[i + 1];
+    }
+    turn = c * k[1];
+    p = a - c * s[1];
+    q = b * k[0] + turn * s[0];
+    r = turn * k[0] - b * s[0];
+    dp = drive[1] + robust->gyration[0] * q * r;
+    dq = drive[2] + robust->gyration[1] * r * p;
+    dr = drive[3] + robust->gyration[2] * p * q;
+    yaw = (dq * s[0] + dr * k[0] + b * (a + c * s[1])) / k[1];
+    level = drive[0] * s[1] * k[0];
+    side = drive[0] * s[0];
+    rates[VX] = k[2] * level + s[2] * side + disturbance[0];
+    rates[VY] = s[2] * level - k[2] * side + disturbance[1];
+    rates[VZ] = drive[0] * k[1] * k[0] + (disturbance[2] - robust->gravity);
+    rates[ROLL + 1] = dp + b * turn + s[1] * yaw;
+    rates[PITCH + 1] = dq * k[0] - dr * s[0] - a * turn;
+    rates[YAW + 1] = yaw;
+}
+
+/* result = state + time rates */
+static void moved(const real *state, real time, const real *rates, real *result)
+{
+    int i;
+    for (i = 0; i < 12; i++) {
+        result[i] = state[i] + time * rates[i];
+    }
+}
+
+/* U/m and I^-1 tau of rotors whose speeds have gone from rotors to command but for a share that decays. */
+static void find_drive(const quadsim_mpc *mpc, const real *rotors, const real *command, real decay, real *drive)
+{
+    int i, j;
+    memset(drive, 0, NU * sizeof(real));
+    for (j = 0; j < NU; j++) {
+        const real speed = command[j] + decay * (rotors[j] - command[j]);
+        for (i = 0; i < NU; i++) {
+            drive[i] += mpc->effectiveness[i * NU + j] * (speed * speed);
+        }
+    }
+}
+
+/* The acceleration (3,) that the estimated disturbance is, world axes, with thrust along an axis. */
+static void find_disturbance(const quadsim_mpc *mpc, const real axis[3], real acceleration[3])
+{
+    acceleration[0] = mpc->estimate[2] * axis[0] + mpc->estimate[0];
+    acceleration[1] = mpc->estimate[2] * axis[1] + mpc->estimate[1];
+    acceleration[2] = mpc->estimate[2] * axis[2];
+}
+
+/* The state some time [s] later under a command, by Runge-Kutta's classical method; decay [SUBSTEPS][4] of the rotors'
+ * speeds at its instants. */
+static void advance(const quadsim_mpc *mpc, real time, const real *decay, const real *rotors, const real *command,
+                    real *state)
+{
+    const quadsim_robust *robust = mpc->controller->robust;
+    const real step = time / (real)QUADSIM_SUBSTEPS;
+    real axis[3], disturbance[3], drive[NU], rates[4][12], at[12];
+    int k, i;
+    if (!(time > R(1e-9))) {
+        return;
+    }
+    thrust_axis(state, axis);
+    find_disturbance(mpc, axis, disturbance);
+    for (k = 0; k < QUADSIM_SUBSTEPS; k++, decay += 4) {
+        find_drive(mpc, rotors, command, decay[0], drive);
+        slopes(robust, state, drive, disturbance, rates[0]);
+        find_drive(mpc, rotors, command, decay[1], drive);
+        moved(state, R(0.5) * step, rates[0], at);
+        slopes(robust, at, drive, disturbance, rates[1]);
+        moved(state, R(0.5) * step, rates[1], at);
+        slopes(robust, at, drive, disturbance, rates[2]);
+        find_drive(mpc, rotors, command, decay[3], drive);
+        moved(state, step, rates[2], at);
+        slopes(robust, at, drive, disturbance, rates[3]);
+        for (i = 0; i < 12; i++) {
+            state[i] += step / R(6.0) * (rates[0][i] + R(2.0) * (rates[1][i] + rates[2][i]) + rates[3][i]);
+        }
+    }
+}
+
+/* ---- what the model does not explain: steady-state Kalman filters of a force and a torque ------------------------ */
+
+/* Where the vehicle rests against the estimated disturbance: lift (3,), trim (4,), twist (3,) and effectiveness.
+ * U / m R(eta) e_z = g e_z - a,    I^-1 tau = -alpha. */
+static void believe(quadsim_mpc *mpc)
+{
+    const quadsim_robust *r = mpc->controller->robust;
+    const real x = mpc->estimate[0], y = mpc->estimate[1];
+    const real length = square_root(x * x + y * y + r->gravity * r->gravity);
+    real axis[3], acceleration[3], drive[NU], up, thrust;
+    int i, j;
+    axis[0] = -x / length;
+    axis[1] = -y / length;
+    axis[2] = r->gravity / length;
+    find_disturbance(mpc, axis, acceleration);
+    up = r->gravity - acceleration[2];
+    if (up < r->least_lift * r->gravity) {
+        up = r->least_lift * r->gravity;
+    }
+    thrust = square_root(acceleration[0] * acceleration[0] + acceleration[1] * acceleration[1] + up * up);
+    mpc->lift[0] = -acceleration[0];
+    mpc->lift[1] = -acceleration[1];
+    mpc->lift[2] = up;
+    memcpy(mpc->effectiveness, r->effectiveness, sizeof(mpc->effectiveness));
+    drive[0] = thrust;
+    for (i = 0; i < 3; i++) {
+        mpc->twist[i] = mpc->estimate[3 + i] / r->gravity;
+        drive[1 + i] = -thrust * mpc->twist[i];
+        for (j = 0; j < NU; j++) {
+            mpc->effectiveness[(1 + i) * NU + j] += mpc->twist[i] * r->effectiveness[j];
+        }
+    }
+    for (j = 0; j < NU; j++) {
+        mpc->trim[j] = square_root(dot(r->allocation + j * NU, drive, NU));
+    }
+}
+
+/* Take note of a measured state and of the one that was expected. */
+static void observe(quadsim_mpc *mpc, const real *measured, const real *expected)
+{
+    const quadsim_robust *r = mpc->controller->robust;
+    real axis[3], rates[3], expected_rates[3], surprise[6], upright;
+    int i;
+    thrust_axis(measured, axis);
+    body_rates(measured, rates);
+    body_rates(expected, expected_rates);
+    upright = axis[2] > r->upright ? axis[2] : r->upright;
+    surprise[2] = (measured[VZ] - expected[VZ]) / upright;
+    surprise[0] = (measured[VX] - expected[VX]) - surprise[2] * axis[0];
+    surprise[1] = (measured[VY] - expected[VY]) - surprise[2] * axis[1];
+    for (i = 0; i < 3; i++) {
+        surprise[3 + i] = rates[i] - expected_rates[i];
+    }
+    for (i = 0; i < 6; i++) {
+        mpc->estimate[i] = clipped(mpc->estimate[i] + r->gain[i] * surprise[i], -r->largest[i], r->largest[i]);
+    }
+    believe(mpc);
+}
+
+/* ---- the robust controller --------------------------------------------------------------------------------------- */
+
+/* Rotor speeds after a time, of which the share that is still what it was is decay. */
+static void spin(real *rotors, const real *command, real decay)
+{
+    int j;
+    for (j = 0; j < NU; j++) {
+        rotors[j] = command[j] + decay * (rotors[j] - command[j]);
+    }
+}
+
+/* The reference's row at the instant that its prediction is for, the delay after it. */
+static void later_row(const quadsim_controller *c, const real *reference, int i, real row[4])
+{
+    const real *now = reference + i * 4, *next = i < c->problem->horizon - 1 ? now + 4 : now;
+    int j;
+    for (j = 0; j < 4; j++) {
+        row[j] = now[j] + c->robust->delayed_share * (next[j] - now[j]);
+    }
+}
+
+/* wanted of the reference [N][4] as the prediction is given it: later by the delay, and where the model is turned by
+ * the heading, yaw without jumps, seen from axes turned by it. */
+static void want_seen(quadsim_mpc *mpc, const real *reference, real yaw, real sine, real cosine)
+{
+    const quadsim_controller *c = mpc->controller;
+    real row[4], last = yaw, turned = yaw;
+    int i;
+    for (i = 0; i < c->problem->horizon; i++) {
+        later_row(c, reference, i, row);
+        if (c->robust->heading) {
+            const real x = row[0], y = row[1], step = row[3] - last;
+            last = row[3];
+            turned += clipped(step, -c->robust->largest_turn, c->robust->largest_turn);
+            row[0] = cosine * x + sine * y;
+            row[1] = cosine * y - sine * x;
+            row[3] = turned - yaw;
+        }
+        want(c, row, mpc->wanted + i * c->problem->regulated);
+    }
+}
+
+/* The last states of a state, which stand for the rotors' speeds where these lag. */
+static void put_modes(const quadsim_controller *c, const real *speeds, real *state)
+{
+    int j;
+    for (j = 0; j < c->problem->states - 12; j++) {
+        state[12 + j] = dot(c->robust->modes + j * NU, speeds, NU);
+    }
+}
+
+/* Where the model rests: x_s at the present place, u_s with what balances the torque that thrust twists now. */
+static void find_rest(const quadsim_mpc *mpc, const real *state, real sine, real cosine, real *rest, real *speeds)
+{
+    const quadsim_robust *r = mpc->controller->robust;
+    const real forward = cosine * mpc->lift[0] + sine * mpc->lift[1];
+    const real left = cosine * mpc->lift[1] - sine * mpc->lift[0];
+    real excess_thrust = R(0.0);
+    int j;
+    rest_at(state, rest);
+    rest[ROLL] = -angle_of(left, square_root(forward * forward + mpc->lift[2] * mpc->lift[2]));
+    rest[PITCH] = angle_of(forward, mpc->lift[2]);
+    for (j = 0; j < NU; j++) {
+        const real turning = mpc->rotors[j], resting = mpc->trim[j];
+        excess_thrust += r->effectiveness[j] * (turning * turning - resting * resting);
+    }
+    for (j = 0; j < NU; j++) {
+        speeds[j] = mpc->trim[j] - excess_thrust * dot(r->slope_inverse + j * NU + 1, mpc->twist, 3);
+    }
+    put_modes(mpc->controller, speeds, rest);
+}
+
+/* The optimum from a state at the instant from which the command acts. */
+static enum quadsim_status solve_ahead(quadsim_mpc *mpc, const real *ahead, const real *reference, const real *acting)
+{
+    const quadsim_controller *c = mpc->controller;
+    real state[MOST_STATES], rest[MOST_STATES], speeds[NU], sine = R(0.0), cosine = R(1.0);
+    memcpy(state, ahead, 12 * sizeof(real));
+    if (c->robust->heading) {
+        sin_cos(ahead[YAW], &sine, &cosine);
+        state[X] = cosine * ahead[X] + sine * ahead[Y];
+        state[Y] = cosine * ahead[Y] - sine * ahead[X];
+        state[VX] = cosine * ahead[VX] + sine * ahead[VY];
+        state[VY] = cosine * ahead[VY] - sine * ahead[VX];
+        state[YAW] = R(0.0);
+    }
+    put_modes(c, mpc->rotors, state);
+    find_rest(mpc, state, sine, cosine, rest, speeds);
+    want_rest(mpc, rest);
+    want_seen(mpc, reference, ahead[YAW], sine, cosine);
+    return optimise(mpc, state, rest, speeds, acting);
+}
+
+/* The optimum of the robust controller, its prediction and its observer brought up to date. */
+static enum quadsim_status solve_robust(quadsim_mpc *mpc, const real *state, const real *reference, const real *acting,
+                                        int usable)
+{
+    const quadsim_robust *r = mpc->controller->robust;
+    real before[NU], expected[12];
+    const int known = mpc->known;
+    memcpy(before, mpc->rotors, sizeof(before));
+    spin(mpc->rotors, acting, r->spun_before);
+    mpc->known = 0;
+    if (usable && r->observes && known) {
+        memcpy(expected, mpc->ahead, sizeof(expected));
+        advance(mpc, r->rest_of_period, r->decay_before, before, acting, expected);
+        if (is_finite(expected, 12)) {
+            observe(mpc, state, expected);
+        }
+    }
+    if (usable) {
+        memcpy(mpc->ahead, state, sizeof(mpc->ahead));
+        advance(mpc, r->delay, r->decay_delay, mpc->rotors, acting, mpc->ahead);
+    }
+    spin(mpc->rotors, acting, r->spun_delay);
+    mpc->known = usable && is_finite(mpc->ahead, 12);
+    return mpc->known ? solve_ahead(mpc, mpc->ahead, reference, acting) : QUADSIM_BEFORE;
+}
+
+/* ---- the controllers --------------------------------------------------------------------------------------------- */
+
+/* Whether numbers are within magnitudes [count] that are taken for a measurement, as none that is not finite is. */
+static int is_plausible(const real *numbers, const real *most, int count)
+{
+    int i;
+    for (i = 0; i < count; i++) {
+        if (!(numbers[i] >= -most[i] && numbers[i] <= most[i])) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* Whether a period's inputs can be answered. */
+static int is_usable(const quadsim_controller *c, const real *state, const real *reference, const real *acting)
+{
+    const int N = c->problem->horizon;
+    int i;
+    if (!is_finite(acting, NU)) {
+        return 0;
+    }
+    if (c->robust == NULL) {
+        return is_finite(state, 12) && is_finite(reference, N * 4);
+    }
+    for (i = 0; i < N; i++) {
+        if (!is_plausible(reference + i * 4, c->robust->plausible_reference, 4)) {
+            return 0;
+        }
+    }
+    return is_plausible(state, c->robust->plausible_state, 12);
+}
+
+/* The optimum of the paper's controllers. */
+static enum quadsim_status solve_paper(quadsim_mpc *mpc, const real *state, const real *reference, const real *acting)
+{
+    const quadsim_controller *c = mpc->controller;
+    real rest[MOST_STATES];
+    int i;
+    rest_at(state, rest); /* hover is an equilibrium anywhere and at any yaw: here there is least to round */
+    want_rest(mpc, rest);
+    for (i = 0; i < c->problem->horizon; i++) {
+        want(c, reference + i * 4, mpc->wanted + i * c->problem->regulated);
+    }
+    return optimise(mpc, state, rest, c->hover, acting);
+}
+
+long quadsim_mpc_reals(const quadsim_controller *controller)
+{
+    const quadsim_problem *p = controller->problem;
+    return quadsim_work_reals(p) + p->horizon * p->regulated;
+}
+
+void quadsim_mpc_start(quadsim_mpc *mpc, const quadsim_controller *controller, real *memory)
+{
+    const quadsim_problem *p = controller->problem;
+    memset(mpc, 0, sizeof(*mpc));
+    mpc->controller = controller;
+    mpc->wanted = memory;
+    quadsim_work_start(&mpc->work, p, memory + p->horizon * p->regulated);
+    quadsim_mpc_reset(mpc, controller->hover);
+}
+
+void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
+{
+    const real *usable = is_finite(speeds, NU) ? speeds : mpc->controller->hover;
+    memcpy(mpc->before, usable, sizeof(mpc->before));
+    memcpy(mpc->rotors, usable, sizeof(mpc->rotors));
+    memset(mpc->estimate, 0, sizeof(mpc->estimate));
+    quadsim_work_reset(&mpc->work);
+    mpc->age = -1;
+    mpc->known = 0;
+    if (mpc->controller->robust != NULL) {
+        believe(mpc);
+    }
+}
+
+enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, const quadsim_real state[12], const quadsim_real *reference,
+                                     const quadsim_real acting[4], quadsim_real command[4])
+{
+    enum quadsim_status found = QUADSIM_BEFORE;
+    const int usable = is_usable(mpc->controller, state, reference, acting);
+    real in_force[NU];
+    mpc->work.changes = 0;
+    memcpy(in_force, is_finite(acting, NU) ? acting : mpc->before, sizeof(in_force));
+    if (mpc->controller->robust != NULL) {
+        found = solve_robust(mpc, state, reference, in_force, usable);
+    } else if (usable) {
+        found = solve_paper(mpc, state, reference, in_force);
+    }
+    return answer(mpc, found, in_force, command);
+}

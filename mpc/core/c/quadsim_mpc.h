@@ -1,0 +1,100 @@
+/* Model predictive controllers of quadrotors.
+ *
+ * Once every period, call quadsim_mpc_step with what is measured now; hold the command until the next call.
+ *
+ * state [12]        x vx y vy z vz roll roll_rate pitch pitch_rate yaw yaw_rate
+ *                   [m, m/s, rad, rad/s]: world axes with z up; Z-Y-X Euler angles, body to world, and their rates
+ * reference [N][4]  x y z yaw [m, rad], where to be one period from now, two, ... N periods from now
+ * acting [4]        command in force up to now, u(k-1) [rad/s]
+ * command [4]       rotor speeds to hold for the period [rad/s], rotors in the vehicle file's order
+ *
+ * A controller's numbers are a quadsim_controller, which is read only and may be shared.  All that a controller
+ * remembers is in a quadsim_mpc and its memory of quadsim_mpc_reals(controller) numbers, both of the caller's.  Nothing
+ * is allocated, nothing is shared: two structs are two controllers. */
+#ifndef QUADSIM_MPC_H
+#define QUADSIM_MPC_H
+
+#include "quadsim_core.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+enum { QUADSIM_SUBSTEPS = 2 }; /* Runge-Kutta steps of a prediction */
+
+/* The robust controller's numbers besides those of its problem.  Matrices are row by row. */
+typedef struct quadsim_robust {
+    int observes;                                      /* whether disturbances are estimated */
+    int heading;                                       /* whether the model is turned by the yaw */
+    quadsim_real gravity;                              /* [m/s^2] */
+    quadsim_real least_lift, upright;                  /* least shares of weight, and of thrust along z */
+    quadsim_real delay, delayed_share, rest_of_period; /* [s], share of the period, [s] */
+    quadsim_real spun_delay, spun_before;              /* shares of rotor speeds left after delay and rest_of_period */
+    quadsim_real largest_turn;                         /* of the reference's yaw in a period [rad] */
+    quadsim_real effectiveness[16];                    /* from squared speeds to U/m and I^-1 tau */
+    quadsim_real allocation[16];                       /* its inverse */
+    quadsim_real gyration[3];
+    quadsim_real slope_inverse[16]; /* from changes of U/m and I^-1 tau to those of speeds at hover */
+    quadsim_real modes[16];         /* from rotor speeds to the states that stand for them where they lag */
+    quadsim_real gain[6], largest[6];                                  /* of the observer; of its estimate */
+    quadsim_real decay_before[QUADSIM_SUBSTEPS * 4];                   /* shares left at instants of rest_of_period */
+    quadsim_real decay_delay[QUADSIM_SUBSTEPS * 4];                    /* and of delay */
+    quadsim_real plausible_state[12], plausible_reference[4];          /* most that is taken for a measurement */
+} quadsim_robust;
+
+/* A controller's numbers. */
+typedef struct quadsim_controller {
+    const quadsim_problem *problem;
+    const quadsim_robust *robust;                            /* NULL: the paper's controllers */
+    const quadsim_real *C_r;                                 /* [n_r][n] regulated outputs, C_r x */
+    quadsim_real hover[4];                                   /* [rad/s] */
+    quadsim_real speed_min[4], speed_max[4];                 /* [rad/s]; no bound: +-1e30 */
+    quadsim_real step_min[4], step_max[4];                   /* of speeds from one period to the next [rad/s] */
+} quadsim_controller;
+
+/* How a command was found.  The first three are the optimum; the others are fallbacks where there is none, or none
+ * was found, in this order. */
+enum quadsim_status {
+    QUADSIM_FREE = 0,    /* the optimum without constraints keeps them all */
+    QUADSIM_AXES = 1,    /* the optimum with rows of states alone, axis by axis, keeps all others */
+    QUADSIM_WHOLE = 2,   /* the optimum of the whole problem */
+    QUADSIM_CLIPPED = 3, /* the axes' optimum, clipped to what the bounds on rotor speeds and their steps leave */
+    QUADSIM_SHIFTED = 4, /* what the last optimum planned for now, clipped likewise */
+    QUADSIM_BEFORE = 5   /* the command before */
+};
+
+/* A controller.  Read work.changes and work.plan, the last optimum [N][4] in rad/s; the rest is its own. */
+typedef struct quadsim_mpc {
+    const quadsim_controller *controller;
+    quadsim_work work;
+    quadsim_real *wanted;           /* [N][n_r] y_d - C_r x_s */
+    quadsim_real before[4];         /* the last command [rad/s] */
+    int age;                        /* periods since the last optimum; negative: there is none yet */
+    int known;                      /* robust: whether the state ahead is known */
+    quadsim_real rotors[4];         /* robust: speeds at the instant from which the command acts [rad/s] */
+    quadsim_real ahead[12];         /* the state there */
+    quadsim_real estimate[6];       /* disturbance: world x, y, along thrust [m/s^2], body [rad/s^2] */
+    quadsim_real trim[4];           /* rotor speeds at rest against it [rad/s] */
+    quadsim_real lift[3];           /* along which thrust points there, world axes */
+    quadsim_real twist[3];          /* angular acceleration over that by thrust [1/m] */
+    quadsim_real effectiveness[16]; /* from squared speeds to U/m and I^-1 tau, so twisted */
+} quadsim_mpc;
+
+/* Numbers of memory that a controller needs. */
+long quadsim_mpc_reals(const quadsim_controller *controller);
+
+/* A controller in memory of the caller's, after the command of hover. */
+void quadsim_mpc_start(quadsim_mpc *mpc, const quadsim_controller *controller, quadsim_real *memory);
+
+/* Restart after the command u(-1) [rad/s]. */
+void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4]);
+
+/* The command of the period that starts now, always finite and within the bounds on rotor speeds. */
+enum quadsim_status quadsim_mpc_step(quadsim_mpc *mpc, const quadsim_real state[12], const quadsim_real *reference,
+                                     const quadsim_real acting[4], quadsim_real command[4]);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,90 @@
+"""The numbers of a law in C besides those of its problem: members of the structs of quadsim_mpc.h, in their order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from mpc.answer import ActuatorBounds
+from mpc.equilibrium import LEAST_LIFT
+from mpc.fallback.completion import PLAUSIBLE
+from mpc.heading import slope
+from mpc.model import hover_model
+from mpc.nonlinear.model import SUBSTEPS, nonlinear_model
+from mpc.observer import UPRIGHT, DisturbanceObserver
+from mpc.ocp import Problem
+from mpc.robust.settings import RobustSettings
+from quadsim.state import REFERENCE_STATES, Array
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+NO_BOUND: Final = 1e30
+"""In place of infinity."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exportable:
+    """What a law in C is made from.
+
+    Attributes:
+        name: of the law.
+        problem: its optimisation.
+        vehicle: that modelled.
+        settings: the parts of the robust controller; None for the paper's controllers.
+    """
+
+    name: str
+    problem: Problem
+    vehicle: Vehicle
+    settings: RobustSettings | None = None
+
+
+def controller_numbers(law: Exportable) -> dict[str, Array]:
+    """Those of a `quadsim_controller`."""
+    problem, free = law.problem, np.full(N_ROTORS, NO_BOUND)
+    limits = {"speed_min": -free, "speed_max": free, "step_min": -free, "step_max": free}
+    if problem.every_constraint:
+        bounds = ActuatorBounds.of_problem(problem)
+        found = bounds.u_min, bounds.u_max, bounds.delta_min, bounds.delta_max
+        limits = {name: np.clip(bound, -NO_BOUND, NO_BOUND) for name, bound in zip(limits, found, strict=True)}
+    return {"C_r": problem.objective.C_r, "hover": problem.model.u_bar, **limits}
+
+
+def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
+    """Those of a `quadsim_robust`; `modes` (4, 4) as in `mpc.core.tables.Tables`."""
+    settings, vehicle, period = law.settings, law.vehicle, law.problem.model.period
+    assert settings is not None
+    lag, delay = settings.rotor_lag, settings.delay
+    model = nonlinear_model(vehicle, period, rotor_lag=lag or None)
+    observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
+    instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
+
+    def decay(time: Array | float) -> Array:
+        """Share of rotor speeds that is left after a time [s]."""
+        return np.asarray(np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time)), float)
+
+    return {
+        "observes": int(observer is not None),
+        "heading": int(settings.heading),
+        "gravity": model.gravity,
+        "least_lift": LEAST_LIFT,
+        "upright": UPRIGHT,
+        "delay": delay,
+        "delayed_share": delay / period,
+        "rest_of_period": period - delay,
+        "spun_delay": float(decay(delay)),
+        "spun_before": float(decay(period - delay)),
+        "largest_turn": settings.largest_turn,
+        "effectiveness": np.asarray(model.effectiveness, float),
+        "allocation": np.asarray(model.allocation, float),
+        "gyration": np.asarray(model.gyration, float),
+        "slope_inverse": np.asarray(np.linalg.inv(slope(hover_model(vehicle, period))), float),
+        "modes": modes,
+        "gain": np.zeros(6) if observer is None else observer.gain,
+        "largest": np.zeros(6) if observer is None else observer.largest,
+        "decay_before": decay(instants * (period - delay)),
+        "decay_delay": decay(instants * delay),
+        "plausible_state": PLAUSIBLE,
+        "plausible_reference": PLAUSIBLE[list(REFERENCE_STATES)],
+    }
