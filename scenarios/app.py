@@ -11,12 +11,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
+from glob import escape, glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
 from cyclopts import App, Parameter
 
 from quadsim import __version__
+from quadsim.assets import vehicle_names
 from quadsim.errors import FileError, InputError, OutputError, ParameterError
 from scenarios import shipped
 
@@ -58,7 +60,10 @@ if TYPE_CHECKING:
 else:  # as cyclopts reads them: it resolves all annotations where a command is declared
 
     def _one_of(names: Any) -> Any:
-        return Annotated[str, Parameter(completer=lambda _: names())]
+        def completions(context: Any) -> list[str]:
+            return [*names(), *glob(f"{escape(context.incomplete or '.')}*")]  # noqa: PTH207  # as it was typed
+
+        return Annotated[str, Parameter(completer=completions)]
 
     def _whole(_: type, tokens: Sequence[Any]) -> int:
         text = tokens[0].value
@@ -69,7 +74,7 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
     CampaignComparison = CampaignResult = Catalogue = Comparison = Document = Flight = Listing = Reaudit = Any
     Replay = Reproductions = ScenarioFile = TuningResult = VehicleReport = Any
     File = Path
-    VehicleName = str
+    VehicleName = _one_of(vehicle_names)
     Target = ScenarioName = _one_of(shipped.scenario_names)
     CampaignName, PaperName = _one_of(shipped.campaign_names), _one_of(shipped.paper_names)
     TuningName = _one_of(shipped.tuning_names)
@@ -984,7 +989,7 @@ def scenario(
     *,
     changes: Changes = (),
     seed: Whole | None = None,
-    vehicle: Annotated[str | None, Parameter(name="--for")] = None,
+    vehicle: Annotated[VehicleName | None, Parameter(name="--for")] = None,
     course: str | None = None,
     controller: str | None = None,
     schema: Flag = False,
@@ -1028,7 +1033,7 @@ def scenario(
         for option, value in {"a scenario": name, "--set": changes, "--seed": seed}.items():
             if value:
                 raise ParameterError("", "--for", vehicle, f"given without {option}")
-        return results.ScenarioFile(first_scenario(load_vehicle(vehicle), vehicle, **choice).to_toml())
+        return results.ScenarioFile(first_scenario(load_vehicle(vehicle), str(vehicle), **choice).to_toml())
     for option, value in choice.items():
         raise ParameterError("", "--course" if option == "course" else "--controller", value, "given with --for alone")
     if name is None:
@@ -1076,7 +1081,7 @@ def vehicle_report(
         >>> can.shortfalls[0]
         'controller.input_bounds.speed: hover is 453.2 rad/s, the scenario allows 250'
     """
-    from quadsim.assets import vehicle_names, vehicle_path
+    from quadsim.assets import vehicle_path
     from quadsim.report.film.video import render_portrait
     from quadsim.vehicle import vehicle_sources
     from scenarios import loading, results

@@ -81,13 +81,19 @@ def test_without_a_command_it_prints_help_and_fails(capsys: pytest.CaptureFixtur
 
 @pytest.mark.parametrize(
     ("words", "names"),
-    [(["run"], scenario_names), (["campaign", "--resume"], campaign_names), (["tune"], tuning_names)],
+    [
+        (["run"], scenario_names),
+        (["campaign", "--resume"], campaign_names),
+        (["tune"], tuning_names),
+        (["scenario", "--for"], vehicle_names),
+    ],
 )
-def test_a_shell_completes_names(
-    words: list[str], names: Callable[[], list[str]], capsys: pytest.CaptureFixture[str]
+def test_a_shell_completes_names_and_paths(
+    words: list[str], names: Callable[[], list[str]], here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["__complete", *words, ""]) == EXIT_DONE
-    assert set(names()) <= set(capsys.readouterr().out.split())
+    (here / "mine.toml").touch()
+    assert main(["__complete", *words, "mi"]) == EXIT_DONE
+    assert {*names(), "mine.toml"} <= set(capsys.readouterr().out.split())
 
 
 # --- scenario ------------------------------------------------------------------------------------------------------
