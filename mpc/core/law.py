@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 import time as clock
-from functools import cache
+from functools import cache, lru_cache
 from typing import Final, NoReturn
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from mpc.answer import ActuatorBounds
 from mpc.core.library import check_mirrors
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
-from mpc.core.solver import Work, core_library, core_problem
+from mpc.core.solver import PROBLEMS, Key, Work, core_library, core_problem
 from mpc.equilibrium import Trim
 from mpc.fallback.completion import CompletedMoment
 from mpc.heading import predict_in_heading_frame
@@ -76,17 +76,12 @@ def _library() -> ctypes.CDLL:
     return library
 
 
-class CompiledLaw:
-    """A law's numbers where the library reads them; any number of controllers may share them.
-
-    Raises:
-        MissingCoreError: there is no library.
-        ParameterError: the problem is not one for the core.
-    """
+class _Shared:
+    """A law's numbers where the library reads them, which equal laws of this process share."""
 
     def __init__(self, law: Exportable) -> None:
-        self.law, self.library = law, _library()
         self.nominal = hover_model(law.vehicle, law.problem.model.period)
+        self.bounds = ActuatorBounds.of_problem(law.problem) if law.problem.every_constraint else None
         self.problem = core_problem(law.problem)
         numbers, robust = controller_numbers(law), None
         self._C_r = np.ascontiguousarray(numbers.pop("C_r"))
@@ -102,22 +97,31 @@ class CompiledLaw:
         )
 
 
+@lru_cache(PROBLEMS)
+def _shared(key: Key[Exportable]) -> _Shared:
+    return _Shared(key.of)
+
+
 def _plain(value: float | Array) -> float | tuple[float, ...]:
     return tuple(value.ravel().tolist()) if isinstance(value, np.ndarray) else value
 
 
 class CompiledMPC:
-    """A law by the library; it answers as the C does on a target, whatever there is no optimum for."""
+    """A law by the library; it answers as the C does on a target, whatever there is no optimum for.
+
+    Raises:
+        MissingCoreError: there is no library.
+        ParameterError: the problem is not one for the core.
+    """
 
     solver: Final = "compiled"
     """In place of a solver's name."""
 
-    def __init__(self, shared: CompiledLaw) -> None:
-        law, library = shared.law, shared.library
+    def __init__(self, law: Exportable) -> None:
+        library, shared = _library(), _shared(Key.to(law))
         self.name, self.problem, self.horizon = law.name, law.problem, law.problem.horizon
         self._shared, self._robust = shared, law.settings is not None
-        self._unbounded = not law.problem.every_constraint  # whose law is the gain: no status reports a free optimum
-        self._bounds = None if self._unbounded else ActuatorBounds.of_problem(law.problem)
+        self._unbounded = shared.bounds is None  # whose law is the gain: no status reports a free optimum
         controller = ctypes.addressof(shared.struct)
         # The struct points into this memory, and so do the views of it.
         self._memory, self._mpc = np.zeros(library.quadsim_mpc_reals(controller)), _MPC()
@@ -152,8 +156,13 @@ class CompiledMPC:
         self._before = np.array(speeds, float)
         self._restart(self._arguments[0], self._before.ctypes.data)
         self._called_at = self._measured = -math.inf
-        self.trim = Trim(speeds=self._shared.nominal.u_bar, lift=np.array([0.0, 0.0, 1.0]))
+
+    @property
+    def trim(self) -> Trim:
         """What holds the vehicle at rest against the disturbance that is estimated."""
+        if self._robust:
+            return Trim(speeds=self._trim.copy(), lift=self._lift.copy(), twist=self._twist.copy())
+        return Trim(speeds=self._shared.nominal.u_bar, lift=np.array([0.0, 0.0, 1.0]))
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`."""
@@ -167,10 +176,8 @@ class CompiledMPC:
         status = self._step(*self._arguments)
         spent_s = clock.perf_counter() - started
         self._before = self._command.copy()
-        if self._robust:
-            self.trim = Trim(speeds=self._trim.copy(), lift=self._lift.copy(), twist=self._twist.copy())
-            if now.phase is not Phase.FLYING:  # the ground holds the vehicle, which is nothing to learn from
-                self._mpc.known = 0
+        if now.phase is not Phase.FLYING:  # the ground holds the vehicle, which is nothing to learn from
+            self._mpc.known = 0
         accepted = LEVELS[status] == 0
         plan = self._plan.copy() if accepted else np.empty_like(self._plan)
         plan[0 if accepted else slice(None)] = self._before
@@ -200,7 +207,8 @@ class CompiledMPC:
         return float(np.maximum(values - self._upper[beyond], self._lower[beyond] - values).max(initial=0.0))
 
     def _stop(self, acting: Array, phase: Phase) -> Command:
-        speeds = np.zeros(N_ROTORS) if self._bounds is None else self._bounds.reach(acting)[0]
+        bounds = self._shared.bounds
+        speeds = np.zeros(N_ROTORS) if bounds is None else bounds.reach(acting)[0]
         self.reset(speeds)
         return stopped(speeds.copy(), self.horizon, phase)
 

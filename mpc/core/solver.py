@@ -7,7 +7,7 @@ import math
 import time as clock
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, cached_property, lru_cache, partial
-from typing import Final, NoReturn
+from typing import Final, Generic, NoReturn, TypeVar
 
 import numpy as np
 
@@ -24,8 +24,6 @@ from quadsim.vehicle import N_ROTORS
 
 MOST_STATES: Final = 20
 """Of an axis, with the inputs before where changes cost something; as in quadsim_core.h."""
-MOST_OUTPUTS: Final = 20
-"""Rows of an axis's states, likewise."""
 MOST_ROWS: Final = 256
 """Rows of a step, which are numbered in bytes."""
 MOST_CHANGES: Final = 3000
@@ -183,19 +181,26 @@ def _refuse_large(found: Tables) -> None:
         raise ParameterError("controller", "problem", f"{found.problem.model.nu} inputs", f"of {N_ROTORS} inputs")
     for name, count, most in (
         ("states of an axis", max(len(part.B) for part in found.axes), MOST_STATES),
-        ("rows on an axis's states", max(len(part.rows) for part in found.axes), MOST_OUTPUTS),
         ("rows of a step", len(found.rows), MOST_ROWS),
     ):
         if count > most:
             raise ParameterError("controller", "problem", f"{count} {name}", f"such that there are at most {most}")
 
 
+Made = TypeVar("Made")
+
+
 @dataclass(frozen=True)
-class _Key:
-    """A problem by what it consists of."""
+class Key(Generic[Made]):
+    """Something made of dataclasses, by what it consists of."""
 
     content: object
-    problem: Problem = field(compare=False)
+    of: Made = field(compare=False)
+
+    @classmethod
+    def to(cls, value: Made) -> Key[Made]:
+        """The key of a value."""
+        return cls(_content(value), value)
 
 
 def _content(value: object) -> object:
@@ -212,12 +217,12 @@ def core_problem(problem: Problem) -> CoreProblem:
     Raises:
         ParameterError: the problem is not one for the core.
     """
-    return _core_problem(_Key(_content(problem), problem))
+    return _core_problem(Key.to(problem))
 
 
 @lru_cache(PROBLEMS)
-def _core_problem(key: _Key) -> CoreProblem:
-    return CoreProblem(key.problem)
+def _core_problem(key: Key[Problem]) -> CoreProblem:
+    return CoreProblem(key.of)
 
 
 class Core:
@@ -262,8 +267,8 @@ class Core:
         self._arguments = self._at, *(part.ctypes.data for part in parts)
 
     def _view(self, address: int, kind: type[ctypes.c_double | ctypes.c_int8], columns: int) -> Array:
-        count = self._problem.horizon * columns
-        return np.ctypeslib.as_array((kind * count).from_address(address)).reshape(-1, columns)
+        shape = self._problem.horizon, columns
+        return np.ctypeslib.as_array((kind * math.prod(shape)).from_address(address)).reshape(shape)
 
     def __reduce__(self) -> NoReturn:
         """Addresses are of no use to a copy, or in another process."""

@@ -208,13 +208,13 @@ def _compiled(
     """
     if not spec.compiled:
         return None
-    from mpc.core.law import CompiledLaw, CompiledMPC
+    from mpc.core.law import CompiledMPC
     from mpc.core.library import why_missing
 
     reason = why_missing()
     if reason is not None:
         raise MissingCoreError(reason, instead="leave out controller.compiled")
-    return CompiledMPC(CompiledLaw(exportable(spec, vehicle, period, shapes)))
+    return CompiledMPC(exportable(spec, vehicle, period, shapes))
 
 
 def _bounded(

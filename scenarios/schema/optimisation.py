@@ -78,7 +78,7 @@ class WeightedSpec(Spec):
     )
     compiled: bool = Field(
         default=False,
-        description="fly its export as C99, compiled once by this machine's C compiler, in place of Python's steps",
+        description="fly the whole law in C, by the compiled core, in place of Python's steps",
     )
 
     @model_validator(mode="after")

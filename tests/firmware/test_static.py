@@ -49,7 +49,8 @@ def test_analysers_find_nothing(exported: Export, run: Run, tmp_path: Path) -> N
     sources = [directory / name for name in (*CONTROLLER, "main.c", "serial.c", "posix.c")]
     for source in sources:
         run("gcc", *WARNINGS, "-O1", "-fanalyzer", "-c", source, "-o", tmp_path / "object.o")
-    run("cppcheck", *CPPCHECK, *sources, exported("cortex-m7", "double") / "startup.c")
+    # In one precision: else cppcheck takes lengths in floats for those in doubles.
+    run("cppcheck", *CPPCHECK, "-UQUADSIM_FLOAT", *sources, exported("cortex-m7", "double") / "startup.c")
     run("clang-tidy", "-quiet", f"-checks={TIDY}", "-warnings-as-errors=*", *sources, "--", "-std=c99")
 
 

@@ -88,20 +88,7 @@ static void rest_at(const real *state, real *rest)
 static enum quadsim_status optimise(quadsim_mpc *mpc, const real *state, const real *rest, const real *speeds,
                                     const real *acting)
 {
-    switch (quadsim_optimise(&mpc->work, state, mpc->wanted, rest, speeds, acting)) {
-    case QUADSIM_FOUND_FREE:
-        return QUADSIM_FREE;
-    case QUADSIM_FOUND_AXES:
-        return QUADSIM_AXES;
-    case QUADSIM_FOUND_WHOLE:
-        return QUADSIM_WHOLE;
-    case QUADSIM_NOT_WHOLE:
-        return QUADSIM_CLIPPED;
-    case QUADSIM_NOT_AXES:
-        return QUADSIM_SHIFTED;
-    default:
-        return QUADSIM_BEFORE;
-    }
+    return (enum quadsim_status)quadsim_optimise(&mpc->work, state, mpc->wanted, rest, speeds, acting);
 }
 
 /* ---- the vehicle's model ----------------------------------------------------------------------------------------- */

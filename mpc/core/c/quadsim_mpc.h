@@ -55,12 +55,12 @@ typedef struct quadsim_controller {
 /* How a command was found.  The first three are the optimum; the others are fallbacks where there is none, or none
  * was found, in this order. */
 enum quadsim_status {
-    QUADSIM_FREE = 0,    /* the optimum without constraints keeps them all */
-    QUADSIM_AXES = 1,    /* the optimum with rows of states alone, axis by axis, keeps all others */
-    QUADSIM_WHOLE = 2,   /* the optimum of the whole problem */
-    QUADSIM_CLIPPED = 3, /* the axes' optimum, clipped to what the bounds on rotor speeds and their steps leave */
-    QUADSIM_SHIFTED = 4, /* what the last optimum planned for now, clipped likewise */
-    QUADSIM_BEFORE = 5   /* the command before */
+    QUADSIM_FREE = QUADSIM_FOUND_FREE,   /* the optimum without constraints keeps them all */
+    QUADSIM_AXES = QUADSIM_FOUND_AXES,   /* the optimum with rows of states alone, axis by axis, keeps all others */
+    QUADSIM_WHOLE = QUADSIM_FOUND_WHOLE, /* the optimum of the whole problem */
+    QUADSIM_CLIPPED = QUADSIM_NOT_WHOLE, /* the axes' optimum, clipped to what bounds on speeds and steps leave */
+    QUADSIM_SHIFTED = QUADSIM_NOT_AXES,  /* what the last optimum planned for now, clipped likewise */
+    QUADSIM_BEFORE = QUADSIM_NOT_FINITE  /* the command before */
 };
 
 /* A controller.  Read work.changes and work.plan, the last optimum [N][4] in rad/s; the rest is its own. */

@@ -238,7 +238,7 @@ def with_rows(count: int, *, shared: bool = False) -> Problem:
     C[:, 0] = np.arange(1, count + 1)
     penalty = Penalty(l1=np.ones(count), l2=np.ones(count), largest=True) if shared else None
     rows = Constraint(name="rows", C=C, lower=-bound, upper=bound, penalty=penalty)
-    return replace(paper_problem(), constraints=(rows,))
+    return replace(paper_problem("paper-constrained", "controller.horizon=2"), constraints=(rows,))
 
 
 @pytest.mark.parametrize(
@@ -246,7 +246,7 @@ def with_rows(count: int, *, shared: bool = False) -> Problem:
     [
         (lambda: random_problem(np.random.default_rng(0), horizon=3), "of 4 inputs; got '2 inputs'"),
         (lambda: random_problem(np.random.default_rng(0), horizon=2, n=21, nu=4), "at most 20; got '21 states of"),
-        (lambda: with_rows(20), 'at most 20; got "21 rows on'),
+        (lambda: with_rows(250), "at most 256; got '260 rows of a step'"),
         (lambda: with_rows(2, shared=True), "each with its own; got 'soft rows that share a slack'"),
         (lambda: paper_problem("paper-constrained", "controller.horizon=900"), "at most 1048576 numbers; they have "),
     ],
