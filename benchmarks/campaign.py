@@ -26,7 +26,7 @@ def campaign(scenario: Scenario, solver: str, flights: int, workers: int) -> Rec
         directory = Path(scratch) / "campaign"
         result = fly_campaign(plan, directory, workers=workers, report=False)
         flying = sum(read_table(directory / TIMES_FILE)["wall_s"].to_pylist())
-        violations = sum(read_table(directory / FLIGHTS_FILE)["violation"].to_pylist())
+        violations = sum(read_table(directory / FLIGHTS_FILE)["violated"].to_pylist())
     wall = float(result.manifest["sessions"][-1]["wall_s"])  # from the first process started to the last answer
     return {
         "scenario": f"{scenario.duration:g} s of {scenario.name}",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mpc.ocp import Problem
+from mpc.solvers import CORE_OR_PIQP
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
 from quadsim.sim.airframe import outline
@@ -18,13 +19,21 @@ from scenarios.parts.effects import build_changes, build_wind
 from scenarios.parts.plugin import import_plugin, make_force
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import actual_effects, build_actual, resolve_vehicle, saturates
-from scenarios.schema.optimisation import WeightedSpec
+from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
 from scenarios.schema.scenario import Scenario
 
 
 def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     """The scenario with every number that it leaves to its vehicle written out: its file alone defines the flight."""
     return resolve_vehicle(scenario, vehicle).model_copy(update={"effects": actual_effects(scenario, vehicle)})
+
+
+def preferring_core(scenario: Scenario) -> Scenario:
+    """The scenario with `core-or-piqp` in place of `piqp`, the default: for where a step's time matters."""
+    controller = scenario.controller
+    if isinstance(controller, BoundedSpec) and controller.solver == "piqp":
+        return scenario.replace({"controller.solver": CORE_OR_PIQP})
+    return scenario
 
 
 def build_plant(scenario: Scenario, vehicle: Vehicle, forces: Sequence[Force] | None = None) -> Plant:

@@ -18,7 +18,7 @@ from mpc.qp import QP, Backend, KKTResiduals, Solution
 from mpc.solvers.free import FreeOptimum
 from mpc.staged import Staged
 from quadsim.controller import ACCEPTED, CORE, GAIN
-from quadsim.errors import MissingPackageError, ParameterError, UnknownNameError
+from quadsim.errors import InputError, MissingCoreError, MissingPackageError, ParameterError, UnknownNameError
 from quadsim.state import Array
 
 Formulation: TypeAlias = Condensed | Staged
@@ -81,6 +81,9 @@ COMPILED: Final = SolverEntry(
 
 ALIASES: Final = {"piqp": "piqp-multistage"}
 
+CORE_OR_PIQP: Final = "core-or-piqp"
+"""The core where it is compiled and takes the problem, else PIQP."""
+
 INVALID_DATA: Final = "invalid_data"
 """Status of a query with numbers that is passed to no back end."""
 
@@ -96,7 +99,7 @@ def find_solver(name: str) -> SolverEntry:
         UnknownNameError: there is no such solver.
     """
     name = ALIASES.get(name, name)
-    if name in (CORE, *SOLVERS):
+    if name in (CORE, CORE_OR_PIQP, *SOLVERS):
         return SOLVERS.get(name, COMPILED)
     entries = solver_entries()
     if name not in entries:
@@ -218,13 +221,17 @@ def make_solver(name: str, problem: Problem) -> Solver:
         MissingCoreError: the core was not compiled.
         ParameterError: the core cannot take the problem.
     """
-    if name != CORE:
+    if name not in (CORE, CORE_OR_PIQP):
         return QPSolver(name, problem, free_first=True)
     from mpc.core.solver import Core
 
     try:
         return Core(problem)
-    except ParameterError as error:
+    except InputError as error:
+        if name == CORE_OR_PIQP:
+            return make_solver("piqp", problem)
+        if isinstance(error, MissingCoreError):
+            raise
         rule = f"a QP solver such as 'piqp' for this problem: {error}"
         raise ParameterError("controller", "solver", CORE, rule) from error
 
@@ -238,7 +245,7 @@ class QPSolver:
     """
 
     def __init__(self, name: str, problem: Problem, *, changing: bool = False, free_first: bool = False) -> None:
-        self.name, self._changing = name, changing
+        self.name, self._changing = ALIASES.get(name, name), changing
         self.formulation = find_solver(name).formulate(problem, changing=changing)
         self._free: tuple[Condensed, FreeOptimum] | None = None
         if free_first and not (changing and isinstance(self.formulation, Staged)):

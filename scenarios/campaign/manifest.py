@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from mpc.core.library import why_missing
 from quadsim.assets import models_dir
 from quadsim.errors import FileError, InputError
 from quadsim.flight.summary import read_json, require_inside
@@ -110,8 +111,9 @@ def flown_by(plan: Plan) -> dict[str, Any]:
 
 @functools.cache
 def code_digest() -> str:
-    """SHA-256 of everything of ours that numbers come from: code, models, scenarios."""
-    return _digest([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
+    """SHA-256 of everything of ours that numbers come from: code, models, scenarios, and whether there is a core."""
+    code = _digest([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
+    return code if why_missing() is None else f"{code}, without the core"
 
 
 def _user_code(spec: PluginSpec | ForceSpec) -> str | None:
@@ -127,7 +129,7 @@ def _digest(roots: Iterable[Path]) -> str:
     found = hashlib.sha256()
     for root in roots:
         for path in [root] if root.is_file() else sorted(root.rglob("*")):
-            if path.suffix in (".py", ".toml", ".xml") and path.is_file():
+            if path.suffix in (".py", ".c", ".h", ".toml", ".xml") and path.is_file():
                 found.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
                 found.update(path.read_bytes())
     return f"sha256:{found.hexdigest()}"

@@ -22,7 +22,7 @@ from quadsim.flight.log import FlightLog
 from quadsim.report.film.camera import Camera
 from quadsim.sim.loop import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array
-from scenarios.build import build_controller
+from scenarios.build import build_controller, preferring_core
 from scenarios.campaign.plan import Plan, make_plan, read_campaign
 from scenarios.flight import Flight
 from scenarios.gym.spaces import USUAL, Action, Actions, Observations
@@ -110,7 +110,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         Raises:
             InputError: one of these is not possible.
         """
-        scenario = as_scenario(scenario)
+        scenario = preferring_core(as_scenario(scenario))
         self._plan = None if vary is None else _varying(scenario, str(vary))
         self._base = scenario if self._plan is None else self._plan.scenario
         if render_mode not in (None, "rgb_array"):

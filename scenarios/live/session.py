@@ -21,6 +21,7 @@ from quadsim.fields import Fraction
 from quadsim.flight.audit import Limit
 from quadsim.sim.loop import Sample
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
+from scenarios.build import preferring_core
 from scenarios.flight import Flight
 from scenarios.limits import with_bounds_stated
 from scenarios.parts.live import Successor, validated
@@ -103,7 +104,7 @@ class Session:
     """
 
     def __init__(self, scenario: Scenario, against: ControllerSpec | None = None) -> None:
-        self.scenario, self._against = scenario, against
+        self.scenario, self._against = preferring_core(scenario), against
         self._queue: deque[tuple[Mapping[str, Any], str | None, Successor | None]] = deque()
         self.flights: tuple[StartedFlight, ...] = ()
         self.reset()

@@ -18,7 +18,7 @@ from mpc.fallback.settings import USUAL_TILT, FallbackSettings
 from mpc.model import hover_model
 from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.robust.tightening import SHORTEST_LAG
-from mpc.solvers import Solver, make_solver
+from mpc.solvers import CORE_OR_PIQP, Solver, make_solver
 from quadsim.controller import CORE, Controller
 from quadsim.errors import ExportError, InputError, MissingCoreError, ParameterError
 from quadsim.state import INDEX, N_STATES, POSITION, STATE_NAMES, Array
@@ -322,10 +322,10 @@ def _constrained(spec: ConstrainedSpec, vehicle: Vehicle, period: float, shapes:
 
 
 def _solver(spec: BoundedSpec, problem: Problem, space: Space | None) -> Solver:
-    if spec.solver == CORE and space is not None:
+    if space is not None and spec.solver == CORE:
         rule = "a QP solver such as 'piqp' with controller.avoidance: half-spaces differ from step to step"
         raise ParameterError("controller", "solver", CORE, rule)
-    return make_solver(spec.solver, problem)
+    return make_solver("piqp" if space is not None and spec.solver == CORE_OR_PIQP else spec.solver, problem)
 
 
 def _unconstrained(problem: Problem) -> Controller:

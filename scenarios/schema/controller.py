@@ -17,7 +17,7 @@ from mpc.nonlinear.settings import Weights
 from mpc.observer import ObserverSettings
 from mpc.qp import KKT_EVERY
 from mpc.robust.tightening import SHORTEST_LAG
-from mpc.solvers import SOLVERS
+from mpc.solvers import CORE_OR_PIQP, SOLVERS
 from quadsim.controller import CORE
 from quadsim.fields import NonNegative, Positive
 from scenarios.schema.base import MOST_ENTRIES, Horizon, Lag, Pair, Spec, require_ordered
@@ -133,8 +133,9 @@ class NonlinearSpec(Spec):
     def _check(self) -> NonlinearSpec:
         if self.solver is not None:
             require_solver(self.solver)
-            if self.solver == CORE:
-                raise ValueError(f"solver must be a QP solver: the core takes no models that change; got {CORE!r}")
+            if self.solver in (CORE, CORE_OR_PIQP):
+                rule = "a QP solver: the core takes no models that change"
+                raise ValueError(f"solver must be {rule}; got {self.solver!r}")
         if self.rotor_lag != "vehicle" and 0.0 < self.rotor_lag < SHORTEST_LAG:
             raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {self.rotor_lag:g}")
         if self.attitude_error == "difference" and not isinstance(self.weights.attitude, float):

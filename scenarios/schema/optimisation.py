@@ -11,7 +11,7 @@ from annotated_types import Len, MaxLen, doc
 from pydantic import Field, model_validator
 
 from mpc.qp import KKT_EVERY
-from mpc.solvers import SOLVERS, find_solver
+from mpc.solvers import ALIASES, CORE_OR_PIQP, SOLVERS, find_solver
 from mpc.space.halfspaces import AvoidanceSettings
 from quadsim.controller import CORE
 from quadsim.errors import UnknownNameError
@@ -173,9 +173,9 @@ class BoundedSpec(WeightedSpec):
         default=None, description="absent: it knows of no obstacles, corridors or fence, which are audited all the same"
     )
     solver: str = Field(
-        default="piqp-multistage",
+        default="piqp",
         description="who solves what the unconstrained optimum does not, by its name in `quadsim list`",
-        json_schema_extra={"examples": [*SOLVERS, CORE]},
+        json_schema_extra={"examples": [*ALIASES, *SOLVERS, CORE, CORE_OR_PIQP]},
     )
     kkt_every: KktEvery = Field(
         default=KKT_EVERY,

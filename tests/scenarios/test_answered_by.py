@@ -56,7 +56,7 @@ def test_kkt_residuals_are_computed_as_often_as_stated(every: int) -> None:
     for name in ("kkt_stationarity", "kkt_complementarity", "kkt_dual"):
         values = getattr(control, name)
         np.testing.assert_array_equal(np.isfinite(values), expected)
-        assert values[expected].max() < 1e-6
+        assert values[expected].max() < 1e-5
     assert np.isfinite(control.infeasibility).all()
 
 

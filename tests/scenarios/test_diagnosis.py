@@ -301,7 +301,8 @@ def test_a_flight_whose_sqp_does_not_converge_says_so_and_what_helps() -> None:
     assert f"{found['sentence']}\n{found['advice']}\n" in text
     helped = quadsim.fly(tumble.replace(found["suggestions"][0]["settings"]))
     assert helped.summary["controller"]["statuses"].get("not_converged", 0) == 0
-    assert np.abs(helped.state["roll"][-1]) < 0.1 < np.abs(flight.state["roll"][-1])
+    last = slice(-20, None)  # one sample of a tumble may be level
+    assert np.abs(helped.state["roll"][last]).max() < 0.1 < np.abs(flight.state["roll"][last]).max()
 
 
 def test_a_satisfied_flight_is_not_diagnosed_for_a_period_that_did_not_converge(

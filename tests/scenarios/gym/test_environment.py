@@ -89,9 +89,9 @@ def test_actions_are_within_the_controllers_bounds_or_the_vehicles() -> None:
 )
 def test_an_episode_of_the_own_controller_has_the_bytes_of_a_run(name: str, action: str, tmp_path: Path) -> None:
     scenario = short(name)
-    flight = quadsim.fly(scenario.replace({"seed": 7}), progress=False)
-    flight.save(tmp_path / "run", video=False, recording=False, figures=False)
     env = quadsim.gym.make_env(scenario, action=action)
+    flight = quadsim.fly(env.unwrapped.scenario.replace({"seed": 7}), progress=False)
+    flight.save(tmp_path / "run", video=False, recording=False, figures=False)
     infos = flown(env, seed=7)
     env.unwrapped.flight().save(tmp_path / "episode", video=False, recording=False, figures=False)
     for file in ("flight.parquet", "plant.parquet"):

@@ -38,7 +38,7 @@ def test_defaults_are_written_out() -> None:
     assert table["plant"] == {"timestep": 0.001, "integrator": "mujoco", "limit_speeds": False}
     at_rest = {"position": [0.0, 0.0, 0.0], "euler": [0.0, 0.0, 0.0], "cold": False, "on_reference": False}
     assert table["initial"] == at_rest
-    assert table["controller"]["solver"] == "piqp-multistage"
+    assert table["controller"]["solver"] == "piqp"
 
 
 def test_counts_follow_from_the_times() -> None:
