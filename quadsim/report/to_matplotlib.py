@@ -137,7 +137,7 @@ def _share_time(panels: list[Axes], figure: Figure) -> None:
 
 def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
     """Draw a panel; the legend's entries."""
-    from matplotlib.ticker import MaxNLocator
+    from matplotlib.ticker import LogLocator, MaxNLocator
 
     shown: dict[str, Artist] = {}
     for area in panel.areas:
@@ -152,7 +152,10 @@ def _draw_panel(axes: Axes, panel: Panel) -> dict[str, Artist]:
         shown["bound"] = _draw_bound(axes, bound)
     if panel.y_log:
         axes.set_yscale("log")
+        bottom, top = axes.get_ylim()
         axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+        axes.yaxis.set_minor_formatter("{x:g}" if top < 100.0 * bottom else "")  # by default mathematical text
     elif panel.whole:
         axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         axes.set_ylim(bottom=0.0, top=max(1.0, axes.get_ylim()[1]))
