@@ -161,3 +161,13 @@ def test_a_run_among_obstacles_is_drawn_from_above_with_its_clearances(short_run
 def test_every_signal_can_be_drawn(short_run: Run) -> None:
     figure = flight_figures.signals(short_run, list(SIGNALS))
     assert [panel.unit for panel in figure.panels] == [signal.unit for signal in SIGNALS.values()]
+
+
+@pytest.mark.parametrize(("top", "shown"), [(3.0, {"0.2", "0.5", "1", "2"}), (1e4, {"1", "100", "10000"})])
+def test_a_logarithmic_axis_has_plain_numbers(top: float, shown: set[str]) -> None:
+    series = Series(x=np.arange(2.0), y=np.array([0.13, top]), colour="black", label="a")
+    canvas = draw(Figure(key="a", title="a", panels=(Panel(title="time", unit="ms", series=(series,), y_log=True),)))
+    canvas.draw_without_rendering()
+    texts = {text.get_text() for text in canvas.axes[0].yaxis.get_ticklabels(which="both")}
+    assert shown <= texts
+    assert not [text for text in texts if "$" in text]
