@@ -45,7 +45,7 @@ _MODULES = {
     "mpc.unconstrained": ("UnconstrainedMPC",),
 }
 _PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
-_SUBPACKAGES = ("baselines", "exact", "fallback", "nonlinear", "paper", "robust", "solvers")
+_SUBPACKAGES = ("baselines", "core", "fallback", "nonlinear", "paper", "robust", "solvers")
 __all__ = [*_PUBLIC, *_SUBPACKAGES]
 
 
