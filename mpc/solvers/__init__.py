@@ -133,7 +133,7 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
         UnknownNameError: there is no such QP solver.
         MissingPackageError: it needs a package that is not installed.
     """
-    if name == CORE:
+    if name in (CORE, CORE_OR_PIQP):
         raise UnknownNameError("QP solver", name, SOLVERS, "make_solver has it")
     entry = find_solver(name)
     if not entry.installed:

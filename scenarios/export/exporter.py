@@ -158,7 +158,7 @@ state, and of the C library `memcpy` and `memset`.
 | file | is |
 |---|---|
 | `quadsim_mpc.h` | the interface: state order, units, frames |
-| `quadsim_mpc.c`, `quadsim_core.h`, `quadsim_core.c` | the law and its solver, the same for every controller |
+| `quadsim_mpc.c`, `quadsim_core.{{h,c}}`, `quadsim_math.h` | the law and its solver, the same for every controller |
 | `{DATA}` | this controller's numbers, and the memory that it needs |
 | `{FACTS}` | what it takes, and how far its room for active rows suffices |
 | `vectors.h`, `vectors.c` | the periods of the flight that it was recorded on, with the exact answers |

@@ -15,7 +15,7 @@ from mpc.constraints import Penalty
 from mpc.ocp import Query
 from mpc.paper.condensed import Condensed
 from mpc.qp import kkt_residuals
-from mpc.solvers import SOLVERS, Answer, QPSolver, find_solver, make_backend, make_solver, solver_entries
+from mpc.solvers import CORE_OR_PIQP, SOLVERS, Answer, QPSolver, find_solver, make_backend, make_solver, solver_entries
 from mpc.solvers.daqp_dense import DaqpDense
 from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
 from mpc.staged import Staged
@@ -154,8 +154,9 @@ def test_daqp_starts_from_the_active_set_one_step_earlier(constrained_flight: Fl
 def test_unknown_solver_lists_those_there_are() -> None:
     with pytest.raises(UnknownNameError, match=r"no solver named 'piqp-dens'; did you mean 'piqp-dense'"):
         QPSolver("piqp-dens", paper_problem())
-    with pytest.raises(UnknownNameError, match=r"no QP solver named 'core'.*make_solver has it"):
-        QPSolver(CORE, paper_problem())
+    for name in (CORE, CORE_OR_PIQP):
+        with pytest.raises(UnknownNameError, match=rf"no QP solver named '{name}'.*make_solver has it"):
+            QPSolver(name, paper_problem())
     assert {"clarabel", "quadprog"} & {*solver_entries()} <= {*qpsolvers.available_solvers}
 
 
