@@ -8,9 +8,9 @@ from timing import Record, Stopwatch, options, run, undisturbed
 from quadsim.sim.loop import complete
 from scenarios.api import load
 from scenarios.build import build_controller, build_plant
-from scenarios.courses.make import build_reference
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.reference import build_reference
 from scenarios.run import closed_loop
 
 

@@ -22,8 +22,8 @@ from quadsim.state import Array, make_state
 from scenarios.api import load
 from scenarios.build import build_controller, build_plant
 from scenarios.catalogue import catalogue
-from scenarios.courses.make import build_reference
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.reference import build_reference
 from scenarios.run import fly_scenario
 from scenarios.schema.controller import ConstrainedSpec
 from scenarios.schema.robust import RobustSpec

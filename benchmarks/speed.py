@@ -24,8 +24,8 @@ from quadsim.errors import QuadsimError
 from quadsim.flight import metrics
 from quadsim.state import INDEX, tilt
 from quadsim.vehicle import Vehicle, load_vehicle
-from scenarios.courses.feasibility_check import report
 from scenarios.design.first_scenario import first_scenario
+from scenarios.feasibility_check import report
 from scenarios.loading import parse_scenario
 from scenarios.many import fly_many
 from scenarios.run import fly_scenario

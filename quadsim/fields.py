@@ -8,6 +8,7 @@ degrees; what computes with them converts them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Annotated, Any, TypeVar
 
@@ -21,6 +22,7 @@ Positive = Annotated[float, Gt(0.0), Le(1e6)]
 Fraction = Annotated[float, Ge(0.0), Le(1.0)]
 Weight = Annotated[float, Gt(0.0), Le(1e12)]  # of a cost function
 Vector = Annotated[tuple[Number, ...], Len(3, 3)]  # of three numbers, x, y, z
+Pair = Annotated[tuple[Number, ...], Len(2, 2)]
 Instant = Annotated[float, Ge(0.0), Le(1e6), doc("[s] when it happens")]  # of an event
 
 
@@ -28,3 +30,12 @@ def filled(settings: Settings, **values: object) -> Settings:
     """A settings dataclass with the fields that are None taken from elsewhere."""
     absent: dict[str, Any] = {name: value for name, value in values.items() if getattr(settings, name) is None}
     return replace(settings, **absent)  # type: ignore[type-var]
+
+
+def is_plain(value: object) -> bool:
+    """Whether a value is one that TOML and JSON can hold, and no date."""
+    if isinstance(value, dict):
+        return all(map(is_plain, value.values()))
+    if isinstance(value, list):
+        return all(map(is_plain, value))
+    return isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))

@@ -6,6 +6,7 @@ Beside it: `scenarios.many_flights`, `vehicles`, `catalogue`, `benchmarks`, `sel
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from quadsim.sim.effects import Force
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller
 from scenarios.build import resolve as write_out
+from scenarios.courses.csv_course import Csv
 from scenarios.flight import Flight, Outputs
 from scenarios.loading import check_parts, load_scenario
 from scenarios.parts.plugin import import_plugin, make_force, make_law, refer_to
@@ -27,7 +29,6 @@ from scenarios.progress import Progress, reporting
 from scenarios.reaudit import Reaudit, reaudit, stored_scenario
 from scenarios.run import StartedFlight, fly_scenario, run_scenario
 from scenarios.run import start as start_flight
-from scenarios.schema.course import CsvSpec
 from scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -89,8 +90,8 @@ def resolve(scenario: Scenario | str | Path) -> Scenario:
     """
     scenario = as_scenario(scenario)
     found = write_out(scenario, build_vehicle(scenario))
-    if isinstance(found.reference, CsvSpec):
-        return found.model_copy(update={"reference": found.reference.model_copy(update={"sha256": None})})
+    if isinstance(found.reference, Csv):
+        return found.model_copy(update={"reference": replace(found.reference, sha256=None)})
     return found
 
 
@@ -115,7 +116,7 @@ def feasibility(scenario: Scenario | str | Path) -> Feasibility:
         >>> quadsim.feasibility(fast).problems[0]
         'roll up to 40.43 deg (bound 5)'
     """
-    from scenarios.courses.feasibility_check import report
+    from scenarios.feasibility_check import report
 
     scenario = as_scenario(scenario)
     return report(scenario, build_vehicle(scenario))
@@ -139,7 +140,7 @@ def fitting(scenario: Scenario | str | Path) -> str:
         >>> quadsim.fitting(fast)
         'It would fit at 31 % of its speed.'
     """
-    from scenarios.courses.feasibility_check import fitting as find_fitting
+    from scenarios.feasibility_check import fitting as find_fitting
 
     scenario = as_scenario(scenario)
     return find_fitting(scenario, build_vehicle(scenario))

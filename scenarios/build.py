@@ -13,12 +13,12 @@ from quadsim.sim.effects import Force
 from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
 from quadsim.vehicle import Vehicle
-from scenarios.courses.make import timed_regions
 from scenarios.parts.controllers import make_controller, make_problem
 from scenarios.parts.effects import build_changes, build_wind
 from scenarios.parts.plugin import import_plugin, make_force
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import actual_effects, build_actual, resolve_vehicle, saturates
+from scenarios.reference import timed_regions
 from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
 from scenarios.schema.scenario import Scenario
 

@@ -29,14 +29,14 @@ from quadsim.sim.estimation.filter import Tally
 from quadsim.sim.sensing.sensor import SensorName
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
-from scenarios.courses.feasibility_check import report
-from scenarios.courses.make import build_course_steps
+from scenarios.feasibility_check import report
 from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
 from scenarios.parts.effects import build_computation
 from scenarios.parts.events import story
 from scenarios.parts.vehicle import build_actual
 from scenarios.progress import Progress, silent
+from scenarios.reference import build_course_steps
 from scenarios.schema.scenario import Scenario, Verdict
 from scenarios.schema.settings import leaves
 

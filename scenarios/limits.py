@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 
 from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
 from quadsim.report.table import format_number
-from scenarios.courses.make import timed_regions
 from scenarios.parts.vehicle import build_actual, build_vehicle
+from scenarios.reference import timed_regions
 from scenarios.schema.controller import NonlinearSpec
 
 if TYPE_CHECKING:

@@ -17,12 +17,12 @@ from quadsim.sim.rigid_body import check_free
 from quadsim.space import Region
 from quadsim.state import POSITION
 from quadsim.vehicle import Vehicle
-from scenarios.courses.make import build_course, build_motion, located
+from scenarios.courses.csv_course import Csv
 from scenarios.limits import space_limits
 from scenarios.parts.effects import build_changes, check_changes, moving_air
 from scenarios.parts.vehicle import actual_effects, build_actual, build_initial_state, build_vehicle
+from scenarios.reference import build_course, build_motion
 from scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
-from scenarios.schema.course import CsvSpec
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting
@@ -65,7 +65,7 @@ def check_parts(scenario: Scenario) -> None:
 
 def _check_start(scenario: Scenario, vehicle: Vehicle) -> None:
     """Refuse a start below the floor, or one in the air with rotors at rest."""
-    shape, state, position = outline(vehicle), build_initial_state(scenario)[None, :], scenario.initial.position
+    shape, state, position = outline(vehicle), build_initial_state(scenario)[None, :], list(scenario.initial.position)
     feet = float(clearance(state, shape.feet, shape.foot_radius, shape.floor)[0])
     hull = float(clearance(state, shape.hull, 0.0, shape.floor)[0])
     lowest = min(feet, hull)
@@ -131,6 +131,6 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
         data = {name: {**value} if isinstance(value, dict) else value for name, value in data.items()}
         locate_files(data, directory)
     scenario = Scenario.parse(data, source=source)
-    if directory is not None and isinstance(scenario.reference, CsvSpec):
-        scenario = scenario.model_copy(update={"reference": located(scenario.reference, directory)})
+    if directory is not None and isinstance(scenario.reference, Csv):
+        scenario = scenario.model_copy(update={"reference": scenario.reference.located(directory)})
     return scenario

@@ -24,13 +24,13 @@ from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.summary import constraint_verdict, limit_to_json
 from quadsim.report.comparison import verdict
+from quadsim.sim.effects.rotors import LagChange
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.courses.make import build_course_steps
 from scenarios.limits import build_limits
 from scenarios.loading import parse_scenario
+from scenarios.reference import build_course_steps
 from scenarios.schema.bases import read_whole
-from scenarios.schema.events import RotorLagEvent
 from scenarios.schema.plugin import LAWS, is_plugin
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import leaves
@@ -186,7 +186,7 @@ def _holds_commands(scenario: Scenario) -> bool:
     """Whether the rotors turn at the commanded speeds throughout each period that begins with its command."""
     laws = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
     held = all(spec.type in _HOLDING and getattr(spec, "indi", None) is None for spec in laws)
-    return held and scenario.effects.rotors is None and not any(isinstance(e, RotorLagEvent) for e in scenario.events)
+    return held and scenario.effects.rotors is None and not any(isinstance(e, LagChange) for e in scenario.events)
 
 
 def _differences(

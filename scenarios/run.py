@@ -25,7 +25,6 @@ from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller, build_ground, build_plant, resolve
-from scenarios.courses.make import build_motion, follow_course
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.limits import build_limits
 from scenarios.parts.effects import build_computation
@@ -35,6 +34,7 @@ from scenarios.parts.navigation import build_navigation
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_actual, build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent
+from scenarios.reference import build_motion, follow_course
 from scenarios.schema.controller import ControllerSpec, NonlinearSpec
 from scenarios.schema.events import ControllerEvent, Event
 from scenarios.schema.scenario import LONGEST_FLIGHT, MOST_STEPS, Scenario
@@ -50,7 +50,7 @@ def closed_loop(
     navigation: Navigation | None,
     recorded: bool = True,
 ) -> ClosedLoop:
-    """The loop of a scenario, at t = 0; the reference is (K + N, 4), or an object (see `scenarios.courses.make`)."""
+    """The loop of a scenario, at t = 0; the reference is (K + N, 4), or an object (see `scenarios.reference`)."""
     motion = build_motion(scenario, vehicle)
     return ClosedLoop(
         plant,

@@ -15,10 +15,10 @@ from quadsim.report.film.video import rendering_backend
 from quadsim.report.recording import viewer_problem
 from quadsim.vehicle import N_ROTORS
 from scenarios.build import build_controller
-from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
 from scenarios.machine import machine, versions
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
+from scenarios.reference import build_reference
 
 
 def doctor() -> dict[str, dict[str, str]]:

@@ -25,10 +25,10 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios import many
 from scenarios.build import build_problem
 from scenarios.campaign.results.table import Row
-from scenarios.courses.make import build_reference
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.reference import build_reference
 from scenarios.run import closed_loop
 from scenarios.schema.scenario import Scenario
 

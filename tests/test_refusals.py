@@ -19,11 +19,15 @@ from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.json_schema import scenario_schema
 
 TABLE = tomllib.loads((Path(__file__).parent / "refusals.toml").read_text(encoding="utf-8"))
+SEED = "must be a whole number >= 0 and <= 9223372036854775807"
 NESTED = "--set must be of at most 20 tables and lists within one another@"
 LONG = [  # settings too long for the table
-    ("constraints=[" + ",".join(["{}"] * 1001) + "]", "constraints must be of 1000 or fewer@"),
-    ("seed=" + 5000 * "9", "seed must be a whole number; got '9999@"),
-    ("duration=" + 300 * "x", "duration must be a number; got '" + 196 * "x" + "..."),
+    (
+        "constraints=[" + ",".join(["{}"] * 1001) + "]",
+        "constraints must be a list of 1000 or fewer entries; got [{}, {}@",
+    ),
+    ("seed=" + 5000 * "9", f"seed {SEED}; got '9999@"),
+    ("duration=" + 300 * "x", "duration must be a number > 0 and <= 86400; got '" + 196 * "x" + "..."),
     ("duration=" + 2000 * "[" + 2000 * "]", NESTED),
     ("seed=" + 99_999 * "[", NESTED),
     (".".join(40_000 * "a") + "=1", NESTED),
@@ -161,7 +165,9 @@ def test_every_command_reports_it_once_and_writes_nothing(
     more = {"compare": ["hover", "--out", "page"], "campaign": ["--out", "out"]}.get(command, [])
     assert main([command, "mine.toml", *more]) == 2
     printed = capsys.readouterr()
-    field = "flights must be >= 1; got 0" if command == "campaign" else "seed must be >= 0; got -1"
+    field = (
+        "flights must be a whole number >= 1 and <= 1000000; got 0" if command == "campaign" else f"seed {SEED}; got -1"
+    )
     assert (printed.out, printed.err) == ("", f"quadsim: mine.toml: {field}\n")
     assert [path.name for path in tmp_path.iterdir()] == ["mine.toml"]
 
@@ -192,7 +198,7 @@ def test_all_problems_are_named_at_once_but_for_those_beyond_twenty() -> None:
     message = refusal(lambda: load_scenario("hover", [f"reference={{x={windows}}}", "seed=-1"]))
     *lines, last = message.splitlines()
     assert (len(lines), last) == (20, "  and 6 more")
-    assert lines[0] == "hover.toml: seed must be >= 0; got -1"
+    assert lines[0] == f"hover.toml: seed {SEED}; got -1"
     assert lines[-1] == "  reference.x.18.start must be below stop = 0.0; got 1.0"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, doc
@@ -14,10 +14,15 @@ from quadsim.fields import Instant, Positive
 
 @dataclass(frozen=True, kw_only=True)
 class Stall:
-    """For a while no command is completed: one that is being computed waits for the end."""
+    """The computer answers nothing for a while; a command being computed waits for its end."""
 
     at: Instant
+    type: Annotated[Literal["stall"], doc("kind of event: stall")] = "stall"
     duration: Annotated[Positive, doc("[s] how long")]
+
+    def text(self) -> str:
+        """What happens, in words."""
+        return "the computer stalls"
 
 
 Seconds = Annotated[float, Ge(0.0), Le(100.0)]

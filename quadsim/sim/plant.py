@@ -18,10 +18,10 @@ from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError, RaisedError
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
-from quadsim.sim.effects import LOADING, Change, Effects, Force, LagChange, MassChange, PushChange, RotorChange
+from quadsim.sim.effects import LOADING, Change, Effects, Force, PushChange
 from quadsim.sim.effects.forces import StepForces
-from quadsim.sim.effects.load import Load, Payload, apply_mass, mass_properties
-from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects.load import Load, MassChange, Payload, apply_mass, mass_properties
+from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator, Segment, physics_to_state
 from quadsim.sim.rigid_body import RigidBody, check_free
@@ -235,8 +235,8 @@ class Plant:
 
     def _scheduled(self, changes: Sequence[Change]) -> list[tuple[int, Change]]:
         """Changes in the order of time, each with the physics step before which it happens."""
-        ordered = sorted(changes, key=lambda change: change.time)
-        return [(math.ceil(change.time / self.timestep - 1e-6), change) for change in ordered]
+        ordered = sorted(changes, key=lambda change: change.at)
+        return [(math.ceil(change.at / self.timestep - 1e-6), change) for change in ordered]
 
     def _change(self) -> None:
         """Let happen what is due before the next step."""
@@ -247,11 +247,11 @@ class Plant:
             elif isinstance(change, MassChange):
                 self._carry(self._payloads, change.factor)
             elif isinstance(change, LagChange):
-                self._rotors = self._rotors.lagging(change.rise, change.fall)
+                self._rotors = self._rotors.lagging(change)
             elif isinstance(change, PushChange):
                 self._forces.push(change.pushes)
             else:
-                self._carry(() if change.payload is None else (*self._payloads, change.payload), self._mass_factor)
+                self._carry((*self._payloads, change) if isinstance(change, Payload) else (), self._mass_factor)
 
     def _carry(self, payloads: tuple[Payload, ...], mass_factor: float) -> None:
         self._payloads, self._mass_factor = payloads, mass_factor

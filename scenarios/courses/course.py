@@ -1,17 +1,27 @@
-"""What a course is: a position and a yaw at any time."""
+"""What a course is: a position and a yaw at any time; and what the tables `[reference]` of all types share."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from itertools import pairwise
+from typing import Annotated, Final
 
 import numpy as np
+from annotated_types import Ge, Le, doc
 
+from quadsim.errors import ParameterError
+from quadsim.fields import NonNegative, Number, Vector
 from quadsim.state import Array
 
 EXACT: Final = (0.0, 0.0, 0.0, 0.0)
+MOST_POINTS: Final = 200  # points or turns of one course; a longer one is a table, `type = "csv"`
+CLOSEST: Final = 1e-3
+"""Least distance [m] between points that a speed leads from one to the other, and least time [s] between points."""
+
+Speed = Annotated[float, Ge(1e-3), Le(1e4)]  # of travel [m/s], or of turning [deg/s]
+Time = Annotated[float, Ge(CLOSEST), Le(1e6)]
 Derivatives = Callable[[Array], tuple[Array, Array]]
 """Times (M,) [s] -> velocity (M, 3) [m/s] and acceleration (M, 3) [m/s^2], world."""
 
@@ -73,3 +83,68 @@ def begin(path: Path, *, start: float, initial: Array) -> Course:
         end=start + path.duration,
         free_heading=path.free_heading,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filtered:
+    """A table `[reference]`, in the units of files."""
+
+    response_time: Annotated[NonNegative, doc("[s] tau_r of Eq. (31); 0 for no filter")] = 0.0
+
+    def build(self, initial: Array, gravity: float) -> Course:
+        """The course before its filter, from the initial pose (4,) x, y, z [m], yaw [rad]; gravity in m/s^2.
+
+        Raises:
+            InputError: its file is wrong, or it does not suit the initial pose.
+        """
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Started(Filtered):
+    """A course that begins at a time of its own."""
+
+    start: Annotated[NonNegative, doc("[s] when the course begins; until then it is the initial position and yaw")] = (
+        0.0
+    )
+
+    def build(self, initial: Array, gravity: float) -> Course:
+        """As `Filtered.build`."""
+        return begin(self.path(initial, gravity), start=self.start, initial=initial)
+
+    def path(self, initial: Array, gravity: float) -> Path:
+        """What begins at `start`; arguments and errors as of `build`."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Point:
+    """A point to fly through."""
+
+    position: Annotated[Vector, doc("[m] x, y, z, world")]
+    yaw: Annotated[Number | None, doc("[deg] yaw there; that of the point before if absent")] = None
+
+
+def poses_of(points: Sequence[Point], initial: Array) -> Array:
+    """(n, 4) x, y, z [m], yaw [rad] of points; a yaw that is left out is that before."""
+    poses, yaw = [], float(initial[3])
+    for point in points:
+        yaw = yaw if point.yaw is None else math.radians(point.yaw)
+        poses.append([*point.position, yaw])
+    return np.array(poses)
+
+
+def require_one(**fields: object) -> None:
+    """Refuse two fields of which not exactly one is given."""
+    first, second = fields
+    given = {name: value for name, value in fields.items() if value is not None}
+    if len(given) != 1:
+        raise ParameterError("", first, given, f"given, or {second}, but not both")
+
+
+def require_apart(points: Sequence[Point], advice: str) -> None:
+    """Refuse points at the place of the point before: no speed leads from one to the other."""
+    for i, (before, after) in enumerate(pairwise(points), start=1):
+        if math.dist(before.position, after.position) < CLOSEST:
+            rule = f"{CLOSEST} m or more from {list(before.position)}, the point before it ({advice})"
+            raise ParameterError("", f"points.{i}.position", list(after.position), rule)

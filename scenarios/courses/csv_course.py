@@ -10,13 +10,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path as FilePath
-from typing import Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
+from annotated_types import doc
+from pydantic import StringConstraints
 
 from quadsim.errors import FileError, InputError
 from quadsim.state import Array
-from scenarios.courses.course import EXACT, Path
+from scenarios.courses.course import EXACT, Course, Path, Started, begin
 from scenarios.courses.legs import polyline
 
 POSE_HEADER: Final = ("t", "x", "y", "z", "yaw")
@@ -38,6 +40,42 @@ class Table:
     sha256: str  # hash of the file
     # one unit of the last decimal in each column of the poses [m, m, m, rad]; 0 where it is not rounded
     resolution: tuple[float, ...] = EXACT
+
+
+@dataclass(frozen=True, kw_only=True)
+class Csv(Started):
+    """A table with the header t,x,y,z,yaw or t,x,y,z,yaw,vx,vy,vz; yaw in RADIANS, as in flight.parquet."""
+
+    type: Annotated[Literal["csv"], doc("kind of course: a table in a file")]
+    file: Annotated[
+        str,
+        doc(
+            "path of the CSV file, relative to the scenario file; "
+            "t [s] after start, x, y, z [m], yaw [rad] (radians, as ref_yaw in flight.parquet), vx, vy, vz [m/s]"
+        ),
+    ]
+    sha256: Annotated[
+        Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")] | None,
+        doc("hash of the file, recorded when it is read; another content is refused"),
+    ] = None
+
+    def build(self, initial: Array, gravity: float) -> Course:
+        """As `Filtered.build`."""
+        table = read_table(FilePath(self.file))
+        if self.sha256 not in (None, table.sha256):
+            raise FileError(self.file, f"is not the file of the scenario: its SHA-256 is not {self.sha256}")
+        return begin(through_rows(table), start=self.start + float(table.t[0]), initial=initial)
+
+    def located(self, directory: FilePath) -> Csv:
+        """The table's whole path and its hash, so that a resolved scenario defines its flight.
+
+        Raises:
+            FileError: what is there is no such table.
+        """
+        for path in (directory / self.file, FilePath(self.file)):
+            if path.is_file():
+                return replace(self, file=str(path.resolve()), sha256=self.sha256 or read_table(path).sha256)
+        return self
 
 
 def read_table(path: FilePath) -> Table:

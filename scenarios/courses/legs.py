@@ -2,31 +2,104 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import Len, doc
 
+from quadsim.errors import ParameterError
+from quadsim.fields import NonNegative, Number
 from quadsim.state import Array
-from scenarios.courses.course import Path
+from scenarios.courses.course import (
+    MOST_POINTS,
+    Course,
+    Filtered,
+    Path,
+    Point,
+    Speed,
+    Started,
+    begin,
+    poses_of,
+    require_apart,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Waypoint:
-    """A pose to reach in a straight line, and how long to stay there."""
+class Waypoint(Point):
+    """A point to fly to in a straight line at constant speed, and how long to stay there."""
 
-    pose: Array  # (4,) x, y, z [m], yaw [rad]
-    speed: float  # of the leg [m/s]
-    hold: float = 0.0  # how long to stay there [s]
+    hold: Annotated[NonNegative, doc("[s] how long to stay there")] = 0.0
+    speed: Annotated[Speed | None, doc("[m/s] of the leg; that of the course if absent")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waypoints(Started):
+    """Straight legs at constant speed, from the initial position from one point to the next."""
+
+    type: Annotated[Literal["waypoints"], doc("kind of course: straight legs between points")]
+    speed: Annotated[Speed, doc("[m/s] along a leg, unless its point gives its own")] = 1.0
+    points: Annotated[tuple[Waypoint, ...], Len(1, MOST_POINTS), doc("the points, in order")]
+
+    def __post_init__(self) -> None:
+        require_apart(self.points, "to stay at a point give it a hold")
+
+    def path(self, initial: Array, gravity: float) -> Path:
+        """The legs, yaw turning evenly along each; a first point at the initial position takes no time to reach."""
+        times, poses = [0.0], [initial]
+        for point, pose in zip(self.points, poses_of(self.points, initial), strict=True):
+            length = float(np.linalg.norm(pose[:3] - poses[-1][:3]))
+            if length > 0.0:
+                times.append(times[-1] + length / (self.speed if point.speed is None else point.speed))
+                poses.append(pose)
+            else:
+                poses[-1] = pose
+            if point.hold > 0.0:
+                times.append(times[-1] + point.hold)
+                poses.append(pose)
+        return polyline(np.array(times), np.array(poses))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Turn:
-    """A turn at constant rate."""
+    """A turn on the spot at constant rate."""
 
-    start: float  # when it begins [s]
-    yaw: float  # where it ends [rad]
-    rate: float  # magnitude [rad/s]
+    start: Annotated[NonNegative, doc("[s] when it begins; a turn that is not over then ends")]
+    yaw: Annotated[Number, doc("[deg] where it ends; 360 is a whole turn from 0")]
+    rate: Annotated[Speed, doc("[deg/s] how fast it turns, in either direction")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class YawTurns(Filtered):
+    """Turns on the spot: the position stays the initial one."""
+
+    type: Annotated[Literal["yaw_turns"], doc("kind of course: turns on the spot")]
+    turns: Annotated[tuple[Turn, ...], Len(1, MOST_POINTS), doc("the turns, in order")]
+
+    def __post_init__(self) -> None:
+        for i, (before, after) in enumerate(pairwise(self.turns), start=1):
+            if after.start <= before.start:
+                raise ParameterError("", f"turns.{i}.start", after.start, f"above that before it = {before.start}")
+
+    def build(self, initial: Array, gravity: float) -> Course:
+        """As `Filtered.build`; a turn cuts off one that is not over."""
+        times, yaws = [0.0], [float(initial[3])]
+        for turn in self.turns:
+            target = math.radians(turn.yaw)
+            yaw = float(np.interp(turn.start, times, yaws))
+            while times and times[-1] >= turn.start:
+                times.pop()
+                yaws.pop()
+            times.append(turn.start)
+            yaws.append(yaw)
+            if target != yaw:
+                times.append(turn.start + abs(target - yaw) / math.radians(turn.rate))
+                yaws.append(target)
+        poses = np.tile(initial, (len(times), 1))
+        poses[:, 3] = yaws
+        return begin(polyline(np.array(times), poses), start=0.0, initial=initial)
 
 
 def polyline(t: Array, poses: Array) -> Path:
@@ -36,40 +109,3 @@ def polyline(t: Array, poses: Array) -> Path:
         return np.stack([np.interp(times, t, column) for column in poses.T], axis=1)
 
     return Path(pose=pose, duration=float(t[-1]), kinks=tuple(t.tolist()))
-
-
-def waypoints(start: Array, points: Sequence[Waypoint]) -> Path:
-    """Straight legs at constant speed from a pose (4,) through the points, yaw turning evenly along each leg.
-
-    A first point at the place of `start` takes no time to reach.
-    """
-    times, poses = [0.0], [start]
-    for point in points:
-        length = float(np.linalg.norm(point.pose[:3] - poses[-1][:3]))
-        if length > 0.0:
-            times.append(times[-1] + length / point.speed)
-            poses.append(point.pose)
-        else:
-            poses[-1] = point.pose
-        if point.hold > 0.0:
-            times.append(times[-1] + point.hold)
-            poses.append(point.pose)
-    return polyline(np.array(times), np.array(poses))
-
-
-def yaw_turns(start: Array, turns: Sequence[Turn]) -> Path:
-    """Turns on the spot from a pose (4,), in order of their starts; a turn cuts off one that is not over."""
-    times, yaws = [0.0], [float(start[3])]
-    for turn in turns:
-        yaw = float(np.interp(turn.start, times, yaws))
-        while times and times[-1] >= turn.start:
-            times.pop()
-            yaws.pop()
-        times.append(turn.start)
-        yaws.append(yaw)
-        if turn.yaw != yaw:
-            times.append(turn.start + abs(turn.yaw - yaw) / turn.rate)
-            yaws.append(turn.yaw)
-    poses = np.tile(start, (len(times), 1))
-    poses[:, 3] = yaws
-    return polyline(np.array(times), poses)

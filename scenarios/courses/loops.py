@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import doc
 
+from quadsim.errors import ParameterError
+from quadsim.fields import NonNegative, Number, Pair, Positive
 from quadsim.state import Array
-from scenarios.courses.course import Path
+from scenarios.courses.course import Path, Speed, Started, Time, require_one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,3 +93,136 @@ def fly_round(loop: Loop, *, turn_time: float, turns: float, ramp: float, yaw: f
         return np.column_stack([loop.position(theta), headings])
 
     return Path(pose=pose, duration=total / rate + ramp)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Round(Started):
+    period: Annotated[Time | None, doc("[s] of one turn at full speed; either period or speed")] = None
+    speed: Annotated[Speed | None, doc("[m/s] along the path at full speed; either period or speed")] = None
+    turns: Annotated[Number, doc("[-] how many turns; negative: reversed")] = 1.0
+    ramp: Annotated[
+        NonNegative, doc("[s] over which it gains its speed smoothly, and loses it at the end; 0 for at once")
+    ] = 5.0
+    height: Annotated[Number | None, doc("[m] z where it begins; the initial one if absent")] = None
+    yaw: Annotated[Number | None, doc("[deg] held throughout; the initial one if absent")] = None
+    yaw_along_path: Annotated[bool, doc("whether yaw follows the direction of travel instead")] = False
+
+    def __post_init__(self) -> None:
+        require_one(period=self.period, speed=self.speed)
+        if self.turns == 0.0:
+            raise ParameterError("", "turns", self.turns, "other than 0")
+        longest = abs(self.turns) * self.turn_time
+        if self.ramp > longest:
+            rule = f"at most the time of all turns at full speed = {longest:g} s"
+            raise ParameterError("", "ramp", self.ramp, rule)
+        if self.yaw is not None and self.yaw_along_path:
+            raise ParameterError("", "yaw", self.yaw, "absent where yaw_along_path is true")
+
+    @property
+    def turn_length(self) -> float:
+        """Speed at full speed times the time of one turn [m]."""
+        raise NotImplementedError
+
+    @property
+    def turn_time(self) -> float:
+        """Of one turn at full speed [s]."""
+        return self.period or self.turn_length / (self.speed or math.inf)
+
+    @property
+    def until(self) -> float:
+        """When it is over [s]."""
+        return self.start + abs(self.turns) * self.turn_time + self.ramp
+
+    def loop(self, initial: Array, height: float) -> Loop:
+        """The curve that is flown, from a height [m] on; otherwise as `path`."""
+        raise NotImplementedError
+
+    def path(self, initial: Array, gravity: float) -> Path:
+        """The loop, flown from and to rest."""
+        return fly_round(
+            self.loop(initial, float(initial[2]) if self.height is None else self.height),
+            turn_time=self.turn_time,
+            turns=abs(self.turns),
+            ramp=self.ramp,
+            yaw=float(initial[3]) if self.yaw is None else math.radians(self.yaw),
+            along=self.yaw_along_path,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Circular(_Round):
+    radius: Annotated[Positive, doc("[m] seen from above")]
+    centre: Annotated[
+        Pair | None, doc("[m] x, y, world; if absent, such that the course begins at the initial position")
+    ] = None
+    angle: Annotated[Number, doc("[deg] where on the circle it begins, seen from the centre; 0 is +x")] = 0.0
+
+    @property
+    def climb_per_turn(self) -> float:
+        """[m]."""
+        return 0.0
+
+    @property
+    def turn_length(self) -> float:
+        """Of the path [m]."""
+        return math.hypot(2.0 * math.pi * self.radius, self.climb_per_turn)
+
+    def loop(self, initial: Array, height: float) -> Loop:
+        """A circle or a helix."""
+        angle = math.radians(self.angle)
+        from_centre = (self.radius * math.cos(angle), self.radius * math.sin(angle))
+        centre = np.array([*(initial[:2] - from_centre if self.centre is None else self.centre), height])
+        clockwise, climb = self.turns < 0.0, self.climb_per_turn
+        return circle(centre=centre, radius=self.radius, angle=angle, clockwise=clockwise, climb_per_turn=climb)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Circle(_Circular):
+    """A level circle, counter-clockwise seen from above."""
+
+    type: Annotated[Literal["circle"], doc("kind of course: a level circle")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Helix(_Circular):
+    """A circle that climbs in proportion to the angle flown."""
+
+    type: Annotated[Literal["helix"], doc("kind of course: a circle that climbs")]
+    climb: Annotated[Number, doc("[m] gained per turn; negative: lost")]
+
+    @property
+    def climb_per_turn(self) -> float:
+        """[m]."""
+        return self.climb
+
+
+@dataclass(frozen=True, kw_only=True)
+class FigureEight(_Round):
+    """A level lemniscate of Gerono, begun at its crossing."""
+
+    type: Annotated[Literal["figure_eight"], doc("kind of course: a level lemniscate of Gerono")]
+    length: Annotated[Positive, doc("[m] from end to end, through the crossing")]
+    width: Annotated[Positive | None, doc("[m] across; half the length if absent")] = None
+    speed: Annotated[Speed | None, doc("[m/s] at the crossing, where it is largest; either period or speed")] = None
+    centre: Annotated[Pair | None, doc("[m] x, y of the crossing, world; the initial position if absent")] = None
+    angle: Annotated[Number, doc("[deg] direction of the length; 0 is +x")] = 0.0
+
+    @property
+    def half_width(self) -> float:
+        """[m]."""
+        return 0.5 * (0.5 * self.length if self.width is None else self.width)
+
+    @property
+    def turn_length(self) -> float:
+        """As if the speed of the crossing, where it is largest, were kept [m]."""
+        return 2.0 * math.pi * math.hypot(0.5 * self.length, 2.0 * self.half_width)
+
+    def loop(self, initial: Array, height: float) -> Loop:
+        """The lemniscate."""
+        return figure_eight(
+            centre=np.array([*(initial[:2] if self.centre is None else self.centre), height]),
+            half_length=0.5 * self.length,
+            half_width=self.half_width,
+            angle=math.radians(self.angle),
+            clockwise=self.turns < 0.0,
+        )

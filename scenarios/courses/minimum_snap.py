@@ -4,18 +4,73 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import numpy as np
+from annotated_types import Len, doc
 
+from quadsim.errors import ParameterError
 from quadsim.state import Array
-from scenarios.courses.course import Path
+from scenarios.courses.course import (
+    CLOSEST,
+    MOST_POINTS,
+    Path,
+    Point,
+    Speed,
+    Started,
+    Time,
+    poses_of,
+    require_apart,
+    require_one,
+)
 
 if TYPE_CHECKING:
     from scipy.interpolate import BPoly
 
 SNAP: Final = 4
 ACCELERATION: Final = 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class MinimumSnap(Started):
+    """The smoothest course through points, from rest at the initial position to rest at the last of them."""
+
+    type: Annotated[Literal["minimum_snap"], doc("kind of course: least snap through points")]
+    points: Annotated[tuple[Point, ...], Len(1, MOST_POINTS), doc("the points, in order")]
+    times: Annotated[
+        tuple[Time, ...] | None, doc("[s] after start, when each point is passed; either times or speed")
+    ] = None
+    speed: Annotated[Speed | None, doc("[m/s] average on the straight line between points; either times or speed")] = (
+        None
+    )
+
+    def __post_init__(self) -> None:
+        require_one(times=self.times, speed=self.speed)
+        if self.times is None:
+            require_apart(self.points, "or give times instead of speed")
+        elif len(self.times) != len(self.points):
+            rule = f"a list of {len(self.points)} times, one for each point"
+            raise ParameterError("", "times", list(self.times), rule)
+        elif any(after - before < CLOSEST for before, after in pairwise(self.times)):
+            raise ParameterError("", "times", list(self.times), f"increasing, by {CLOSEST} s or more")
+
+    def path(self, initial: Array, gravity: float) -> Path:
+        """The polynomials through the points.
+
+        Raises:
+            ParameterError: a speed is to lead to a first point at the initial position.
+        """
+        poses = poses_of(self.points, initial)
+        if self.times is not None:
+            return minimum_snap(initial, poses, self.times)
+        lengths = np.linalg.norm(np.diff(np.vstack([initial, poses])[:, :3], axis=0), axis=1)
+        if lengths[0] < CLOSEST:
+            rule = f"{CLOSEST} m or more from the initial position, where the course begins"
+            rule += " (or give times instead of speed)"
+            raise ParameterError("reference", "points.0.position", list(self.points[0].position), rule)
+        return minimum_snap(initial, poses, (np.cumsum(lengths) / self.speed).tolist())
 
 
 def smoothest(times: Array, values: Array, order: int) -> BPoly:

@@ -9,13 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated, Final, Literal
 
 import numpy as np
+from annotated_types import doc
 
 from mpc.flatness import attitudes
+from quadsim.errors import ParameterError
+from quadsim.fields import Positive
 from quadsim.rotation import quaternion_to_euler
 from quadsim.state import Array
-from scenarios.courses.course import Path
+from scenarios.courses.course import Path, Speed, Started, Time
+
+MOST_SAMPLES: Final = 100_000  # of the phase: 2000 s at 50 Hz
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,3 +138,87 @@ def fly_ramped(curve: Curve, phase: Phase, *, initial: Array, gravity: float, fr
 
 def _level(x: Array, y: Array) -> Array:
     return np.column_stack([x, y, np.zeros_like(x)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Ramped(Started):
+    speed: Annotated[
+        Speed,
+        doc(
+            "[m/s] v, the product of radius and rate that would be reached without ramps; the phase's own top rate is "
+            "somewhat higher"
+        ),
+    ]
+    acceleration: Annotated[Speed, doc("[m/s^2] a, along the path, of radius and phase")] = 1.0
+    radius: Annotated[Positive, doc("[m] r, seen from above; of a lemniscate half its length")]
+    ramp: Annotated[Time, doc("[s] T, over which the acceleration grows; below speed / acceleration")] = 2.0
+    heading: Annotated[
+        Literal["free", "held"],
+        doc("free: no rate is left about body z, and the heading drifts; held: the initial yaw"),
+    ] = "free"
+    sampling: Annotated[Time, doc("[s] step of the rectangle sums that make the phase")] = 0.02
+
+    def __post_init__(self) -> None:
+        if self.response_time:
+            raise ParameterError("", "response_time", self.response_time, "0: the course is smooth by itself")
+        longest = self.speed / self.acceleration
+        if self.ramp >= longest:
+            raise ParameterError("", "ramp", self.ramp, f"below speed / acceleration = {longest:g} s")
+        least = 2.0 * (longest + self.ramp) / MOST_SAMPLES
+        if least > self.sampling:
+            rule = f">= {least:.3g}, which makes {MOST_SAMPLES} samples"
+            raise ParameterError("", "sampling", self.sampling, rule)
+
+    @property
+    def until(self) -> float:
+        """When it is over [s]; see `ramped_phase`."""
+        parts = (self.ramp, self.speed / self.acceleration - self.ramp)
+        rising, constant, turning = (math.ceil(time / self.sampling - 1e-9) for time in (*parts, 2.0 * self.ramp))
+        return self.start + self.sampling * (2 * rising + 2 * constant + turning)
+
+    def curve(self, yaw: float) -> Curve:
+        """What is flown, with an initial yaw [rad]."""
+        raise NotImplementedError
+
+    def path(self, initial: Array, gravity: float) -> Path:
+        """The curve by its phase."""
+        rate, acceleration = self.speed / self.radius, self.acceleration / self.radius
+        phase = ramped_phase(rate=rate, acceleration=acceleration, ramp=self.ramp, step=self.sampling)
+        curve, free = self.curve(float(initial[3])), self.heading == "free"
+        return fly_ramped(curve, phase, initial=initial, gravity=gravity, free_heading=free)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RampedCircle(_Ramped):
+    """A level circle, clockwise seen from above, from the initial position, its northernmost point, towards +x.
+
+    Or a vertical one, from its lowest point towards the initial yaw.
+    """
+
+    type: Annotated[Literal["ramped_circle"], doc("kind of course: a circle flown up to a speed and back to rest")]
+    plane: Annotated[
+        Literal["level", "vertical"],
+        doc("vertical: upside down at the top, where it is fast enough; the heading is free"),
+    ] = "level"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.plane == "vertical" and self.heading == "held":
+            raise ParameterError("", "heading", self.heading, "free where plane is vertical")
+
+    def curve(self, yaw: float) -> Curve:
+        """The circle."""
+        return upright_circle_curve(self.radius, yaw) if self.plane == "vertical" else circle_curve(self.radius)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RampedLemniscate(_Ramped):
+    """A level lemniscate of Gerono from the initial position, its tip in +x, towards +y."""
+
+    type: Annotated[
+        Literal["ramped_lemniscate"], doc("kind of course: a lemniscate flown up to a speed and back to rest")
+    ]
+
+    def curve(self, yaw: float) -> Curve:
+        """The lemniscate."""
+        return lemniscate_curve(self.radius)

@@ -3,21 +3,62 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import MaxLen, doc
 
+from quadsim.errors import ParameterError
+from quadsim.fields import Number
 from quadsim.state import Array
+from scenarios.courses.course import Course, Filtered
 
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
-    """A value held strictly between two instants, as in Eq. (30)."""
+    """A value held strictly between two instants.  Eq. (30)."""
 
-    start: float  # [s], excluded; at the instant itself the reference is elsewhere's value
-    stop: float  # [s], excluded
-    value: float  # [m], or [rad] for yaw
+    start: Annotated[Number, doc("[s] when it begins; at that instant the value does not hold yet")]
+    stop: Annotated[Number, doc("[s] when it ends; at that instant the value holds no longer")]
+    value: Annotated[Number, doc("[m], or [deg] for yaw, held in between")]
+
+    def __post_init__(self) -> None:
+        if not self.start < self.stop:
+            raise ParameterError("", "start", self.start, f"below stop = {self.stop}")
+
+
+Windows = Annotated[tuple[Window, ...], MaxLen(1000)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps(Filtered):
+    """Steps of Eq. (30); outside its windows an axis stays at its initial position, and yaw at 0."""
+
+    type: Annotated[Literal["steps"], doc("kind of course: values held in windows of time")] = "steps"
+    x: Annotated[Windows, doc("[m] windows of the x axis, world")] = ()
+    y: Annotated[Windows, doc("[m] windows of the y axis, world")] = ()
+    z: Annotated[Windows, doc("[m] windows of the z axis, world")] = ()
+    yaw: Annotated[Windows, doc("[deg] windows of the yaw angle")] = ()
+
+    def build(self, initial: Array, gravity: float) -> Course:
+        """As `Filtered.build`."""
+        channels = self.channels(initial)
+        elsewhere = np.array([value for _, value in channels])
+        instants = {time for windows, value in channels for time, _, _ in switches(windows, value, initial=value)}
+
+        def sample(t: Array) -> Array:
+            return np.stack([steps(t, windows, value) for windows, value in channels], axis=1)
+
+        return Course(sample=sample, initial=elsewhere, jumps=tuple(sorted(instants)))
+
+    def channels(self, initial: Array) -> list[tuple[Sequence[Window], float]]:
+        """Windows of x, y, z [m] and yaw [rad], each with the value outside them."""
+        yaw = [replace(window, value=math.radians(1.0) * window.value) for window in self.yaw]
+        x, y, z = initial[:3].tolist()
+        return [(self.x, x), (self.y, y), (self.z, z), (yaw, 0.0)]
 
 
 def steps(t: Array, windows: Sequence[Window], elsewhere: float) -> Array:

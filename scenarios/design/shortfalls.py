@@ -6,8 +6,8 @@ import math
 from typing import Final
 
 from quadsim.vehicle import Vehicle
-from scenarios.courses.feasibility_check import fitting, report
 from scenarios.design.authority import Authority, authority
+from scenarios.feasibility_check import fitting, report
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
 from scenarios.schema.optimisation import BoundedSpec, InputBoundsSpec
 from scenarios.schema.robust import RobustSpec

@@ -11,13 +11,13 @@ from mpc.fallback.settings import FallbackSettings
 from quadsim.errors import ParameterError
 from quadsim.fields import filled
 from quadsim.sim.computation import Computation, ComputationTime, Stall
-from quadsim.sim.effects import Change, LagChange, MassChange, PayloadChange, PushChange, RotorChange
-from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects import LOADING, Change, Push, PushChange
+from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics, RotorLoss
 from quadsim.sim.effects.wind import Air, Gust, WindChange, WindField
 from quadsim.vehicle import Vehicle
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import actual_effects
-from scenarios.schema import events as kinds
+from scenarios.schema.events import Event
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
@@ -77,23 +77,15 @@ def build_computation(scenario: Scenario) -> Computation | None:
     return Computation(**vars(filled(spec or ComputationTime(), plan=guarded)), stalls=stalls)
 
 
-def build_changes(scenario: Scenario, events: Sequence[kinds.Event] | None = None) -> tuple[Change, ...]:
+def build_changes(scenario: Scenario, events: Sequence[Event] | None = None) -> tuple[Change, ...]:
     """What these events, or else all of the scenario, do to rotors, mass and payload, and what pushes, in any order."""
     events = scenario.events if events is None else events
-    pushes = _in_force([event for event in events if isinstance(event, kinds.PushEvent)])
-    found: list[Change] = [*_losses(scenario, events)]
-    found += [PushChange(time=time, pushes=tuple(in_force)) for time, in_force in pushes]
-    for event in events:
-        if isinstance(event, kinds.PayloadPickupEvent):
-            found.append(PayloadChange(time=event.at, payload=event))
-        elif isinstance(event, kinds.PayloadDropEvent):
-            found.append(PayloadChange(time=event.at, payload=None))
-        elif isinstance(event, kinds.MassEvent):
-            found.append(MassChange(time=event.at, factor=event.factor))
-        elif isinstance(event, kinds.RotorLagEvent):
-            fall = event.rise if event.fall is None else event.fall
-            found.append(LagChange(time=event.at, rise=event.rise, fall=fall))
-    return tuple(found)
+    pushes = _in_force([event for event in events if isinstance(event, Push)])
+    return (
+        *_losses(scenario, [event for event in events if isinstance(event, RotorLoss)]),
+        *(PushChange(at=time, pushes=tuple(in_force)) for time, in_force in pushes),
+        *(event for event in events if isinstance(event, (*LOADING, LagChange))),
+    )
 
 
 def check_changes(scenario: Scenario, vehicle: Vehicle, changes: Iterable[Change]) -> None:
@@ -105,20 +97,19 @@ def check_changes(scenario: Scenario, vehicle: Vehicle, changes: Iterable[Change
     rotors = actual_effects(scenario, vehicle).rotors or RotorDynamics()
     for change in changes:
         if isinstance(change, LagChange):
-            rotors.lagging(change.rise, change.fall)
+            rotors.lagging(change)
 
 
-def _losses(scenario: Scenario, events: Sequence[kinds.Event]) -> Iterator[RotorChange]:
+def _losses(scenario: Scenario, losses: Sequence[RotorLoss]) -> Iterator[RotorChange]:
     """Each rotor's share whenever one of its losses begins or ends: the product of what all losses in force leave."""
-    losses = [event for event in events if isinstance(event, kinds.RotorLossEvent)]
     rotors = scenario.effects.rotors or RotorDynamics()
     for rotor, worn in enumerate(rotors.efficiency, start=1):
         for time, in_force in _in_force([loss for loss in losses if loss.rotor == rotor]):
             left = math.prod(1.0 - loss.loss for loss in in_force)
-            yield RotorChange(time=time, rotor=rotor, efficiency=worn * left)
+            yield RotorChange(at=time, rotor=rotor, efficiency=worn * left)
 
 
-_Lasting = TypeVar("_Lasting", kinds.RotorLossEvent, kinds.PushEvent)
+_Lasting = TypeVar("_Lasting", RotorLoss, Push)
 
 
 def _in_force(events: Sequence[_Lasting]) -> Iterator[tuple[float, list[_Lasting]]]:

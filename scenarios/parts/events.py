@@ -7,26 +7,22 @@ live flight and in the one that is saved of it, whether or not anything of its k
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 from quadsim.errors import printable
-from quadsim.sim.effects.load import Load
+from quadsim.sim.effects import LOADING, Push
+from quadsim.sim.effects.load import Load, MassChange
 from quadsim.sim.effects.wind import Air, Gust, WindChange
-from quadsim.state import REFERENCE_NAMES
 from quadsim.vehicle import Vehicle
 from scenarios.parts.vehicle import actual_effects
-from scenarios.schema import events as kinds
+from scenarios.schema.events import Event, SensorFaultEvent, SensorText
 
 if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
 
-SensorText = Literal["position", "velocity", "attitude", "rates"]
 _MOST: Final = 3  # events of one kind in a row that are reported one by one; more of them in one entry
 _LONGEST: Final = 200
-_FAULTS: Final = {"dropout": "gives no samples", "freeze": "is frozen", "nan": "gives no numbers", "bias": "is offset"}
 
 
 def prepared(scenario: Scenario, vehicle: Vehicle) -> Scenario:
@@ -38,7 +34,7 @@ def prepared(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     air = actual_effects(scenario, vehicle).air
     sensed = {} if scenario.sensors is None else scenario.sensors.present()
     names = [*sensed] if scenario.estimator is not None else [*get_args(SensorText)]
-    possible: list[kinds.Event] = [
+    possible: list[Event] = [
         _push(scenario),
         *([_mass(scenario)] if scenario.plant.integrator == "mujoco" else []),
         *([_wind(scenario)] if air is not None and air.drags else []),
@@ -48,34 +44,32 @@ def prepared(scenario: Scenario, vehicle: Vehicle) -> Scenario:
     return scenario.model_copy(update={"events": [*added, *scenario.events]})  # what the file has at 0 comes after
 
 
-def neutral(scenario: Scenario, event: kinds.Event) -> kinds.Event | None:
+def neutral(scenario: Scenario, event: Event) -> Event | None:
     """An event at the start that changes nothing, and prepares a flight for one; None where it needs no preparing."""
-    if isinstance(event, kinds.PushEvent):
+    if isinstance(event, Push):
         return _push(scenario)
-    if isinstance(event, kinds.MassEvent | kinds.PayloadPickupEvent | kinds.PayloadDropEvent):
+    if isinstance(event, LOADING):
         return _mass(scenario)
     if isinstance(event, Gust | WindChange):
         return _wind(scenario)
-    return _fault(scenario, event.sensor) if isinstance(event, kinds.SensorFaultEvent) else None
+    return _fault(scenario, event.sensor) if isinstance(event, SensorFaultEvent) else None
 
 
-def _push(scenario: Scenario) -> kinds.PushEvent:
-    return kinds.PushEvent(type="push", at=0.0, duration=scenario.plant.timestep, force=(0.0, 0.0, 0.0))
+def _push(scenario: Scenario) -> Push:
+    return Push(at=0.0, duration=scenario.plant.timestep, force=(0.0, 0.0, 0.0))
 
 
-def _mass(scenario: Scenario) -> kinds.MassEvent:
-    return kinds.MassEvent(type="mass", at=0.0, factor=(scenario.effects.load or Load()).mass_factor)
+def _mass(scenario: Scenario) -> MassChange:
+    return MassChange(at=0.0, factor=(scenario.effects.load or Load()).mass_factor)
 
 
-def _wind(scenario: Scenario) -> kinds.WindEvent:
-    return kinds.WindEvent(type="wind", at=0.0, velocity=(scenario.effects.air or Air()).wind)
+def _wind(scenario: Scenario) -> WindChange:
+    return WindChange(at=0.0, velocity=(scenario.effects.air or Air()).wind)
 
 
-def _fault(scenario: Scenario, sensor: SensorText) -> kinds.SensorFaultEvent:
-    nothing, step = [0.0, 0.0, 0.0], scenario.plant.timestep
-    return kinds.SensorFaultEvent(
-        type="sensor_fault", at=0.0, sensor=sensor, fault="bias", offset=nothing, duration=step
-    )
+def _fault(scenario: Scenario, sensor: SensorText) -> SensorFaultEvent:
+    step = scenario.plant.timestep
+    return SensorFaultEvent(at=0.0, sensor=sensor, fault="bias", offset=(0.0, 0.0, 0.0), duration=step)
 
 
 def story(scenario: Scenario, duration: float) -> list[dict[str, Any]]:
@@ -96,39 +90,7 @@ def story(scenario: Scenario, duration: float) -> list[dict[str, Any]]:
     return entries
 
 
-def _text(event: kinds.Event) -> str:
-    return printable("".join(_parts(event)))[:_LONGEST]
-
-
-def _parts(event: kinds.Event) -> Iterator[str]:
-    match event:
-        case kinds.RotorLossEvent():
-            yield f"rotor {event.rotor} loses {100.0 * event.loss:.3g} %"
-        case kinds.RotorLagEvent():
-            fall = "" if event.fall in (None, event.rise) else f", {event.fall:g} s downwards"
-            yield f"rotors lag by {event.rise:g} s{fall}"
-        case kinds.MassEvent():
-            yield f"the mass is {event.factor:g} times the file's"
-        case kinds.PayloadPickupEvent():
-            yield f"{event.mass:g} kg are taken up"
-        case kinds.PayloadDropEvent():
-            yield "what is carried is dropped"
-        case kinds.PushEvent():
-            yield f"a push of {math.hypot(*event.force):.3g} N"
-        case kinds.GustEvent():
-            yield f"a gust of {math.hypot(*event.velocity):.3g} m/s"
-        case kinds.WindEvent():
-            yield f"the mean wind is {math.hypot(*event.velocity):.3g} m/s"
-        case kinds.SensorFaultEvent():
-            yield f"the {event.sensor} sensor {_FAULTS[event.fault]}"
-        case kinds.StallEvent():
-            yield "the computer stalls"
-        case kinds.SetpointEvent():
-            units = {name: "deg" if name == "yaw" else "m" for name in REFERENCE_NAMES}
-            given = [f"{name} {getattr(event, name):g} {units[name]}" for name in event.values]
-            yield f"set-point {', '.join(given)}"
-        case kinds.ControllerEvent():
-            yield f"controller: {', '.join(f'{name} = {value}' for name, value in event.fields.items())}"
+def _text(event: Event) -> str:
     duration = getattr(event, "duration", None)
-    if duration is not None:
-        yield f" for {duration:g} s"
+    lasting = "" if duration is None else f" for {duration:g} s"
+    return printable(f"{event.text()}{lasting}")[:_LONGEST]

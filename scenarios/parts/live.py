@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 from bisect import insort
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from mpc.ocp import Unanswered
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.sim.computation import Computation, Stall
+from quadsim.sim.effects.load import PayloadDrop, PayloadPickup
 from quadsim.sim.effects.wind import Gust, WindChange
 from quadsim.sim.loop import ClosedLoop
 from quadsim.sim.navigation import Navigation
@@ -32,8 +32,6 @@ from scenarios.schema.events import (
     MOST_EVENTS,
     ControllerEvent,
     Event,
-    PayloadDropEvent,
-    PayloadPickupEvent,
     SensorFaultEvent,
     SetpointEvent,
 )
@@ -43,7 +41,7 @@ if TYPE_CHECKING:
     from scenarios.courses.followed import FollowedCourse
     from scenarios.schema.scenario import Scenario
 
-_DEPENDENT: Final = (ControllerEvent, PayloadDropEvent, PayloadPickupEvent, SensorFaultEvent)
+_DEPENDENT: Final = (ControllerEvent, PayloadDrop, PayloadPickup, SensorFaultEvent)
 """The events that depend on what else the scenario has."""
 
 
@@ -168,9 +166,7 @@ class FlightEvents:
             at = round(at + step, 9)
         if isinstance(event, Stall) and self._loop.answered >= at:  # a command that has come was not held up
             at = round(self._loop.answered + step, 9)
-        if isinstance(event, BaseModel):
-            return event.model_copy(update={"at": at})
-        return dataclasses.replace(event, at=at)
+        return replace(event, at=at)
 
     def _with(self, event: Event) -> Scenario:
         """The scenario with one event more, and as long as that takes."""

@@ -10,8 +10,8 @@ from typing import Any, Final
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
+from scenarios.courses.table import DEFAULT, ReferenceTable
 from scenarios.schema.base import fields_of
-from scenarios.schema.course import ReferenceSpec
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import headline, is_absent, tables_in
 
@@ -46,6 +46,11 @@ class _SchemaOfToml(GenerateJsonSchema):
                 found["properties"][name]["description"] = field.description
         return found
 
+    def field_is_required(self, field: Any, total: bool) -> bool:
+        """Whether a table has to state a field: its type too, although Python's default is its only value."""
+        named = field.get("name") == "type" and field["schema"].get("default") != DEFAULT
+        return named or super().field_is_required(field, total)
+
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> dict[str, Any]:
         """The same without a default where that is to be absent."""
         if "default" in schema and is_absent(schema["default"]):
@@ -66,7 +71,7 @@ def scenario_schema() -> dict[str, Any]:
     whole = Scenario.model_json_schema(schema_generator=_SchemaOfToml)
     tables = whole.pop("$defs")
     difference = _loosened(whole)
-    ending = {table.__name__ for table in tables_in(ReferenceSpec) if hasattr(table, "until")}
+    ending = {table.__name__ for table in tables_in(ReferenceTable) if hasattr(table, "until")}
     kinds = [tables[name]["properties"]["type"]["const"] for name in sorted(ending)]
     known = {"properties": {"reference": {"properties": {"type": {"enum": kinds}}, "required": ["type"]}}}
     whole["anyOf"] = [{"required": ["duration"]}, known]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from importlib import metadata
@@ -11,6 +10,7 @@ from typing import Any, Final
 
 from pydantic import Field, model_validator
 
+from quadsim.fields import is_plain
 from scenarios.schema.base import Horizon, Spec
 
 FORM: Final = "package.module:Class"  # what the text that names a controller looks like
@@ -92,12 +92,3 @@ def located(controller: Any, beside: Path) -> Any:
     first = beside / name.partition(":")[0].partition(".")[0]
     found = "folder" not in table and (first.is_dir() or first.with_suffix(".py").is_file())
     return {**table, "folder": str(beside.resolve())} if found else controller
-
-
-def is_plain(value: Any) -> bool:
-    """Whether a value is one that TOML and JSON can hold, and no date."""
-    if isinstance(value, dict):
-        return all(map(is_plain, value.values()))
-    if isinstance(value, list):
-        return all(map(is_plain, value))
-    return isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value))

@@ -1,24 +1,31 @@
-"""What is wrong with a scenario file, in lines a person can act on."""
+"""What is wrong with a scenario file, in lines a person can act on: each says what the declaration allows."""
 
 from __future__ import annotations
 
 import datetime
 import difflib
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from itertools import islice
 from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
-from annotated_types import Len, MaxLen, MinLen
+from annotated_types import GroupedMetadata
 from pydantic import BaseModel, Tag, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, core_schema
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.vehicle import MEANT
 from scenarios.schema.base import fields_of, is_table
 
 _LISTS: Final = (list, tuple, Sequence)  # types that are lists in a file
+_TAGS: Final = ("type", "distribution")  # fields that distinguish tables
+_NAMES: Final = {float: "number", int: "whole number", str: "text"}
+_LIMITS: Final = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+_KNOWN: Final = frozenset(get_args(core_schema.ErrorType))  # pydantic's kinds of error; a custom one states its rule
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,12 +46,71 @@ class Kind:
         return (get_origin(self.type) or self.type) in _LISTS
 
     @property
+    def entries(self) -> tuple[Kind, ...]:
+        """What a list, or a table with names of the writer's choice, holds."""
+        origin, arguments = get_origin(self.type), get_args(self.type)
+        return kinds_of(arguments[0] if origin is tuple else arguments[-1]) if origin in (*_LISTS, dict) else ()
+
+    @property
+    def choices(self) -> tuple[Any, ...]:
+        """The values that there are, where they are listed."""
+        if isinstance(self.type, type) and issubclass(self.type, Enum):
+            return tuple(member.value for member in self.type)
+        return get_args(self.type) if get_origin(self.type) is Literal else ()
+
+    @property
     def labels(self) -> set[str]:
         """What pydantic calls this kind among several."""
         tags = {note.tag for note in self.metadata if isinstance(note, Tag)}
-        if "type" in self.fields and get_origin(choice := fields_of(self.type)["type"].annotation) is Literal:
-            tags |= {*get_args(choice)}
+        for name in {*_TAGS} & {*self.fields}:
+            tags |= {str(choice) for kind in kinds_of(fields_of(self.type)[name].annotation) for choice in kind.choices}
         return tags or {getattr(self.type, "__name__", "")}
+
+    @property
+    def lengths(self) -> tuple[int, float]:
+        """The least and the largest number of entries of a list, or characters of a text."""
+        limits = dict(_limits(self.metadata))
+        return limits.get("min_length") or 0, limits.get("max_length") or math.inf
+
+    def __str__(self) -> str:
+        """What is allowed, as the end of "must be ..."."""
+        if self.choices:
+            *rest, last = ("false" if choice is False else repr(choice) for choice in self.choices)
+            return f"one of {', '.join(rest)} or {last}" if rest else last
+        limits, count = dict(_limits(self.metadata)), _count(*self.lengths)
+        if self.is_list:
+            held = {entry.type for entry in self.entries}
+            return f"a list of {count}{'numbers' if held <= {float, int} else 'texts' if held == {str} else 'entries'}"
+        if self.type in _NAMES:
+            bounds = [f"{sign} {_number(limits[name])}" for name, sign in _LIMITS.items() if name in limits]
+            finite = "finite " if self.type is float and not bounds else ""
+            count = f"of {count}characters" if count else ""
+            form = f"of the form {limits['pattern']}" if "pattern" in limits else ""
+            return " ".join(filter(None, [f"a {finite}{_NAMES[self.type]}", " and ".join(bounds), count, form]))
+        return "true or false" if self.type is bool else f"a table of {count}entries" if count else "a table"
+
+
+def _limits(notes: Iterable[Any]) -> Iterator[tuple[str, Any]]:
+    """The limits that notes of a field set, by annotated_types' and pydantic's names for them."""
+    for note in notes:
+        if isinstance(note, FieldInfo):
+            yield from _limits(note.metadata)
+        elif isinstance(note, GroupedMetadata):
+            yield from _limits(note)
+        names = (*_LIMITS, "min_length", "max_length", "pattern")
+        yield from ((name, getattr(note, name)) for name in names if getattr(note, name, None) is not None)
+
+
+def _count(shortest: int, longest: float) -> str:
+    if shortest == longest:
+        return f"{shortest} "
+    if math.isinf(longest):
+        return f"{shortest} or more " if shortest else ""
+    return f"{shortest} to {longest} " if shortest else f"{longest} or fewer "
+
+
+def _number(value: float) -> str:
+    return str(value) if isinstance(value, int) else f"{value:.15g}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,24 +127,13 @@ class Place:
         return tuple(dict.fromkeys(name for kind in self.kinds for name in kind.fields))
 
     @property
-    def exact_length(self) -> int | None:
-        """How long a list has to be, where that is one number."""
-        for kind in self.kinds:
-            notes = kind.metadata if kind.is_list else ()
-            shortest = {note.min_length for note in notes if isinstance(note, Len | MinLen)}
-            longest = {note.max_length for note in notes if isinstance(note, Len | MaxLen)}
-            if shortest and shortest == longest:
-                return int(shortest.pop())
-        return None
-
-    @property
-    def entries(self) -> str:
-        """What a list there holds."""
-        held = {entry.type for kind in self.kinds if kind.is_list for entry in _entries(kind)}
-        return "numbers" if held <= {float, int} else "texts" if held == {str} else "entries"
+    def is_of_wrong_length(self) -> bool:
+        """Whether a list is given that is too short or too long."""
+        lists = [kind.lengths for kind in self.kinds if kind.is_list]
+        return isinstance(self.given, list) and not any(low <= len(self.given) <= high for low, high in lists)
 
 
-def find(path: Sequence[int | str], data: Any, root: type[BaseModel]) -> Place:
+def find(path: Sequence[int | str], data: Any, root: type[Any]) -> Place:
     """The place of a path of pydantic's in a file that is to be a `root`."""
     names: list[str] = []
     kinds: tuple[Kind, ...] = (Kind(type=root),)
@@ -89,14 +144,14 @@ def find(path: Sequence[int | str], data: Any, root: type[BaseModel]) -> Place:
             data = data[part]
             name = data.get("name") if isinstance(data, Mapping) else None
             names.append(name if isinstance(name, str) else str(part))
-            kinds = tuple(entry for kind in kinds for entry in _entries(kind))
+            kinds = tuple(entry for kind in kinds for entry in kind.entries)
         elif len(kinds) > 1 and named:
             kinds = named
         elif fields or (isinstance(data, Mapping) and part in data):
             names.append(part)
             data = data.get(part) if isinstance(data, Mapping) else None
-            inner = [kinds_of(field.annotation, tuple(field.metadata)) for field in fields] or map(_entries, kinds)
-            kinds = tuple(kind for each in inner for kind in each)
+            inner = [kinds_of(field.annotation, tuple(field.metadata)) for field in fields]
+            kinds = tuple(kind for each in inner or [kind.entries for kind in kinds] for kind in each)
     return Place(names=tuple(names), kinds=kinds, given=data)
 
 
@@ -111,42 +166,6 @@ def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...
     return () if annotation is NoneType else (Kind(type=annotation, metadata=metadata),)
 
 
-def _entries(kind: Kind) -> tuple[Kind, ...]:
-    """What a list, or a table with names of the writer's choice, holds."""
-    origin, arguments = get_origin(kind.type), get_args(kind.type)
-    return kinds_of(arguments[0] if origin is tuple else arguments[-1]) if origin in (*_LISTS, dict) else ()
-
-
-_RULES: Final = {
-    "greater_than": "> {gt}",
-    "greater_than_equal": ">= {ge}",
-    "less_than": "< {lt}",
-    "less_than_equal": "<= {le}",
-    "multiple_of": "a multiple of {multiple_of}",
-    "finite_number": "a finite number",
-    "float_type": "a number",
-    "int_type": "a whole number",
-    "string_type": "a text",
-    "string_too_short": "a text of {min_length} or more characters",
-    "string_too_long": "a text of {max_length} or fewer characters",
-    "literal_error": "one of {expected}",
-    "enum": "one of {expected}",
-    "bool_type": "true or false",
-    "list_type": "a list",
-    "tuple_type": "a list",
-    "dict_type": "a table",
-    "model_type": "a table",
-    "model_attributes_type": "a table",
-    "dataclass_type": "a table",
-    "too_short": "of {min_length} or more entries",
-    "too_long": "of {max_length} or fewer entries",
-    "string_pattern_mismatch": "of the form {pattern}",
-    "union_tag_invalid": "one of {expected_tags} in its field {discriminator}",
-    "union_tag_not_found": "a table with a field {discriminator}",
-}
-"""How pydantic's kinds of error end the sentence "must be ..."."""
-_OF_TYPE: Final = frozenset({"float_type", "list_type", "tuple_type", "is_instance_of", "sequence_str"})
-"""Those that say that a value is no number, or no list."""
 _MOST_LINES: Final = 20  # problems that one message names; it only counts the rest
 _MOST_ENTRIES: Final = 10
 _LONGEST: Final = 200
@@ -175,37 +194,25 @@ def describe_all(
 
     Fields that are missing come last: what is missing may only be misspelt.  Arguments as for `describe`.
     """
-    found = _of_given_types(error.errors(include_url=False), data, root)
-    found.sort(key=lambda details: details["type"] == "missing")
-    unsaid: set[int] = set()
-    for each in found:
-        if each["type"] in ("too_short", "too_long"):
-            entries = [id(other) for other in found if other["loc"][:-1] == each["loc"]]
-            bounds = each["ctx"]
-            longer = len(each["input"]) > (bounds["max_length"] if "max_length" in bounds else bounds["min_length"])
-            unsaid.update(entries if longer else [id(each)] if entries else [])
-    return [describe(details, data, root, file=file) for details in found if id(details) not in unsaid]
-
-
-def _of_given_types(found: list[ErrorDetails], data: Mapping[str, Any], root: type[BaseModel]) -> list[ErrorDetails]:
-    """Without the errors that say of a field of several types that its value is not of one of the others."""
-    kept = list(found)
-    for each in reversed(found):
-        field, kind = each["loc"][:-1], each["type"]
-        other_type = kind in _OF_TYPE or (kind == "literal_error" and not isinstance(each["input"], str))
-        if other_type and find(field, data, root).names == find(each["loc"], data, root).names:
-            rest = [error for error in kept if error is not each]
-            kept = rest if any(error["loc"][: len(field)] == field for error in rest) else kept
-    return kept
+    lines: dict[tuple[str, ...], str] = {}
+    whole: set[tuple[str, ...]] = set()  # lists of a wrong length, whose entries do not matter
+    for details in sorted(error.errors(include_url=False), key=lambda details: details["type"] == "missing"):
+        place = find(details["loc"], data, root)
+        lines.setdefault(place.names, describe(details, data, root, file=file))
+        if details["type"] in ("too_short", "too_long") and place.is_of_wrong_length:
+            whole.add(place.names)
+    return [
+        line
+        for names, line in lines.items()
+        if not any(names[: len(above)] == above != names for above in whole)
+        and (names in whole or not any(other[: len(names)] == names != other for other in lines))
+    ]
 
 
 def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel], *, file: str = "scenario") -> str:
     """One line about one field of a file that is to be a `root`: its name, what is allowed, what was given."""
     place = find(details["loc"], data, root)
-    field, kind, context = ".".join(place.names), details["type"], {**details.get("ctx", {})}
-    given = details["input"] if details["loc"][-1:] == ("[key]",) else place.given
-    if kind == "finite_number" and not isinstance(given, float):  # see `scenarios.schema.scenario.Scenario.read`
-        kind = "float_type"
+    field, kind, given = ".".join(place.names), details["type"], place.given
     if kind == "missing":
         return f"{field} is missing"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
@@ -215,24 +222,26 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseMode
         guess = _guess(place.names[-1], allowed)
         return f"{field} is not a field of the {file} file{guess} (there are: {', '.join(allowed)})"
     if kind == "value_error":
-        error = context["error"]
-        if isinstance(error, ParameterError):  # of a dataclass, which does not know where it stands
-            return str(ParameterError(field, error.name, error.value, error.rule))
-        if isinstance(error, UnknownNameError):
-            return f"{field}.{error.kind}: {error}"
-        return ".".join([*place.names, str(error)])
-    if kind in ("too_short", "too_long") and place.exact_length is not None:
-        return f"{field} must be a list of {place.exact_length} {place.entries}; got {shown(given)}"
-    if kind == "too_long":
-        return f"{field} must be {_RULES[kind].format(**context)}; got {len(given)}"
-    guess = ""
+        cause = details["ctx"]["error"]
+        if isinstance(cause, ParameterError):  # of a dataclass, which does not know where it stands
+            return str(ParameterError(field, cause.name, cause.value, cause.rule))
+        if isinstance(cause, UnknownNameError):
+            return f"{field}.{cause.kind}: {cause}"
+        return ".".join([*place.names, str(cause)])
+    choices = [str(choice) for each in place.kinds for choice in each.choices]
+    rule = " or ".join(dict.fromkeys(map(str, place.kinds)))
     if kind.startswith("union_tag"):
-        quoted = context["discriminator"]  # in quotes where it is a field's name, and else a function of the spec's
-        context["discriminator"] = name = quoted.strip("'") if quoted.startswith("'") else "type"
+        quoted = details["ctx"][
+            "discriminator"
+        ]  # in quotes where it is a field's name, and else a function of the spec's
+        name = quoted.strip("'") if quoted.startswith("'") else "type"
+        expected = details["ctx"].get("expected_tags") or ", ".join(
+            repr(each) for k in place.kinds for each in k.labels
+        )
+        choices = expected.strip("'").split("', '")
         given = given.get(name) if isinstance(given, Mapping) else given
-        guess = _guess(given, context.get("expected_tags", "").strip("'").split("', '"))
-    rule = _RULES[kind].format(**context) if kind in _RULES else details["msg"]
-    return f"{field} must be {rule}; got {shown(given)}{guess}"
+        field, rule = f"{field}.{name}", f"one of {expected}"
+    return f"{field} must be {rule if kind in _KNOWN else details['msg']}; got {shown(given)}{_guess(given, choices)}"
 
 
 def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:

@@ -6,26 +6,27 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 
-from annotated_types import MaxLen
+from annotated_types import Ge, Gt, Le, MaxLen, doc
 from pydantic import BeforeValidator, Field, ValidationError, create_model, model_validator
-from pydantic_core import PydanticCustomError
 
 from mpc.indi import INDISettings
 from quadsim.errors import InputError, ParameterError
-from quadsim.fields import Positive
+from quadsim.fields import Positive, Vector
 from quadsim.flight.audit import Limit
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
+from quadsim.sim.effects.load import PayloadDrop, PayloadPickup
 from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
-from scenarios.schema import events as kinds
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, Triple, fields_of
+from scenarios.courses.table import ReferenceTable
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, fields_of
 from scenarios.schema.controller import ControllerSpec, NonlinearSpec, changed
-from scenarios.schema.course import ReferenceSpec
+from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
 from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
 from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
@@ -61,75 +62,74 @@ if not TYPE_CHECKING:  # with every parameter of `quadsim.vehicle.Vehicle`, each
     )
 
 
-class InitialSpec(Spec):
+@dataclass(frozen=True, kw_only=True)
+class Initial:
     """Where the flight starts, at rest."""
 
-    position: Triple = Field(default=[0.0, 0.0, 0.0], description="[m] x, y, z in the world frame")
-    euler: Triple = Field(default=[0.0, 0.0, 0.0], description="[deg] roll, pitch, yaw")
-    cold: bool = Field(
-        default=False, description="whether it starts on the ground with rotors at rest, u(-1) = 0; else from hover"
+    position: Annotated[Vector, doc("[m] x, y, z in the world frame")] = (0.0, 0.0, 0.0)
+    euler: Annotated[Vector, doc("[deg] roll, pitch, yaw")] = (0.0, 0.0, 0.0)
+    cold: Annotated[bool, doc("whether it starts on the ground with rotors at rest, u(-1) = 0; else from hover")] = (
+        False
     )
-    on_reference: bool = Field(
-        default=False,
-        description="whether it starts with velocity, attitude and body rates of the reference at t = 0 instead; only "
-        "with courses that state them (ramped_circle, ramped_lemniscate)",
-    )
+    on_reference: Annotated[
+        bool,
+        doc(
+            "whether it starts with velocity, attitude and body rates of the reference at t = 0 instead; only with "
+            "courses that state them (ramped_circle, ramped_lemniscate)"
+        ),
+    ] = False
 
-    @model_validator(mode="after")
-    def _check(self) -> InitialSpec:
+    def __post_init__(self) -> None:
         if abs(self.euler[0]) > 180.0 or abs(self.euler[1]) >= 90.0:
-            raise ValueError(f"euler must have a roll within +-180 deg and a pitch within +-90 deg; got {self.euler}")
+            raise ParameterError("", "euler", list(self.euler), "within +-180 deg of roll and below +-90 deg of pitch")
         if self.on_reference and any(self.euler[:2]):
-            raise ValueError(f"euler must have roll and pitch 0 where on_reference is true; got {self.euler}")
-        return self
+            raise ParameterError("", "euler", list(self.euler), "of roll and pitch 0 where on_reference is true")
 
 
-class PlantSpec(Spec):
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
     """The simulated vehicle."""
 
-    timestep: Annotated[float, Field(ge=1e-6, le=0.01)] = Field(default=1e-3, description="[s] physics step")
-    integrator: Integrator = Field(
-        default="mujoco",
-        description="mujoco: MuJoCo's Runge-Kutta step, forces that follow the motion held over it; rk4: that of a "
-        "free rigid body with all forces evaluated at each stage, for the rules of published simulations",
-    )
-    limit_speeds: bool = Field(
-        default=False, description="whether rotors saturate at the vehicle's speed_min and speed_max"
-    )
+    timestep: Annotated[float, Ge(1e-6), Le(0.01), doc("[s] physics step")] = 1e-3
+    integrator: Annotated[
+        Integrator,
+        doc(
+            "mujoco: MuJoCo's Runge-Kutta step, forces that follow the motion held over it; rk4: that of a "
+            "free rigid body with all forces evaluated at each stage, for the rules of published simulations"
+        ),
+    ] = "mujoco"
+    limit_speeds: Annotated[bool, doc("whether rotors saturate at the vehicle's speed_min and speed_max")] = False
 
 
-_STEEPEST: Final = 180.0
+def _false_alone(value: object) -> object:
+    """Refuse 0, which Python takes for false."""
+    if value is not False:
+        raise ValueError("must be false")
+    return value
 
 
-def _number_or_false(value: Any, most: float = 1e6) -> Any:
-    """Refuse all but numbers in range and false, in one sentence; 0, which Python takes for false, is refused too."""
-    if value is False or (isinstance(value, int | float) and value is not True and 0.0 < value <= most):
-        return value
-    raise PydanticCustomError("number_or_false", "a number > 0 and <= {most}, or false", {"most": f"{most:g}"})
+Off = Annotated[Literal[False], BeforeValidator(_false_alone)]
 
 
-LimitOrOff = Annotated[Positive | Literal[False], BeforeValidator(_number_or_false)]
-
-
-class LostSpec(Spec):
+@dataclass(frozen=True, kw_only=True)
+class Lost:
     """When the flight is lost and ends, by the true state at each control sample; false switches a criterion off."""
 
     tilt: Annotated[
-        Annotated[float, Field(gt=0.0, le=_STEEPEST)] | Literal[False],
-        BeforeValidator(lambda value: _number_or_false(value, _STEEPEST)),
-    ] = Field(
-        default=120.0,
-        description="[deg] between the thrust axis and the vertical; at 120, half the thrust pulls down; false for "
-        "loops and flips",
-    )
-    distance: LimitOrOff = Field(default=100.0, description="[m] from the reference at the same time")
-    depth: LimitOrOff = Field(default=50.0, description="[m] below the lowest of the start and the reference so far")
-    speed: LimitOrOff = Field(default=50.0, description="[m/s] in any direction")
+        Annotated[float, Gt(0.0), Le(180.0)] | Off,
+        doc(
+            "[deg] between the thrust axis and the vertical; at 120, half the thrust pulls down; false for "
+            "loops and flips"
+        ),
+    ] = 120.0
+    distance: Annotated[Positive | Off, doc("[m] from the reference at the same time")] = 100.0
+    depth: Annotated[Positive | Off, doc("[m] below the lowest of the start and the reference so far")] = 50.0
+    speed: Annotated[Positive | Off, doc("[m/s] in any direction")] = 50.0
 
     @property
     def limits(self) -> dict[str, float]:
         """The criteria that are on; see `quadsim.sim.phase`."""
-        return {name: limit for name, limit in self if limit is not False}
+        return {name: limit for name, limit in vars(self).items() if limit is not False}
 
 
 LONGEST_FLIGHT: Final = 86_400.0
@@ -171,9 +171,9 @@ class Scenario(Spec):
     )
     vehicle: VehicleSpec
     actual: ActualSpec | None = None
-    initial: InitialSpec = InitialSpec()
-    plant: PlantSpec = PlantSpec()
-    reference: ReferenceSpec
+    initial: Initial = Initial()
+    plant: Simulation = Simulation()
+    reference: ReferenceTable
     controller: ControllerSpec
     effects: Effects = Effects()
     forces: Annotated[list[ForceSpec], MaxLen(MOST_ENTRIES)] = Field(
@@ -184,10 +184,8 @@ class Scenario(Spec):
     estimator: EstimatorSpec | None = Field(
         default=None, description="absent: the controller receives the sensors' samples as they arrive"
     )
-    events: Annotated[list[kinds.Event], MaxLen(kinds.MOST_EVENTS)] = Field(
-        default=[], description="what happens in flight"
-    )
-    lost: LostSpec = LostSpec()
+    events: Annotated[list[Event], MaxLen(MOST_EVENTS)] = Field(default=[], description="what happens in flight")
+    lost: Lost = Lost()
     obstacles: Annotated[list[Annotated[AnyObstacle, Field(discriminator="type")]], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="what the vehicle, a ball of its extent, must not touch: a touch is a crash"
     )
@@ -277,18 +275,18 @@ class Scenario(Spec):
         for i, event in sorted(enumerate(self.events), key=lambda entry: entry[1].at):
             if event.at >= self.duration:
                 raise ValueError(f"events.{i}.at must be before the flight's end, {self.duration} s; got {event.at}")
-            if isinstance(event, kinds.PayloadPickupEvent):
+            if isinstance(event, PayloadPickup):
                 carried += 1
-            elif isinstance(event, kinds.PayloadDropEvent):
+            elif isinstance(event, PayloadDrop):
                 if not carried:
                     raise ValueError(f"events.{i}.type must not be payload_drop at {event.at} s: nothing is carried")
                 carried = 0
-            elif isinstance(event, kinds.SensorFaultEvent) and self.estimator is not None:
+            elif isinstance(event, SensorFaultEvent) and self.estimator is not None:
                 present = [] if self.sensors is None else [str(name) for name in self.sensors.present()]
                 if event.sensor not in present:
                     rule = f"one that the estimator has, of {', '.join(present)}"
                     raise ValueError(f"events.{i}.sensor must be {rule}; got {event.sensor!r}")
-            elif isinstance(event, kinds.ControllerEvent):
+            elif isinstance(event, ControllerEvent):
                 try:
                     controller = changed(controller, event.fields)
                 except InputError as error:
@@ -315,7 +313,7 @@ class Scenario(Spec):
     def controller_changes(self) -> list[tuple[float, ControllerSpec]]:
         """Each controller that takes over from the one before it, and when [s], in order of time."""
         found: list[tuple[float, ControllerSpec]] = []
-        events = (event for event in self.events if isinstance(event, kinds.ControllerEvent))
+        events = (event for event in self.events if isinstance(event, ControllerEvent))
         for event in sorted(events, key=lambda event: event.at):
             found.append((event.at, changed(found[-1][1] if found else self.controller, event.fields)))
         return found

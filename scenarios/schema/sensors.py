@@ -18,13 +18,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Len, doc
-from pydantic import Field
 
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Number, Vector
 from quadsim.sim.estimation.estimate import EstimatorSettings
 from quadsim.sim.sensing.sensor import Sampling, Sensor, SensorName
-from scenarios.schema.base import Spec
 
 Deviations = NonNegative | Annotated[tuple[NonNegative, ...], Len(3, 3)]
 """One standard deviation for all three axes, or one each."""
@@ -70,13 +68,14 @@ class RatesSpec(Sampling):
 AnySensorSpec = PositionSpec | VelocitySpec | AttitudeSpec | RatesSpec
 
 
-class SensorsSpec(Spec):
+@dataclass(frozen=True, kw_only=True)
+class SensorsSpec:
     """What measures the state; a sensor left out is perfect, or not there where there is an estimator."""
 
-    position: PositionSpec | None = Field(default=None, description="[m] in the world frame")
-    velocity: VelocitySpec | None = Field(default=None, description="[m/s] in the world frame")
-    attitude: AttitudeSpec | None = Field(default=None, description="[deg] roll, pitch, yaw")
-    rates: RatesSpec | None = Field(default=None, description="[deg/s] body rates")
+    position: Annotated[PositionSpec | None, doc("[m] in the world frame")] = None
+    velocity: Annotated[VelocitySpec | None, doc("[m/s] in the world frame")] = None
+    attitude: Annotated[AttitudeSpec | None, doc("[deg] roll, pitch, yaw")] = None
+    rates: Annotated[RatesSpec | None, doc("[deg/s] body rates")] = None
 
     def present(self) -> dict[SensorName, AnySensorSpec]:
         """The sensors that there are."""

@@ -15,10 +15,10 @@ from quadsim.flight.metrics import tracking
 from quadsim.sim.loop import fly
 from quadsim.sim.plant import Plant
 from scenarios.build import build_controller, build_plant
-from scenarios.courses.make import build_reference
 from scenarios.limits import build_limits
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
+from scenarios.reference import build_reference
 from scenarios.schema.scenario import Scenario
 
 SCENARIO: Final = "paper-constrained"

@@ -19,9 +19,9 @@ from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
 from quadsim.controller import ACCEPTED, Moment
 from quadsim.motion import Motion
 from quadsim.state import N_STATES, POSITIONS, VELOCITIES, Array
-from scenarios.courses.make import build_motion
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.reference import build_motion
 
 COURSE: Final = "torrente-loop8-drag"
 """Whose reference motion and vehicle these are; the plant is not flown."""

@@ -11,8 +11,8 @@ from mpc import ocp
 from mpc.ocp import Problem
 from quadsim.state import Array
 from scenarios.build import build_problem
-from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.reference import build_reference
 from scenarios.run import fly_scenario
 
 SCENARIO: Final = "paper-constrained"

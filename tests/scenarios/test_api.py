@@ -93,7 +93,7 @@ def test_a_scenario_is_changed_field_by_field() -> None:
     changed = scenario.replace(
         {"vehicle.mass": np.float64(4.2), "constraints.roll.upper": 4.0, "initial.euler.2": 10.0}
     )
-    assert (changed.controller.horizon, changed.vehicle.mass, changed.initial.euler) == (30, 4.2, [0.0, 0.0, 10.0])
+    assert (changed.controller.horizon, changed.vehicle.mass, changed.initial.euler) == (30, 4.2, (0.0, 0.0, 10.0))
     assert next(each.upper for each in changed.constraints if each.name == "roll") == 4.0
     assert scenario.vehicle.mass is None
     assert changed.replace({"vehicle.mass": None}).vehicle.mass is None

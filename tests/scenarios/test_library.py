@@ -19,7 +19,8 @@ from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.run import fly_scenario
-from scenarios.schema.scenario import LostSpec, Scenario
+from scenarios.schema.base import fields_of
+from scenarios.schema.scenario import Lost, Scenario
 from scenarios.shipped import LIBRARY, scenario_names
 
 SHARED = (
@@ -211,5 +212,5 @@ def test_every_scenario_has_golden_numbers() -> None:
 
 def test_the_page_states_every_loss_criterion_and_its_default() -> None:
     text = (ROOT / "docs" / "scenarios.md").read_text(encoding="utf-8")
-    for name, info in LostSpec.model_fields.items():
+    for name, info in fields_of(Lost).items():
         assert f"- `lost.{name} = {info.default:g}`: {info.description}\n" in text

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
 from annotated_types import doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Instant, NonNegative, Positive, Vector, filled
-from quadsim.sim.effects.load import Factor, Load, Payload
-from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects.load import Load, MassChange, PayloadDrop, PayloadPickup
+from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -20,12 +20,20 @@ from quadsim.vehicle import Vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class Push:
-    """A constant force in the world frame that acts at a point of the body, with the torque r x R' F that follows."""
+    """Something pushes the vehicle.
+
+    It is a constant force that acts at a point of the body, with the torque r x R' F that follows.
+    """
 
     at: Instant
+    type: Annotated[Literal["push"], doc("kind of event: push")] = "push"
     duration: Annotated[Positive, doc("[s] how long")]
     force: Annotated[Vector, doc("[N] world frame")]
     point: Annotated[Vector, doc("[m] where it acts, body frame")] = (0.0, 0.0, 0.0)
+
+    def text(self) -> str:
+        """What happens, in words."""
+        return f"a push of {math.hypot(*self.force):.3g} N"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,52 +104,16 @@ class Disturbance:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RotorChange:
-    """From `time` [s] on, a rotor gives the share `efficiency` of the thrust and torque that its speed would give.
-
-    At 0 it has lost its propeller: it drags no more either, and carries no momentum.
-    """
-
-    time: float
-    rotor: int
-    efficiency: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class PayloadChange:
-    """From `time` [s] on, the vehicle carries this payload, or with None lets go of all it carries."""
-
-    time: float
-    payload: Payload | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class MassChange:
-    """From `time` [s] on, the vehicle's mass is `factor` times its own, whatever it carries besides."""
-
-    time: float
-    factor: Factor
-
-
-@dataclass(frozen=True, kw_only=True)
-class LagChange:
-    """From `time` [s] on, rotors have these time constants of speeding up and slowing down [s]; 0 for at once."""
-
-    time: float
-    rise: float
-    fall: float
-
-
-@dataclass(frozen=True, kw_only=True)
 class PushChange:
-    """From `time` [s] on, these pushes act and no others."""
+    """From `at` [s] on, these pushes act and no others."""
 
-    time: float
+    at: float
     pushes: tuple[Push, ...]
 
 
-Change = RotorChange | PayloadChange | MassChange | LagChange | PushChange  # what happens to the vehicle on the way
-LOADING = (PayloadChange, MassChange)
+Change = RotorChange | PayloadPickup | PayloadDrop | MassChange | LagChange | PushChange
+"""What happens to the vehicle on the way."""
+LOADING = (PayloadPickup, PayloadDrop, MassChange)
 """The changes of what the vehicle weighs, for which its model is compiled another way."""
 
 

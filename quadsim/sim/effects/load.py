@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import mujoco
 import numpy as np
 from annotated_types import Ge, Le, Len, MaxLen, doc
 
 from quadsim.errors import ParameterError
-from quadsim.fields import Positive, Vector
+from quadsim.fields import Instant, Positive, Vector
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -24,7 +24,44 @@ class Payload:
     position: Annotated[Vector, doc("[m] in the body frame")] = (0.0, 0.0, 0.0)
 
 
+@dataclass(frozen=True, kw_only=True)
+class PayloadPickup(Payload):
+    """The vehicle takes up a point mass, which moves with it from then on."""
+
+    at: Instant
+    type: Annotated[Literal["payload_pickup"], doc("kind of event: payload_pickup")] = "payload_pickup"
+
+    def text(self) -> str:
+        """What happens, in words."""
+        return f"{self.mass:g} kg are taken up"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PayloadDrop:
+    """The vehicle lets go of all it carries."""
+
+    at: Instant
+    type: Annotated[Literal["payload_drop"], doc("kind of event: payload_drop")] = "payload_drop"
+
+    def text(self) -> str:
+        """What happens, in words."""
+        return "what is carried is dropped"
+
+
 Factor = Annotated[float, Ge(0.05), Le(20.0)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MassChange:
+    """The vehicle's mass becomes another one, whatever it carries besides."""
+
+    at: Instant
+    type: Annotated[Literal["mass"], doc("kind of event: mass")] = "mass"
+    factor: Annotated[Factor, doc("[-] mass over the vehicle's from then on, instead of load.mass_factor")]
+
+    def text(self) -> str:
+        """What happens, in words."""
+        return f"the mass is {self.factor:g} times the file's"
 
 
 @dataclass(frozen=True, kw_only=True)

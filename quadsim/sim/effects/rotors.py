@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
-from annotated_types import Len, doc
+from annotated_types import Ge, Gt, Le, Len, doc
 
 from quadsim.errors import ParameterError
-from quadsim.fields import Fraction, NonNegative, Positive, filled
+from quadsim.fields import Fraction, Instant, NonNegative, Positive, filled
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -61,13 +61,13 @@ class RotorDynamics:
         found._check_torque()
         return found
 
-    def lagging(self, rise: float, fall: float) -> RotorDynamics:
-        """With other time constants [s].
+    def lagging(self, change: LagChange) -> RotorDynamics:
+        """With other time constants.
 
         Raises:
             ParameterError: rotors with inertia change their speed at once.
         """
-        found = replace(self, rise=rise, fall=fall)
+        found = replace(self, rise=change.rise, fall=change.rise if change.fall is None else change.fall)
         found._check_torque()
         return found
 
@@ -97,3 +97,46 @@ class RotorDynamics:
         after = np.where(ramping, speeds + sign * limit * t, target - sign * eased * decay)
         slope = np.where(ramping, sign * limit, sign * eased * rate * decay)
         return after, slope
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotorLoss:
+    """A rotor loses thrust, permanently or for a time."""
+
+    at: Instant
+    type: Annotated[Literal["rotor_loss"], doc("kind of event: rotor_loss")] = "rotor_loss"
+    rotor: Annotated[int, Ge(1), Le(N_ROTORS), doc("which rotor, 1 to 4")]
+    loss: Annotated[float, Gt(0.0), Le(1.0), doc("[-] share of thrust and torque lost; 1 is all of it")]
+    duration: Annotated[Positive | None, doc("[s] after which the rotor is whole again; absent: never")] = None
+
+    def text(self) -> str:
+        """What happens, in words."""
+        return f"rotor {self.rotor} loses {100.0 * self.loss:.3g} %"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotorChange:
+    """From `at` [s] on, a rotor gives the share `efficiency` of the thrust and torque that its speed would give.
+
+    It is what all losses in force leave.  At 0 it has lost its propeller: it drags no more either, and carries no
+    momentum.
+    """
+
+    at: float
+    rotor: int
+    efficiency: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class LagChange:
+    """The rotors follow their commands more quickly or more slowly."""
+
+    at: Instant
+    type: Annotated[Literal["rotor_lag"], doc("kind of event: rotor_lag")] = "rotor_lag"
+    rise: Annotated[NonNegative, doc("[s] time constant while speeding up; 0: at once")]
+    fall: Annotated[NonNegative | None, doc("[s] time constant while slowing down; absent: the same")] = None
+
+    def text(self) -> str:
+        """What happens, in words."""
+        fall = "" if self.fall in (None, self.rise) else f", {self.fall:g} s downwards"
+        return f"rotors lag by {self.rise:g} s{fall}"

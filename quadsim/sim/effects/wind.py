@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from annotated_types import Len, doc
@@ -71,8 +71,9 @@ class Air:
 
 @dataclass(frozen=True, kw_only=True)
 class Gust:
-    """One 1-cosine gust, v(t) = v_peak / 2 (1 - cos(2 pi (t - t0) / T)) for t0 <= t <= t0 + T, and zero elsewhere.
+    """A gust of the 1-cosine shape.
 
+    v(t) = v_peak / 2 (1 - cos(2 pi (t - t0) / T)) for t0 <= t <= t0 + T, and zero elsewhere.
     The shape is that of 14 CFR 25.341(a)(2), v = v_peak / 2 (1 - cos(pi s / H)) over the way s = 0 .. 2 H; its rise
     to the peak is the discrete gust of MIL-F-8785C, Sec. 3.7.1.3.  Both measure the gust along the way of an aeroplane
     that flies into it at the airspeed V.  A hovering vehicle waits for the air instead: T = 2 H / V is given here.
@@ -80,8 +81,13 @@ class Gust:
     """
 
     at: Instant
+    type: Annotated[Literal["gust"], doc("kind of event: gust")] = "gust"
     duration: Annotated[Positive, doc("[s] from calm to calm")]
     velocity: Annotated[Vector, doc("[m/s] in its middle, world frame")]
+
+    def text(self) -> str:
+        """What happens, in words."""
+        return f"a gust of {math.hypot(*self.velocity):.3g} m/s"
 
 
 def gust_velocity(gusts: Sequence[Gust], t: Array) -> Array:
@@ -96,10 +102,15 @@ def gust_velocity(gusts: Sequence[Gust], t: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class WindChange:
-    """A step of the mean wind."""
+    """The mean wind changes."""
 
     at: Instant
+    type: Annotated[Literal["wind"], doc("kind of event: wind")] = "wind"
     velocity: Annotated[Vector, doc("[m/s] from then on, world frame")]
+
+    def text(self) -> str:
+        """What happens, in words."""
+        return f"the mean wind is {math.hypot(*self.velocity):.3g} m/s"
 
 
 class WindField:

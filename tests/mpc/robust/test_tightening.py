@@ -36,8 +36,8 @@ from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_plant
-from scenarios.courses.make import build_reference
 from scenarios.loading import load_scenario
+from scenarios.reference import build_reference
 
 ROOT = Path(__file__).resolve().parents[3]
 TILTS = [INDEX["roll"], INDEX["pitch"]]

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import ForceError, ParameterError
-from quadsim.sim.effects import Disturbance, Effects, Ground, PayloadChange, ThrustNoise
-from quadsim.sim.effects.load import Load, Payload
+from quadsim.sim.effects import Disturbance, Effects, Ground, ThrustNoise
+from quadsim.sim.effects.load import Load, PayloadPickup
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator
@@ -143,7 +143,7 @@ def test_its_wrench_is_the_mean_of_what_acted(torrente: Vehicle) -> None:
     [
         ({"effects": Effects(ground=Ground(contact=True))}, "contact with the ground"),
         ({"effects": Effects(load=Load(mass_factor=1.1))}, "a load"),
-        ({"changes": [PayloadChange(time=1.0, payload=Payload(mass=0.1))]}, "a load"),
+        ({"changes": [PayloadPickup(at=1.0, mass=0.1)]}, "a load"),
         ({"effects": Effects(air=Air(body_drag=(0.01, 0.01, 0.02)))}, "effects.air.body_drag"),
     ],
 )

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from quadsim.state import Array
-from scenarios.courses.feasibility_check import report
 from scenarios.courses.followed import FollowedCourse
-from scenarios.courses.make import build_course, build_course_steps, build_reference, follow_course
+from scenarios.feasibility_check import report
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.reference import build_course, build_course_steps, build_reference, follow_course
 from scenarios.schema.scenario import Scenario
 
 SAMPLES = 700

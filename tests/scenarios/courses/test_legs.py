@@ -7,18 +7,22 @@ import math
 import numpy as np
 import pytest
 
-from scenarios.courses.course import begin
-from scenarios.courses.legs import Turn, Waypoint, polyline, waypoints, yaw_turns
+from scenarios.courses.course import Path, begin
+from scenarios.courses.legs import Turn, Waypoint, Waypoints, YawTurns, polyline
 
 START = np.array([1.0, 0.0, 2.0, 0.0])
 
 
 def point(x: float, y: float, z: float, yaw: float = 0.0, *, speed: float = 1.0, hold: float = 0.0) -> Waypoint:
-    return Waypoint(pose=np.array([x, y, z, yaw]), speed=speed, hold=hold)
+    return Waypoint(position=(x, y, z), yaw=math.degrees(yaw), speed=speed, hold=hold)
+
+
+def waypoints(*points: Waypoint) -> Path:
+    return Waypoints(type="waypoints", points=points).path(START, 9.81)
 
 
 def test_legs_take_the_time_of_their_length_and_speed_and_holds_last() -> None:
-    path = waypoints(START, [point(4.0, 4.0, 2.0, 1.0, speed=2.0, hold=3.0), point(4.0, 4.0, 0.0, -1.0, speed=0.5)])
+    path = waypoints(point(4.0, 4.0, 2.0, 1.0, speed=2.0, hold=3.0), point(4.0, 4.0, 0.0, -1.0, speed=0.5))
     assert path.kinks == (0.0, 2.5, 5.5, 9.5)
     assert path.duration == 9.5
     t = np.array([0.0, 1.25, 2.5, 4.0, 5.5, 7.5, 9.5])
@@ -35,24 +39,25 @@ def test_legs_take_the_time_of_their_length_and_speed_and_holds_last() -> None:
 
 
 def test_a_first_point_at_the_start_takes_no_time() -> None:
-    path = waypoints(START, [point(1.0, 0.0, 2.0, hold=1.0), point(2.0, 0.0, 2.0)])
+    path = waypoints(point(1.0, 0.0, 2.0, hold=1.0), point(2.0, 0.0, 2.0))
     assert path.kinks == (0.0, 1.0, 2.0)
-    turned = waypoints(START, [point(1.0, 0.0, 2.0, 0.5), point(2.0, 0.0, 2.0, 0.5)])
+    turned = waypoints(point(1.0, 0.0, 2.0, 0.5), point(2.0, 0.0, 2.0, 0.5))
     assert begin(turned, start=3.0, initial=START).jumps == (3.0,)
-    assert waypoints(START, [point(1.0, 0.0, 2.0)]).duration == 0.0
+    assert waypoints(point(1.0, 0.0, 2.0)).duration == 0.0
 
 
 def test_turns_begin_when_they_should_and_turn_at_their_rate() -> None:
-    path = yaw_turns(START, [Turn(start=1.0, yaw=2.0, rate=0.5), Turn(start=8.0, yaw=-1.0, rate=1.0)])
-    poses = path.pose(np.array([0.0, 1.0, 3.0, 5.0, 8.0, 9.5, 11.0]))
-    np.testing.assert_allclose(poses[:, 3], [0.0, 0.0, 1.0, 2.0, 2.0, 0.5, -1.0])
+    turns = (Turn(start=1.0, yaw=200.0, rate=50.0), Turn(start=8.0, yaw=-100.0, rate=100.0))
+    poses = YawTurns(type="yaw_turns", turns=turns).build(START, 9.81).sample(np.array([0, 1, 3, 5, 8, 9.5, 11]))
+    np.testing.assert_allclose(np.degrees(poses[:, 3]), [0, 0, 100, 200, 200, 50, -100], atol=1e-12)
     np.testing.assert_array_equal(poses[:, :3], np.tile(START[:3], (7, 1)))
 
 
 def test_a_turn_cuts_off_one_that_is_not_over() -> None:
-    path = yaw_turns(START, [Turn(start=0.0, yaw=2.0 * math.pi, rate=1.0), Turn(start=2.0, yaw=0.0, rate=0.5)])
-    np.testing.assert_allclose(path.pose(np.array([1.0, 2.0, 4.0, 6.0]))[:, 3], [1.0, 2.0, 1.0, 0.0])
-    assert path.kinks == (0.0, 2.0, 6.0)
+    turns = (Turn(start=0.0, yaw=360.0, rate=50.0), Turn(start=2.0, yaw=0.0, rate=25.0))
+    course = YawTurns(type="yaw_turns", turns=turns).build(START, 9.81)
+    np.testing.assert_allclose(np.degrees(course.sample(np.array([1, 2, 4, 6.0]))[:, 3]), [50, 100, 50, 0], atol=1e-12)
+    assert course.kinks == pytest.approx((0.0, 2.0, 6.0))
 
 
 def test_a_course_is_the_initial_pose_then_the_path_then_its_end() -> None:

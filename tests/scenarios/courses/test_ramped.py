@@ -14,9 +14,9 @@ from quadsim.motion import Motion
 from quadsim.rotation import quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.courses.make import build_course, build_motion, build_reference
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_initial_state, build_vehicle
+from scenarios.reference import build_course, build_motion, build_reference
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 

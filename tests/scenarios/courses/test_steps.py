@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
-from scenarios.courses.make import build_course_steps, build_reference
 from scenarios.courses.smoothing import smooth
 from scenarios.courses.steps import Window, steps, switches
 from scenarios.loading import load_scenario
+from scenarios.reference import build_course_steps, build_reference
 
 PERIOD = 0.05
 

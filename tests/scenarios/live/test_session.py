@@ -104,10 +104,10 @@ def test_what_is_refused_is_reported_and_changes_nothing(session: Session) -> No
     before = session.flight().scenario.events
     for table, message in (
         ({"type": "wear", "rotor": 5, "loss": 0.1}, "rotor"),
-        ({"type": "wear", "rotor": True, "loss": 0.1}, "input.rotor must be a whole number; got True"),
+        ({"type": "wear", "rotor": True, "loss": 0.1}, "input.rotor must be a whole number >= 1 and <= 4; got True"),
         ({"type": "pull", "to": [float("nan"), 0.0, 0.0]}, "to.0"),
         ({"type": "pull", "too": [0.0, 0.0, 1.0]}, "input.too is not a field"),
-        ({"type": "steer", "velocity": "north"}, "input.velocity must be a list; got 'north'"),
+        ({"type": "steer", "velocity": "north"}, "input.velocity must be a list of 3 numbers; got 'north'"),
         ({"type": "controller", "fields": {"horizon": 0}}, "horizon"),
         ({"type": "nonsense"}, "nonsense"),
         ({}, "type"),
@@ -231,7 +231,7 @@ def test_the_script_on_the_page_is_saved_as_a_run_that_flies_to_the_same_bytes(
 @pytest.mark.parametrize(
     ("text", "refusal"),
     [
-        ("duration = 0", "duration must be > 0"),
+        ("duration = 0", "duration must be a number > 0"),
         ("duration = 1\ninputs = [{ at = 2.0 }]", "inputs.0.at must be below duration"),
         ("duration = 1\ninputs = 3", "inputs must be a list"),
         ("duration = 1\nspeed = 3", "speed is not a field"),

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from quadsim.errors import ParameterError
-from quadsim.sim.effects import Effects, LagChange, MassChange, Push, PushChange
-from quadsim.sim.effects.load import Load
-from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects import Effects, Push, PushChange
+from quadsim.sim.effects.load import Load, MassChange
+from quadsim.sim.effects.rotors import LagChange, RotorDynamics
 from quadsim.sim.physics import Integrator
 from quadsim.sim.plant import Plant
 from quadsim.state import make_state
@@ -20,12 +20,12 @@ HOLD = 200  # physics steps of 1 ms
 
 
 def pushed(force: tuple[float, float, float], point: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PushChange:
-    return PushChange(time=0.0, pushes=(Push(at=0.0, duration=1.0, force=force, point=point),))
+    return PushChange(at=0.0, pushes=(Push(at=0.0, duration=1.0, force=force, point=point),))
 
 
 @pytest.mark.parametrize("integrator", ["mujoco", "rk4"])
 def test_a_push_accelerates_by_its_force_while_it_lasts(vehicle: Vehicle, integrator: Integrator) -> None:
-    changes = [pushed((1.5, -0.5, 2.0)), PushChange(time=0.1, pushes=())]
+    changes = [pushed((1.5, -0.5, 2.0)), PushChange(at=0.1, pushes=())]
     with Plant(vehicle, changes=changes, integrator=integrator) as plant:
         segment = plant.advance(plant.hover_speeds, HOLD)
     gained = np.array([1.5, -0.5, 2.0]) / vehicle.mass * 0.1
@@ -59,7 +59,7 @@ def test_a_push_of_nothing_changes_no_bit(vehicle: Vehicle) -> None:
 
 def test_another_mass_hovers_no_more(vehicle: Vehicle) -> None:
     """(1 / factor - 1) g upwards; the factor takes the place of the load's, and a reset brings that back."""
-    changes = [MassChange(time=0.1, factor=1.25)]
+    changes = [MassChange(at=0.1, factor=1.25)]
     effects = Effects(load=Load(mass_factor=2.0))
     with Plant(vehicle, effects=effects, changes=changes) as plant:
         for _ in range(2):
@@ -71,7 +71,7 @@ def test_another_mass_hovers_no_more(vehicle: Vehicle) -> None:
 
 def test_rotors_follow_by_another_time_constant(vehicle: Vehicle) -> None:
     start, target = vehicle.hover_speed, vehicle.hover_speed + 20.0
-    changes = [LagChange(time=0.0, rise=0.05, fall=0.1), LagChange(time=0.1, rise=0.0, fall=0.0)]
+    changes = [LagChange(at=0.0, rise=0.05, fall=0.1), LagChange(at=0.1, rise=0.0, fall=0.0)]
     with Plant(vehicle, changes=changes) as plant:
         speeds = plant.advance(np.full(4, target), HOLD).speeds
         steps = np.arange(100) * 1e-3
@@ -81,7 +81,7 @@ def test_rotors_follow_by_another_time_constant(vehicle: Vehicle) -> None:
 
 def test_what_is_due_later_may_be_put_otherwise(vehicle: Vehicle) -> None:
     """Rescheduled midway, a plant flies as one scheduled from the start; what is past is not done again."""
-    first, second = MassChange(time=0.05, factor=1.1), MassChange(time=0.15, factor=0.9)
+    first, second = MassChange(at=0.05, factor=1.1), MassChange(at=0.15, factor=0.9)
     with Plant(vehicle, changes=[first, second]) as scheduled, Plant(vehicle, changes=[first]) as later:
         expected = scheduled.advance(scheduled.hover_speeds, HOLD).physics
         begin = later.advance(later.hover_speeds, 100).physics
@@ -91,6 +91,6 @@ def test_what_is_due_later_may_be_put_otherwise(vehicle: Vehicle) -> None:
 
 def test_rotors_with_inertia_are_never_at_once() -> None:
     rotors = RotorDynamics(rise=0.05, fall=0.05, inertia=1e-5)
-    assert rotors.lagging(0.1, 0.2).fall == 0.2
+    assert rotors.lagging(LagChange(at=0.0, rise=0.1, fall=0.2)).fall == 0.2
     with pytest.raises(ParameterError, match="change their speed at once"):
-        rotors.lagging(0.0, 0.1)
+        rotors.lagging(LagChange(at=0.0, rise=0.0, fall=0.1))

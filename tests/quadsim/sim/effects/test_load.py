@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from quadsim.errors import ParameterError
-from quadsim.sim.effects import Effects, PayloadChange
-from quadsim.sim.effects.load import Load, Payload, mass_properties
+from quadsim.sim.effects import Effects
+from quadsim.sim.effects.load import Load, Payload, PayloadDrop, PayloadPickup, mass_properties
 from quadsim.sim.plant import Plant
 from quadsim.state import make_state
 from quadsim.vehicle import Vehicle
@@ -64,9 +64,9 @@ def test_a_shifted_centre_of_mass_tips_the_vehicle(vehicle: Vehicle) -> None:
 
 def test_payload_is_taken_up_and_let_go(vehicle: Vehicle) -> None:
     changes = (
-        PayloadChange(time=0.5, payload=Payload(mass=1.0)),
-        PayloadChange(time=0.2, payload=Payload(mass=1.0)),
-        PayloadChange(time=1.0, payload=None),
+        PayloadPickup(at=0.5, mass=1.0),
+        PayloadPickup(at=0.2, mass=1.0),
+        PayloadDrop(at=1.0),
     )
     with Plant(vehicle, changes=changes) as plant:
         for _ in range(2):  # the second flight begins as the first did

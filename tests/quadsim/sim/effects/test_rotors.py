@@ -10,8 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from quadsim.errors import ParameterError
-from quadsim.sim.effects import Effects, RotorChange
-from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.effects import Effects
+from quadsim.sim.effects.rotors import RotorChange, RotorDynamics
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -144,7 +144,7 @@ def test_gyroscopic_and_spin_up_torque_are_those_of_real_rotors(vehicle: Vehicle
 
 def test_a_worn_rotor_gives_its_share(vehicle: Vehicle) -> None:
     worn = Effects(rotors=RotorDynamics(efficiency=(1.0, 0.8, 1.0, 1.0)))
-    lost = (RotorChange(time=0.1, rotor=4, efficiency=0.0),)
+    lost = (RotorChange(at=0.1, rotor=4, efficiency=0.0),)
     speeds = np.full(4, vehicle.hover_speed)
     with Plant(vehicle, effects=worn, changes=lost) as plant:
         plant.reset(make_state(position=(0.0, 0.0, 100.0)))

@@ -17,8 +17,8 @@ from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course
-from scenarios.courses.make import build_course, filtered, initial_pose
 from scenarios.courses.smoothing import within_rounding
+from scenarios.reference import build_course, filtered, initial_pose
 from scenarios.schema.events import SetpointEvent
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.robust import RobustSpec
@@ -59,7 +59,7 @@ def fitting(scenario: Scenario, vehicle: Vehicle) -> str:
         return not _required(_scaled(course, size=share), scenario, vehicle, duration=duration).problems
 
     def smoother(share: float) -> bool:
-        changed = scenario.reference.model_copy(update={"response_time": filtered_by / share})
+        changed = replace(scenario.reference, response_time=filtered_by / share)
         softened = scenario.model_copy(update={"reference": changed})
         return not _required(course, softened, vehicle, duration=duration).problems
 

@@ -13,9 +13,9 @@ from support import scenario_table
 
 from quadsim.errors import FileError
 from quadsim.state import Array
-from scenarios.courses.make import build_course, build_reference
 from scenarios.courses.smoothing import smooth
 from scenarios.loading import load_scenario, parse_scenario
+from scenarios.reference import build_course, build_reference
 from scenarios.schema.scenario import Scenario
 
 INITIAL = (1.0, -2.0, 3.0)

@@ -13,10 +13,10 @@ from support import scenario_table
 from quadsim.flight.feasibility import Feasibility
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.courses.feasibility_check import fitting, report
-from scenarios.courses.make import build_course
+from scenarios.feasibility_check import fitting, report
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.reference import build_course
 from scenarios.schema.scenario import Scenario
 
 

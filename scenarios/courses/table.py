@@ -1,0 +1,38 @@
+"""`[reference]`: the table of a course, of the type that it names."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+from pydantic import Discriminator, Tag
+
+from scenarios.courses.csv_course import Csv
+from scenarios.courses.legs import Waypoints, YawTurns
+from scenarios.courses.loops import Circle, FigureEight, Helix
+from scenarios.courses.minimum_snap import MinimumSnap
+from scenarios.courses.ramped import RampedCircle, RampedLemniscate
+from scenarios.courses.steps import Steps
+
+DEFAULT: Final = "steps"  # the type of a table that states none
+
+
+def _kind(value: object) -> str:
+    """The tag of a table or of what was made of one."""
+    given = value.get("type", DEFAULT) if isinstance(value, dict) else getattr(value, "type", DEFAULT)
+    return given if isinstance(given, str) else repr(given)
+
+
+ReferenceTable = Annotated[
+    Annotated[Steps, Tag("steps")]
+    | Annotated[Waypoints, Tag("waypoints")]
+    | Annotated[MinimumSnap, Tag("minimum_snap")]
+    | Annotated[Circle, Tag("circle")]
+    | Annotated[Helix, Tag("helix")]
+    | Annotated[FigureEight, Tag("figure_eight")]
+    | Annotated[RampedCircle, Tag("ramped_circle")]
+    | Annotated[RampedLemniscate, Tag("ramped_lemniscate")]
+    | Annotated[YawTurns, Tag("yaw_turns")]
+    | Annotated[Csv, Tag("csv")],
+    Discriminator(_kind),
+]
+"""The desired course, of the kind that its field `type` names; a new one is a line here."""
