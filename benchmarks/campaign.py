@@ -8,7 +8,7 @@ from pathlib import Path
 from timing import Record, options, run
 
 from mpc.core.library import why_missing
-from scenarios.api import load
+from scenarios.app import load
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
 from scenarios.campaign.results.table import read_table

@@ -8,7 +8,7 @@ from pathlib import Path
 from timing import Record, Stopwatch, options, run
 
 from quadsim.report.film.video import render_video, rendering_backend, worker_count
-from scenarios.api import load
+from scenarios.app import load
 from scenarios.flight import Outputs
 from scenarios.run import run_scenario
 

@@ -6,7 +6,7 @@ import numpy as np
 from timing import Record, Stopwatch, options, run, undisturbed
 
 from quadsim.sim.loop import complete
-from scenarios.api import load
+from scenarios.app import load
 from scenarios.build import build_controller, build_plant
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle

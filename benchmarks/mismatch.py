@@ -17,7 +17,7 @@ from quadsim.assets import read_toml
 from quadsim.errors import QuadsimError
 from quadsim.flight import metrics
 from quadsim.state import INDEX, POSITION
-from scenarios.api import load
+from scenarios.app import load
 from scenarios.many import fly_many
 from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Scenario

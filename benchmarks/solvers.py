@@ -19,9 +19,9 @@ from quadsim.controller import ACCEPTED, Command, Controller, Moment
 from quadsim.errors import FlightError, InputError, MissingCoreError, MissingPackageError
 from quadsim.flight.log import ControlLog
 from quadsim.state import Array, make_state
-from scenarios.api import load
+from scenarios.app import load
 from scenarios.build import build_controller, build_plant
-from scenarios.catalogue import catalogue
+from scenarios.catalogue import read_catalogue
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.reference import build_reference
 from scenarios.run import fly_scenario
@@ -66,7 +66,7 @@ class Replayed:
 
 def entries(scenario: Scenario) -> dict[str, Scenario]:
     """The scenario with each installed solver, and with its whole law in C."""
-    entries = {name: scenario.replace({"controller.solver": name}) for name in catalogue().solvers}
+    entries = {name: scenario.replace({"controller.solver": name}) for name in read_catalogue().solvers}
     entries[LAW] = scenario.replace({"controller.compiled": True})
     found = {}
     for name, changed in entries.items():

@@ -99,7 +99,7 @@ def main() -> None:
     FIGURES.mkdir(exist_ok=True)
     mpl.rcParams |= {"svg.hashsalt": "quadsim", "font.size": 8.0, "axes.spines.top": False, "axes.spines.right": False}
     with ProcessPoolExecutor(usable_cores()) as pool:
-        entries = list(pool.map(entry, quadsim.scenarios()))
+        entries = list(pool.map(entry, quadsim.catalogue().scenarios))
     parts = [HEAD]
     for group in get_args(Group):
         members = [text for of, text in entries if of == group]

@@ -43,6 +43,8 @@ class QuadsimError(Exception):
     """
 
     exit_status = 2
+    result: object = None
+    """What was done all the same: the flight whose film failed."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return _restore, (type(self), self.args, self.__dict__)

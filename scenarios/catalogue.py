@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, Final, get_args
 
 from mpc.solvers import solver_entries
 from quadsim.assets import read_toml, vehicle_names, vehicle_path
 from quadsim.vehicle import load_vehicle
+from scenarios.results import Result, Shown
 from scenarios.shipped import (
     CONTROLLERS,
     Group,
@@ -22,104 +23,64 @@ from scenarios.shipped import (
     tuning_path,
 )
 
+_MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
+"""The mark of a scenario that is to defeat its controller."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class LibraryScenario:
-    """A scenario that ships.
+    """A scenario that ships."""
 
-    Attributes:
-        name: for `load` and `fly`.
-        description: one sentence.
-        group: what it is an example of.
-        expect: the verdict that it is meant to have: satisfied, violated or lost.
-
-    Examples:
-        >>> import quadsim
-        >>> quadsim.scenarios()["helix"].group
-        'courses'
-    """
-
-    name: str
-    description: str
-    group: Group
-    expect: str
+    description: str  # one sentence
+    group: Group  # what it is an example of
+    expect: str  # the verdict that it is meant to have: satisfied, violated or lost
 
 
 @dataclass(frozen=True, kw_only=True)
-class Catalogue:
-    """What ships, by name.
+class Catalogue(Result):
+    """What ships, by name."""
 
-    Attributes:
-        scenarios: for `load` and `fly`.
-        campaigns: for `campaign`, with a sentence each, as all that follow.
-        tunings: for `tune`.
-        vehicles: for `load_vehicle` and `vehicle.file`.
-        controllers: for `controller.type`.
-        papers: for `reproduce`, by their titles.
-        solvers: for `controller.solver`; those that are not installed are marked.
+    scenarios: Mapping[str, LibraryScenario]  # for `load` and `fly`
+    campaigns: Mapping[str, str]  # for `campaign`, with a sentence each, as all that follow
+    tunings: Mapping[str, str]  # for `tune`
+    vehicles: Mapping[str, str]  # for `load_vehicle` and `vehicle.file`
+    controllers: Mapping[str, str]  # for `controller.type`
+    papers: Mapping[str, str]  # for `reproduce`, by their titles
+    solvers: Mapping[str, str]  # for `controller.solver`; those that are not installed are marked
 
-    Examples:
-        >>> import quadsim
-        >>> "hover" in quadsim.catalogue().to_json()["scenarios"]
-        True
-    """
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
 
-    scenarios: Mapping[str, LibraryScenario]
-    campaigns: Mapping[str, str]
-    tunings: Mapping[str, str]
-    vehicles: Mapping[str, str]
-    controllers: Mapping[str, str]
-    papers: Mapping[str, str]
-    solvers: Mapping[str, str]
+        shipped = self.scenarios.items()
+        groups = {
+            f"scenarios: {group}": lines
+            for group in get_args(Group)
+            if (
+                lines := {
+                    n: each.description + _MEANT.get(each.expect, "") for n, each in shipped if each.group == group
+                }
+            )
+        }
+        others = ("campaigns", "tunings", "vehicles", "controllers", "papers", "solvers")
+        return console.listing({**groups, **{title: getattr(self, title) for title in others}})
 
     def to_json(self) -> dict[str, Any]:
         """As plain values, those of scenarios by their field."""
-        shipped = self.scenarios.values()
-        return {
-            "scenarios": {each.name: each.description for each in shipped},
-            "groups": {each.name: each.group for each in shipped},
-            "expected": {each.name: each.expect for each in shipped},
-            "campaigns": dict(self.campaigns),
-            "tunings": dict(self.tunings),
-            "vehicles": dict(self.vehicles),
-            "controllers": dict(self.controllers),
-            "papers": dict(self.papers),
-            "solvers": dict(self.solvers),
-        }
+        shipped = self.scenarios.items()
+        columns = {"scenarios": "description", "groups": "group", "expected": "expect"}
+        by_field = {title: {name: getattr(each, field) for name, each in shipped} for title, field in columns.items()}
+        return {**by_field, **{title: value for title, value in asdict(self).items() if title != "scenarios"}}
 
 
-def scenarios() -> dict[str, LibraryScenario]:
-    """The scenarios that ship by name, sorted, each with its sentence and group.
-
-    Examples:
-        >>> import quadsim
-        >>> "paper-constrained" in quadsim.scenarios()
-        True
-        >>> [name for name, each in quadsim.scenarios().items() if each.group == "ground"]
-        ['ground-effect', 'hard-landing', 'take-off-and-landing']
-    """
-    found = {}
-    for name in scenario_names():  # they are right, and not checked
+def read_catalogue() -> Catalogue:
+    """Everything that ships; files are right, and not checked."""
+    scenarios = {}
+    for name in scenario_names():
         read = {"group": "other", "expect": "satisfied"} | read_toml(scenario_path(name))
-        found[name] = LibraryScenario(
-            name=name, description=read["description"], group=read["group"], expect=read["expect"]
-        )
-    return found
-
-
-def catalogue() -> Catalogue:
-    """Everything that ships: scenarios, campaigns, tunings, vehicles, controllers and QP solvers.
-
-    Examples:
-        >>> import quadsim
-        >>> found = quadsim.catalogue()
-        >>> "lopes2011" in found.vehicles
-        True
-        >>> found.controllers["lqr"]
-        "infinite-horizon LQR on the hover model, following the reference's velocity"
-    """
+        scenarios[name] = LibraryScenario(description=read["description"], group=read["group"], expect=read["expect"])
     return Catalogue(
-        scenarios=scenarios(),
+        scenarios=scenarios,
         campaigns={name: read_toml(campaign_path(name))["description"] for name in campaign_names()},
         tunings={name: read_toml(tuning_path(name))["description"] for name in tuning_names()},
         vehicles={name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 from quadsim.errors import InputError
 from quadsim.flight import rundir
@@ -19,25 +20,29 @@ from scenarios.flight import Flight, Outputs
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import reaudit
+from scenarios.results import Result, Shown
 from scenarios.run import run_scenario
 from scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
     from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
 
+_log: Final = logging.getLogger("quadsim")
+_BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "answered by", "statuses", "whole step, m")
+"""How the labels begin of the rows that are shown; the page and its `comparison.md` have them all."""
+
 Target = Flight | Scenario | str | Path
 """What can be compared: a flight, a run directory, or a scenario to fly, by itself or by its name."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Comparison(Result):
     """Flights side by side."""
 
     runs: tuple[rundir.Run, ...]  # the flights
     rows: list[Row]  # the table, a row per quantity
     names: tuple[str, ...]  # of its columns, one per flight
     page: Path | None  # `index.html`, where it was written
-    notes: tuple[str, ...] = ()  # what a person should know of the runs that were read
 
     def to_markdown(self) -> str:
         """The table as Markdown."""
@@ -45,9 +50,33 @@ class Comparison:
 
         return to_markdown(self.rows, self.names)
 
-    def _repr_markdown_(self) -> str:
-        """The table, for notebooks."""
-        return self.to_markdown()
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+
+        lines = [
+            (
+                (row.group if row.headline else row.label) + (f" [{row.unit}]" if row.unit else ""),
+                *map(console.cell, row.cells),
+            )
+            for row in self.rows
+            if row.label.startswith(_BRIEF)
+        ]
+        yield console.table("comparison", ["", *self.names], lines)
+        if self.page is not None:
+            yield console.styled("every number, plots and films: ", (console.shown(self.page), "bold"))
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """A row per quantity, with a text for each flight."""
+        return [
+            {
+                "group": row.group,
+                "label": row.label,
+                "unit": row.unit,
+                "values": dict(zip(self.names, (cell.text for cell in row.cells), strict=True)),
+            }
+            for row in self.rows
+        ]
 
 
 def compare_flights(
@@ -66,7 +95,8 @@ def compare_flights(
     from quadsim.report.comparison import comparison_rows, run_names
     from quadsim.report.comparison_page import write_comparison
 
-    notes = [note for target in targets for note in _checked(target)]
+    for target in targets:
+        _check(target)
     with contextlib.ExitStack() as stack:
         scratch = stack.enter_context(tempfile.TemporaryDirectory())
         if out is not None:
@@ -74,17 +104,18 @@ def compare_flights(
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
         runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
         page = None if out is None else write_comparison(runs, out, overwrite=overwrite)
-    return Comparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page, notes=tuple(notes))
+    return Comparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page)
 
 
-def _checked(target: Target) -> Sequence[str]:
-    """What a person should know of a target, before anything is flown."""
+def _check(target: Target) -> None:
+    """Refuse what cannot be compared, before anything is flown."""
     if isinstance(target, Flight | Scenario):
-        return ()
+        return
     if Path(target).is_dir():
-        return [f"{target}: {note}" for note in reaudit(Path(target), products=False).notes]
-    load_scenario(str(target))
-    return ()
+        for note in reaudit(Path(target), products=False).notes:
+            _log.info("%s: %s", target, note)
+    else:
+        load_scenario(str(target))
 
 
 def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool) -> rundir.Run:
@@ -126,6 +157,6 @@ def compare_campaigns(
     failures = (plans[0].spec.failure, plans[1].spec.failure)
     a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
     comparison = compare(a, b, names, failures, plan_differences(*plans))
-    if out is not None:
-        write_comparison_report(comparison, out, overwrite=overwrite)
-    return comparison
+    if out is None:
+        return comparison
+    return replace(comparison, page=write_comparison_report(comparison, out, overwrite=overwrite))

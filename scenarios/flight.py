@@ -37,6 +37,7 @@ from scenarios.parts.events import story
 from scenarios.parts.vehicle import build_actual
 from scenarios.progress import Progress, silent
 from scenarios.reference import build_course_steps
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario, Verdict
 from scenarios.schema.settings import leaves
 
@@ -74,7 +75,7 @@ class Outputs:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Flight:
+class Flight(Result):
     """A flown scenario.
 
     Arrays with one row per control period k, taken at t_k, are `time`, `state`, `measured`, `reference`, `command` and
@@ -317,6 +318,21 @@ class Flight:
         outputs.check()
         write_run(self, absolute(directory), outputs, progress, overwrite=overwrite)
         return Path(directory)
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`."""
+        return EXIT_DONE if self.outcome in ("satisfied", "incomplete") else EXIT_FAILED
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios.summary_tables import summary_tables
+
+        return summary_tables(self.to_json(), self.directory)
+
+    def to_json(self) -> dict[str, Any]:
+        """`summary.json`, as it is on disk where the flight is."""
+        return dict(self.summary) if self.directory is None else rundir.read_summary(self.directory)
 
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""

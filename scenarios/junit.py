@@ -14,9 +14,8 @@ from quadsim.report.comparison import failure_sentences
 from quadsim.report.table import format_number
 
 if TYPE_CHECKING:
-    from scenarios.campaign.run import Result
+    from scenarios.campaign.run import CampaignResult
     from scenarios.campaign.statistics.requirement import Judgement
-    from scenarios.flight import Flight
     from scenarios.papers.reproduction import Reproduction
     from scenarios.reaudit import Reaudit
 
@@ -38,14 +37,14 @@ def junit_file(path: str | Path) -> Path:
     return require_file(path, overwrite=ours)
 
 
-def write_junit(result: Flight | Reaudit | Result | Sequence[Reproduction], path: str | Path) -> Path:
+def write_junit(result: Reaudit | CampaignResult | Sequence[Reproduction], path: str | Path) -> Path:
     """Write verdicts as JUnit XML: a test case per constraint and one for the flight; per requirement; or per number.
 
     A constraint that is not required is a case that passes, with what was measured in its output.  One that is
     required and was not reached is `skipped`: the flight shows neither that it holds nor that it does not.
 
     Args:
-        result: of `fly`, `read` or `check`, of a `campaign` with requirements, or of `reproduce`.
+        result: of `check`, of a `campaign` with requirements, or of `reproduce`.
         path: an XML file; one with earlier verdicts is replaced.
 
     Returns:
@@ -53,14 +52,6 @@ def write_junit(result: Flight | Reaudit | Result | Sequence[Reproduction], path
 
     Raises:
         OutputError: it cannot be written.
-
-    Examples:
-        >>> import tempfile, quadsim
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     flown = quadsim.fly(quadsim.load("hover").replace({"duration": 1.0}))
-        ...     file = quadsim.write_junit(flown, folder + "/verdicts.xml")
-        ...     'tests="8" failures="0"' in file.read_text()
-        True
     """
     if isinstance(result, Sequence):
         numbers = [(each.paper.name, number) for each in result for number in each.numbers]

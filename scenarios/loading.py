@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from quadsim.errors import FileError, ParameterError
+from quadsim.errors import FileError, InputError, ParameterError
 from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.effects.load import Load, mass_properties
@@ -100,6 +100,25 @@ def load_scenario(name: str, settings: Sequence[str] = ()) -> Scenario:
     except OSError as error:  # of looking whether a file is there, e.g. under a name longer than the system takes
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
     return scenario
+
+
+def as_scenario(
+    given: Scenario | str | Path, changes: Mapping[str, Any] | Sequence[str] = (), seed: int | None = None
+) -> Scenario:
+    """A scenario that is given itself, or by its name or file, with some fields changed; see `scenarios.app.load`."""
+    if seed is not None:
+        changes = {**changes, "seed": seed} if isinstance(changes, Mapping) else [*changes, f"seed={seed}"]
+    if not isinstance(given, str | Path):
+        if changes and not isinstance(changes, Mapping):
+            raise InputError("changes of a Scenario are a mapping: {'controller.horizon': 30}")
+        scenario = given
+    elif Path(given).is_dir():
+        raise InputError(f"{given} is a directory; give a scenario's name or its TOML file")
+    elif not isinstance(changes, Mapping):
+        return load_scenario(str(given), changes)
+    else:
+        scenario = load_scenario(str(given))
+    return scenario.replace(changes) if isinstance(changes, Mapping) and changes else scenario
 
 
 def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:

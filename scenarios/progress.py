@@ -1,11 +1,21 @@
-"""How long work reports its progress."""
+"""How long work reports its progress: as bars on a terminal, as lines elsewhere, or to a function of the caller's."""
 
 from __future__ import annotations
 
 import contextlib
+import datetime
+import time as clock
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+    from scenarios.campaign.run import Standing, Watch
 
 Progress = Callable[[str, int, int], None]  # called with (what, done, total) during long work
+
+LINE_EVERY: Final = 30.0  # between two lines of progress where stderr is no terminal [s]
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -14,13 +24,68 @@ def silent(stage: str, done: int, total: int) -> None:
 
 @contextlib.contextmanager
 def reporting(progress: Progress | bool) -> Iterator[Progress]:
-    """What is called with the progress: bars on a terminal, none, or the caller's function."""
+    """What is called with the progress: bars on a terminal, one per stage, none, or the caller's function."""
     if callable(progress):
         yield progress
-    elif not progress:
-        yield silent
-    else:
-        from scenarios.commands.console import progress_bars
+        return
+    from scenarios.console import stderr
 
-        with progress_bars() as bars:
-            yield bars
+    if not progress or not (screen := stderr()).is_terminal:
+        yield silent
+        return
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    columns = (TextColumn("{task.description:<10}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
+    with Bars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=screen, transient=True) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total)
+            bars.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+@contextlib.contextmanager
+def watching(progress: bool) -> Iterator[Watch]:
+    """What is called with how a campaign stands: a bar on a terminal; elsewhere, as in a batch job, a line at times."""
+    from scenarios.console import stderr
+
+    screen, printed = stderr(), clock.perf_counter()
+    if not progress:
+        yield lambda standing: None
+    elif screen.is_terminal:
+        from rich.progress import BarColumn, TextColumn
+        from rich.progress import Progress as Bars
+
+        with Bars(
+            TextColumn("flights"), BarColumn(), TextColumn("{task.description}"), console=screen, transient=True
+        ) as bars:
+            bar = bars.add_task("starting")
+            yield lambda standing: bars.update(
+                bar, completed=standing.flown, total=standing.flights, description=_describe(standing)
+            )
+    else:
+
+        def show(standing: Standing) -> None:
+            nonlocal printed
+            if clock.perf_counter() - printed > LINE_EVERY or standing.flown == standing.flights:
+                printed = clock.perf_counter()
+                screen.print(_describe(standing), soft_wrap=True)
+
+        yield show
+
+
+def _describe(standing: Standing) -> str:
+    """How far it is, how fast, until when, and how it looks."""
+    from scenarios.campaign.statistics.inference import proportion
+    from scenarios.campaign.statistics.wording import interval
+
+    share = proportion(standing.failed, standing.flown)
+    left = datetime.timedelta(seconds=round((standing.flights - standing.flown) / standing.rate))
+    return (
+        f"{standing.flown}/{standing.flights}, {standing.rate:.2f}/s, {left} left; "
+        f"{standing.failed} failed ({interval(share.lower, share.upper)})"
+    )

@@ -30,6 +30,7 @@ from quadsim.vehicle import N_ROTORS
 from scenarios.limits import build_limits
 from scenarios.loading import parse_scenario
 from scenarios.reference import build_course_steps
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.bases import read_whole
 from scenarios.schema.plugin import LAWS, is_plugin
 from scenarios.schema.scenario import Scenario
@@ -49,19 +50,33 @@ _TURNING: Final = tuple(f"w{i}" for i in range(1, N_ROTORS + 1))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reaudit:
-    """The audit from a run's tables."""
+class Reaudit(Result):
+    """The audit from a run's tables, or of a flight as it was flown."""
 
     summary: dict[str, Any]  # `summary.json`
-    findings: tuple[Finding, ...]  # the audit made again, at the control samples and at the log rate
-    satisfied: bool  # the verdict on the flight that follows from the tables
-    rate: float  # rows per second of `plant.parquet` [Hz]
-    notes: tuple[str, ...]  # what a person should know, and what is no error
+    findings: tuple[Finding, ...]  # the audit, from tables at the control samples and at the log rate
+    satisfied: bool  # the verdict on the flight that follows from it
+    rate: float | None = None  # rows per second of `plant.parquet` [Hz]; None of a flight as it was flown
+    notes: tuple[str, ...] = ()  # what a person should know, and what is no error
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`; 1 where a constraint was not reached too: not all were shown to hold."""
+        return EXIT_DONE if self.satisfied and self.summary["satisfied"] else EXIT_FAILED
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios.summary_tables import summary_tables
+
+        return summary_tables(self.to_json())
 
     def to_json(self) -> dict[str, Any]:
-        """The audit made again, for `quadsim check --json`."""
+        """The summary; under `reaudit` the audit that was made again."""
+        if self.rate is None:
+            return self.summary
         entries = [limit_to_json(finding) for finding in self.findings]
-        return {"rate": self.rate, "satisfied": self.satisfied, "constraints": entries, "notes": list(self.notes)}
+        again = {"rate": self.rate, "satisfied": self.satisfied, "constraints": entries, "notes": list(self.notes)}
+        return {**self.summary, "reaudit": again}
 
 
 def reaudit(directory: Path, *, products: bool = True) -> Reaudit:

@@ -295,7 +295,7 @@ def start(
     live: bool = False,
     recorded: bool = True,
 ) -> StartedFlight:
-    """Build everything that a scenario's flight needs, and fly nothing yet; see `scenarios.api.start`.
+    """Build everything that a scenario's flight needs, and fly nothing yet; see `scenarios.app.start`.
 
     `law` and `forces` take the place of what is built from the scenario's `controller` and `forces`.
 

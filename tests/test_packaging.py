@@ -105,7 +105,7 @@ def test_wheel_flies_alone(installed: Path, tmp_path: Path) -> None:
 
 def test_version_is_the_same_everywhere(dist: Path) -> None:
     printed = subprocess.run(
-        [sys.executable, "-m", "scenarios.cli", "--version"], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "-m", "scenarios.entry", "--version"], cwd=ROOT, capture_output=True, text=True
     )
     changes = re.search(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     citation = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)

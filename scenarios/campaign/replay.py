@@ -17,6 +17,7 @@ from scenarios.campaign.statistics.estimates import worst_flight
 from scenarios.flight import Flight, Outputs
 from scenarios.many import MEMORY, TIMEOUT
 from scenarios.progress import Progress, silent
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.run import run_scenario
 from scenarios.schema.scenario import Scenario
 
@@ -62,13 +63,33 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Replay:
+class Replay(Result):
     """A flight of a campaign, flown again."""
 
     recorded: Recorded  # as the campaign has it
     flight: Flight  # as it was flown now
     directory: Path  # its run directory
     differing: Sequence[str]  # columns of the campaign's table that are not the same bit for bit
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`; 1 where its numbers are not the campaign's."""
+        return EXIT_FAILED if self.differing else EXIT_DONE
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+
+        yield from self.flight.shown()
+        number, count = self.recorded.number, len(self.recorded.row)
+        if self.differing:
+            yield console.styled((f"flight {number} differs from the campaign's in {', '.join(self.differing)}", "red"))
+        else:
+            yield f"flight {number}: {count} columns, each the same as in the campaign"
+
+    def to_json(self) -> dict[str, Any]:
+        """`summary.json` of the flight as it was flown now."""
+        return self.flight.to_json()
 
 
 def replay_flight(

@@ -30,6 +30,7 @@ from scenarios.campaign.statistics.inference import proportion
 from scenarios.campaign.statistics.requirement import Judgement
 from scenarios.flight import to_pandas
 from scenarios.many import count_workers
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 
 REPORT_FILES: Final = ("index.html", "campaign.png")
 CHECK_EVERY: Final = 10
@@ -50,7 +51,7 @@ Watch = Callable[[Standing], None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Result:
+class CampaignResult(Result):
     """What came of a campaign."""
 
     directory: Path  # where everything is
@@ -58,6 +59,21 @@ class Result:
     table: pa.Table  # `flights.parquet`
     summary: dict[str, Any]  # `summary.json`
     judgements: tuple[Judgement, ...] = ()  # of the requirements that were stated
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`; 1 where the flights do not support a requirement."""
+        return EXIT_DONE if all(judgement.holds for judgement in self.judgements) else EXIT_FAILED
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios.campaign.report.campaign_tables import campaign_lines
+
+        return campaign_lines(self.summary, self.judgements, self.directory)
+
+    def to_json(self) -> dict[str, Any]:
+        """`summary.json`, and the verdict on each requirement."""
+        return {**self.summary, "requirements": [judgement.to_json() for judgement in self.judgements]}
 
     def to_pandas(self) -> Any:
         """The table as a pandas DataFrame.
@@ -79,7 +95,7 @@ def fly_campaign(
     until_width: float | None = None,
     report: bool = True,
     watch: Watch = lambda standing: None,
-) -> Result:
+) -> CampaignResult:
     """Fly a campaign, or what is missing of it; the arguments are those of `quadsim.campaign`.
 
     Each flight's row is the same with any worker and order; so is the table of all.  Whatever ends this
@@ -126,7 +142,7 @@ def fly_campaign(
         manifest["status"] = "complete" if progress.wanted == spec.flights else "stopped"
         records.write(manifest, files)
         files.finish(summary)
-    return Result(directory=directory, manifest=manifest, table=table, summary=summary)
+    return CampaignResult(directory=directory, manifest=manifest, table=table, summary=summary)
 
 
 class _Progress:

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from quadsim.state import INDEX, Array
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import TorqueRange, authority, torque_ranges
 from scenarios.design.tuning import delay_margin, tune
+from scenarios.results import Result, Shown
 
 SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
 _RPM: Final = 60.0 / (2.0 * math.pi)
@@ -64,7 +66,7 @@ class VehicleSheet:
 
 
 @dataclass(frozen=True, kw_only=True)
-class VehicleReport:
+class VehicleReport(Result):
     """What a vehicle can do."""
 
     vehicle: Vehicle  # its numbers
@@ -73,12 +75,22 @@ class VehicleReport:
     scenario: str | None = None  # that it was held against, or None
     shortfalls: tuple[str, ...] | None = None
     """Which bounds of that scenario it cannot meet and why, a sentence each; None without a scenario."""
+    picture: Path | None = None  # where it was drawn to, or None
 
     @property
     def parameters(self) -> list[tuple[str, Any, str]]:
         """Name, value and unit of those that the file gives."""
         given = ((name, getattr(self.vehicle, name), unit) for name, unit in VEHICLE_UNITS.items())
         return [(name, value, unit) for name, value, unit in given if value is not None]
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+        from scenarios.design.vehicle_tables import vehicle_tables
+
+        yield from console.grids(vehicle_tables(self), left=("unit", "source", "what and why"))
+        if self.picture is not None:
+            yield console.written_to(self.picture)
 
     def to_json(self) -> dict[str, Any]:
         """All of it as plain values: the vehicle, each parameter with unit and source, and what follows from them."""

@@ -14,9 +14,9 @@ from mpc.export.source import CHANGES, DATA, CController, part
 from mpc.export.targets import TARGETS, Target
 from quadsim.errors import ParameterError
 from quadsim.outputs import absolute, reserving, writing
-from scenarios.api import as_scenario
 from scenarios.export.reach import Reach, reach
 from scenarios.export.record import Recording, record
+from scenarios.loading import as_scenario
 from scenarios.parts.controllers import exportable
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario

@@ -18,12 +18,12 @@ from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Moment, s
 from quadsim.outputs import absolute
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.api import as_scenario
 from scenarios.export.emulation import Program, build, require_programs
 from scenarios.export.exporter import c_controller, exported_law, programs
 from scenarios.export.serial_line import SerialMPC
 from scenarios.flight import Flight, Outputs
 from scenarios.limits import with_bounds_stated
+from scenarios.loading import as_scenario
 from scenarios.progress import Progress, reporting
 from scenarios.run import fly_scenario, run_scenario
 from scenarios.schema.scenario import Scenario

@@ -22,13 +22,12 @@ from quadsim.flight.log import FlightLog
 from quadsim.report.film.camera import Camera
 from quadsim.sim.loop import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array
-from scenarios.api import as_scenario
 from scenarios.build import build_controller, preferring_core
 from scenarios.campaign.plan import Plan, make_plan, read_campaign
 from scenarios.flight import Flight
 from scenarios.gym.spaces import USUAL, Action, Actions, Observations
 from scenarios.limits import build_limits
-from scenarios.loading import parse_scenario
+from scenarios.loading import as_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.run import StartedFlight, start
 from scenarios.schema.base import LARGEST_SEED

@@ -12,6 +12,7 @@ from quadsim.errors import InputError
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
 from scenarios.papers.paper import NumberSpec, Paper, scenario_of
 from scenarios.progress import Progress, silent
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.run import fly_scenario
 
 HEAD: Final = ("number", "unit", "published", "ours", "difference", "tolerance", "reproduced")
@@ -112,6 +113,25 @@ class Reproduction:
             lines=tuple(number.cells() for number in self.numbers),
             note=". ".join(filter(None, [citation, paper.about])),
         )
+
+
+class Reproductions(tuple[Reproduction, ...], Result):
+    """One for each paper."""
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`; 1 where a number is not reproduced."""
+        return EXIT_DONE if all(paper.within for paper in self) else EXIT_FAILED
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+
+        return console.grids([paper.grid for paper in self], left=("number",))
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as plain data."""
+        return {"reproduced": not self.exit_status, "papers": [paper.to_json() for paper in self]}
 
 
 def reproduce_paper(

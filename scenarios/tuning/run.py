@@ -27,6 +27,7 @@ from scenarios.campaign.statistics.comparison import Comparison, compare
 from scenarios.campaign.statistics.inference import paired_difference
 from scenarios.campaign.statistics.requirement import judge
 from scenarios.many import count_workers
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario
 from scenarios.tuning.page import Summary, write_page
 from scenarios.tuning.plan import OWN, START, TuningPlan
@@ -37,7 +38,7 @@ _MAY_CHANGE: Final = {"trials", "fresh", "description"}  # where a tuning is res
 
 
 @dataclass(frozen=True, kw_only=True)
-class TuningResult:
+class TuningResult(Result):
     """What came of a tuning.
 
     Attributes:
@@ -58,6 +59,25 @@ class TuningResult:
     def holds(self) -> bool:
         """Whether the answer's fresh flights support the requirement."""
         return bool(self.summary["fresh"]["best"]["requirement"]["holds"])
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`; 1 where the requirement does not hold."""
+        return EXIT_DONE if self.holds else EXIT_FAILED
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+        from scenarios.tuning.page import sentences, tables, verdict
+
+        yield console.styled((self.summary["tuning"], "bold"), f": {verdict(self.summary)}")
+        yield from sentences(self.summary)
+        yield from console.grids(tables(self.summary), left=("fields",))
+        yield console.written_to(self.directory)
+
+    def to_json(self) -> dict[str, Any]:
+        """`summary.json`."""
+        return dict(self.summary)
 
 
 def tune(

@@ -21,7 +21,7 @@ from mpc.solvers import Method
 from quadsim.errors import ExportError, OutputError, ParameterError
 from quadsim.state import REFERENCE_STATES, Array
 from scenarios.build import build_problem
-from scenarios.catalogue import scenarios
+from scenarios.catalogue import read_catalogue
 from scenarios.cli import main
 from scenarios.export.exporter import FACTS, c_controller, export, exported_law, room_sentence
 from scenarios.export.record import record
@@ -39,7 +39,7 @@ NOT_EXPORTED = {
 
 def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
     exported, refused, seen = 0, {}, set()
-    for name in scenarios():
+    for name in read_catalogue().scenarios:
         scenario = load_scenario(name)
         key = scenario.controller.model_dump_json(), repr(build_vehicle(scenario)), bool(scenario.obstacles)
         if key in seen:

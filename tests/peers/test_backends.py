@@ -11,7 +11,7 @@ from mpc.solvers import SOLVERS, QPSolver, find_solver, make_backend
 from mpc.solvers.qpsolvers_backend import UNSOLVED
 from quadsim.controller import SOLVED
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE
+from scenarios.results import EXIT_DONE
 
 NAMES = (*SOLVERS, "clarabel", "osqp", "proxqp", "quadprog")
 

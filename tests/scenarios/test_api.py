@@ -56,7 +56,7 @@ def flight() -> Flight:
     return quadsim.fly(quadsim.load("paper-constrained").replace({"duration": 6.0}), progress=False)
 
 
-RENDERS = {"film", "draw_vehicle"}
+RENDERS = {"film"}
 """Whose examples need a machine that renders."""
 
 
@@ -138,7 +138,7 @@ def test_it_is_drawn(flight: Flight) -> None:
 def test_a_saved_flight_is_the_run_that_the_command_writes(flight: Flight, tmp_path: Path) -> None:
     """The same bytes of Parquet; read again it is the same."""
     flight.save(tmp_path / "saved", video=False, recording=False, figures=False)
-    quadsim.fly(flight.scenario, out=tmp_path / "run", video=False, recording=False, figures=False, progress=False)
+    quadsim.run(flight.scenario, out=tmp_path / "run", video=False, recording=False, figures=False, progress=False)
     for name in ("flight.parquet", "plant.parquet", "horizon.parquet", "scenario.toml"):
         assert (tmp_path / "saved" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
     read = quadsim.read(tmp_path / "saved")

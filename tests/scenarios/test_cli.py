@@ -5,20 +5,23 @@ from __future__ import annotations
 import json
 import shutil
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
+import quadsim
 from mpc.solvers import SOLVERS, solver_entries
 from quadsim import __version__
 from quadsim.assets import vehicle_names
 from quadsim.errors import RenderingUnavailableError
 from quadsim.flight import rundir
+from scenarios.app import app
 from scenarios.campaign.plan import read_campaign
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.loading import load_scenario
+from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.shipped import campaign_names, scenario_names, tuning_names
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -51,6 +54,8 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     """And as lines, one for each."""
     assert main(["list"]) == EXIT_DONE
     lines = {line.split()[0]: line.split(maxsplit=1)[1:] for line in capsys.readouterr().out.splitlines() if line}
+    printed = quadsim.catalogue().text()
+    assert lines == {line.split()[0]: line.split(maxsplit=1)[1:] for line in printed.splitlines() if line}
     assert main(["list", "--json"]) == EXIT_DONE
     listed = json.loads(capsys.readouterr().out)
     titles = ["scenarios", "groups", "expected", "campaigns", "tunings", "vehicles", "controllers", "papers", "solvers"]
@@ -65,6 +70,30 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(listed["solvers"]) == list(solver_entries())
     for name in (*scenario_names(), *campaign_names(), *tuning_names(), *vehicle_names(), *SOLVERS, "constrained"):
         assert len(lines[name][0]) > 10
+
+
+def test_without_a_command_it_prints_help_and_fails(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == EXIT_WRONG_INPUT
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert all(f"│ {name} " in printed.out for name in app if not name.startswith("-"))
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (["run"], scenario_names),
+        (["campaign", "--resume"], campaign_names),
+        (["tune"], tuning_names),
+        (["scenario", "--for"], vehicle_names),
+    ],
+)
+def test_a_shell_completes_names_and_paths(
+    words: list[str], names: Callable[[], list[str]], here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "mine.toml").touch()
+    assert main(["__complete", *words, "mi"]) == EXIT_DONE
+    assert {*names(), "mine.toml"} <= set(capsys.readouterr().out.split())
 
 
 # --- scenario ------------------------------------------------------------------------------------------------------
@@ -89,9 +118,7 @@ def test_a_printed_scenario_is_a_scenario_file(here: Path, capsys: pytest.Captur
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["--version"])
-    assert caught.value.code == EXIT_DONE
+    assert main(["--version"]) == EXIT_DONE
     assert capsys.readouterr().out == f"quadsim {__version__}\n"
 
 
@@ -203,6 +230,13 @@ def test_compare_prints_markdown(hover_directory: Path, here: Path, capsys: pyte
 
 RUN = ["run", "hover", *SHORT, *TABLES]
 WRONG: dict[str, tuple[list[str], str]] = {
+    "a command that is none": (["rum", "hover"], 'Unknown command "rum". Did you mean "run"?'),
+    "an option that is none": (["run", "hover", "--sed", "3"], "Unknown option: --sed. Did you mean --seed?"),
+    "an option without its value": (["export", "hover"], "--out requires an argument"),
+    "a number that is not whole": (["run", "hover", "--seed", "3.7"], "--seed: must be a whole number; got '3.7'"),
+    "a word too many": (["list", "hover"], "Unused Tokens: ['hover']"),
+    "nothing to compare": (["compare", "--out", "page"], "compare needs runs, scenarios, or two campaigns"),
+    "two flights to replay": (["replay", "gone", "--worst", "--flight", "3"], "--flight must be absent with --worst"),
     "one scenario of two": (["compare", "hover", "nope", "--out", "page"], "no scenario named 'nope'"),
     "a scenario without a name": (["scenario"], "scenario needs a name or a TOML file, or --schema (there are: "),
     "a directory": (["run", "folder"], "folder is a directory; give a scenario's name or its TOML file"),

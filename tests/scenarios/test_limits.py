@@ -11,11 +11,11 @@ import pytest
 import quadsim
 from quadsim.flight.audit import Limit
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE, EXIT_FAILED
 from scenarios.limits import audit_notes, build_limits
 from scenarios.live.session import Session
 from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
+from scenarios.results import EXIT_DONE, EXIT_FAILED
 from scenarios.schema.scenario import Scenario
 
 

@@ -19,9 +19,9 @@ from quadsim.errors import FileError
 from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.flight import Flight
 from scenarios.reaudit import reaudit
+from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
 SHORT = ("--set", "duration=0.5")

@@ -19,12 +19,12 @@ from quadsim.report.flight_figures import page_figures, write_figures
 from quadsim.report.recording import write_recording
 from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.space import Cylinder
-from scenarios.commands.console import outcome
 from scenarios.flight import Flight, Outputs, write_run
 from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
 from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Scenario
+from scenarios.summary_tables import outcome
 
 PILLAR = {"type": "cylinder", "name": "pillar", "position": [1.0, 0.0, 1.0], "radius": 0.1, "height": 3.0}
 BALL = {

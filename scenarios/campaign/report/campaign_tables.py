@@ -3,19 +3,51 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from scenarios.campaign.results.events import HARMLESS, INCOMPLETE
 from scenarios.campaign.results.table import Summary
 from scenarios.campaign.statistics.estimates import drivers
 from scenarios.campaign.statistics.inference import ALPHA
+from scenarios.campaign.statistics.requirement import Judgement
 from scenarios.campaign.statistics.wording import count_of, interval, label, p_value, percent
 
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+_MOST_LINES: Final = 8  # of a table on the console; the report has them all
 _MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN}
 _ENDS: Final = ("lower", "upper")
 _ALWAYS: Final = ("failure", "violation", "lost")  # events that are listed even where they never happened
+
+
+def campaign_lines(summary: Summary, judgements: Sequence[Judgement], directory: Path) -> Iterator[RenderableType]:
+    """What came of a campaign, as a console shows it."""
+    from scenarios import console
+
+    where = console.shown(directory)
+    yield console.styled((summary["campaign"], "bold"), f": {verdict_sentence(summary)}")
+    if summary["parameters"]:
+        yield driver_sentence(summary)
+    tables = [event_table(summary), constraint_table(summary), worst_table(summary, where)]
+    yield from console.grids([_brief(grid) for grid in tables if grid.lines], left=("constraint", "reason"))
+    if summary["worst"]:
+        command = replay_command(where, summary["worst"][0]["flight"])
+        yield console.styled("to fly one of them again: ", (command, "bold"))
+    for judgement in judgements:
+        yield console.styled((judgement.sentence, "green" if judgement.holds else "red"))
+    yield console.written_to(directory)
+
+
+def _brief(grid: Grid) -> Grid:
+    """The first lines of a table, with a short last column."""
+    ends = [(line, " ".join(line[-1].text.split())) for line in grid.lines[:_MOST_LINES]]
+    lines = [(*line[:-1], replace(line[-1], text=end if len(end) <= 60 else f"{end[:57]}...")) for line, end in ends]
+    return replace(grid, note="", lines=tuple(lines))
 
 
 def verdict_sentence(summary: Summary) -> str:

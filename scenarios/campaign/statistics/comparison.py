@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -29,6 +30,7 @@ from scenarios.campaign.results.table import (
 from scenarios.campaign.statistics import inference
 from scenarios.campaign.statistics.estimates import FAILURE
 from scenarios.campaign.statistics.wording import p_value
+from scenarios.results import Result, Shown
 
 COMPARED: Final = (
     *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
@@ -76,7 +78,7 @@ class MetricComparison:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
+class Comparison(Result):
     """What two campaigns on the same draws show of each other."""
 
     names: tuple[str, str]  # of the first and the second campaign
@@ -88,6 +90,7 @@ class Comparison:
     differences: Differences | None  # fields in which their scenarios and draws differ; None where not known
     events: tuple[EventComparison, ...]  # failure, then every other event with a name, then each constraint not held
     metrics: tuple[MetricComparison, ...]
+    page: Path | None = None  # of the report, where it was written
 
     @property
     def verdict(self) -> str:
@@ -108,6 +111,24 @@ class Comparison:
             f"{phrase}: of {self.flights} paired flights, {failure.counts[1]} failed with {b} and {failure.counts[0]} "
             f"with {a} (McNemar's exact test, {p_value(failure.p)})."
         )
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+        from scenarios.campaign.report.comparison_tables import comparison_tables, difference_table, pairing
+
+        yield pairing(self)
+        yield from console.grids(difference_table(self))
+        yield self.sentence
+        yield from console.grids(comparison_tables(self))
+        if self.page is not None:
+            yield console.written_to(self.page)
+
+    def to_markdown(self) -> str:
+        """The same as Markdown."""
+        from scenarios.campaign.report.comparison_tables import comparison_markdown
+
+        return comparison_markdown(self)
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for a file; differences are of the second campaign less the first."""

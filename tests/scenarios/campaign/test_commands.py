@@ -15,7 +15,7 @@ import pytest
 import tomlkit
 
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
+from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 MASS = {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
 CAMPAIGN = {

@@ -66,7 +66,7 @@ def test_pid_and_geometric_control_meet_all_requirements_and_the_lqr_tracks_no_m
 def test_a_course_below_the_floor_or_a_detuned_controller_is_violated(
     changes: dict[str, object], violated: set[str]
 ) -> None:
-    scenario = quadsim.first_scenario("hummingbird", course="figure-eight").scenario.replace(changes)
+    scenario = quadsim.scenario(vehicle="hummingbird", course="figure-eight").scenario.replace(changes)
     flight = quadsim.fly(scenario)
     assert flight.outcome == ("violated" if violated else "satisfied")
     assert {finding.limit.name for finding in flight.audit if not finding.satisfied} == violated

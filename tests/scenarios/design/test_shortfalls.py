@@ -7,16 +7,18 @@ import tomllib
 
 import pytest
 
+import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
+from scenarios import console
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE, console
 from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
 from scenarios.design.shortfalls import shortfalls
 from scenarios.loading import load_scenario, parse_scenario
+from scenarios.results import EXIT_DONE
 from scenarios.schema.base import fields_of
-from scenarios.vehicles import vehicle_template
 
+TEMPLATE = quadsim.vehicle_report(template=True).content
 HUMMINGBIRD, LOPES = (load_vehicle(vehicle_path(name)) for name in ("hummingbird", "lopes2011"))
 
 
@@ -57,9 +59,9 @@ def test_a_first_scenario_suits_its_vehicle(course: str, law: str) -> None:
 
 
 def test_the_template_documents_every_parameter() -> None:
-    tables = tomllib.loads(vehicle_template())
+    tables = tomllib.loads(TEMPLATE)
     assert [*tables] == ["name", "description", *VEHICLE_UNITS]
-    text = " ".join(vehicle_template().replace("# ", "").split())
+    text = " ".join(TEMPLATE.replace("# ", "").split())
     for name, unit in VEHICLE_UNITS.items():
         assert tables[name]["unit"] == unit
         meaning = (fields_of(Vehicle)[name].description or "").partition("] ")[2]

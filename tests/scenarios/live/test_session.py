@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 import scenarios.parts.live
 from quadsim.errors import InputError
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.live.knobs import knobs
 from scenarios.live.pacing import LATE, Pace
 from scenarios.live.session import STRONGEST, Frame, Session, read_script
 from scenarios.loading import load_scenario
+from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.run import fly_scenario
 from scenarios.schema.scenario import Scenario
 

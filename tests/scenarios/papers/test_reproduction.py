@@ -16,11 +16,11 @@ import quadsim
 from quadsim.errors import FileError, UnknownNameError
 from quadsim.report.table import grid_to_markdown
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.papers.paper import NumberSpec, load_paper, scenario_of
 from scenarios.papers.reproduction import Reproduced, Reproduction, reproduce_paper
+from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.run import fly_scenario
 from scenarios.schema.problems import ScenarioError
 from scenarios.shipped import paper_names, scenario_names

@@ -8,11 +8,13 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from rich.text import Text
 
 from quadsim.errors import printable
 from quadsim.report.table import Cell, Grid, Mark, Row, to_markdown
-from scenarios.commands import campaign_console, console
+from scenarios import console
 from scenarios.junit import write_cases
+from scenarios.summary_tables import summary_tables
 
 NASTY = ("[/bold]", "[link=file:///decoy]x[/link]", "\x1b[2J\x1b]0;title\x07", "a\r\nquadsim: all is well", "\ud800")
 
@@ -36,14 +38,15 @@ def test_a_foreign_summary_is_shown_as_text(nasty: str, short_run: Any, capsys: 
     summary["course"]["sentence"] = nasty
     for entry in summary["constraints"]:
         entry |= {"name": nasty, "unit": nasty}
-    console.print_summary(summary, where=nasty)
-    console.say(nasty)
-    console.print_listing({nasty: {nasty: nasty}})
     cells = tuple(Cell(text=nasty, mark=mark) for mark in (Mark.NONE, Mark.BAD))
     row = Row(group=nasty, label="outcome", unit=nasty, cells=cells, headline=True)
-    console.print_comparison([row], [nasty, nasty], nasty)
-    console.print_grids([Grid(key="k", title=nasty, head=(nasty, nasty), lines=(cells,), note=nasty)], nasty)
-    campaign_console.print_replay(3, {"a": 1}, [nasty])
+    grid = Grid(key="k", title=nasty, head=(nasty, nasty), lines=(cells,), note=nasty)
+    parts = [*summary_tables(summary, Path(nasty.encode(errors="replace").decode())), *console.grids([grid])]
+    parts += [*console.listing({nasty: {nasty: nasty}}), console.table(nasty, [nasty], [[nasty]])]
+    console.show(parts)
+    console.say(nasty)
+    assert console.to_text(parts).count(printable(nasty)) > 20
+    assert "<b>" not in console.to_html([nasty, Text("<b>")])
     print(to_markdown([row], [nasty, nasty]))
     output = capsys.readouterr()
     assert is_plain(output.out + output.err)

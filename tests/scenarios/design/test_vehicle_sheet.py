@@ -19,9 +19,9 @@ from quadsim.report.film.video import render_portrait, rendering_backend
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.cli import main
-from scenarios.commands import EXIT_DONE
 from scenarios.design.authority import torque_ranges
 from scenarios.design.vehicle_figures import make_sheet
+from scenarios.results import EXIT_DONE
 
 VEHICLES = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]
 CRAZYFLIE, HUMMINGBIRD, LOPES, _ = VEHICLES

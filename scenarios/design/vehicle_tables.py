@@ -1,36 +1,12 @@
-"""`quadsim vehicle`: what its numbers amount to, as tables."""
+"""What the numbers of a vehicle amount to, as tables."""
 
 from __future__ import annotations
 
-import json
-from argparse import Namespace
 from collections.abc import Sequence
 
-from quadsim.assets import vehicle_names
-from quadsim.errors import InputError
 from quadsim.report.table import Cell, Grid, format_number
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.commands import EXIT_DONE, console
 from scenarios.design.vehicle_figures import VehicleReport, VehicleSheet
-from scenarios.vehicles import draw_vehicle, vehicle_report, vehicle_template
-
-
-def vehicle(options: Namespace) -> int:
-    """`quadsim vehicle`."""
-    if options.template:
-        print(vehicle_template(), end="")
-        return EXIT_DONE
-    if options.vehicle is None:
-        names = ", ".join(vehicle_names())
-        raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
-    if options.out is not None:
-        draw_vehicle(options.vehicle, options.out, overwrite=options.overwrite)
-    found = vehicle_report(options.vehicle, scenario=options.scenario)
-    if options.json:
-        print(json.dumps(found.to_json(), indent=2))
-    else:
-        console.print_grids(vehicle_tables(found), options.out, prose=("unit", "source", "what and why"))
-    return EXIT_DONE
 
 
 def vehicle_tables(report: VehicleReport) -> list[Grid]:

@@ -1,0 +1,1172 @@
+"""All that quadsim does: what `import quadsim` hands out, and what the command line is made of.
+
+A function under `@app.command` is both.  What it returns is shown by `scenarios.cli`, the only one that prints; see
+`scenarios.results`.  Nothing heavy is imported before a function runs.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
+from functools import partial
+from glob import escape, glob
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
+
+from cyclopts import App, Parameter
+
+from quadsim import __version__
+from quadsim.assets import vehicle_names
+from quadsim.errors import FileError, InputError, OutputError, ParameterError
+from scenarios import shipped
+
+if TYPE_CHECKING:
+    from quadsim.controller import Controller
+    from quadsim.flight.feasibility import Feasibility
+    from quadsim.vehicle import Vehicle
+    from scenarios.campaign.replay import Replay
+    from scenarios.campaign.run import CampaignResult
+    from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
+    from scenarios.campaign.sweep import Sweep
+    from scenarios.catalogue import Catalogue
+    from scenarios.comparison import Comparison
+    from scenarios.design.vehicle_figures import VehicleReport
+    from scenarios.flight import Flight
+    from scenarios.papers.reproduction import Reproductions
+    from scenarios.progress import Progress
+    from scenarios.reaudit import Reaudit
+    from scenarios.results import Document, Listing, ScenarioFile
+    from scenarios.run import StartedFlight
+    from scenarios.schema.scenario import Scenario
+    from scenarios.tuning.run import TuningResult
+
+    File: TypeAlias = str | Path
+    PaperName: TypeAlias = File
+    TuningName: TypeAlias = File
+    VehicleName: TypeAlias = File
+    ScenarioName: TypeAlias = Scenario | File
+    CampaignName: TypeAlias = ScenarioName
+    Target: TypeAlias = Flight | ScenarioName
+    Changes: TypeAlias = Mapping[str, Any] | Sequence[str]
+    Whole = int
+    Flag = bool
+    UserCode = object
+    UserForces = Sequence[object]
+    Fields: TypeAlias = Mapping[str, Any]
+    Draws: TypeAlias = Sequence[Mapping[str, Any]]
+    Watched: TypeAlias = Progress | bool
+else:  # as cyclopts reads them: it resolves all annotations where a command is declared
+
+    def _one_of(names: Any) -> Any:
+        def completions(context: Any) -> list[str]:
+            return [*names(), *glob(f"{escape(context.incomplete or '.')}*")]  # noqa: PTH207  # as it was typed
+
+        return Annotated[str, Parameter(completer=completions)]
+
+    def _whole(_: type, tokens: Sequence[Any]) -> int:
+        text = tokens[0].value
+        if not text.lstrip("+-").isdecimal():  # by itself cyclopts rounds 3.7
+            raise ValueError(f"must be a whole number; got {text!r:.100}")
+        return int(text)
+
+    CampaignComparison = CampaignResult = Catalogue = Comparison = Document = Flight = Listing = Reaudit = Any
+    Replay = Reproductions = ScenarioFile = TuningResult = VehicleReport = Any
+    File = Path
+    VehicleName = _one_of(vehicle_names)
+    Target = ScenarioName = _one_of(shipped.scenario_names)
+    CampaignName, PaperName = _one_of(shipped.campaign_names), _one_of(shipped.paper_names)
+    TuningName = _one_of(shipped.tuning_names)
+    Changes = Annotated[Sequence[str], Parameter(name="--set")]
+    Whole = Annotated[int, Parameter(converter=_whole)]
+    Flag = Annotated[bool, Parameter(negative="")]
+    UserCode = UserForces = Fields = Draws = Watched = Annotated[Any, Parameter(parse=False)]
+
+app: Final = App(
+    name="quadsim",
+    help="Fly model predictive controllers of quadrotors in MuJoCo; record, film and audit every flight.",
+    help_epilogue="exit status: 0 done; 1 a required constraint does not hold, or the flight was aborted or "
+    "interrupted; 2 wrong input",
+    help_format="plaintext",
+    default_parameter=Parameter(show_default=False, negative_iterable=(), allow_repeating=True),
+    version=f"quadsim {__version__}",
+)
+_log: Final = logging.getLogger("quadsim")
+
+
+# --- scenarios -----------------------------------------------------------------------------------------------------
+
+
+def load(name: str | Path, changes: Changes = ()) -> Scenario:
+    """A scenario of the library, or of a file, checked together with the vehicle and the course that it names.
+
+    Args:
+        name: a library name, or a path ending in `.toml`.
+        changes: fields to replace: values by dotted path as `Scenario.replace` takes them, or texts as of `--set`.
+
+    Raises:
+        InputError: it is missing or malformed, or cannot be flown so.
+
+    Examples:
+        >>> import quadsim
+        >>> scenario = quadsim.load("paper-constrained", {"controller.horizon": 30})
+        >>> scenario.controller.horizon, scenario.duration
+        (30, 60.0)
+    """
+    from scenarios.loading import as_scenario
+
+    return as_scenario(name, changes)
+
+
+def feasibility(scenario: ScenarioName) -> Feasibility:
+    """What a course requires of the vehicle and of the controller's bounds, tightened ones too; nothing is flown.
+
+    Args:
+        scenario: it, or its name or file.
+
+    Returns:
+        Peaks of the course, as `tilt` [deg], `problems` where a limit or a bound is passed, and a `sentence`.
+
+    Raises:
+        InputError: the course cannot be built.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.feasibility("hover").problems
+        ()
+        >>> fast = quadsim.load("figure-eight").replace({"reference.period": 6.0, "reference.ramp": 3.0})
+        >>> quadsim.feasibility(fast).problems[0]
+        'roll up to 40.43 deg (bound 5)'
+    """
+    from scenarios import feasibility_check
+    from scenarios.loading import as_scenario
+    from scenarios.parts.vehicle import build_vehicle
+
+    scenario = as_scenario(scenario)
+    return feasibility_check.report(scenario, build_vehicle(scenario))
+
+
+def make_controller(scenario: ScenarioName) -> Controller:
+    """The controller of a scenario, ready for `reset` and `step`, without a simulator.
+
+    Raises:
+        InputError: it cannot be made from these numbers.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> law = quadsim.make_controller("paper-constrained")
+        >>> law.reset(np.full(4, 200.0))
+        >>> command = law.step(quadsim.Moment(), np.zeros(12), np.zeros((law.horizon, 4)))
+        >>> command.speeds.shape, command.plan.shape
+        ((4,), (50, 4))
+    """
+    from scenarios.build import build_controller
+    from scenarios.loading import as_scenario
+    from scenarios.parts.vehicle import build_vehicle
+
+    scenario = as_scenario(scenario)
+    return build_controller(scenario, build_vehicle(scenario))
+
+
+# --- flights -------------------------------------------------------------------------------------------------------
+
+
+def fly(
+    scenario: ScenarioName, *, controller: object = None, forces: Sequence[object] = (), progress: Watched = True
+) -> Flight:
+    """Fly a scenario and audit it, in memory; `run` and `Flight.save` write its run directory.
+
+    Ctrl-C, or a controller or force that raises, ends the flight in order: it is returned as far as it came, with the
+    reason, and its outcome is `aborted`.
+
+    Args:
+        scenario: what is flown, or its name or file.
+        controller: flies it, instead of the scenario's: a class, called as MyLaw(vehicle, period=..., horizon=...)
+            and with a method `step(now, state, reference)`; a function `law(now, state, reference)` that gives four
+            rotor speeds [rad/s]; an object with such a `step`; or a text `package.module:Class`.  Further arguments of
+            a class through `functools.partial`.
+        forces: forces of one's own that act on the vehicle, besides the scenario's effects: functions
+            `force(time, state)`, called once per physics step, that give force x, y, z in the world frame [N] and
+            torque in the body frame [N m]; or classes called as MyForce(vehicle, rng=...) whose objects are called so.
+        progress: called with (what, done, total); True for bars on a terminal, False for none.
+
+    Raises:
+        InputError: the scenario cannot be flown, or the controller cannot be set up.
+
+    Examples:
+        >>> import quadsim
+        >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
+        >>> quadsim.fly(scenario).satisfied
+        True
+        >>> def full_throttle(now, state, reference):
+        ...     return [300.0] * 4
+        >>> quadsim.fly(scenario, controller=full_throttle).state["vz"][-1].round()
+        np.float64(13.0)
+    """
+    from scenarios import loading, user_code
+    from scenarios import run as runs
+    from scenarios.progress import reporting
+
+    flown, law, own = user_code.set_up(loading.as_scenario(scenario), controller, forces)
+    with reporting(progress) as report:
+        return runs.fly_scenario(flown, report, law, own)
+
+
+@app.command
+def run(
+    scenario: ScenarioName,
+    /,
+    *,
+    out: File | None = None,
+    overwrite: Flag = False,
+    changes: Changes = (),
+    seed: Whole | None = None,
+    video: bool | None = None,
+    recording: bool | None = None,
+    figures: bool | None = None,
+    controller: UserCode = None,
+    forces: UserForces = (),
+    progress: Watched = True,
+) -> Flight:
+    """Fly one scenario and write its run directory.
+
+    A flight that was flown is kept: tables and summary first, then what is made from them.
+
+    Args:
+        scenario: library name, or path to a TOML file.
+        out: run directory (default: runs/SCENARIO, or the next free name).
+        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
+        changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
+        seed: replace the seed, of everything random in it.
+        video: film it (default: where that can be done).
+        recording: write flight.rrd for the rerun viewer (default: where that can be done).
+        figures: draw it (default: where that can be done).
+        controller: as of `fly`.
+        forces: as of `fly`.
+        progress: as of `fly`.
+
+    Raises:
+        InputError: the scenario cannot be flown, or the controller cannot be set up.
+        RenderingUnavailableError: a video is asked for and cannot be made; nothing was flown.
+        OutputError: the directory cannot be written; or what was asked for by name: its `result` is the flight then.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     flown = quadsim.run("hover", out=folder + "/run", changes={"duration": 0.5}, video=False)
+        ...     flown.outcome, flown.directory.name
+        ('satisfied', 'run')
+    """
+    from scenarios import loading, user_code
+    from scenarios import run as runs
+    from scenarios.flight import Outputs
+    from scenarios.progress import reporting
+
+    flown, law, own = user_code.set_up(loading.as_scenario(scenario, changes, seed), controller, forces)
+    _announce(flown, progress)
+    outputs = Outputs(video=video, recording=recording, figures=figures)
+    with run_directory(flown.name, out, overwrite=overwrite) as directory, reporting(progress) as report:
+        try:
+            return runs.run_scenario(flown, directory, outputs, report, law, own, overwrite=overwrite)
+        except OutputError as error:
+            if error.path.parent == directory:  # a product that was asked for by name
+                error.result = read(directory)
+            raise
+
+
+def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> AbstractContextManager[Path]:
+    """The directory of a run, reserved: `out`, or `runs/NAME`, or the next free name where that is not replaced."""
+    from quadsim.outputs import reserving
+
+    if out is not None:
+        return reserving(out, overwrite=overwrite)
+    return reserving(Path("runs") / name, overwrite=overwrite, free=not overwrite)
+
+
+def _announce(scenario: Scenario, progress: Watched) -> None:
+    """On a terminal, report what the course requires before it is flown; the summary repeats it."""
+    from scenarios import console
+    from scenarios.feasibility_check import fitting
+    from scenarios.parts.vehicle import build_vehicle
+
+    if progress is True and (terminal := console.stderr()).is_terminal:
+        required = feasibility(scenario)
+        fits = fitting(scenario, build_vehicle(scenario)) if required.problems else ""
+        console.show([f"{required.sentence} {fits}".rstrip()], terminal)
+
+
+def start(
+    scenario: ScenarioName,
+    *,
+    controller: object = None,
+    forces: Sequence[object] = (),
+    live: bool = False,
+    recorded: bool = True,
+) -> StartedFlight:
+    """Build everything that a flight needs, for a script of one's own to fly it period by period.
+
+    Args:
+        scenario: what is flown, or its name or file.
+        controller: as of `fly`.
+        forces: as of `fly`.
+        live: whether anything may be applied to it that can happen to its vehicle; else what its scenario's events are
+            of, and set-points, stalls, rotor losses and lags, and other controllers.
+        recorded: whether all periods are recorded, some 10 kB each; without them there is no `StartedFlight.flight`.
+
+    Raises:
+        InputError: the scenario cannot be flown, or the controller cannot be set up.
+
+    Examples:
+        >>> import quadsim
+        >>> with quadsim.start("hover") as started:
+        ...     while started.k < 20:
+        ...         sample = started.step()
+        ...     started.flight().outcome
+        'satisfied'
+    """
+    from scenarios import loading, user_code
+    from scenarios import run as runs
+
+    parts = user_code.set_up(loading.as_scenario(scenario), controller, forces)
+    return runs.start(*parts, live=live, recorded=recorded)
+
+
+def read(directory: str | Path) -> Flight:
+    """A finished run: its log at the scenario's `log_rate`, its audit as it was recorded.
+
+    Args:
+        directory: as `quadsim run` or `Flight.save` wrote it.
+
+    Raises:
+        FileError: it is no run directory, or a file is missing or damaged.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     flown = quadsim.fly(quadsim.load("hover").replace({"duration": 1.0}))
+        ...     read = quadsim.read(flown.save(folder + "/run", video=False))
+        >>> bool((read.command == flown.command).all()), read.outcome
+        (True, 'satisfied')
+    """
+    from quadsim.flight import rundir
+    from quadsim.flight.summary import finding_from_json
+    from quadsim.vehicle import Vehicle
+    from scenarios.flight import Flight
+    from scenarios.reaudit import stored_scenario
+
+    directory = Path(directory)
+    run = rundir.load_run(directory)
+    law = run.summary["controller"]
+    return Flight(
+        scenario=stored_scenario(directory),
+        vehicle=Vehicle(**run.summary["vehicle"]),
+        log=run.log,
+        findings=tuple(finding_from_json(entry) for entry in run.summary["constraints"]),
+        controller=law["name"],
+        solver=law["solver"],
+        simulate_s=run.summary["wall_s"]["simulate"],
+        tallies={},
+        directory=directory,
+        recorded=run.summary,
+    )
+
+
+@app.command
+def check(
+    target: ScenarioName,
+    /,
+    *,
+    changes: Changes = (),
+    seed: Whole | None = None,
+    junit: File | None = None,
+    progress: Watched = True,
+) -> Reaudit:
+    """Audit a scenario (flown first) or a finished run; exit 1 if it fails.
+
+    A finished run is audited again from its tables, and its summary and its files' hashes are held against that.  It
+    finds damage and mistakes: integrity, not authenticity.  Who writes every file anew can make them agree.
+
+    Args:
+        target: library name, TOML file, or run directory.
+        changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
+        seed: replace the seed, of everything random in it.
+        junit: also write the verdicts as JUnit XML.
+        progress: as of `fly`.
+
+    Raises:
+        InputError: the scenario cannot be flown.
+        FileError: a file is missing, changed or damaged, or the summary contradicts the tables.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     flown = quadsim.fly(quadsim.load("hover").replace({"duration": 1.0}))
+        ...     audited = quadsim.check(flown.save(folder + "/run", video=False))
+        >>> audited.satisfied, audited.notes
+        (True, ())
+    """
+    from scenarios import loading, reaudit
+    from scenarios.campaign.manifest import is_campaign
+    from scenarios.junit import junit_file, write_junit
+
+    file = None if junit is None else junit_file(junit)
+    if isinstance(target, str | Path) and Path(target).is_dir():
+        if changes or seed is not None:
+            option, value = ("--set", changes) if changes else ("--seed", seed)
+            raise ParameterError("", option, value, "absent when a finished run is checked")
+        if is_campaign(Path(target)):
+            raise InputError(
+                f"{target} is a campaign, not a run: quadsim replay {target} --worst makes a run of its worst flight; "
+                "quadsim campaign --require judges them all"
+            )
+        audited = reaudit.reaudit(Path(target))
+        for note in audited.notes:
+            _log.info("%s: %s", target, note)
+    else:
+        scenario = loading.as_scenario(target, changes, seed)
+        _announce(scenario, progress)
+        flight = fly(scenario, progress=progress)
+        audited = reaudit.Reaudit(summary=dict(flight.summary), findings=flight.findings, satisfied=flight.satisfied)
+    if file is not None:
+        write_junit(audited, file)
+    return audited
+
+
+@app.command
+def compare(
+    *targets: Target,
+    out: File | None = None,
+    overwrite: Flag = False,
+    markdown: Flag = False,
+    progress: Watched = True,
+) -> Comparison | CampaignComparison | Document:
+    """Flights, or two campaigns flight by flight, side by side: table, figures, HTML page.
+
+    Args:
+        targets: run directories, scenarios to fly, or the directories of two campaigns.
+        out: directory of the page, its figures and its table.
+        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
+        markdown: print the table as Markdown.
+        progress: as of `fly`.
+
+    Raises:
+        InputError: something is neither; nothing was flown.
+        OutputError: the page cannot be written.
+
+    Examples:
+        >>> import quadsim
+        >>> hover = quadsim.load("hover").replace({"duration": 1.0})
+        >>> pid = hover.replace({"controller": {"type": "pid"}})
+        >>> quadsim.compare(quadsim.fly(hover), quadsim.fly(pid)).to_markdown().count("|") > 10
+        True
+    """
+    from quadsim.outputs import absolute
+    from scenarios.comparison import compare_campaigns, compare_flights, is_campaign
+    from scenarios.progress import reporting
+    from scenarios.results import Document
+
+    if not targets:
+        raise InputError("compare needs runs, scenarios, or two campaigns")
+    page = None if out is None else absolute(out)
+    compared: Comparison | CampaignComparison
+    if any(isinstance(target, str | Path) and is_campaign(Path(target)) for target in targets):
+        compared = compare_campaigns([Path(str(target)) for target in targets], page, overwrite=overwrite)
+    else:
+        with reporting(progress) as report:
+            compared = compare_flights(targets, page, report, overwrite=overwrite)
+    return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared
+
+
+@app.command(name="video")
+def film(
+    directory: File,
+    /,
+    *,
+    out: File | None = None,
+    overwrite: Flag = False,
+    workers: Whole | None = None,
+    progress: Watched = True,
+) -> Path:
+    """Film a finished run.
+
+    Args:
+        directory: run directory.
+        out: MP4 or GIF file (default: flight.mp4 in the run's directory, replacing an earlier one).
+        overwrite: replace a file that is there.
+        workers: rendering processes (default: one per core).
+        progress: as of `fly`.
+
+    Returns:
+        The file.
+
+    Raises:
+        InputError: it is no run directory, or the file has another ending.
+        RenderingUnavailableError: nothing can render here.
+        OutputError: the file cannot be written.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     flown = quadsim.fly(quadsim.load("hover").replace({"duration": 0.2}))
+        ...     file = quadsim.film(flown.save(folder + "/run", video=False), workers=1)
+        ...     file.name, file.stat().st_size > 1000
+        ('flight.mp4', True)
+    """
+    from quadsim.flight import rundir
+    from quadsim.outputs import absolute, adding
+    from quadsim.report.film.video import render_gif, render_video
+    from scenarios.progress import reporting
+    from scenarios.reaudit import reaudit
+
+    reaudit(Path(directory), products=False)
+    directory = absolute(directory)
+    path = absolute(directory / rundir.VIDEO_FILE if out is None else out)
+    if workers is not None and workers < 1:
+        raise ParameterError("", "--workers", workers, "at least 1")
+    if path.suffix not in (".mp4", ".gif"):
+        raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
+    with reporting(progress) as report:
+        render = partial(render_gif, directory, workers=workers)
+        if path.suffix == ".mp4":
+            render = partial(render_video, directory, workers=workers, progress=partial(report, "video"))
+        if path.parent != directory:
+            render(path, overwrite=overwrite)
+        else:  # a product of the run, which its summary lists
+            with adding(directory, products={path.name: "made"}) as folder:
+                render(folder / path.name, overwrite=False)
+    return path
+
+
+@app.command
+def view(run: File, /, *, web: Flag = False) -> None:
+    """Open a run's recording in the rerun viewer.
+
+    It returns when the viewer is closed or Ctrl-C is pressed.
+
+    Args:
+        run: run directory or .rrd file.
+        web: serve the viewer to a browser instead, to this machine alone.
+
+    Raises:
+        FileError: there is no such recording.
+        ViewerUnavailableError: there is no display, or the viewer failed.
+
+    Examples:
+        >>> import quadsim
+        >>> try:
+        ...     quadsim.view("runs/not-flown-yet")
+        ... except quadsim.QuadsimError as error:
+        ...     print(error)
+        runs/not-flown-yet: no such run or recording
+    """
+    from quadsim.flight import rundir
+    from quadsim.flight.summary import require_inside
+    from quadsim.report.recording import open_viewer
+
+    path = Path(run)
+    recording = path / rundir.RECORDING_FILE if path.is_dir() else path
+    if not path.exists():
+        raise FileError(path, "no such run or recording")
+    if path.is_dir():
+        require_inside(path)
+    if not recording.is_file():
+        raise FileError(path, f"has no {rundir.RECORDING_FILE}; run the scenario again without --no-recording")
+    if recording.suffix != ".rrd":
+        raise FileError(path, "is no recording; give a run directory or a file ending in .rrd")
+    open_viewer(recording, web=web)
+
+
+@app.command
+def live(
+    scenario: ScenarioName,
+    /,
+    *,
+    against: ScenarioName | None = None,
+    out: File | None = None,
+    overwrite: Flag = False,
+    script: File | None = None,
+    port: Whole = 0,
+    host: str = "127.0.0.1",
+    browser: bool = True,
+    video: Flag = False,
+    changes: Changes = (),
+    seed: Whole | None = None,
+) -> Document:
+    """Fly in the browser: push, turn every knob, keep it as a scenario.
+
+    Args:
+        scenario: library name, or path to a TOML file; or the directory of a run to fly on from.
+        against: a second vehicle, flown by the controller of this scenario.
+        out: run directory (default: runs/SCENARIO-live, or the next free name).
+        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
+        script: TOML file of inputs and times: no browser, as fast as it goes.
+        port: to listen on (default: any free one).
+        host: other than this machine: for a network that you trust.
+        browser: open the browser.
+        video: film what was flown.
+        changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
+        seed: replace the seed, of everything random in it.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.live("hover", port=70_000)
+        Traceback (most recent call last):
+        quadsim.errors.ParameterError: --port must be from 1 to 65535, or 0 for any that is free; got 70000
+    """
+    from scenarios.live.serve import fly_live
+    from scenarios.loading import as_scenario
+    from scenarios.reaudit import reaudit, stored_scenario
+
+    onward = isinstance(scenario, str | Path) and Path(scenario).is_dir()
+    if onward:
+        if changes or seed is not None:
+            raise ParameterError("", "--set" if changes else "--seed", "given", "absent where a run is flown on")
+        reaudit(Path(str(scenario)), products=False)
+        scenario = stored_scenario(Path(str(scenario)))
+    flown = as_scenario(scenario, changes, seed)
+    other = None if against is None else as_scenario(against).controller
+    place = {"port": port, "host": host, "browser": browser}
+    return fly_live(flown, other, script, onward=onward, out=out, overwrite=overwrite, video=video, **place)
+
+
+# --- many flights --------------------------------------------------------------------------------------------------
+
+
+def sweep(
+    scenario: ScenarioName,
+    values: Mapping[str, Sequence[Any]],
+    *,
+    controller: object = None,
+    forces: Sequence[object] = (),
+    workers: int | None = None,
+    progress: bool = True,
+) -> Sweep:
+    """Fly a scenario once for every combination of some fields' values, all with the scenario's own seed.
+
+    Args:
+        scenario: what is flown, or its name or file.
+        values: what to try, by dotted path.
+        controller: as of `fly`; a class or a function of a module that other processes can import.
+        forces: what acts on it, as of `fly`; the same.
+        workers: processes that fly; one per usable core where absent.
+        progress: whether to show a bar on a terminal.
+
+    Returns:
+        A row per flight, in the order of the combinations, the last field varying fastest.
+
+    Raises:
+        InputError: a value is not allowed, or the controller cannot be sent to other processes.
+
+    Examples:
+        >>> import quadsim
+        >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
+        >>> found = quadsim.sweep(scenario, {"controller.horizon": [20, 40]}, workers=1)
+        >>> found["controller.horizon"].tolist(), found["verdict"].tolist()
+        ([20.0, 40.0], ['satisfied', 'satisfied'])
+    """
+    from scenarios.campaign.sweep import fly_sweep
+    from scenarios.loading import as_scenario
+    from scenarios.progress import reporting
+    from scenarios.user_code import importable
+
+    with reporting(progress) as report:
+        return fly_sweep(importable(as_scenario(scenario), controller, forces), values, workers, report)
+
+
+@app.command
+def campaign(
+    campaign: CampaignName,
+    /,
+    *,
+    out: File | None = None,
+    overwrite: Flag = False,
+    workers: Whole | None = None,
+    cluster: str | None = None,
+    resume: Flag = False,
+    flights: Whole | None = None,
+    until_width: float | None = None,
+    require: Sequence[str] = (),
+    report: bool = True,
+    junit: File | None = None,
+    changes: Changes = (),
+    seed: Whole | None = None,
+    vary: Draws = (),
+    fields: Fields | None = None,
+    controller: UserCode = None,
+    forces: UserForces = (),
+    progress: Watched = True,
+) -> CampaignResult:
+    """Fly a scenario many times, what may vary drawn at random.
+
+    Args:
+        campaign: a campaign's name, or path to a TOML file; in Python also a scenario, with `vary` and `fields`.
+        out: campaign's directory (default: runs/campaigns/NAME).
+        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
+        workers: processes (default: one per core).
+        cluster: fly on a Dask cluster: its scheduler's address, tcp://HOST:PORT.
+        resume: continue what is there.
+        flights: number of flights, instead of the file's.
+        until_width: stop once the 95 % interval of the failure probability is as narrow as this, e.g. 0.05.
+        require: exit 1 unless the flights support it, e.g. "P(violation) < 0.01 @ 95%"; may be repeated.
+        report: write the report, an HTML page.
+        junit: also write the requirements' verdicts as JUnit XML.
+        changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
+        seed: replace the seed, of all draws.
+        vary: of a scenario: what varies, entries as `[[vary]]` of a campaign file.
+        fields: of a scenario: other fields of a campaign file, as `name`, `failure` or `sampling`.
+        controller: of a scenario, as of `sweep`.
+        forces: of a scenario, as of `sweep`.
+        progress: whether to show a bar on a terminal, and elsewhere a line now and then.
+
+    Returns:
+        The results: `table` (a row per flight), `summary` (estimates with their intervals), `judgements` (of what was
+        required), and the `directory`.
+
+    Raises:
+        InputError: something cannot be flown so.
+        OutputError: a campaign is there already, or the directory cannot be written.
+        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` continues it.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
+        >>> mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "uniform", "low": 4.0, "high": 4.4}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     found = quadsim.campaign(scenario, vary=[mass], flights=3, workers=1, out=folder + "/mass")
+        >>> found.table["verdict"].to_pylist()
+        ['satisfied', 'satisfied', 'satisfied']
+    """
+    from scenarios.campaign.plan import load_plan, make_plan
+    from scenarios.campaign.results.events import parse_event
+    from scenarios.campaign.run import fly_campaign
+    from scenarios.campaign.statistics.requirement import judge, parse_requirement
+    from scenarios.junit import junit_file, write_junit
+    from scenarios.schema.scenario import Scenario
+    from scenarios.user_code import importable
+
+    if junit is not None and not require:
+        raise ParameterError("", "--junit", junit, "given with --require, whose verdicts it is to hold")
+    file = None if junit is None else junit_file(junit)
+    requirements = [parse_requirement(text) for text in require]
+    if isinstance(campaign, Scenario):
+        if changes:
+            raise InputError("changes go with a campaign file; a scenario is changed by its replace")
+        given = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **(fields or {})}
+        given = {name: value for name, value in given.items() if value is not None}
+        plan = make_plan(importable(campaign, controller, forces), given)
+    elif vary or fields or controller is not None or forces:
+        raise InputError("vary, controller and other fields go with a scenario; a campaign file has its own")
+    else:
+        plan = load_plan(str(campaign), list(changes), flights=flights, seed=seed)
+    for requirement in requirements:
+        parse_event(requirement.event.text, plan.columns)
+    target = Path("runs") / "campaigns" / plan.spec.name if out is None else Path(out)
+    with _growing(target, progress, resume=resume, overwrite=overwrite) as options:
+        result = fly_campaign(plan, workers=workers, cluster=cluster, report=report, until_width=until_width, **options)
+    result = replace(result, judgements=tuple(judge(result.table, requirement) for requirement in requirements))
+    if file is not None:
+        write_junit(result, file)
+    return result
+
+
+@app.command
+def replay(
+    campaign: File,
+    /,
+    *,
+    worst: Flag = False,
+    flight: Whole | None = None,
+    out: File | None = None,
+    overwrite: Flag = False,
+    video: bool | None = None,
+    recording: bool | None = None,
+    figures: bool | None = None,
+    progress: Watched = True,
+) -> Replay:
+    """Fly one flight of a finished campaign again, with all outputs.
+
+    Args:
+        campaign: a campaign's directory.
+        worst: the worst flight (the default).
+        flight: that flight.
+        out: run directory (default: runs/CAMPAIGN-N, or the next free name).
+        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
+        video: film it (default: where that can be done).
+        recording: write flight.rrd for the rerun viewer (default: where that can be done).
+        figures: draw it (default: where that can be done).
+        progress: as of `fly`.
+
+    Returns:
+        The flight, and the columns of the campaign's table that it does not agree with, bit for bit.
+
+    Raises:
+        InputError: there is no such campaign or flight.
+        OutputError: the directory cannot be written.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.replay("runs/campaigns/not-flown")
+        Traceback (most recent call last):
+        quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
+    """
+    from scenarios.campaign.replay import recorded_flight, replay_flight
+    from scenarios.flight import Outputs
+    from scenarios.progress import reporting
+
+    if worst and flight is not None:
+        raise ParameterError("", "--flight", flight, "absent with --worst")
+    recorded = recorded_flight(Path(campaign), flight)
+    for note in recorded.notes:
+        _log.info(note)
+    outputs = Outputs(video=video, recording=recording, figures=figures)
+    with reporting(progress) as report, run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
+        return replay_flight(recorded, directory, outputs, report, overwrite=overwrite)
+
+
+@app.command
+def tune(
+    tuning: TuningName,
+    /,
+    *,
+    out: File | None = None,
+    overwrite: Flag = False,
+    trials: Whole | None = None,
+    seed: Whole | None = None,
+    workers: Whole | None = None,
+    cluster: str | None = None,
+    resume: Flag = False,
+    report: bool = True,
+    progress: Watched = True,
+) -> TuningResult:
+    """Search fields of a scenario; the answer is held against the start on fresh draws.
+
+    Args:
+        tuning: name of a tuning that ships, or path to a TOML file.
+        out: tuning's directory (default: runs/tunings/NAME).
+        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
+        trials: number of candidates, instead of the file's.
+        seed: replace the seed, of the search and of its draws.
+        workers: processes (default: one per core).
+        cluster: fly on a Dask cluster, as quadsim campaign does.
+        resume: continue what is there.
+        report: write the report, HTML pages.
+        progress: as of `campaign`.
+
+    Returns:
+        `best` (the scenario that was found), `summary` (the search and the fresh flights),
+        `comparison` (flight by flight), `holds`, and the `directory`.
+
+    Raises:
+        InputError: something cannot be flown so.
+        MissingPackageError: the extra `tune` is not installed.
+        OutputError: a tuning is there already, or the directory cannot be written.
+        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` continues it.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.tune("paper-robust", trials=0)
+        Traceback (most recent call last):
+        scenarios.schema.problems.ScenarioError: paper-robust.toml: trials must be >= 1; got 0
+    """
+    from scenarios.tuning.plan import load_tuning
+    from scenarios.tuning.run import tune as carry_out
+    from scenarios.tuning.search import require_optuna
+
+    require_optuna()
+    plan = load_tuning(str(tuning), trials=trials, seed=seed)
+    target = Path("runs") / "tunings" / plan.spec.name if out is None else Path(out)
+    with _growing(target, progress, resume=resume, overwrite=overwrite) as options:
+        return carry_out(plan, workers=workers, cluster=cluster, report=report, **options)
+
+
+@contextmanager
+def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) -> Iterator[dict[str, Any]]:
+    """What grows in a directory: the options of where, and of its progress; Ctrl-C says what is there."""
+    from quadsim.outputs import absolute
+    from scenarios.progress import watching
+
+    if resume and overwrite:
+        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
+    directory = absolute(target)
+    try:
+        with watching(bool(progress)) as watch:
+            yield {"directory": directory, "resume": resume, "overwrite": overwrite, "watch": watch}
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{directory} has what was flown, --resume continues it") from None
+
+
+@app.command
+def reproduce(
+    paper: PaperName | None = None, /, *, junit: File | None = None, progress: Watched = True
+) -> Reproductions:
+    """Fly what papers publish: published, ours, difference; exit 1 if one is off.
+
+    Args:
+        paper: name, or path to a TOML file (default: every paper that ships).
+        junit: also write each number's verdict as JUnit XML.
+        progress: as of `fly`.
+
+    Returns:
+        A reproduction for each paper: `numbers`, each with `ours`, `difference` and `within`, and a table, `grid`.
+
+    Raises:
+        InputError: there is no such paper, or a number of it cannot be flown.
+
+    Examples:
+        >>> import quadsim
+        >>> (found,) = quadsim.reproduce("quadrotor-uav", progress=False)
+        >>> found.within, found.numbers[2].spec.published, round(found.numbers[2].ours, 3)
+        (True, 250.0, 250.0)
+    """
+    from scenarios.junit import junit_file, write_junit
+    from scenarios.papers.paper import load_paper
+    from scenarios.papers.reproduction import Reproductions, reproduce_paper
+    from scenarios.progress import reporting
+
+    file = None if junit is None else junit_file(junit)
+    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else shipped.paper_names())]
+    with reporting(progress) as report:
+        found = Reproductions(reproduce_paper(each, report) for each in papers)
+    if file is not None:
+        write_junit(found, file)
+    return found
+
+
+# --- files, code, and what there is --------------------------------------------------------------------------------
+
+
+@app.command
+def export(
+    scenario: ScenarioName,
+    /,
+    *,
+    out: File,
+    overwrite: Flag = False,
+    precision: str = "double",
+    target: str = "posix",
+    rows: Whole | None = None,
+    fly: Flag = False,
+    changes: Changes = (),
+    seed: Whole | None = None,
+) -> Document | Flight:
+    """Write a scenario's controller as self-contained C99, with its recorded periods.
+
+    Args:
+        scenario: library name, or path to a TOML file.
+        out: directory.
+        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
+        precision: of all numbers: double or float (default: double).
+        target: what its programs are for: posix, cortex-m7 or cortex-m4f (default: posix).
+        rows: room for so many active rows; memory grows with the square (default: 2.56 per step, at least 64).
+        fly: then fly the scenario with the exported controller on its target, emulated, into runs/SCENARIO-TARGET.
+        changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
+        seed: replace the seed, of everything random in it.
+    """
+    import json
+    import shlex
+
+    from scenarios import loading, results
+    from scenarios.export import exporter, in_the_loop
+
+    flown, options = loading.as_scenario(scenario, changes, seed), {"precision": precision, "target": target}
+    directory = exporter.export(flown, out, overwrite=overwrite, rows=rows, **options)  # type: ignore[arg-type]
+    room = exporter.room_sentence(json.loads((directory / exporter.FACTS).read_text()))
+    make = f"make -C {shlex.quote(str(directory))} check"
+    text = f"{precision}: {room}\nWrote {directory}: {make} compiles it and runs its recorded periods"
+    if not fly:
+        return results.Document(f"{text}\n", {"directory": str(directory)})
+    _log.info(text.replace("\n", "; "))
+    with run_directory(f"{flown.name}-{target}", None, overwrite=False) as place:
+        return in_the_loop.fly_exported(flown, place, **options)  # type: ignore[arg-type]
+
+
+@app.command
+def scenario(
+    name: ScenarioName | None = None,
+    /,
+    *,
+    changes: Changes = (),
+    seed: Whole | None = None,
+    vehicle: Annotated[VehicleName | None, Parameter(name="--for")] = None,
+    course: str | None = None,
+    controller: str | None = None,
+    schema: Flag = False,
+) -> ScenarioFile:
+    """Print a scenario with all defaults and comments: a start for yours.
+
+    Args:
+        name: library name, or path to a TOML file.
+        changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
+        seed: replace the seed, of everything random in it.
+        vehicle: print one made for this vehicle instead.
+        course: of it: hover, step (of 1 m) or figure-eight, at 60 % of what the vehicle can do (default: hover).
+        controller: of it: robust, lqr, pid or geometric (default: robust).
+        schema: print the JSON Schema of scenario files instead.
+
+    Returns:
+        Its `content`, where every number has its unit or source, and the `scenario` that it is.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.scenario("hover").scenario.vehicle.mass  # [kg]
+        4.0
+        >>> first = quadsim.scenario(vehicle="hummingbird", course="figure-eight").scenario
+        >>> first.control_period, first.reference.length  # [s], [m]
+        (0.025, 1.69)
+        >>> quadsim.fly(first).outcome
+        'satisfied'
+    """
+    import json
+    from dataclasses import replace
+
+    from scenarios import build, loading, results
+    from scenarios.courses.csv_course import Csv
+    from scenarios.design.first_scenario import first_scenario
+    from scenarios.parts.vehicle import build_vehicle
+    from scenarios.schema.json_schema import scenario_schema
+
+    if schema:
+        return results.ScenarioFile(json.dumps(scenario_schema(), indent=2) + "\n", scenario_schema())
+    choice = {option: value for option, value in {"course": course, "law": controller}.items() if value is not None}
+    if vehicle is not None:
+        for option, value in {"a scenario": name, "--set": changes, "--seed": seed}.items():
+            if value:
+                raise ParameterError("", "--for", vehicle, f"given without {option}")
+        return results.ScenarioFile(first_scenario(load_vehicle(vehicle), str(vehicle), **choice).to_toml())
+    for option, value in choice.items():
+        raise ParameterError("", "--course" if option == "course" else "--controller", value, "given with --for alone")
+    if name is None:
+        names = ", ".join(shipped.scenario_names())
+        raise InputError(f"scenario needs a name or a TOML file, or --schema (there are: {names})")
+    given = loading.as_scenario(name, changes, seed)
+    whole = build.resolve(given, build_vehicle(given))
+    if isinstance(whole.reference, Csv):  # another table may take the place of its own
+        whole = whole.model_copy(update={"reference": replace(whole.reference, sha256=None)})
+    return results.ScenarioFile(whole.to_toml())
+
+
+@app.command(name="vehicle")
+def vehicle_report(
+    name: VehicleName | None = None,
+    /,
+    *,
+    template: Flag = False,
+    scenario: ScenarioName | None = None,
+    out: File | None = None,
+    overwrite: Flag = False,
+) -> VehicleReport | Document:
+    """A vehicle's derived figures, its parameters' sources, its picture.
+
+    Args:
+        name: a shipped vehicle's name, or path to a TOML file.
+        template: print a commented vehicle file to fill in instead.
+        scenario: report which of its bounds the vehicle cannot meet.
+        out: PNG file to draw it to, on a floor of 10 cm squares.
+        overwrite: replace a file that is there.
+
+    Returns:
+        Its numbers with their sources, `figures` that follow from them, `shortfalls` where a scenario is given; or the
+        template.
+
+    Raises:
+        InputError: there is no such vehicle or scenario, it cannot fly, or the file has another ending.
+        RenderingUnavailableError: nothing can render here.
+
+    Examples:
+        >>> import quadsim
+        >>> can = quadsim.vehicle_report("hummingbird", scenario="paper-constrained")
+        >>> can.figures.designed.limited_by, round(can.figures.designed.time_constants["x, y"], 2)  # [s]
+        ('torque', 0.18)
+        >>> can.shortfalls[0]
+        'controller.input_bounds.speed: hover is 453.2 rad/s, the scenario allows 250'
+    """
+    from quadsim.assets import vehicle_path
+    from quadsim.report.film.video import render_portrait
+    from quadsim.vehicle import vehicle_sources
+    from scenarios import loading, results
+    from scenarios.design import shortfalls, vehicle_figures
+
+    if template:
+        return results.Document((Path(__file__).parent / "design/vehicle_template.toml").read_text(encoding="utf-8"))
+    if name is None:
+        names = ", ".join(vehicle_names())
+        raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
+    loaded = load_vehicle(name)
+    against = None if scenario is None else loading.as_scenario(scenario)
+    if out is not None:
+        if Path(out).suffix != ".png":
+            raise ParameterError("", "--out", str(out), "a file ending in .png")
+        render_portrait(loaded, Path(out), overwrite=overwrite)
+    return vehicle_figures.VehicleReport(
+        vehicle=loaded,
+        sources=vehicle_sources(vehicle_path(str(name))),
+        figures=vehicle_figures.make_sheet(loaded),
+        scenario=None if against is None else against.name,
+        shortfalls=None if against is None else shortfalls.shortfalls(against, loaded),
+        picture=None if out is None else Path(out),
+    )
+
+
+def load_vehicle(name: VehicleName) -> Vehicle:
+    """The numbers of a vehicle.
+
+    Args:
+        name: of one that ships, or a path ending in `.toml`.
+
+    Raises:
+        InputError: there is none, or it cannot fly.
+
+    Examples:
+        >>> import quadsim
+        >>> vehicle = quadsim.load_vehicle("hummingbird")
+        >>> vehicle.mass, round(vehicle.hover_speed)
+        (0.716, 453)
+    """
+    from quadsim.assets import vehicle_path
+    from quadsim.vehicle import load_vehicle as read_vehicle
+
+    return read_vehicle(vehicle_path(str(name)))
+
+
+@app.command(name="list")
+def catalogue() -> Catalogue:
+    """Scenarios, campaigns, tunings, vehicles, controllers, papers and solvers, one line each.
+
+    Returns:
+        Each by its name: `scenarios`, with their `description`, `group` and the verdict that they `expect`, and
+        `campaigns`, `tunings`, `vehicles`, `controllers`, `papers` and `solvers`, with a sentence.
+
+    Examples:
+        >>> import quadsim
+        >>> found = quadsim.catalogue()
+        >>> [name for name, each in found.scenarios.items() if each.group == "ground"]
+        ['ground-effect', 'hard-landing', 'take-off-and-landing']
+        >>> found.controllers["lqr"]
+        "infinite-horizon LQR on the hover model, following the reference's velocity"
+    """
+    from scenarios.catalogue import read_catalogue
+
+    return read_catalogue()
+
+
+@app.command
+def doctor() -> Listing:
+    """What this machine can do: cores, packages, rendering, viewer, and every QP solver tried on a step.
+
+    Returns:
+        Checks by section (machine, packages, rendering, viewer, solvers), each a line that a person can act on.
+
+    Examples:
+        >>> import quadsim
+        >>> found = quadsim.doctor()
+        >>> found["solvers"]["piqp-multistage"].startswith("works")
+        True
+        >>> sorted(found)
+        ['machine', 'packages', 'rendering', 'solvers', 'viewer']
+    """
+    from scenarios.results import Listing
+    from scenarios.self_check import doctor as check_machine
+
+    return Listing(check_machine())

@@ -1,0 +1,111 @@
+"""What a command returns: a result shows itself as tables on a console, as JSON, and as HTML in a notebook."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from scenarios.schema.scenario import Scenario
+
+Shown: TypeAlias = "Iterable[RenderableType]"
+
+EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
+
+
+class Result:
+    """What the functions of `scenarios.app` return, as far as a person or a program is to read it."""
+
+    @property
+    def exit_status(self) -> int:
+        """Of the command: 0, or 1 where a constraint, a requirement or a number does not hold."""
+        return EXIT_DONE
+
+    def shown(self) -> Shown:
+        """Its tables and sentences, in order."""
+        raise NotImplementedError
+
+    def to_json(self) -> Any:
+        """All of it as plain data, which `--json` prints."""
+        raise NotImplementedError
+
+    def show(self) -> None:
+        """Print it."""
+        from scenarios import console
+
+        console.show(self.shown())
+
+    def text(self) -> str:
+        """What `show` prints, without colours."""
+        from scenarios import console
+
+        return console.to_text(self.shown())
+
+    def _repr_html_(self) -> str:
+        """For notebooks."""
+        from scenarios import console
+
+        return console.to_html(self.shown())
+
+
+@dataclass(frozen=True)
+class Document(Result):
+    """A text that is shown as it is."""
+
+    content: str
+    data: Any = None
+    status: int = EXIT_DONE
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`."""
+        return self.status
+
+    def show(self) -> None:
+        """See `Result.show`."""
+        print(self.content, end="")
+
+    def text(self) -> str:
+        """See `Result.text`."""
+        return self.content
+
+    def to_json(self) -> Any:
+        """Its data, or else the text."""
+        return self.content if self.data is None else self.data
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.content)}</pre>"
+
+
+class ScenarioFile(Document):
+    """The text of a scenario file."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """To be flown."""
+        from scenarios.loading import parse_scenario
+
+        return parse_scenario(tomllib.loads(self.content))
+
+    def to_json(self) -> Any:
+        """Its tables."""
+        return tomllib.loads(self.content) if self.data is None else self.data
+
+
+class Listing(dict[str, Mapping[str, str]], Result):
+    """Names by section, each with a line."""
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+
+        return console.listing(self)
+
+    def to_json(self) -> Any:
+        """See `Result.to_json`."""
+        return dict(self)

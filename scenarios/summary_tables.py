@@ -1,0 +1,172 @@
+"""A flight's summary as tables and sentences: outcome, tracking, audit, controller, effects."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from quadsim.controller import OPTIMAL, Phase, counts, law_name
+from quadsim.flight.audit import HELD
+from quadsim.flight.summary import constraint_verdict, deciding_margin
+from quadsim.report.comparison import (
+    crash,
+    event_sentences,
+    failure_sentences,
+    required,
+    verdict,
+    violated_by_fallback,
+)
+from scenarios import console
+
+
+def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) -> Iterator[RenderableType]:
+    """All of it, and where it was written."""
+    flown = console.styled(f"  {summary['duration']:.2f} s flown")
+    yield console.styled((summary["scenario"], "bold"), "  ") + outcome(summary) + flown
+    if summary.get("description"):
+        yield summary["description"]
+    yield from summary.get("traceback", ())
+    if "course" in summary:
+        yield summary["course"]["sentence"]
+    if summary["tracking"]:
+        yield _tracking_table(summary["tracking"])
+    if summary["constraints"]:
+        yield audit_table(summary["constraints"])
+    yield from summary.get("audit_notes", ())
+    if summary["tracking"]:
+        yield from _controller_lines(summary)
+    yield from _effect_lines(summary)
+    yield from failure_sentences(summary)
+    if "reaudit" in summary:
+        again = summary["reaudit"]
+        phrase = "as recorded" if again["satisfied"] == summary["satisfied"] else "its verdict is recorded alone"
+        yield f"audited again from the tables, {again['rate']:g} rows per second: {phrase}"
+    if directory is not None:
+        yield console.written_to(directory)
+
+
+def outcome(summary: Mapping[str, Any]) -> Text:
+    """Completed or aborted with its reason, the verdict on the required constraints, and whether that was expected."""
+    expected, as_expected = summary.get("expected", "satisfied"), summary.get("as_expected", True)
+    remark = ""
+    if expected != "satisfied":
+        remark = ", as the scenario expects" if as_expected else f", where the scenario expects it {expected}"
+    colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
+    if summary["status"] != "completed":
+        return console.styled((f"aborted{remark}", colour), f": {summary['reason']}")
+    phrase = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
+    if verdict(summary) == "incomplete":
+        colour = "green" if remark and as_expected else "yellow"
+        return console.styled((f"incomplete, {required(summary).text}{remark}", colour))
+    if violated_by_fallback(summary):
+        phrase = "but in permanent fallback"
+    return console.styled((f"{crash(summary) or 'completed'}, {phrase}{remark}", colour))
+
+
+def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
+    """Every constraint with its bounds, peaks, margin, tolerances and verdict."""
+    caption = (
+        "margin: the one that decides, negative = violated, s: at the samples; tolerance: its own; beyond: seconds; "
+        "-: no value there"
+    )
+    if any(not entry["required"] for entry in constraints):
+        caption += ";  * reported, not required by the scenario"
+    head = ("constraint", "bounds", "sampled", "plant", "margin", "tolerance", "beyond", "verdict")
+    lines = []
+    for entry in constraints:
+        margin, tolerance = deciding_margin(entry)
+        at_samples = "" if margin == entry["worst_margin"] else " s"
+        lines.append(
+            (
+                f"{entry['name']} [{entry['unit']}]",
+                _range(entry["lower"], entry["upper"]),
+                *(_number(entry[name]) for name in ("peak_sampled", "peak_plant")),
+                f"{_number(margin)}{at_samples}",
+                _number(tolerance),
+                _number(entry["time_violated"]),
+                _verdict(entry),
+            )
+        )
+    return console.table("audit at the physics rate", head, lines, caption=caption, left=("verdict",), rigid=True)
+
+
+def _verdict(entry: Mapping[str, Any]) -> Text:
+    found = constraint_verdict(entry)
+    if found == "violated":
+        return console.styled(("VIOLATED", "red") if entry["required"] else ("exceeded*", "yellow"))
+    return console.styled((HELD[found], "green" if found == "satisfied" else "yellow"))
+
+
+def _tracking_table(tracking: Mapping[str, Any]) -> Table:
+    head = ["", *(f"{channel} [{unit}]" for channel, unit in tracking["unit"].items())]
+    lines = [
+        (name.replace("_", " "), *(f"{tracking[name][channel]:.4g}" for channel in tracking["unit"]))
+        for name in ("rmse", "max_error", "final_error", "overshoot")
+    ]
+    return console.table("tracking, real minus filtered reference", head, lines)
+
+
+def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    control, controller = summary["control"], summary["controller"]
+    times, usual = controller["step_ms"], OPTIMAL | {Phase.LANDED, Phase.CRASHED}
+    refused = ", ".join(f"{n} {status}" for status, n in controller["statuses"].items() if status not in usual)
+    where = f" ({controller['solver']})" if controller["solver"].startswith("C99") else ""
+    yield (
+        f"{law_name(controller['name'])}{where}: {counts(controller['answered_by'])}"
+        f"{f' ({refused})' if refused else ''}; "
+        f"step p50 {times['p50']:.3f}, p99 {times['p99']:.3f}, max {times['max']:.3f} ms "
+        f"of {controller['deadline_ms']:g} ms"
+    )
+    yield (
+        f"commanded speeds {control['speed_min']:.2f} .. {control['speed_max']:.2f} rad/s, "
+        f"steps {control['slew_min']:.2f} .. {control['slew_max']:.2f} rad/s per period; "
+        f"simulated in {summary['wall_s']['simulate']:.2f} s"
+    )
+
+
+def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What a flight's effects did, where it has them: events, ground, late commands, errors of the estimate."""
+    if events := summary.get("events"):
+        yield f"events: {'; '.join(event_sentences(events))}"
+    if "ground" in summary:
+        ground = summary["ground"]
+        left = "started in the air" if ground["started"] == "flying" else "never left it"
+        if ground["takeoff_time"] is not None:
+            left = f"left it at {ground['takeoff_time']:.2f} s"
+        touch = ground["touchdown"]
+        met = ""
+        if touch is not None:
+            met = (
+                f", met it at {touch['time']:.2f} s with {touch['speed']:.3g} m/s down, "
+                f"{touch['horizontal_speed']:.3g} m/s along and {touch['tilt']:.3g} deg of tilt"
+            )
+        yield f"ground: {left}{met}; {ground['phase']} at the end"
+    if "computation" in summary:
+        delay = summary["computation"]["delay_ms"]
+        yield (
+            f"simulated computation: p50 {delay['p50']:.3g}, p99 {delay['p99']:.3g}, max {delay['max']:.3g} ms; "
+            f"{summary['computation']['missed']} commands too late to be used"
+        )
+    if "estimation" in summary:
+        rmse = summary["estimation"]["rmse"]
+        lengths = ", ".join(f"{name} {rmse[name]:.3g}" for name in ("x", "y", "z"))
+        angles = ", ".join(f"{name} {math.degrees(rmse[name]):.3g}" for name in ("roll", "pitch", "yaw"))
+        yield f"RMS error of the measured state: {lengths} m; {angles} deg"
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value:.3g}".replace("e-0", "e-")
+
+
+def _range(lower: float | None, upper: float | None) -> str:
+    if lower is not None and upper is not None and lower == -upper:
+        return f"±{_number(upper)}"
+    return f"{_number(lower)}..{_number(upper)}"
