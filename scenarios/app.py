@@ -868,7 +868,7 @@ def tune(
         >>> import quadsim
         >>> quadsim.tune("paper-robust", trials=0)
         Traceback (most recent call last):
-        scenarios.schema.problems.ScenarioError: paper-robust.toml: trials must be a whole number >= 1 and <= 100000; got 0
+        scenarios.schema.problems.ScenarioError: paper-robust.toml: trials must be a whole number >= 1 ...
     """
     from scenarios.tuning.plan import load_tuning
     from scenarios.tuning.run import tune as carry_out
