@@ -38,6 +38,12 @@ def arrow(x1: float, y1: float, x2: float, y2: float, kind: str = "forward") -> 
     return f'<line {ends} stroke="{colour}" stroke-width="2" marker-end="url(#{kind})"/>'
 
 
+def beam(x1: float, y1: float, x2: float, y2: float) -> str:
+    """An arm of a vehicle, or all of it from the side."""
+    ends = f'x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"'
+    return f'<line {ends} stroke="{INK}" stroke-width="4" opacity=".6"/>'
+
+
 def from_above(vehicle_name: str, cx: float, cy: float) -> list[str]:
     """A vehicle from above, x up the page: rotors with their numbers and the sense in which they turn."""
     vehicle = load_vehicle(vehicle_name)
@@ -46,15 +52,13 @@ def from_above(vehicle_name: str, cx: float, cy: float) -> list[str]:
     for i, (azimuth, spin) in enumerate(zip(vehicle.rotor_azimuths, vehicle.rotor_spins, strict=True), 1):
         angle = math.radians(azimuth)
         x, y = cx - 95 * math.sin(angle), cy - 95 * math.cos(angle)
-        parts.append(f'<line x1="{cx}" y1="{cy}" x2="{x:.1f}" y2="{y:.1f}" stroke="{INK}" stroke-width="4" opacity=".5"/>')
+        parts.append(beam(cx, cy, x, y))
         parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="34" fill="none" stroke="{INK}" stroke-width="2"/>')
         # A reaction torque about +z is that of a rotor which turns clockwise, seen from above.
         sweep, (start, end) = (1, (-1, 1)) if spin > 0 else (0, (1, -1))
         at = 24 * math.cos(math.radians(35)), 24 * math.sin(math.radians(35))
-        parts.append(
-            f'<path d="M{x + start * at[0]:.1f} {y - at[1]:.1f} A24 24 0 0 {sweep} {x + end * at[0]:.1f} {y - at[1]:.1f}" '
-            f'fill="none" stroke="{TURN}" stroke-width="2" marker-end="url(#turn)"/>'
-        )
+        arc = f"M{x + start * at[0]:.1f} {y - at[1]:.1f} A24 24 0 0 {sweep} {x + end * at[0]:.1f} {y - at[1]:.1f}"
+        parts.append(f'<path d="{arc}" fill="none" stroke="{TURN}" stroke-width="2" marker-end="url(#turn)"/>')
         parts.append(text(x + 11, y + 25, f"{i}", colour=INK))
     return [*parts, text(cx, cy + 160, f"{vehicle.name}, from above")]
 
@@ -65,7 +69,7 @@ def tilted(cx: float, cy: float, title: str, towards: str, side: int) -> list[st
     dx, dy = 80 * math.cos(angle), 80 * math.sin(angle)
     up = 70 * math.sin(angle), -70 * math.cos(angle)
     return [
-        f'<line x1="{cx - dx:.1f}" y1="{cy - dy:.1f}" x2="{cx + dx:.1f}" y2="{cy + dy:.1f}" stroke="{INK}" stroke-width="5"/>',
+        beam(cx - dx, cy - dy, cx + dx, cy + dy),
         arrow(cx, cy, cx + up[0], cy + up[1], "turn"),
         text(cx + up[0] * 1.2, cy + up[1] * 1.2, "thrust", colour=TURN),
         arrow(cx + 40 * side, cy + 55, cx + 100 * side, cy + 55),

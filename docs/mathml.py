@@ -27,7 +27,10 @@ def _quoted(text: str) -> str:
 class Inline(InlineProcessor):
     """`$...$` within a paragraph."""
 
-    def handleMatch(self, m: re.Match[str], data: str) -> tuple[str | ElementTree.Element, int, int]:  # type: ignore[override]  # noqa: ARG002, D102, N802
+    def handleMatch(  # type: ignore[override]
+        self, m: re.Match[str], data: str
+    ) -> tuple[str | ElementTree.Element, int, int]:
+        """The formula, put aside as the Markdown library does with HTML, and its place."""
         return self.md.htmlStash.store(mathml(m.group(1), "inline")), m.start(0), m.end(0)
 
 
@@ -46,10 +49,12 @@ class Block(Preprocessor):
 class Formulas(Extension):
     """Both, of which code takes precedence."""
 
-    def extendMarkdown(self, md: Markdown) -> None:  # noqa: D102, N802
+    def extendMarkdown(self, md: Markdown) -> None:
+        """Register both."""
         md.preprocessors.register(Block(md), "mathml-block", 24)  # after fenced code, 25
         md.inlinePatterns.register(Inline(INLINE, md), "mathml", 185)  # after code in backticks, 190
 
 
-def makeExtension(**settings: object) -> Formulas:  # noqa: D103, N802
+def makeExtension(**settings: object) -> Formulas:
+    """The extension, as the Markdown library asks for it."""
     return Formulas(**settings)
