@@ -26,10 +26,8 @@ if TYPE_CHECKING:
     from quadsim.controller import Controller
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
-    from scenarios.campaign.replay import Replay
-    from scenarios.campaign.run import CampaignResult
-    from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
-    from scenarios.campaign.sweep import Sweep
+    from scenarios.campaign.campaign import CampaignResult, Replay, Sweep
+    from scenarios.campaign.paired import Comparison as CampaignComparison
     from scenarios.catalogue import Catalogue
     from scenarios.comparison import Comparison
     from scenarios.design.vehicle_figures import VehicleReport
@@ -40,7 +38,7 @@ if TYPE_CHECKING:
     from scenarios.results import Document, Listing, ScenarioFile
     from scenarios.run import StartedFlight
     from scenarios.schema.scenario import Scenario
-    from scenarios.tuning.run import TuningResult
+    from scenarios.tuning.tuning import TuningResult
 
     File: TypeAlias = str | Path
     PaperName: TypeAlias = File
@@ -408,7 +406,7 @@ def check(
         (True, ())
     """
     from scenarios import loading, reaudit
-    from scenarios.campaign.manifest import is_campaign
+    from scenarios.campaign.store import is_campaign
     from scenarios.junit import junit_file, write_junit
 
     file = None if junit is None else junit_file(junit)
@@ -666,7 +664,7 @@ def sweep(
         >>> found["controller.horizon"].tolist(), found["verdict"].tolist()
         ([20.0, 40.0], ['satisfied', 'satisfied'])
     """
-    from scenarios.campaign.sweep import fly_sweep
+    from scenarios.campaign.campaign import fly_sweep
     from scenarios.loading import as_scenario
     from scenarios.progress import reporting
     from scenarios.user_code import importable
@@ -738,10 +736,10 @@ def campaign(
         >>> found.table["verdict"].to_pylist()
         ['satisfied', 'satisfied', 'satisfied']
     """
+    from scenarios.campaign.campaign import fly_campaign
+    from scenarios.campaign.events import parse_event
     from scenarios.campaign.plan import load_plan, make_plan
-    from scenarios.campaign.results.events import parse_event
-    from scenarios.campaign.run import fly_campaign
-    from scenarios.campaign.statistics.requirement import judge, parse_requirement
+    from scenarios.campaign.statistics import judge, parse_requirement
     from scenarios.junit import junit_file, write_junit
     from scenarios.schema.scenario import Scenario
     from scenarios.user_code import importable
@@ -811,7 +809,7 @@ def replay(
         Traceback (most recent call last):
         quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
     """
-    from scenarios.campaign.replay import recorded_flight, replay_flight
+    from scenarios.campaign.campaign import recorded_flight, replay_flight
     from scenarios.flight import Outputs
     from scenarios.progress import reporting
 
@@ -870,9 +868,9 @@ def tune(
         Traceback (most recent call last):
         scenarios.schema.problems.ScenarioError: paper-robust.toml: trials must be >= 1; got 0
     """
-    from scenarios.tuning.plan import load_tuning
-    from scenarios.tuning.run import tune as carry_out
     from scenarios.tuning.search import require_optuna
+    from scenarios.tuning.tuning import tune as carry_out
+    from scenarios.tuning.tuning_plan import load_tuning
 
     require_optuna()
     plan = load_tuning(str(tuning), trials=trials, seed=seed)

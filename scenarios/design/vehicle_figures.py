@@ -16,7 +16,7 @@ from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import TorqueRange, authority, torque_ranges
-from scenarios.design.tuning import delay_margin, tune
+from scenarios.design.rules import delay_margin, tune
 from scenarios.results import Result, Shown
 
 SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
@@ -25,7 +25,7 @@ _RPM: Final = 60.0 / (2.0 * math.pi)
 
 @dataclass(frozen=True, kw_only=True)
 class Designed:
-    """What a controller made for a vehicle can do; see `scenarios.design.tuning`."""
+    """What a controller made for a vehicle can do; see `scenarios.design.rules`."""
 
     time_constants: dict[str, float]  # one over the bandwidth of each axis [s]
     limited_by: str  # what the bandwidth of x and y is the limit of: lag, torque or period

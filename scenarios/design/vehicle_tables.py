@@ -32,7 +32,7 @@ def vehicle_tables(report: VehicleReport) -> list[Grid]:
             "what a controller made for it can do",
             ("", "value", "unit"),
             _abilities(sheet),
-            note="quadsim scenario --for VEHICLE makes it; the rules: scenarios/design/tuning.py",
+            note="quadsim scenario --for VEHICLE makes it; the rules: scenarios/design/rules.py",
         ),
         _grid("linear model at hover", ("", "continuous [1/s]", f"discrete, {1e3 * sheet.period:g} ms"), _poles(sheet)),
         _grid(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -14,12 +14,10 @@ import pyarrow as pa
 from quadsim.errors import InputError, MissingPackageError
 from quadsim.outputs import Growing
 from quadsim.state import Array
-from scenarios.campaign.pilot import CampaignPilot
-from scenarios.campaign.results.store import Store
-from scenarios.campaign.results.table import Row
-from scenarios.campaign.spec import ChoiceSpec, IntegerSpec, LogUniformSpec, Value
-from scenarios.tuning.plan import START, SearchPlan, TuningPlan, Values
-from scenarios.tuning.spec import SearchSpec
+from scenarios.campaign.campaign_file import Choice, Integer, LogUniform, Value
+from scenarios.campaign.rows import Row
+from scenarios.campaign.store import Store
+from scenarios.tuning.tuning_plan import START, Searched, SearchPlan, TuningPlan, Values
 
 if TYPE_CHECKING:
     from optuna.trial import Trial
@@ -59,11 +57,9 @@ class Score:
 class Search:
     """The study and the flights of its candidates: trial n is candidate n, and trial 0 the start."""
 
-    def __init__(
-        self, plan: TuningPlan, files: Growing, fly: Callable[..., Generator[Row]], watch: Callable[..., None]
-    ) -> None:
+    def __init__(self, plan: TuningPlan, files: Growing, watch: Callable[..., None], **where: Any) -> None:
         optuna = require_optuna()
-        self._plan, self._fly, self._watch, self._started = plan, fly, watch, clock.perf_counter()
+        self._plan, self._watch, self._where, self._started = plan, watch, where, clock.perf_counter()
         self.candidates: dict[int, Values] = {START: {}}
         self.scores: dict[int, Score] = {}
         self._flights = SearchPlan(plan.start.spec, plan.start.scenario, tuning=plan, candidates=self.candidates)
@@ -165,7 +161,7 @@ class Search:
         if not missing:
             return
         try:
-            with closing(self._fly(CampaignPilot(plan), missing)) as rows:
+            with closing(plan.fly_all(missing, **self._where)) as rows:
                 for row in rows:
                     self._store.add(row)
                     self._rows[row["flight"]] = row
@@ -199,16 +195,16 @@ class Search:
         return next((c for c in near if np.less_equal(scores[c].values, start.values).all()), START), front
 
 
-def _distribution(kinds: Any, entry: SearchSpec) -> Any:
+def _distribution(kinds: Any, entry: Searched) -> Any:
     match entry:
-        case ChoiceSpec():
+        case Choice():
             return kinds.CategoricalDistribution(entry.values)
-        case IntegerSpec():
+        case Integer():
             return kinds.IntDistribution(entry.low, entry.high)
-    return kinds.FloatDistribution(entry.low, entry.high, log=isinstance(entry, LogUniformSpec))
+    return kinds.FloatDistribution(entry.low, entry.high, log=isinstance(entry, LogUniform))
 
 
-def _contains(entry: SearchSpec, value: Value | None) -> bool:
-    if isinstance(entry, ChoiceSpec):
+def _contains(entry: Searched, value: Value | None) -> bool:
+    if isinstance(entry, Choice):
         return value in entry.values
     return isinstance(value, int | float) and entry.low <= value <= entry.high

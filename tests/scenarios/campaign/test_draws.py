@@ -11,20 +11,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from scenarios.campaign.draws import Draws
+from scenarios.campaign.campaign_file import CampaignFile, Draws
 from scenarios.campaign.plan import parse_campaign
-from scenarios.campaign.spec import CampaignSpec
 
 SAMPLINGS = ("random", "latin_hypercube", "sobol", "halton")
 
 
-def campaign(*vary: dict[str, Any], flights: int = 400, seed: int = 1, sampling: str = "random") -> CampaignSpec:
+def campaign(*vary: dict[str, Any], flights: int = 400, seed: int = 1, sampling: str = "random") -> CampaignFile:
     entries = [{"name": f"p{i}", "fields": [f"vehicle.inertia.{i}"], **entry} for i, entry in enumerate(vary)]
     data = {"name": "c", "scenario": "hover", "flights": flights, "seed": seed, "sampling": sampling, "vary": entries}
     return parse_campaign(data, source="test")
 
 
-def column(spec: CampaignSpec, name: str = "p0") -> list[Any]:
+def column(spec: CampaignFile, name: str = "p0") -> list[Any]:
     draws = Draws(spec)
     return [draws.values(flight)[name] for flight in range(spec.flights)]
 

@@ -12,11 +12,10 @@ from browser import open_page
 
 from quadsim.report.figure import Panel
 from quadsim.report.to_matplotlib import to_png
-from scenarios.campaign.report.campaign_page import histograms, overview, scatters, write_report
-from scenarios.campaign.results.table import Summary
-from scenarios.campaign.spec import CampaignSpec
-from scenarios.campaign.statistics.estimates import estimate
-from scenarios.campaign.statistics.wording import interval, percent
+from scenarios.campaign.campaign_file import CampaignFile
+from scenarios.campaign.campaign_report import histograms, overview, scatters, write_report
+from scenarios.campaign.rows import Summary
+from scenarios.campaign.statistics import estimate, interval, percent
 
 MakeCampaign = Callable[..., pa.Table]
 
@@ -41,7 +40,7 @@ CASES = {"five": (5, 1.0), "clean": (60, 0.0), "lost": (40, 100.0), "one": (1, 1
 def write(directory: Path, table: pa.Table, text: str = "What is flown.", summary: Summary | None = None) -> str:
     directory.mkdir(exist_ok=True)
     failure = ["violated", "rmse.z > 0.5"]
-    spec = CampaignSpec(name=NAME, description=text, scenario="hover", flights=1, failure=failure)
+    spec = CampaignFile(name=NAME, description=text, scenario="hover", flights=1, failure=failure)
     page = write_report(directory, table, json.loads(json.dumps(summary or estimate(table))), spec)
     assert page == directory / "index.html"
     return page.read_text()

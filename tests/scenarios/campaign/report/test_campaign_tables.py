@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pyarrow as pa
 
-from scenarios.campaign.report.campaign_tables import group_table, worst_draws_table, worst_table
-from scenarios.campaign.statistics.estimates import estimate
+from scenarios.campaign.campaign_report import group_table, worst_draws_table, worst_table
+from scenarios.campaign.statistics import estimate
 
 MakeCampaign = Callable[..., pa.Table]
 

@@ -5,7 +5,7 @@ import pyarrow as pa
 import pytest
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from scenarios.campaign.results.events import parse_event
+from scenarios.campaign.events import parse_event
 
 ROW = {
     **{"failed": False, "violated": True, "crashed": False, "verdict": "lost"},

@@ -14,9 +14,10 @@ import pytest
 
 from quadsim.errors import FileError, OutputError
 from quadsim.outputs import Growing, growing
-from scenarios.campaign.results.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store, read_flights
-from scenarios.campaign.results.table import Row, failed_row, make_schema, make_table, read_table
+from scenarios.campaign.rows import Row, make_schema, make_table, read_table
+from scenarios.campaign.store import FLIGHTS_FILE, PARTS_DIR, TIMES_FILE, Store, read_flights
 
+FAILED: Row = {"status": "error", "verdict": "error", "reason": "x", "violated": True, "crashed": False}
 SCHEMA = make_schema({"mass": (pa.float64(), "kg")}, [])
 
 
@@ -28,7 +29,7 @@ def store_in(directory: Path, schema: pa.Schema = SCHEMA) -> Iterator[Store]:
 
 
 def row(flight: int) -> Row:
-    return {"flight": flight, "seed": 7, "draw.mass": 0.5 * flight, "failed": False, "wall_s": 1.0} | failed_row("x")
+    return {"flight": flight, "seed": 7, "draw.mass": 0.5 * flight, "failed": False, "wall_s": 1.0} | FAILED
 
 
 def flights(store: Store) -> list[int]:

@@ -9,11 +9,9 @@ import pyarrow as pa
 import pytest
 
 from quadsim.errors import InputError, OutputError
-from scenarios.campaign.report.campaign_page import write_comparison_report
-from scenarios.campaign.report.comparison_tables import comparison_markdown
-from scenarios.campaign.results.events import EVENT_NAMES
-from scenarios.campaign.statistics.comparison import compare
-from scenarios.campaign.statistics.inference import holm
+from scenarios.campaign.events import EVENT_NAMES
+from scenarios.campaign.paired import compare
+from scenarios.campaign.statistics import holm
 
 MakeCampaign = Callable[..., pa.Table]
 
@@ -54,7 +52,7 @@ def test_losses_are_compared_beside_failures(make_campaign: MakeCampaign) -> Non
     many = ["lost"] * 12 + ["violated"] * 28
     found = compare(changed(one, "verdict", many), changed(other, "verdict", ["violated"] * 40), NAMES)
     assert "not distinguishable by their failures" in found.sentence
-    table = comparison_markdown(found)
+    table = found.to_markdown()
     assert "| lost | 12 (30.0 %) | 0 (0 %) | 12 | 0 | 0 | p < 0.001 | **p < 0.001** |" in table
     assert "| timeout |" not in table, "it never happened"
 
@@ -94,7 +92,7 @@ def test_flights_of_one_campaign_alone_are_left_out(thousand: pa.Table, better: 
     found = compare(thousand, better.take(order), NAMES)
     assert (found.flights, found.left_out) == (600, 400)
     assert found.events == compare(thousand.slice(0, 600), better.slice(0, 600), NAMES).events
-    assert "400 flights are left out" in comparison_markdown(found)
+    assert "400 flights are left out" in found.to_markdown()
 
 
 def test_campaigns_of_one_name_are_distinguished(thousand: pa.Table, better: pa.Table) -> None:
@@ -136,7 +134,7 @@ def test_what_one_campaign_alone_draws_is_reported(thousand: pa.Table, better: p
     found = compare(thousand.drop_columns(["draw.lag"]), better, NAMES)
     assert found.own_draws == ("lag",)
     assert "lag" not in found.shared_draws
-    assert "one campaign alone draws lag" in comparison_markdown(found)
+    assert "one campaign alone draws lag" in found.to_markdown()
 
 
 def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.Table) -> None:
@@ -144,13 +142,13 @@ def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.T
     plain = found.to_json()
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
     assert plain["verdict"] == "better"
-    text = comparison_markdown(found)
+    text = found.to_markdown()
     assert text.startswith("# robust against paper\n\nPairs share their seed")
     assert "\n\nrobust is better than paper" in text
     assert "differ:" not in text.partition("robust is better")[0], "nobody said what differs"
     same, other = (compare(thousand, better, NAMES, differences=d) for d in ((), (("effects.air", None, 3e-4),) * 2))
-    assert "Fields in which the campaigns differ: 0." in comparison_markdown(same)
-    before = comparison_markdown(other).partition("robust is better")[0]
+    assert "Fields in which the campaigns differ: 0." in same.to_markdown()
+    before = other.to_markdown().partition("robust is better")[0]
     assert "Fields in which the campaigns differ: 2." in before
     assert "| effects.air | absent | 0.0003 |" in before
     assert "| failure | 30 (3.0 %) |" in text
@@ -159,16 +157,16 @@ def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.T
 
 def test_the_page_stands_with_its_files(thousand: pa.Table, better: pa.Table, tmp_path: Path) -> None:
     hostile = ("<b>paper</b>", "robust & more")
-    page = write_comparison_report(compare(thousand, better, hostile), tmp_path / "out")
+    page = compare(thousand, better, hostile).write_report(tmp_path / "out")
     names = {path.name for path in page.parent.iterdir()}
     assert names == {"index.html", "comparison.json", "comparison.md", "summary.json"}
     text = page.read_text()
     assert "<b>paper</b>" not in text
     assert "&lt;b&gt;paper&lt;/b&gt;" in text
-    write_comparison_report(compare(thousand, thousand, NAMES), tmp_path / "out", overwrite=True)
+    compare(thousand, thousand, NAMES).write_report(tmp_path / "out", overwrite=True)
     assert "not distinguishable" in page.read_text()
     theirs = tmp_path / "theirs"
     theirs.mkdir()
     (theirs / "index.html").write_text("mine")
     with pytest.raises(OutputError, match="it is not empty"):
-        write_comparison_report(compare(thousand, better, NAMES), theirs)
+        compare(thousand, better, NAMES).write_report(theirs)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from scenarios.campaign.statistics.dependence import Dependence, dependence
+from scenarios.campaign.statistics import Dependence, dependence
 
 
 def related(x: np.ndarray, y: np.ndarray) -> Dependence | None:

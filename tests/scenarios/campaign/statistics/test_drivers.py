@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from scenarios.campaign.report.campaign_tables import driver_sentence, driver_table
-from scenarios.campaign.statistics.estimates import estimate, parameters
+from scenarios.campaign.campaign_report import driver_sentence, driver_table
+from scenarios.campaign.statistics import estimate, parameters
 
 MakeCampaign = Callable[..., pa.Table]
 

@@ -9,10 +9,9 @@ import pytest
 from scipy import stats
 
 from quadsim.errors import InputError, ParameterError
-from scenarios.campaign.report.campaign_tables import event_table, verdict_sentence
-from scenarios.campaign.statistics.comparison import compare
-from scenarios.campaign.statistics.estimates import estimate, ranking, worst_flight
-from scenarios.campaign.statistics.requirement import judge, parse_requirement
+from scenarios.campaign.campaign_report import event_table, verdict_sentence
+from scenarios.campaign.paired import compare
+from scenarios.campaign.statistics import estimate, judge, parse_requirement, ranking, worst_flight
 
 MakeCampaign = Callable[..., pa.Table]
 NONE = ("incomplete", "died", "timeout", "memory")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from scenarios.campaign.statistics.inference import (
+from scenarios.campaign.statistics import (
     holm,
     lower_bounds,
     mcnemar,
@@ -20,12 +20,12 @@ from scenarios.campaign.statistics.inference import (
 def test_the_interval_is_scipys(count: int, trials: int) -> None:
     found = proportion(count, trials)
     exact = stats.binomtest(count, trials).proportion_ci(0.95, method="exact")
-    assert (found.lower, found.upper) == pytest.approx((exact.low, exact.high), abs=1e-9)
+    assert (found["lower"], found["upper"]) == pytest.approx((exact.low, exact.high), abs=1e-9)
     one_sided = stats.binomtest(count, trials, alternative="less").proportion_ci(0.95, method="exact")
-    assert found.upper_one_sided == pytest.approx(one_sided.high, abs=1e-9)
+    assert found["upper_one_sided"] == pytest.approx(one_sided.high, abs=1e-9)
     other = stats.binomtest(count, trials, alternative="greater").proportion_ci(0.9, method="exact")
     assert lower_bounds(count, trials, 0.9) == pytest.approx(other.low, abs=1e-9)
-    assert found.share == count / trials
+    assert found["share"] == count / trials
 
 
 def test_bounds_in_closed_form() -> None:
@@ -33,7 +33,7 @@ def test_bounds_in_closed_form() -> None:
     assert lower_bounds(50, 50, 0.99) == pytest.approx(0.01 ** (1.0 / 50.0), rel=1e-12)
     assert (upper_bounds(50, 50), lower_bounds(0, 50)) == (1.0, 0.0)
     nothing = proportion(0, 0)
-    assert (nothing.share, nothing.lower, nothing.upper, nothing.upper_one_sided) == (None, 0.0, 1.0, 1.0)
+    assert (nothing["share"], nothing["lower"], nothing["upper"], nothing["upper_one_sided"]) == (None, 0.0, 1.0, 1.0)
 
 
 @pytest.mark.parametrize("p", [0.002, 0.03, 0.2, 0.5, 0.97])
@@ -51,7 +51,7 @@ def test_bounds_have_their_nominal_coverage(n: int, p: float) -> None:
 def test_intervals_cover_simulated_campaigns() -> None:
     rng = np.random.default_rng(1)
     found = [proportion(int(count), 300) for count in rng.binomial(300, 0.04, 2000)]
-    covered = np.mean([one.lower <= 0.04 <= one.upper for one in found])
+    covered = np.mean([one["lower"] <= 0.04 <= one["upper"] for one in found])
     assert 0.95 <= covered < 0.985
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from scenarios.campaign.statistics.requirement import judge, least_flights, parse_requirement
+from scenarios.campaign.statistics import judge, least_flights, parse_requirement
 
 
 def flown(flights: int, violated: int) -> pa.Table:

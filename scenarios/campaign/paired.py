@@ -15,8 +15,11 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError
-from scenarios.campaign.results.events import EVENT_NAMES, Flags, parse_event
-from scenarios.campaign.results.table import (
+from quadsim.outputs import to_json, writing
+from quadsim.report.page import PAGE_FILE, Section, render_page
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
+from scenarios.campaign.events import EVENT_NAMES, Flags, parse_event
+from scenarios.campaign.rows import (
     DRAW,
     SATISFIED,
     constraint_names,
@@ -27,11 +30,23 @@ from scenarios.campaign.results.table import (
     texts,
     unit_of,
 )
-from scenarios.campaign.statistics import inference
-from scenarios.campaign.statistics.estimates import FAILURE
-from scenarios.campaign.statistics.wording import p_value
+from scenarios.campaign.statistics import (
+    ALPHA,
+    CONFIDENCE,
+    FAILURE,
+    PairedDifference,
+    holm,
+    label,
+    mcnemar,
+    p_value,
+    paired_difference,
+    percent,
+)
 from scenarios.results import Result, Shown
+from scenarios.schema.settings import shown
 
+COMPARISON_FILE: Final = "comparison.json"
+TABLE_FILE: Final = "comparison.md"
 COMPARED: Final = (
     *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
     *(f"max_error.{name}" for name in ("x", "y", "z")),
@@ -74,7 +89,7 @@ class MetricComparison:
     unit: str
     mean_a: float | None  # None of no pairs
     mean_b: float | None
-    difference: inference.PairedDifference  # of the second less the first
+    difference: PairedDifference  # of the second less the first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +111,7 @@ class Comparison(Result):
     def verdict(self) -> str:
         """`better`, `worse` or `not distinguishable`: of the second campaign, by its failures at a level of 5 %."""
         failure = self.events[0]
-        if failure.p >= inference.ALPHA:
+        if failure.p >= ALPHA:
             return "not distinguishable"
         return "better" if failure.only_b < failure.only_a else "worse"
 
@@ -112,23 +127,68 @@ class Comparison(Result):
             f"with {a} (McNemar's exact test, {p_value(failure.p)})."
         )
 
+    @property
+    def pairing(self) -> str:
+        """What the pairs have in common, and what they have not."""
+        phrase = f"Pairs share {', '.join(('their seed', *self.shared_draws))}"
+        if self.own_draws:
+            phrase += f"; one campaign alone draws {', '.join(self.own_draws)}"
+        if self.left_out:
+            phrase += f"; {self.left_out} flights are left out, as one of their pair is absent or incomplete"
+        if self.differences is not None:
+            phrase += f". Fields in which the campaigns differ: {len(self.differences)}"
+        return f"{phrase}."
+
+    @property
+    def difference_tables(self) -> tuple[Grid, ...]:
+        """The fields in which the campaigns' scenarios and draws differ; no table where none does."""
+        lines = tuple(line(field, shown(a), shown(b)) for field, a, b in self.differences or ())
+        grid = Grid(key="differences", title="What differs", head=("field", *self.names), lines=lines)
+        return (grid,) if lines else ()
+
+    @property
+    def tables(self) -> tuple[Grid, Grid]:
+        """Events, and metrics."""
+        return _event_table(self), _metric_table(self)
+
     def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios import console
-        from scenarios.campaign.report.comparison_tables import comparison_tables, difference_table, pairing
 
-        yield pairing(self)
-        yield from console.grids(difference_table(self))
+        yield self.pairing
+        yield from console.grids(self.difference_tables)
         yield self.sentence
-        yield from console.grids(comparison_tables(self))
+        yield from console.grids(self.tables)
         if self.page is not None:
             yield console.written_to(self.page)
 
     def to_markdown(self) -> str:
-        """The same as Markdown."""
-        from scenarios.campaign.report.comparison_tables import comparison_markdown
+        """What differs, the verdict, and its tables."""
+        head = [f"# {self.names[1]} against {self.names[0]}\n", f"{self.pairing}\n"]
+        verdict = [*map(section, self.difference_tables), f"{self.sentence}\n", *map(section, self.tables)]
+        return "\n".join([*head, *verdict])
 
-        return comparison_markdown(self)
+    def write_report(self, directory: Path, *, overwrite: bool = False) -> Path:
+        """Write `index.html`, `comparison.json` and `comparison.md`, together or not at all; the page.
+
+        Raises:
+            OutputError: the directory cannot be written, or holds something else.
+        """
+        sections = [
+            Section(title="What is compared", text=(self.pairing,), tables=self.difference_tables),
+            Section(title="Which is better", text=(self.sentence,), tables=self.tables),
+        ]
+        title = f"{self.names[1]} against {self.names[0]}"
+        files = {file: file for file in (COMPARISON_FILE, TABLE_FILE)}
+        texts = {
+            COMPARISON_FILE: to_json(self.to_json()),
+            TABLE_FILE: self.to_markdown(),
+            PAGE_FILE: render_page("campaign comparison", title, sections, files=files),
+        }
+        with writing(directory, overwrite=overwrite) as partial:
+            for name, text in texts.items():
+                (partial / name).write_text(text, encoding="utf-8")
+        return directory / PAGE_FILE
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for a file; differences are of the second campaign less the first."""
@@ -136,7 +196,7 @@ class Comparison(Result):
             "names": list(self.names),
             "verdict": self.verdict,
             "sentence": self.sentence,
-            "confidence": inference.CONFIDENCE,
+            "confidence": CONFIDENCE,
             **{name: getattr(self, name) for name in ("flights", "left_out", "completed")},
             "shared_draws": list(self.shared_draws),
             "own_draws": list(self.own_draws),
@@ -185,7 +245,9 @@ def compare(
     draws_a, draws_b = draw_names(a), draw_names(b)
     shared_draws = tuple(name for name in draws_a if name in draws_b)
     for column in ("seed", *(DRAW + name for name in shared_draws)):
-        for flight, *values in zip(*(each.to_pylist() for each in (a["flight"], a[column], b[column])), strict=True):
+        for flight, *values in zip(
+            *(values.to_pylist() for values in (a["flight"], a[column], b[column])), strict=True
+        ):
             if values[0] != values[1]:
                 raise InputError(
                     f"flight {flight} of {names[0]!r} has {column} = {values[0]!r}, and of {names[1]!r} {values[1]!r}: "
@@ -220,9 +282,9 @@ def _require_same_questions(
             "campaigns with the same failure events can be compared; fly one of them again with the other's"
         )
     for name, one, other in ((names[0], a, b), (names[1], b, a)):
-        if own := sorted(set(constraint_names(one)) - set(constraint_names(other))):
+        if alone := sorted(set(constraint_names(one)) - set(constraint_names(other))):
             raise InputError(
-                f"{name!r} alone has the constraints {', '.join(own)}: only campaigns that are audited against the "
+                f"{name!r} alone has the constraints {', '.join(alone)}: only campaigns that are audited against the "
                 "same constraints can be compared"
             )
 
@@ -236,9 +298,9 @@ def _compare_events(a: pa.Table, b: pa.Table) -> tuple[EventComparison, ...]:
     for name in constraint_names(a):
         happened[f"{name} not held"] = [~flags(table, SATISFIED + name, absent=False) for table in (a, b)]
     alone = {event: (int((in_a & ~in_b).sum()), int((in_b & ~in_a).sum())) for event, (in_a, in_b) in happened.items()}
-    p = {event: inference.mcnemar(*counts) for event, counts in alone.items()}
+    p = {event: mcnemar(*counts) for event, counts in alone.items()}
     tested = [event for event, counts in alone.items() if any(counts)]
-    corrected = dict(zip(tested, inference.holm([p[event] for event in tested]), strict=True))
+    corrected = dict(zip(tested, holm([p[event] for event in tested]), strict=True))
     return tuple(
         EventComparison(
             event=event,
@@ -263,5 +325,47 @@ def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> Me
         unit=unit_of(a, name),
         mean_a=float(first.mean()) if first.size else None,
         mean_b=float(second.mean()) if second.size else None,
-        difference=inference.paired_difference(first, second),
+        difference=paired_difference(first, second),
+    )
+
+
+def _event_table(comparison: Comparison) -> Grid:
+    a, b = comparison.names
+    lines = []
+    for event in comparison.events:
+        counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
+        pairs = map(str, (event.only_a, event.only_b, event.both))
+        sure = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
+        if any(event.counts):
+            corrected = Cell(text=p_value(event.p_holm), mark=sure)
+            lines.append(line(event.event, *counts, *pairs, p_value(event.p), corrected))
+    return Grid(
+        key="events",
+        title="Events",
+        head=("event", a, b, f"{a} alone", f"{b} alone", "both", "p", "after Holm"),
+        lines=tuple(lines),
+        note="p: McNemar's exact test, two-sided, of each event by itself; the verdict is by that of failure. After "
+        "Holm: corrected for all events that one flight of a pair alone had; bold: beyond chance at "
+        f"{100.0 * ALPHA:g} %.",
+    )
+
+
+def _metric_table(comparison: Comparison) -> Grid:
+    a, b = comparison.names
+    lines = []
+    for metric in comparison.metrics:
+        difference, ends, mark = metric.difference, ABSENT, Mark.NONE
+        if difference.lower is not None and difference.upper is not None:
+            ends = f"{format_number(difference.lower)} to {format_number(difference.upper)}"
+            mark = Mark.BEST if difference.lower > 0.0 or difference.upper < 0.0 else Mark.NONE
+        means = map(format_number, (metric.mean_a, metric.mean_b))
+        mean = Cell(text=format_number(difference.mean), mark=mark)
+        lines.append(line(label(metric.name, metric.unit), *means, mean, ends, str(difference.pairs)))
+    return Grid(
+        key="metrics",
+        title="Metrics",
+        head=("metric", f"{a}, mean", f"{b}, mean", "mean difference", f"{100.0 * CONFIDENCE:g} % interval", "pairs"),
+        lines=tuple(lines),
+        note=f"Over the {comparison.completed} of {comparison.flights} pairs in which both flights were completed. "
+        f"Differences are {b} less {a}; bold where Student's t interval does not hold 0.",
     )

@@ -1,21 +1,38 @@
-"""A tuning ready to be flown: its file, and the campaigns of its start and of each candidate."""
+"""A tuning ready to be flown: its file, what is to be small, and the campaigns of its start and of each candidate."""
 
 from __future__ import annotations
 
+import ast
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import operator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 import pyarrow as pa
 import tomlkit
-from pydantic import ValidationError
+from annotated_types import Ge, Le, MaxLen, MinLen, doc
+from pydantic import Field
 
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.state import Array
+from scenarios.campaign.campaign_file import (
+    MOST_FLIGHTS,
+    CampaignFile,
+    Choice,
+    Integer,
+    LogUniform,
+    Name,
+    Seed,
+    Uniform,
+    Value,
+    Varied,
+    check_fields,
+)
+from scenarios.campaign.events import Event, is_number, parse_event
 from scenarios.campaign.plan import (
     Plan,
     cell,
@@ -26,32 +43,112 @@ from scenarios.campaign.plan import (
     parse_campaign,
     read_campaign,
 )
-from scenarios.campaign.results.events import Event, is_number, parse_event
-from scenarios.campaign.results.table import Row
-from scenarios.campaign.spec import CampaignSpec, Value, VaryBase, check_fields
-from scenarios.campaign.statistics.requirement import Requirement, parse_requirement
+from scenarios.campaign.rows import Row
+from scenarios.campaign.statistics import Requirement, parse_requirement
 from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
 from scenarios.schema.bases import merge
-from scenarios.schema.problems import ScenarioError, describe_all
+from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
 from scenarios.schema.writing import to_toml
 from scenarios.shipped import tuning_path
-from scenarios.tuning.objective import value_of
-from scenarios.tuning.spec import TuningSpec
 
 START: Final = 0  # the candidate that is the scenario as it is
+Searched = Annotated[Uniform | LogUniform | Integer | Choice, Field(discriminator="distribution")]
 OWN: Final = ("name", "description", "flights", "seed")  # fields of a campaign that a tuning has itself
 Values = Mapping[str, Value]
 """Of a candidate, by the names of the entries of `[[search]]`; empty of the start."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Objective:
+    """A number that is to be small."""
+
+    name: Annotated[Name, doc("letters, digits, _ and -")]
+    expression: Annotated[
+        str,
+        MaxLen(500),
+        doc(
+            "of a flight: columns of a campaign's results, numbers, + - * / **, sqrt, abs, min, max; minus it where "
+            "more is better"
+        ),
+    ]
+    unit: Annotated[str, MaxLen(20), doc("of it, for tables and plots")] = "-"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fresh:
+    """The draws, new to both, on which the answer is compared with the start."""
+
+    flights: Annotated[int, Ge(2), Le(MOST_FLIGHTS), doc("of each of the two")] = 300
+    seed: Annotated[Seed, doc("of these draws; not that of the search")] = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class TuningFile:
+    """A search for better values of a scenario's fields."""
+
+    name: Annotated[
+        str,
+        Field(pattern=r"^[a-z0-9][a-z0-9._-]*$"),
+        MaxLen(60),
+        doc("letters a-z, digits and . _ -; names the tuning's directory"),
+    ]
+    description: Annotated[str, doc("one line")] = ""
+    seed: Annotated[Seed, doc("of the draws that all candidates meet, and of the search")] = 0
+    trials: Annotated[int, Ge(1), Le(100_000), doc("candidates besides the start; a multiple of batch")]
+    batch: Annotated[int, Ge(1), Le(1000), doc("candidates that are proposed at once")] = 12
+    flights: Annotated[
+        list[Annotated[int, Ge(1), Le(MOST_FLIGHTS)]],
+        MinLen(1),
+        MaxLen(10),
+        doc("rising: all candidates fly the first number of draws, those that are no worse than the best go on"),
+    ] = field(default_factory=lambda: [4, 12, 36])
+    require: Annotated[
+        str,
+        doc(
+            'what no answer may fail, e.g. "P(violation) < 0.01 @ 95%": in the search by the share of flights, '
+            "on fresh draws with that confidence"
+        ),
+    ]
+    guard: Annotated[
+        str | None,
+        doc(
+            'an event that counts instead of that of require in the search, e.g. "worst_margin < 0.02": few '
+            "flights see near misses before they see failures"
+        ),
+    ] = None
+    fresh: Fresh = Fresh()
+    objectives: Annotated[list[Objective], MinLen(1), MaxLen(2), doc("one, or two for a Pareto front")]
+    search: Annotated[list[Searched], MinLen(1), MaxLen(50), doc("what is searched")]
+    campaign: Annotated[dict[str, Any], doc("what is flown: fields of a campaign file, or a campaign as its base")]
+
+    def __post_init__(self) -> None:
+        if self.trials % self.batch:
+            raise ValueError(f"trials must be a multiple of batch, {self.batch}; got {self.trials}")
+        if sorted(set(self.flights)) != self.flights:
+            raise ValueError(f"flights must rise; got {self.flights}")
+        if self.fresh.seed == self.seed:
+            raise ValueError(f"fresh.seed must not be seed, {self.seed}, whose draws choose the answer")
+        for what, names in (
+            ("objectives", [objective.name for objective in self.objectives]),
+            ("search", [entry.name for entry in self.search]),
+        ):
+            if len(set(names)) < len(names):
+                raise ValueError(f"{what} must have distinct names; got {names}")
+        for entry in self.search:
+            if isinstance(entry, Choice) and entry.weights is not None:
+                raise ValueError(f"search.{entry.name}.weights must be absent: nothing is drawn")
+            if isinstance(entry, Choice) and isinstance(entry.values[0], list):
+                raise ValueError(f"search.{entry.name}.values must be no lists: search their entries, by index")
 
 
 @dataclass(frozen=True)
 class TuningPlan:
     """A tuning's file and the campaign of its start."""
 
-    spec: TuningSpec  # the file
+    spec: TuningFile  # the file
     start: Plan  # on the draws of the search; its scenario has every number of its vehicle in it
 
     @property
@@ -90,8 +187,7 @@ class TuningPlan:
 
     def fresh(self, values: Values, name: str) -> Plan:
         """The campaign of a candidate on fresh draws; errors: `candidate`."""
-        changes = {"name": name, **dict(self.spec.fresh)}
-        return Plan(self.start.spec.model_copy(update=changes), self.candidate(values, name))
+        return Plan(replace(self.start.spec, name=name, **asdict(self.spec.fresh)), self.candidate(values, name))
 
     def shown(self, values: Values) -> dict[str, Value | str | None]:
         """The searched values of a candidate as tables have them; None where the start has no single one."""
@@ -129,7 +225,7 @@ class TuningPlan:
                 value_of(objective.expression, {name: 1.0 for name, kind in columns.items() if is_number(kind)})
         check_ends(self.spec.search, self._check_at, table="search")
 
-    def _check_at(self, entry: VaryBase, value: Value) -> None:
+    def _check_at(self, entry: Varied, value: Value) -> None:
         scenario = self.candidate({entry.name: value}, self.spec.name)
         if build_limits(scenario) != build_limits(self.start.scenario):
             rule = (
@@ -141,8 +237,8 @@ class TuningPlan:
 
     def to_toml(self) -> str:
         """The file with every field, for a directory that has the start as `scenario.toml`."""
-        campaign = self.start.spec.model_copy(update={"scenario": "scenario.toml", "set": {}})
-        document = tomlkit.parse(to_toml(self.spec.model_copy(update={"campaign": {}})))
+        campaign = replace(self.start.spec, scenario="scenario.toml", set={})
+        document = tomlkit.parse(to_toml(replace(self.spec, campaign={})))
         document["campaign"] = {
             key: value for key, value in tomlkit.parse(campaign.to_toml()).items() if key not in OWN
         }
@@ -197,10 +293,7 @@ def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None
     """
     path, data = tuning_path(name), read_campaign(name, tuning_path)
     data |= {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
-    try:
-        spec = TuningSpec.model_validate(data)
-    except ValidationError as error:
-        raise ScenarioError(path.name, describe_all(error, data, TuningSpec, file="tuning")) from error
+    spec = parse_table(TuningFile, data, path.name, file="tuning")
     try:
         campaign = _campaign(spec, source=f"{path.name}: campaign")
         check_fields(spec.search, "search", {each: entry.name for entry in campaign.vary for each in entry.fields})
@@ -213,7 +306,7 @@ def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None
     return plan
 
 
-def _campaign(spec: TuningSpec, *, source: str) -> CampaignSpec:
+def _campaign(spec: TuningFile, *, source: str) -> CampaignFile:
     """The tables of `[campaign]` over those of its base, with what the tuning has itself."""
     base = spec.campaign.get("base")
     if not isinstance(base, str | None):
@@ -223,3 +316,54 @@ def _campaign(spec: TuningSpec, *, source: str) -> CampaignSpec:
     own = {"name": spec.name, "description": spec.description, "flights": spec.flights[-1], "seed": spec.seed}
     tables = {key: value for key, value in spec.campaign.items() if key != "base"}
     return parse_campaign(merge(read_campaign(base) if base else {}, tables | own), source=source)
+
+
+_OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
+    **{ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul},
+    **{ast.Div: operator.truediv, ast.Pow: math.pow, ast.USub: operator.neg},
+}
+_FUNCTIONS: Final[dict[str, Callable[..., float]]] = {"sqrt": math.sqrt, "abs": abs, "min": min, "max": max}
+
+
+def value_of(expression: str, row: Mapping[str, Any]) -> float:
+    """The value of e.g. `sqrt(rmse.x**2 + rmse.y**2)` in a flight; NaN where it has no such number, or no finite one.
+
+    Raises:
+        InputError: it is no arithmetic on columns.
+        UnknownNameError: the flight has no such column.
+    """
+    rule = f"with + - * / ** and {', '.join(_FUNCTIONS)}, such as 'rmse.x + rmse.y'"
+    refused = InputError(f"{expression!r} must be arithmetic on columns, {rule}")
+    try:
+        tree = ast.parse(expression.strip(), mode="eval")
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise refused from error
+    try:
+        value = _value(tree.body, row)
+    except InputError:
+        raise
+    except (ArithmeticError, ValueError):
+        return math.nan
+    except TypeError as error:
+        raise refused from error
+    return value if math.isfinite(value) else math.nan
+
+
+def _value(node: ast.expr, row: Mapping[str, Any]) -> float:
+    match node:
+        case ast.Constant(value=int() | float() as number):
+            return float(number)
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
+            return _OPERATORS[type(op)](_value(operand, row))
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+            return _OPERATORS[type(op)](_value(left, row), _value(right, row))
+        case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in _FUNCTIONS:
+            return _FUNCTIONS[name](*(_value(each, row) for each in args))
+        case ast.Name() | ast.Attribute():
+            name = ast.unparse(node)
+            if name not in row:
+                raise UnknownNameError("column of numbers", name, row)
+            if row[name] is None:
+                raise ValueError(name)
+            return float(row[name])
+    raise TypeError(node)

@@ -1,22 +1,34 @@
-"""A campaign's directory: its plan, code and progress."""
+"""A campaign's directory while it grows: nothing that was flown is lost, or there twice, whatever is killed.
+
+Rows are appended as files of their own below `parts/`.  When all is flown the parts become `flights.parquet` and
+`timing.parquet`, and go.  The manifest has what was flown, by which code, and how far it is.
+"""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import io
 import sys
-from collections.abc import Iterable, Mapping
+import time as clock
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
 from mpc.core.library import why_missing
 from quadsim.assets import models_dir
 from quadsim.errors import FileError, InputError
 from quadsim.flight.summary import read_json, require_inside
 from quadsim.outputs import SUMMARY_FILE, Growing, digest_of, to_json
+from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import Plan, load_plan
-from scenarios.campaign.results.store import FLIGHTS_FILE, TIMES_FILE
-from scenarios.campaign.spec import CampaignSpec
+from scenarios.campaign.rows import TIMES, Row, make_table, read_table, split_times
 from scenarios.machine import machine, versions
 from scenarios.parts.plugin import import_plugin
 from scenarios.schema.plugin import ForceSpec, PluginSpec
@@ -27,6 +39,104 @@ SCENARIO_FILE: Final = "scenario.toml"
 FORMAT: Final = "quadsim campaign"
 _FORM: Final = {"format": str, "name": str, "status": str, "flights": int, "flown": int, "sessions": list}
 _ROOT: Final = Path(__file__).resolve().parents[2]
+FLIGHTS_FILE: Final = "flights.parquet"
+TIMES_FILE: Final = "timing.parquet"
+FLUSH_S: Final = 5.0  # how long an answer may wait in memory before it is on the disk [s]
+PARTS_DIR: Final = "parts"
+
+
+def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
+    """A campaign's table, with or without its clock times.
+
+    Raises:
+        FileError: it cannot be read, it has other columns than the campaign, or flights are there twice, or unsorted.
+    """
+    table = read_table(path)
+    kinds = {field.name: field.type for field in table.schema}
+    if any(kinds.get(field.name) != field.type for field in schema if field.name not in TIMES):
+        raise FileError(path, "has other columns than this campaign")
+    flights = table["flight"].to_numpy()
+    if flights.size and (flights[0] < 0 or (np.diff(flights) <= 0).any()):
+        raise FileError(path, "has flights that are not numbered upwards from 0")
+    return table
+
+
+class Store:
+    """The rows of a campaign on disk, in the columns of `scenarios.campaign.rows.make_schema`."""
+
+    def __init__(self, files: Growing, schema: pa.Schema) -> None:
+        self._files, self._directory, self._schema = files, files.path, schema
+        self._waiting: list[Row] = []
+        self._flushed = clock.perf_counter()
+
+    def table(self) -> pa.Table:
+        """All flights that are there, each once, sorted.
+
+        Raises:
+            FileError: a file is damaged or of another campaign.
+        """
+        tables = [self._schema.empty_table()]
+        if (path := self._directory / FLIGHTS_FILE).is_file():
+            table, times = read_flights(path, self._schema), read_table(self._directory / TIMES_FILE)
+            same = times["flight"].equals(table["flight"])  # else the process died between the two files
+            for name in TIMES:
+                absent = pa.nulls(table.num_rows, self._schema.field(name).type)
+                table = table.append_column(name, times[name] if same else absent)
+            tables.append(table)
+        tables += [read_flights(self._directory / name, self._schema) for name in self._parts()]
+        columns = [[table[name] for name in self._schema.names] for table in tables]
+        whole = pa.concat_tables(pa.Table.from_arrays(arrays, schema=self._schema) for arrays in columns)
+        _, first = np.unique(whole["flight"].to_numpy(), return_index=True)
+        return whole.take(first)
+
+    def counted(self) -> int:
+        """Flights of the final table that is there; 0 where there is none."""
+        path = self._directory / FLIGHTS_FILE
+        return read_table(path).num_rows if path.is_file() else 0
+
+    def add(self, row: Row) -> None:
+        """Add a row, which may wait in memory until `flush`, though not for long."""
+        self._waiting.append(row)
+        if clock.perf_counter() - self._flushed > FLUSH_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Append the rows that wait."""
+        self._flushed = clock.perf_counter()
+        self.append(self._waiting)
+        self._waiting = []  # not before: by Ctrl-C it is appended once more, to the same file
+
+    def append(self, rows: Sequence[Row]) -> None:
+        """Add rows in one step.
+
+        Raises:
+            OutputError: they cannot be written; what was there is still there.
+        """
+        if rows:
+            first = min(row["flight"] for row in rows)
+            self._files.write({f"{PARTS_DIR}/part-{first:09d}.parquet": _encoded(make_table(rows, self._schema))})
+
+    def close(self, flights: int) -> pa.Table:
+        """Put the first `flights` flights into their final two tables, remove the parts, return `flights.parquet`.
+
+        Raises:
+            OutputError: they cannot be written; the parts are still there.
+        """
+        whole = self.table()
+        table, times = split_times(whole.filter(pc.less(whole["flight"], flights)))
+        self._files.write({TIMES_FILE: _encoded(times), FLIGHTS_FILE: _encoded(table)})
+        self._files.remove(self._parts())
+        return table
+
+    def _parts(self) -> list[str]:
+        """The parts that are there, by their names relative to the directory."""
+        return sorted(f"{PARTS_DIR}/{path.name}" for path in (self._directory / PARTS_DIR).glob("part-*.parquet"))
+
+
+def _encoded(table: pa.Table) -> bytes:
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer, compression="zstd")
+    return buffer.getvalue()
 
 
 def start(plan: Plan, files: Growing, session: Mapping[str, Any], *, flying: bool) -> dict[str, Any]:
@@ -59,8 +169,11 @@ def start(plan: Plan, files: Growing, session: Mapping[str, Any], *, flying: boo
         manifest = {**known, "status": "running", "flights": plan.spec.flights}
         files.remove([SUMMARY_FILE])  # which is there, with the hashes of all others, while nothing is being flown
     manifest["sessions"].append(session)
-    own = {CAMPAIGN_FILE: _own(plan).to_toml(), SCENARIO_FILE: plan.scenario.to_toml()}  # files that need no others
-    files.write({name: text.encode() for name, text in own.items()})
+    texts = {
+        CAMPAIGN_FILE: _stored(plan).to_toml(),
+        SCENARIO_FILE: plan.scenario.to_toml(),
+    }  # files that need no others
+    files.write({name: text.encode() for name, text in texts.items()})
     write(manifest, files)
     return manifest
 
@@ -78,7 +191,11 @@ def require_same(plan: Plan, directory: Path) -> None:
         InputError: it is another one.
     """
     known = stored_plan(directory)
-    differing = [name for name in CampaignSpec.model_fields if getattr(_own(plan), name) != getattr(_own(known), name)]
+    differing = [
+        field.name
+        for field in fields(CampaignFile)
+        if getattr(_stored(plan), field.name) != getattr(_stored(known), field.name)
+    ]
     grows = plan.spec.sampling != "latin_hypercube" and plan.spec.flights >= known.spec.flights
     if differing == ["flights"] and grows:
         differing = []
@@ -126,13 +243,13 @@ def _user_code(spec: PluginSpec | ForceSpec) -> str | None:
 
 def _digest(roots: Iterable[Path]) -> str:
     """SHA-256 of the code, models and scenarios in files and folders."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for root in roots:
         for path in [root] if root.is_file() else sorted(root.rglob("*")):
             if path.suffix in (".py", ".c", ".h", ".toml", ".xml") and path.is_file():
-                found.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
-                found.update(path.read_bytes())
-    return f"sha256:{found.hexdigest()}"
+                digest.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
+                digest.update(path.read_bytes())
+    return f"sha256:{digest.hexdigest()}"
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:
@@ -176,6 +293,6 @@ def stored_plan(directory: Path) -> Plan:
     return load_plan(str(directory / CAMPAIGN_FILE))
 
 
-def _own(plan: Plan) -> CampaignSpec:
+def _stored(plan: Plan) -> CampaignFile:
     """The campaign's file as its directory has it, with the scenario beside it."""
-    return plan.spec.model_copy(update={"scenario": SCENARIO_FILE, "set": {}})
+    return replace(plan.spec, scenario=SCENARIO_FILE, set={})

@@ -21,8 +21,7 @@ from quadsim.flight.audit import Finding, Limit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
-from scenarios.campaign.results.events import HARMLESS, INCOMPLETE, VERDICTS, Event, Flags
-from scenarios.many import ERROR
+from scenarios.campaign.events import HARMLESS, INCOMPLETE, VERDICTS, Event, Flags
 
 Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
 DRAW: Final = "draw."  # how the columns of drawn values begin
@@ -102,11 +101,6 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
         row[SATISFIED + name] = None if unknown else finding.satisfied
     row["worst_margin"], row["worst_constraint"] = worst_margin(findings)
     return row | (_numbers(log) if log.control.t.size else {})
-
-
-def failed_row(reason: str, verdict: str = ERROR) -> Row:
-    """The row of a flight that raised, whose process died, or that met a limit of time or memory."""
-    return {"status": verdict, "verdict": verdict, "reason": reason, "violated": True, "crashed": False}
 
 
 def worst_margin(findings: Iterable[Finding]) -> tuple[float | None, str | None]:

@@ -21,6 +21,7 @@ from scenarios.many import DIED, ERROR, MEMORY, TIMEOUT
 if TYPE_CHECKING:
     import pyarrow as pa
 
+
 Flags = np.ndarray[Any, np.dtype[np.bool_]]
 HARMLESS: Final = "satisfied"
 INCOMPLETE: Final = "incomplete"  # of a flight that ended before it reached a required constraint: neither good nor bad

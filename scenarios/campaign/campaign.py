@@ -1,4 +1,7 @@
-"""Fly a campaign: what is missing is flown, rows are saved as they come, the whole is summed up."""
+"""Campaigns flown: what is missing is flown, rows are saved as they come, the whole is summed up.
+
+Beside it what else maps over `Plan.fly_all`: a sweep of every combination of values; and one flight flown again.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import math
 import tempfile
 import time as clock
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,21 +19,29 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
+from quadsim.errors import InputError, OutputError, ParameterError, UnknownNameError
 from quadsim.outputs import Growing, growing
-from scenarios.campaign import manifest as records
-from scenarios.campaign.pilot import CampaignPilot, fly_flights
-from scenarios.campaign.plan import Plan
-from scenarios.campaign.report.campaign_page import write_report
-from scenarios.campaign.results.store import TIMES_FILE, Store
-from scenarios.campaign.results.table import read_table
-from scenarios.campaign.statistics.estimates import estimate
-from scenarios.campaign.statistics.inference import proportion
-from scenarios.campaign.statistics.requirement import Judgement
-from scenarios.flight import to_pandas
-from scenarios.many import count_workers
+from scenarios.campaign import store as records
+from scenarios.campaign.campaign_report import write_report
+from scenarios.campaign.plan import Plan, parse_campaign
+from scenarios.campaign.rows import DRAW, make_table, read_table
+from scenarios.campaign.statistics import Judgement, estimate, proportion, worst_flight
+from scenarios.campaign.store import (
+    FLIGHTS_FILE,
+    TIMES_FILE,
+    Store,
+    other_than_flew,
+    read_flights,
+    read_manifest,
+    stored_plan,
+)
+from scenarios.flight import Flight, Outputs, to_pandas
+from scenarios.many import MEMORY, TIMEOUT, count_workers
+from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
+from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
+from scenarios.run import run_scenario
+from scenarios.schema.scenario import Scenario
 
 REPORT_FILES: Final = ("index.html", "campaign.png")
 CHECK_EVERY: Final = 10
@@ -67,7 +78,7 @@ class CampaignResult(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
-        from scenarios.campaign.report.campaign_tables import campaign_lines
+        from scenarios.campaign.campaign_report import campaign_lines
 
         return campaign_lines(self.summary, self.judgements, self.directory)
 
@@ -171,10 +182,10 @@ class _Progress:
         """
         missing, counted = self.missing, self.store.counted()
         if self._is_sure() and self.wanted < counted:
-            given = f"the interval is as narrow after {self.wanted} of the {counted} flights that are there"
-            raise InputError(f"--until-width would leave out flights: {given}; go on without it")
+            narrow = f"the interval is as narrow after {self.wanted} of the {counted} flights that are there"
+            raise InputError(f"--until-width would leave out flights: {narrow}; go on without it")
         try:
-            with closing(fly_flights(CampaignPilot(self._plan), missing, workers=workers, cluster=cluster)) as rows:
+            with closing(self._plan.fly_all(missing, workers=workers, cluster=cluster)) as rows:
                 for row in rows:
                     self.store.add(row)
                     self.flown += 1
@@ -199,7 +210,7 @@ class _Progress:
         for count in range(self._checked + every, whole + 1, every):
             self._checked = count
             share = proportion(int(np.count_nonzero(self.outcomes[:count] == 1)), count)
-            if share.upper - share.lower <= self._width:
+            if share["upper"] - share["lower"] <= self._width:
                 self.wanted = count
                 return True
         return False
@@ -217,3 +228,142 @@ def put_report(files: Growing, names: Sequence[str], write: Callable[[Path], obj
         made = {path.name: path.read_bytes() for path in Path(scratch).iterdir()}
     files.remove([name for name in names if name not in made])
     files.write(made)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The flights of a sweep, a row each, with the units in the columns' metadata."""
+
+    table: pa.Table  # what was swept, by dotted path; verdict; tracking errors; commands; margins; step times
+
+    def __getitem__(self, column: str) -> np.ndarray[Any, Any]:
+        """(flights,) of a column by its name.
+
+        Raises:
+            UnknownNameError: there is none.
+        """
+        if column not in self.table.column_names:
+            raise UnknownNameError("column", column, self.table.column_names)
+        return np.asarray(self.table[column].to_numpy())
+
+    def __len__(self) -> int:
+        """Flights."""
+        return int(self.table.num_rows)
+
+    def to_arrow(self) -> pa.Table:
+        """The table."""
+        return self.table
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas DataFrame.
+
+        Raises:
+            MissingPackageError: pandas is not installed.
+        """
+        return to_pandas(self.table)
+
+
+def fly_sweep(
+    scenario: Scenario, values: Mapping[str, Sequence[Any]], workers: int | None = None, progress: Progress = silent
+) -> Sweep:
+    """Fly every combination of values, by dotted path, the last field varying fastest.
+
+    Raises:
+        InputError: a field does not exist, or a value is not allowed.
+    """
+    for path, tried in values.items():
+        if isinstance(tried, str) or not len(tried):
+            raise ParameterError("sweep", path, tried, "a list of values to try")
+    lists = [getattr(tried, "tolist", lambda tried=tried: list(tried))() for tried in values.values()]
+    entries = [
+        {"name": f"field-{i}", "fields": [path], "distribution": "grid", "values": lists[i]}
+        for i, path in enumerate(values)
+    ]
+    count = math.prod(map(len, lists))
+    data = {"name": scenario.name, "scenario": scenario.name, "flights": count, "vary": entries}
+    spec = parse_campaign(data, source="sweep")
+    plan = Plan(spec, resolve_vehicle(scenario, build_vehicle(scenario)), one_seed=True)
+    plan.check()
+    progress("sweep", 0, count)
+    rows = []
+    with closing(plan.fly_all(range(count), workers=workers)) as flown:
+        for row in flown:
+            rows.append(row)
+            progress("sweep", len(rows), count)
+    table = make_table(rows, plan.schema).drop_columns(["flight", "seed", "failed"])
+    table = table.rename_columns({f"{DRAW}field-{i}": path for i, path in enumerate(values)})
+    return Sweep(table.select([*values, *(name for name in table.column_names if name not in values)]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """A flight of a finished campaign."""
+
+    number: int
+    row: Mapping[str, Any]  # of `flights.parquet`
+    plan: Plan
+    scenario: Scenario
+    notes: Sequence[str]  # what a person should know before it is flown again
+
+
+def recorded_flight(directory: Path, number: int | None) -> Recorded:
+    """A flight of a campaign's directory; the worst one where no number is given.
+
+    Raises:
+        InputError: there is no such flight, or its parameters cannot be flown together.
+        FileError: the directory is no campaign, or not a finished one.
+    """
+    plan = stored_plan(directory)
+    table = read_flights(directory / FLIGHTS_FILE, plan.schema)
+    number = worst_flight(table) if number is None else number
+    flights = table["flight"].to_pylist()
+    if number not in flights:
+        raise ParameterError("", "--flight", number, f"one of the flights 0 to {flights[-1]} of {directory}")
+    row, notes = table.slice(flights.index(number), 1).to_pylist()[0], []
+    if differing := other_than_flew(read_manifest(directory), plan):
+        notes.append(f"other {', '.join(differing)} flew that campaign, so numbers may differ")
+    if row["verdict"] in (TIMEOUT, MEMORY):
+        ended = f"flight {number} was ended in the campaign ({row['reason']})"
+        notes.append(f"{ended}; here nothing ends it but Ctrl-C")
+    return Recorded(number=number, row=row, plan=plan, scenario=plan.of(number), notes=notes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay(Result):
+    """A flight of a campaign, flown again."""
+
+    recorded: Recorded  # as the campaign has it
+    flight: Flight  # as it was flown now
+    directory: Path  # its run directory
+    differing: Sequence[str]  # columns of the campaign's table that are not the same bit for bit
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`; 1 where its numbers are not the campaign's."""
+        return EXIT_FAILED if self.differing else EXIT_DONE
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+
+        yield from self.flight.shown()
+        number, count = self.recorded.number, len(self.recorded.row)
+        if self.differing:
+            yield console.styled((f"flight {number} differs from the campaign's in {', '.join(self.differing)}", "red"))
+        else:
+            yield f"flight {number}: {count} columns, each the same as in the campaign"
+
+    def to_json(self) -> dict[str, Any]:
+        """`summary.json` of the flight as it was flown now."""
+        return self.flight.to_json()
+
+
+def replay_flight(
+    recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent, *, overwrite: bool = False
+) -> Replay:
+    """Fly it again and write its run directory; see `scenarios.run.run_scenario`."""
+    flight = run_scenario(recorded.scenario, target, outputs, progress, overwrite=overwrite)
+    row = recorded.plan.row_of(recorded.number, flight)
+    (again,) = make_table([row], recorded.plan.schema).to_pylist()
+    differing = [name for name, value in recorded.row.items() if name not in again or again[name] != value]
+    return Replay(recorded=recorded, flight=flight, directory=target, differing=differing)

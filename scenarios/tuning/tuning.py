@@ -1,15 +1,19 @@
-"""A tuning carried out: the search, then the start and the answer on fresh draws."""
+"""A tuning carried out: the search, then the start and the answer on fresh draws.
+
+A tuning as a page that works offline, and as tables for the terminal.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -17,21 +21,24 @@ import pyarrow as pa
 from quadsim.errors import InputError, OutputError
 from quadsim.flight.summary import read_json
 from quadsim.outputs import SUMMARY_FILE, growing, to_json
-from quadsim.report.page import PAGE_FILE
-from scenarios.campaign.manifest import flown_by
-from scenarios.campaign.pilot import fly_flights
+from quadsim.report.page import PAGE_FILE, Section, render_page
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
+from quadsim.report.to_plotly import Plot, embed
+from scenarios.campaign.campaign import Standing, Watch, fly_campaign, put_report
+from scenarios.campaign.paired import Comparison, compare
 from scenarios.campaign.plan import plan_differences
-from scenarios.campaign.report.campaign_page import write_comparison_report
-from scenarios.campaign.run import Standing, Watch, fly_campaign, put_report
-from scenarios.campaign.statistics.comparison import Comparison, compare
-from scenarios.campaign.statistics.inference import paired_difference
-from scenarios.campaign.statistics.requirement import judge
+from scenarios.campaign.statistics import judge, label, paired_difference
+from scenarios.campaign.store import flown_by
 from scenarios.many import count_workers
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario
-from scenarios.tuning.page import Summary, write_page
-from scenarios.tuning.plan import OWN, START, TuningPlan
 from scenarios.tuning.search import JOURNAL_FILE, Search, require_optuna
+from scenarios.tuning.tuning_plan import OWN, START, TuningPlan
+
+if TYPE_CHECKING:
+    from optuna.study import Study
+    from optuna.trial import FrozenTrial
+
 
 MANIFEST_FILE: Final = "manifest.json"
 _MAY_CHANGE: Final = {"trials", "fresh", "description"}  # where a tuning is resumed
@@ -68,7 +75,7 @@ class TuningResult(Result):
     def shown(self) -> Shown:
         """See `Result.shown`."""
         from scenarios import console
-        from scenarios.tuning.page import sentences, tables, verdict
+        from scenarios.tuning.tuning import sentences, tables, verdict
 
         yield console.styled((self.summary["tuning"], "bold"), f": {verdict(self.summary)}")
         yield from sentences(self.summary)
@@ -116,8 +123,7 @@ def tune(
         files.remove([SUMMARY_FILE, JOURNAL_FILE, f"{JOURNAL_FILE}.lock", *fronts])
         texts = {"tuning.toml": plan.to_toml(), "scenario.toml": plan.start.scenario.to_toml()}
         files.write({file: text.encode() for file, text in {**texts, MANIFEST_FILE: to_json(manifest)}.items()})
-        fly = partial(fly_flights, workers=workers, cluster=cluster)
-        search = Search(plan, files, fly, lambda **standing: watch(Standing(**standing)))
+        search = Search(plan, files, lambda **state: watch(Standing(**state)), workers=workers, cluster=cluster)
         table = search.run()
         answer, front = search.answer()
         best = plan.candidate(search.candidates[answer], f"{name}-best")
@@ -138,7 +144,7 @@ def tune(
                 tables[0], tables[1], ("start", "best"), differences=plan_differences(*campaigns.values())
             )
             if report:
-                write_comparison_report(comparison, files.path / "comparison", overwrite=True)
+                comparison.write_report(files.path / "comparison", overwrite=True)
         summary = _summary(plan, search, answer, front, tables)
         write = partial(write_page, study=search.study, summary=summary)
         put_report(files, [PAGE_FILE], write if report else None)
@@ -160,7 +166,7 @@ def _summary(
         found += [float(each[both, i].mean()) if both.any() else None for each in values]
         named = dict(zip(("start", "best", "fresh_start", "fresh_best"), found, strict=True))
         difference = asdict(paired_difference(*(each[both, i] for each in values)))
-        objectives.append({**objective.model_dump(), **named, **difference})
+        objectives.append({**asdict(objective), **named, **difference})
     return {
         "tuning": plan.spec.name,
         "description": plan.spec.description,
@@ -171,7 +177,7 @@ def _summary(
         "search_flights": sum(score.flights for score in search.scores.values()),
         "draws": plan.most,
         "search": [
-            {**entry.model_dump(), "start": shown[START][entry.name], "best": shown[answer][entry.name]}
+            {**asdict(entry), "start": shown[START][entry.name], "best": shown[answer][entry.name]}
             for entry in plan.spec.search
         ],
         "objectives": objectives,
@@ -189,8 +195,8 @@ def _summary(
 
 def _manifest(plan: TuningPlan) -> dict[str, Any]:
     """What is flown, with what."""
-    tables = plan.spec.model_dump(mode="json", exclude=_MAY_CHANGE)
-    campaign = plan.start.spec.model_dump(mode="json", exclude={*OWN})
+    tables = {k: v for k, v in asdict(plan.spec).items() if k not in _MAY_CHANGE}
+    campaign = {k: v for k, v in asdict(plan.start.spec).items() if k not in OWN}
     scenario = json.loads(plan.start.scenario.model_dump_json())  # infinite bounds are null
     own = {"format": "quadsim tuning", **tables, "campaign": campaign, "scenario": scenario}
     return {**own, "optuna": require_optuna().__version__, **flown_by(plan.start)}
@@ -223,3 +229,103 @@ def _quiet() -> Iterator[None]:
             yield
         finally:
             logging.set_verbosity(level)
+
+
+Summary = Mapping[str, Any]
+FEWEST: Final = 5  # feasible candidates of which importances are drawn
+_FILES: Final = ("best.toml", "tuning.toml", "scenario.toml", "flights.parquet", "summary.json", "journal.log")
+
+
+def verdict(summary: Summary) -> str:
+    """What is better, by how much, on fresh draws."""
+    if summary["answer"] == START:
+        return f"No candidate of {summary['trials']} was better than the start"
+    gains = []
+    for each in summary["objectives"]:
+        start, best, change = _compared(each["fresh_start"], each["fresh_best"])
+        gains.append(f"{label(each['name'], each['unit'])} {best} against {start} ({change})")
+    return f"Candidate {summary['answer']} on fresh draws: {', '.join(gains)}"
+
+
+def sentences(summary: Summary) -> tuple[str, ...]:
+    """Whether the answer and the start hold the requirement."""
+    names = ("best",) if summary["answer"] == START else ("best", "start")
+    return tuple(f"{name}: {summary['fresh'][name]['requirement']['sentence']}" for name in names)
+
+
+def tables(summary: Summary) -> tuple[Grid, Grid]:
+    """The objectives on the draws that chose the answer and on fresh ones, and the values that were found."""
+    objectives = [
+        line(
+            label(each["name"], each["unit"]),
+            *_compared(each["start"], each["best"]),
+            *_compared(each["fresh_start"], each["fresh_best"]),
+            f"{format_number(each['lower'])} to {format_number(each['upper'])}",
+        )
+        for each in summary["objectives"]
+    ]
+    values = [
+        line(
+            label(each["name"], each["unit"]),
+            Cell(text=", ".join(each["fields"]), mark=Mark.CODE),
+            *(str(v) if isinstance(v, str | bool) else format_number(v) for v in (each["start"], each["best"])),
+        )
+        for each in summary["search"]
+    ]
+    head = ("objective", "start, search", "best, search", "promised", "start, fresh", "best, fresh", "confirmed")
+    found = Grid(
+        key="objectives",
+        title="The draws that chose it, and fresh ones",
+        head=(*head, "mean difference, 95 %"),
+        lines=tuple(objectives),
+        note=f"Search: {summary['search_flights']} flights, each on the first of the same {summary['draws']} draws.",
+    )
+    return found, Grid(key="values", title="Values", head=("name", "fields", "start", "best"), lines=tuple(values))
+
+
+def write_page(directory: Path, *, study: Study, summary: Summary) -> None:
+    """Write `index.html`, with Optuna's own plots, for a directory that has the fresh campaigns."""
+    from optuna import visualization
+    from optuna.importance import PedAnovaImportanceEvaluator
+
+    names = [label(each["name"], each["unit"]) for each in summary["objectives"]]
+    if len(names) > 1:
+        plots = [_plot(visualization.plot_pareto_front(study, target_names=names), "candidates", "Pareto front", 430)]
+    else:
+        history = visualization.plot_optimization_history(study, target_name=names[0])
+        plots = [_plot(history, "candidates", "candidates", 430)]
+    feasible = {each["candidate"] for each in summary["candidates"] if each["feasible"]}
+    for i, name in enumerate(names if len(feasible) >= FEWEST and len(summary["search"]) > 1 else ()):
+
+        def value(trial: FrozenTrial, i: int = i) -> float:  # infinite ones are left out
+            return trial.values[i] if trial.number in feasible else math.inf
+
+        by = {"target": value, "target_name": name}
+        shares = visualization.plot_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), **by)
+        plots.append(_plot(shares, f"importance{i}", f"importance for {name}", 170 + 34 * len(summary["search"])))
+        plots.append(_plot(visualization.plot_slice(study, **by), f"slice{i}", f"{name} by field", 380))
+    answer, holds = summary["answer"], summary["fresh"]["best"]["requirement"]["holds"]
+    pages = ["start"] if answer == START else ["start", f"candidate-{answer}", "comparison"]
+    page = render_page(
+        "tuning",
+        summary["tuning"],
+        [
+            Section(title="Fresh draws", text=sentences(summary), tables=tables(summary)),
+            Section(title="The search", plots=tuple(plots)),
+        ],
+        description=summary["description"],
+        verdict=Cell(text=verdict(summary), mark=Mark.GOOD if holds else Mark.BAD),
+        files={**{name: name for name in _FILES}, **{folder: f"{folder}/index.html" for folder in pages}},
+    )
+    (directory / PAGE_FILE).write_text(page, encoding="utf-8")
+
+
+def _plot(figure: Any, key: str, title: str, height: int) -> Plot:
+    figure.update_layout(title_text="", margin={"t": 12, "b": 52})  # the page has the title
+    return embed(figure, key, title, height)
+
+
+def _compared(start: float | None, best: float | None) -> tuple[str, str, str]:
+    """Both values, and the change from the one to the other."""
+    change = f"{100.0 * (best - start) / abs(start):+.1f} %" if start and best is not None else ABSENT
+    return format_number(start), format_number(best), change
