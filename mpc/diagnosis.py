@@ -228,16 +228,19 @@ def _relaxed(
         basis = sparse.hstack([basis[:, others], sparse.csc_matrix(weights[:, None])], format="csc")
         cost, box = np.append(np.zeros(others.size), 1.0), np.vstack([box[others], [0.0, math.inf]])
     above, below = np.isfinite(qp.h_u), np.isfinite(qp.h_l)
-    found = linprog(
-        cost,
-        A_ub=sparse.vstack([qp.G[above], -qp.G[below]]) @ basis,
-        b_ub=np.concatenate([qp.h_u[above], -qp.h_l[below]]),
-        A_eq=qp.A @ basis,
-        b_eq=qp.b,
-        bounds=box,
-        method="highs-ds",
-    )
-    if found.status:
+    for method in ("highs-ds", "highs-ipm"):  # the simplex fails now and then where the optimum is degenerate
+        found = linprog(
+            cost,
+            A_ub=sparse.vstack([qp.G[above], -qp.G[below]]) @ basis,
+            b_ub=np.concatenate([qp.h_u[above], -qp.h_l[below]]),
+            A_eq=qp.A @ basis,
+            b_eq=qp.b,
+            bounds=box,
+            method=method,
+        )
+        if not found.status:
+            break
+    else:
         return None
     slacks = dict(zip(named, form.slacks(basis @ found.x).T, strict=True))
     if together is not None:

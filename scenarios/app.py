@@ -864,9 +864,9 @@ def tune(
 
     Examples:
         >>> import quadsim
-        >>> quadsim.tune("paper-robust", trials=0)
+        >>> quadsim.tune("paper-robust", workers=0)
         Traceback (most recent call last):
-        scenarios.schema.problems.ScenarioError: paper-robust.toml: trials must be >= 1; got 0
+        quadsim.errors.ParameterError: --workers must be 1 or more; got 0
     """
     from scenarios.tuning.search import require_optuna
     from scenarios.tuning.tuning import tune as carry_out
