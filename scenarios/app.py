@@ -919,8 +919,7 @@ def reproduce(
         (True, 250.0, 250.0)
     """
     from scenarios.junit import junit_file, write_junit
-    from scenarios.papers.paper import load_paper
-    from scenarios.papers.reproduction import Reproductions, reproduce_paper
+    from scenarios.papers.reproduction import Reproductions, load_paper, reproduce_paper
     from scenarios.progress import reporting
 
     file = None if junit is None else junit_file(junit)
