@@ -613,7 +613,7 @@ def live(
         Traceback (most recent call last):
         quadsim.errors.ParameterError: --port must be from 1 to 65535, or 0 for any that is free; got 70000
     """
-    from scenarios.live.serve import fly_live
+    from scenarios.live.serving import fly_live
     from scenarios.loading import as_scenario
     from scenarios.reaudit import reaudit, stored_scenario
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-import errno
 import inspect
 import io
 import math
@@ -19,20 +18,18 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from html import escape
-from importlib.util import find_spec
 from typing import Any, Final
 
 import numpy as np
 
 from quadsim.controller import OPTIMAL
-from quadsim.errors import InputError, MissingPackageError, OutputError, ParameterError
+from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.flight.audit import Limit
 from quadsim.report.curves import BOUND, LINES
 from quadsim.rotation import quaternion_to_euler
 from quadsim.vehicle import N_ROTORS
-from scenarios.live.guard import Guard
 from scenarios.live.knobs import Knob, Value, knobs
-from scenarios.live.pacing import Pace
+from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
 from scenarios.live.stage import Stage
 from scenarios.schema.controller import ControllerSpec
@@ -63,26 +60,6 @@ STYLE: Final = """<style>
 </style>"""
 
 
-def require_server(host: str, port: int) -> None:
-    """Refuse, before anything is flown, where no page could be served.
-
-    Raises:
-        MissingPackageError: viser is not installed.
-        ParameterError: the host is no address of this machine, or the port is none, or in use.
-    """
-    if find_spec("viser") is None:
-        raise MissingPackageError("quadsim live", "viser", extra="live")
-    if not 0 <= port <= 65535:
-        raise ParameterError("", "--port", port, "from 1 to 65535, or 0 for any that is free")
-    try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        socket.create_server((host or "?", port), family=family).close()
-    except (OSError, UnicodeError) as error:
-        if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES):
-            raise ParameterError("", "--port", port, "a port that is free") from error
-        raise ParameterError("", "--host", host, "an address of this machine") from error
-
-
 def _reachable(host: str) -> str:
     """How others call this machine: where it listens on all its addresses, one of them."""
     if host not in ("0.0.0.0", "::"):
@@ -94,7 +71,7 @@ def _reachable(host: str) -> str:
 
 
 class Page:
-    """A session's page, which `pace` drives; see `require_server`.
+    """A session's page, which `pace` drives.
 
     Args:
         save: writes the run directory of what has been flown and reports where; in the simulation thread.

@@ -71,17 +71,21 @@ class Kind:
         return tags or {getattr(self.type, "__name__", "")}
 
     @property
+    def limits(self) -> dict[str, Any]:
+        """Its limits, by the names that annotated_types has for them."""
+        return dict(_limits(self.metadata))
+
+    @property
     def lengths(self) -> tuple[int, float]:
         """The least and the largest number of entries of a list, or characters of a text."""
-        limits = dict(_limits(self.metadata))
-        return limits.get("min_length") or 0, limits.get("max_length") or math.inf
+        return self.limits.get("min_length") or 0, self.limits.get("max_length") or math.inf
 
     def __str__(self) -> str:
         """What is allowed, as the end of "must be ..."."""
         if self.choices:
             *rest, last = ("false" if choice is False else repr(choice) for choice in self.choices)
             return f"one of {', '.join(rest)} or {last}" if rest else last
-        limits, count = dict(_limits(self.metadata)), _count(*self.lengths)
+        limits, count = self.limits, _count(*self.lengths)
         if self.is_list:
             held = {entry.type for entry in self.entries}
             return f"a list of {count}{'numbers' if held <= {float, int} else 'texts' if held == {str} else 'entries'}"
