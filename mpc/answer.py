@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
+from mpc.condensing import row_maps
 from mpc.constraints import Bounds
 from mpc.ocp import Problem, Query, predicted
-from mpc.paper.condensed import row_maps
-from mpc.paper.prediction import prediction
+from mpc.paper import prediction
 from mpc.qp import kkt_residuals
 from mpc.solvers import Answer
 from quadsim.controller import ACCEPTED, FALLBACK, Command
@@ -164,7 +164,7 @@ class AnswerCheck:
         steps = plan - np.concatenate((query.u_before[None], plan[:-1]))
         values = plan @ rows.D.T + steps @ rows.E.T
         if self._map is not None and problem is self._problem and query.steps is None:
-            (at, C, of_inputs, of_state), (x_s, u_s) = self._map, query.rest or problem.rest
+            (at, C, of_inputs, of_state), (x_s, u_s) = self._map, query.equilibrium or problem.equilibrium
             of_plan = of_inputs @ (plan - u_s).ravel() + of_state @ (query.state - x_s)
             values[:, at] += of_plan.reshape(len(plan), -1) + C @ x_s
         else:

@@ -44,7 +44,7 @@ from scenarios.schema.settings import leaves
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from mpc.ocp import Unanswered
+    from mpc.ocp import InfeasiblePeriod
 
 _LONGEST: Final = 500  # characters of why a product failed
 _log: Final = logging.getLogger("quadsim")
@@ -114,7 +114,7 @@ class Flight(Result):
     tallies: Mapping[SensorName, Tally] = field(repr=False)
     directory: Path | None = None
     recorded: Mapping[str, Any] | None = field(default=None, repr=False)
-    unanswered: Unanswered | None = field(default=None, repr=False)
+    unanswered: InfeasiblePeriod | None = field(default=None, repr=False)
 
     @property
     def satisfied(self) -> bool:

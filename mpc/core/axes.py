@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from mpc.condensing import CondensedCost, condensed_cost
 from mpc.model import LinearModel
 from mpc.ocp import Objective, Problem
-from mpc.paper.condensed import CondensedCost, condensed_cost
-from mpc.paper.prediction import Prediction, prediction
+from mpc.paper import Prediction, prediction
 from quadsim.state import Array, Indices
 
 ROUNDING: Final = 1e-12

@@ -19,7 +19,7 @@ from mpc.fallback.completion import CompletedMoment
 from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model
 from mpc.nonlinear.model import SUBSTEPS
-from mpc.paper.prediction import rollout
+from mpc.paper import rollout
 from mpc.robust.settings import LONGEST_SPAN
 from quadsim.controller import CORE, FALLBACK, GAIN, GROUNDED, SOLVED, UNCONSTRAINED, Command, Moment, Phase, stopped
 from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array

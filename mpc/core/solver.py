@@ -11,10 +11,10 @@ from typing import Final, Generic, NoReturn, TypeVar
 
 import numpy as np
 
+from mpc.condensing import Condensed
 from mpc.core.library import check_mirrors, load
 from mpc.core.tables import Tables, tables
 from mpc.ocp import Problem, Query
-from mpc.paper.condensed import Condensed
 from mpc.qp import QP, Solution
 from mpc.solvers import Answer, Method, QPSolver
 from quadsim.controller import CORE, GAIN, SOLVED, UNCONSTRAINED
@@ -241,7 +241,7 @@ class Core:
     def __init__(self, problem: Problem) -> None:
         self._library, self._shared = core_library(), core_problem(problem)
         self.formulation = self._shared.condensed
-        self._problem, self._rest, self._C_r = problem, problem.rest, problem.objective.C_r
+        self._problem, self._equilibrium, self._C_r = problem, problem.equilibrium, problem.objective.C_r
         self._modes = self._shared.tables.modes if problem.model.n > N_STATES else None
         self._piqp: QPSolver | None = None
         p, rows = self._shared.struct, problem.rows
@@ -283,7 +283,7 @@ class Core:
     def solve(self, query: Query) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
         started, (state, desired, u_before, rest, _) = clock.perf_counter(), query
-        x_s, u_s = self._rest if rest is None else rest
+        x_s, u_s = self._equilibrium if rest is None else rest
         self._state[:], self._x_s[:], self._u_s[:], self._before[:] = state, x_s, u_s, u_before
         np.subtract(desired, 0.0 if rest is None else self._C_r @ x_s, out=self._wanted)
         if self._modes is not None:

@@ -20,11 +20,11 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
+from mpc.condensing import condensed_cost, row_maps
 from mpc.constraints import Constraint, Rows
 from mpc.core.axes import Axis, axes
 from mpc.ocp import Problem
-from mpc.paper.condensed import condensed_cost, row_maps
-from mpc.paper.prediction import prediction
+from mpc.paper import prediction
 from quadsim.errors import ParameterError
 from quadsim.state import N_STATES, Array
 

@@ -14,9 +14,7 @@ import scipy.linalg
 
 from mpc.constraints import Rows
 from mpc.ocp import Problem, Query, predicted
-from mpc.paper.constraints import slew_matrix
-from mpc.paper.cost import cost
-from mpc.paper.prediction import Prediction, prediction
+from mpc.paper import Prediction, cost, prediction, slew_matrix
 from mpc.qp import QP, Posed, QPRows, Solution
 from quadsim.state import Array, Indices
 
@@ -152,7 +150,7 @@ class Condensed:
             return self._pose_changed(query)
         terms, values, rows = self.cost, self._values, self._rows
         state, desired, u_before = query[:3]
-        x_s, u_s = query.rest or self._problem.rest
+        x_s, u_s = query.equilibrium or self._problem.equilibrium
         dx, dy, du = state - x_s, desired - self._problem.objective.C_r @ x_s, u_before - u_s
         c = self._linear.copy()
         c[: self._inputs] += terms.F_x @ dx + terms.F_y @ dy.ravel() + terms.F_d @ du - self._pull @ u_s
@@ -166,7 +164,7 @@ class Condensed:
         """The same in absolute states and inputs, with a model that changes."""
         assert query.steps is not None
         (A, B, c), (state, desired, u_before) = query.steps, query[:3]
-        rest, blank = query.rest or self._problem.rest, self._blank
+        rest, blank = query.equilibrium or self._problem.equilibrium, self._blank
         objective, rows, m = self._problem.objective, self._rows, self._inputs
         N, n, nu = B.shape
         (target, root_end, H, inputs), count, root = self._changing, len(rows.C), self._changing[0] @ objective.C_r
