@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from scenarios.campaign.paired import Comparison as CampaignComparison
     from scenarios.catalogue import Catalogue
     from scenarios.comparison import Comparison
-    from scenarios.design.vehicle_figures import VehicleReport
+    from scenarios.design.vehicle_report import VehicleReport
     from scenarios.flight import Flight
     from scenarios.papers.reproduction import Reproductions
     from scenarios.progress import Progress
@@ -1083,7 +1083,7 @@ def vehicle_report(
     from quadsim.report.film.video import render_portrait
     from quadsim.vehicle import vehicle_sources
     from scenarios import loading, results
-    from scenarios.design import shortfalls, vehicle_figures
+    from scenarios.design import shortfalls, vehicle_report
 
     if template:
         return results.Document((Path(__file__).parent / "design/vehicle_template.toml").read_text(encoding="utf-8"))
@@ -1096,10 +1096,10 @@ def vehicle_report(
         if Path(out).suffix != ".png":
             raise ParameterError("", "--out", str(out), "a file ending in .png")
         render_portrait(loaded, Path(out), overwrite=overwrite)
-    return vehicle_figures.VehicleReport(
+    return vehicle_report.VehicleReport(
         vehicle=loaded,
         sources=vehicle_sources(vehicle_path(str(name))),
-        figures=vehicle_figures.make_sheet(loaded),
+        figures=vehicle_report.make_sheet(loaded),
         scenario=None if against is None else against.name,
         shortfalls=None if against is None else shortfalls.shortfalls(against, loaded),
         picture=None if out is None else Path(out),

@@ -79,14 +79,14 @@ def verdict_sentence(summary: Summary) -> str:
 
 def driver_sentence(summary: Summary) -> str:
     """The varied parameters on which the worst margin, or else failure, depends beyond chance, the strongest first."""
-    outcome = "worst_margin" if any(found["worst_margin"] for found in drivers(summary).values()) else "failed"
+    outcome = "worst_margin" if any(related["worst_margin"] for related in drivers(summary).values()) else "failed"
     sure = {
-        name: found[outcome]
-        for name, found in drivers(summary).items()
-        if found[outcome] and min(found[outcome]["p_holm"], found[outcome]["p_xi_holm"]) < ALPHA
+        name: related[outcome]
+        for name, related in drivers(summary).items()
+        if related[outcome] and min(related[outcome]["p_holm"], related[outcome]["p_xi_holm"]) < ALPHA
     }
     noun = "The worst margin" if outcome == "worst_margin" else "Failure"
-    listed = ", ".join(f"{name} (rho {found['rho']:+.2f}, xi {found['xi']:.2f})" for name, found in sure.items())
+    listed = ", ".join(f"{name} (rho {related['rho']:+.2f}, xi {related['xi']:.2f})" for name, related in sure.items())
     return f"{noun} depends on {listed or 'no varied parameter beyond chance'}."
 
 
@@ -99,9 +99,9 @@ def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
         title="How often",
         head=("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}"),
         lines=tuple(
-            line(name, str(found["count"]), *_shares(found), *(percent(found[f"{end}_one_sided"]) for end in _ENDS))
-            for name, found in summary["events"].items()
-            if found["count"] or name in _ALWAYS
+            line(name, str(share["count"]), *_shares(share), *(percent(share[f"{end}_one_sided"]) for end in _ENDS))
+            for name, share in summary["events"].items()
+            if share["count"] or name in _ALWAYS
         ),
         note=f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold, or "
         "the flight was lost, raised an error or met a limit. Shares of both leave out incomplete flights, which ended "
@@ -113,10 +113,10 @@ def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
 def constraint_table(summary: Summary) -> Grid:
     """How often each constraint did not hold, and by how much at worst."""
     lines = []
-    for name, found in summary["constraints"].items():
-        failed, worst = found["not_satisfied"], (ABSENT, ABSENT)
-        if found["worst_margin"] is not None:
-            worst = f"{format_number(found['worst_margin'])} {found['unit']}", str(found["worst_flight"])
+    for name, constraint in summary["constraints"].items():
+        failed, worst = constraint["not_satisfied"], (ABSENT, ABSENT)
+        if constraint["worst_margin"] is not None:
+            worst = f"{format_number(constraint['worst_margin'])} {constraint['unit']}", str(constraint["worst_flight"])
         count = Cell(text=str(failed["count"]), mark=Mark.BAD if failed["count"] else Mark.NONE)
         lines.append(line(name, count, *_shares(failed), *worst))
     return Grid(
@@ -136,8 +136,12 @@ def metric_table(summary: Summary) -> Grid:
     """How every metric is distributed."""
     measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
     lines = tuple(
-        line(label(name, found["unit"]), *(format_number(found[each]) for each in measures), str(found["flights"]))
-        for name, found in summary["metrics"].items()
+        line(
+            label(name, metric["unit"]),
+            *(format_number(metric[measure]) for measure in measures),
+            str(metric["flights"]),
+        )
+        for name, metric in summary["metrics"].items()
     )
     return Grid(
         key="metrics",
@@ -176,8 +180,8 @@ def worst_draws_table(summary: Summary) -> Grid:
     """Parameters of the worst flights, a column for each."""
     worst = summary["worst"]
     lines = tuple(
-        line(label(name, found["unit"]), *(_drawn(flight["draws"][name]) for flight in worst))
-        for name, found in summary["parameters"].items()
+        line(label(name, parameter["unit"]), *(_drawn(flight["draws"][name]) for flight in worst))
+        for name, parameter in summary["parameters"].items()
     )
     return Grid(
         key="worst-draws",
@@ -196,21 +200,21 @@ def _drawn(value: Any) -> str:
     return format_number(value) if isinstance(value, float) else str(value)
 
 
-def _shares(found: Mapping[str, Any]) -> tuple[str, str]:
-    return percent(found["share"]), interval(found["lower"], found["upper"])
+def _shares(share: Mapping[str, Any]) -> tuple[str, str]:
+    return percent(share["share"]), interval(share["lower"], share["upper"])
 
 
 def driver_table(summary: Summary) -> Grid:
     """How the worst margin and failure depend on each varied parameter."""
     lines = (
-        line(label(name, found["unit"]), *_association(found["worst_margin"]), *_association(found["failed"]))
-        for name, found in drivers(summary).items()
+        line(label(name, related["unit"]), *_association(related["worst_margin"]), *_association(related["failed"]))
+        for name, related in drivers(summary).items()
     )
     measures = ("rho", "after Holm", "xi", "after Holm")
     return Grid(
         key="drivers-table",
         title="Which parameters matter",
-        head=("varied parameter", *(f"{of}: {each}" for of in ("worst margin", "failure") for each in measures)),
+        head=("varied parameter", *(f"{of}: {measure}" for of in ("worst margin", "failure") for measure in measures)),
         lines=tuple(lines),
         note="rho: Spearman's rank correlation. xi: Chatterjee's (2021), of any dependence, also of harm at both ends "
         "of a range. p-values are corrected by Holm's method for all of this table; bold: beyond chance at "
@@ -222,10 +226,10 @@ def group_table(summary: Summary) -> Grid:
     """How often flights failed over each varied parameter, lowest values first; of none or all failed, no lines."""
     failure = summary["events"]["failure"]
     listed = {}
-    for name, found in summary["parameters"].items() if 0 < failure["count"] < failure["flights"] else ():
-        levels = [f"{level}: {percent(share['share'])}" for level, share in found.get("levels", {}).items()]
-        if cells := levels + [_group(group) for group in found.get("groups", ())]:
-            listed[label(name, found["unit"])] = cells
+    for name, parameter in summary["parameters"].items() if 0 < failure["count"] < failure["flights"] else ():
+        levels = [f"{level}: {percent(share['share'])}" for level, share in parameter.get("levels", {}).items()]
+        if cells := levels + [_group(group) for group in parameter.get("groups", ())]:
+            listed[label(name, parameter["unit"])] = cells
     size = max(map(len, listed.values()), default=0)
     return Grid(
         key="groups",
@@ -237,12 +241,12 @@ def group_table(summary: Summary) -> Grid:
     )
 
 
-def _association(found: Mapping[str, Any] | None) -> tuple[Cell, ...]:
-    if found is None:
+def _association(related: Mapping[str, Any] | None) -> tuple[Cell, ...]:
+    if related is None:
         return line(*[ABSENT] * 4)
-    sure = [Mark.BEST if found[p] < ALPHA else Mark.NONE for p in ("p_holm", "p_xi_holm")]
-    rho, xi = Cell(text=f"{found['rho']:+.2f}", mark=sure[0]), Cell(text=f"{found['xi']:.2f}", mark=sure[1])
-    return line(rho, p_value(found["p_holm"]), xi, p_value(found["p_xi_holm"]))
+    sure = [Mark.BEST if related[p] < ALPHA else Mark.NONE for p in ("p_holm", "p_xi_holm")]
+    rho, xi = Cell(text=f"{related['rho']:+.2f}", mark=sure[0]), Cell(text=f"{related['xi']:.2f}", mark=sure[1])
+    return line(rho, p_value(related["p_holm"]), xi, p_value(related["p_xi_holm"]))
 
 
 def _group(group: Mapping[str, Any]) -> str:
@@ -366,11 +370,11 @@ def scatters(table: pa.Table) -> list[Panel]:
             listed = texts(table, DRAW + name)
             kinds = tuple(sorted(set(listed)))
             spread = np.random.default_rng(0).uniform(-0.3, 0.3, listed.size)  # the same every time
-            values = np.array([kinds.index(each) for each in listed], float) + spread
+            values = np.array([kinds.index(value) for value in listed], float) + spread
         x, beyond_x = _clip(values, *_ends(values[np.isfinite(values)]), "left", "right")
         beyond, points = np.where(beyond_y == "", beyond_x, beyond_y), list[Series]()
-        for verdict, found in verdicts(table).items():
-            rows, (_, colour, symbol) = np.flatnonzero(found), VERDICTS[verdict]
+        for verdict, flown in verdicts(table).items():
+            rows, (_, colour, symbol) = np.flatnonzero(flown), VERDICTS[verdict]
             even = np.linspace(0.0, rows.size - 1.0, min(rows.size, _MOST_POINTS // len(names)))
             rows = rows[np.unique(even.astype(int))]
             for edge in ("", "down", "up", "left", "right"):

@@ -115,11 +115,11 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> 
     if name in _NAMED:
         column, value = _NAMED[name]
         return Event(name, column, "==", value)
-    found = _COMPARISON.fullmatch(text)
-    if found is None:
+    comparison = _COMPARISON.fullmatch(text)
+    if comparison is None:
         hint = "or a comparison, COLUMN OP NUMBER with < <= > or >=, such as 'rmse.z > 0.5'"
         raise UnknownNameError("event", text, {*_NAMED, *_SPELLINGS}, hint=hint)
-    column, operation, given = found.groups()
+    column, operation, threshold = comparison.groups()
     if column in _NEVER_COMPARED:
         raise InputError(
             f"event {text!r} must compare a column that measures a flight, such as rmse.z; {column!r} does not"
@@ -127,9 +127,9 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> 
     if columns is not None:
         _require_number(text, column, columns)
     with contextlib.suppress(ValueError):
-        if math.isfinite(number := float(given)):
+        if math.isfinite(number := float(threshold)):
             return Event(f"{column} {operation} {number:.15g}", column, operation, number)
-    raise ParameterError(f"event {text!r}", "number", given, "a finite number")
+    raise ParameterError(f"event {text!r}", "number", threshold, "a finite number")
 
 
 def is_number(kind: pa.DataType) -> bool:

@@ -289,11 +289,11 @@ def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *,
     Raises:
         InputError: what comes of it is no scenario.
     """
-    given, data = data, merge(data, {})
+    before, data = data, merge(data, {})
     for entry, _ in changes:  # a field of `[actual]` is as modelled until it is drawn
         for above, name, *_rest in (field.split(".") for field in entry.fields if "." in field):
-            if above == "actual" and name in given["vehicle"]:
-                data.setdefault("actual", {}).setdefault(name, given["vehicle"][name])
+            if above == "actual" and name in before["vehicle"]:
+                data.setdefault("actual", {}).setdefault(name, before["vehicle"][name])
     after = merge(data, {})
     for entry, value in changes:
         for field in entry.fields:
@@ -303,13 +303,13 @@ def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *,
 
 
 def _scaled(data: dict[str, Any], entry: Varied, field: str, value: Value, parse: Parse, table: str) -> Value:
-    given = get_field(data, field)
-    if given is None:  # refused with its own message where there is no such field
+    modelled = get_field(data, field)
+    if modelled is None:  # refused with its own message where there is no such field
         changed(data, [(replace(entry, relative=False), value)], parse, table=table)
-    for what, number in ((f"the scenario has no number at {field}", given), ("what is drawn is no number", value)):
+    for what, number in ((f"the scenario has no number at {field}", modelled), ("what is drawn is no number", value)):
         if isinstance(number, bool) or not isinstance(number, int | float):
             raise ParameterError(f"{table}.{entry.name}", "relative", True, f"false where {what}")
-    return value * given
+    return value * modelled
 
 
 def check_ends(entries: Iterable[Varied], check: Callable[[Varied, Value], object], *, table: str) -> None:

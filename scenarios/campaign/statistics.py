@@ -250,7 +250,7 @@ def estimate(table: pa.Table) -> dict[str, Any]:
     return {
         "flights": table.num_rows,
         "confidence": CONFIDENCE,
-        "verdicts": {verdict: int(found.sum()) for verdict, found in verdicts(table).items()},
+        "verdicts": {verdict: int(flown.sum()) for verdict, flown in verdicts(table).items()},
         "events": {
             event.text: share_of(event.column(table)[is_counted(table, event)])
             for event in map(parse_event, EVENT_NAMES)
@@ -369,8 +369,8 @@ def drivers(summary: Summary) -> dict[str, Mapping[str, Any]]:
     }
 
     def weakness(parameter: tuple[str, Mapping[str, Any]]) -> tuple[float, float]:
-        found = parameter[1]["worst_margin"] or parameter[1]["failed"]
-        return min(found["p_holm"], found["p_xi_holm"]), -max(abs(found["rho"]), found["xi"])
+        related = parameter[1]["worst_margin"] or parameter[1]["failed"]
+        return min(related["p_holm"], related["p_xi_holm"]), -max(abs(related["rho"]), related["xi"])
 
     return dict(sorted(related.items(), key=weakness))
 
@@ -472,17 +472,17 @@ def parse_requirement(text: str) -> Requirement:
         ParameterError: a number is outside what is allowed.
     """
     text = " ".join(text.split())
-    owner, found = f"requirement {text!r}", _FORM.fullmatch(text)
-    if found is None:
+    owner, form = f"requirement {text!r}", _FORM.fullmatch(text)
+    if form is None:
         raise InputError(
             f"{owner} must read P(EVENT) OP SHARE @ CONFIDENCE%, with one of < <= > >=, such as {EXAMPLE!r}"
         )
     return Requirement(
         text=text,
-        event=parse_event(found["event"].strip()),
-        operation=found["operation"],
-        share=_number(owner, "share", found["share"], *_SHARES),
-        confidence=_number(owner, "confidence", found["confidence"] + "%", *_CONFIDENCES),
+        event=parse_event(form["event"].strip()),
+        operation=form["operation"],
+        share=_number(owner, "share", form["share"], *_SHARES),
+        confidence=_number(owner, "confidence", form["confidence"] + "%", *_CONFIDENCES),
     )
 
 
@@ -524,14 +524,14 @@ def _bound(requirement: Requirement, count: int, flights: int) -> float:
     return float(bounds(count, flights, requirement.confidence))
 
 
-def _number(owner: str, name: str, given: str, low: Decimal, high: Decimal) -> float:
+def _number(owner: str, name: str, text: str, low: Decimal, high: Decimal) -> float:
     """A share of one, given as such or in percent."""
-    in_percent = given.endswith("%")
+    in_percent = text.endswith("%")
     with contextlib.suppress(ArithmeticError):
-        value = Decimal(given.removesuffix("%").strip()) / (100 if in_percent else 1)
+        value = Decimal(text.removesuffix("%").strip()) / (100 if in_percent else 1)
         if low <= value <= high:
             return float(value)
     rule = f"a number from {low} to {high}".lower()
     if in_percent:
         rule = f"from {(100 * low).normalize():f}% to {(100 * high).normalize():f}%"
-    raise ParameterError(owner, name, given, rule)
+    raise ParameterError(owner, name, text, rule)

@@ -124,7 +124,7 @@ class Session:
         scenarios = [self.scenario]
         if self._against is not None:
             scenarios.append(with_bounds_stated(self.scenario).model_copy(update={"controller": self._against}))
-        self.flights = tuple(start(each, live=True) for each in scenarios)
+        self.flights = tuple(start(flown, live=True) for flown in scenarios)
         self._held = _Hand()
         self.reason: str | None = None
 

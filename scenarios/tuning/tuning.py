@@ -127,15 +127,13 @@ def tune(
         table = search.run()
         answer, front = search.answer()
         best = plan.candidate(search.candidates[answer], f"{name}-best")
-        found = [best]
+        answers = [best]
         if len(plan.spec.objectives) > 1:
-            found += [plan.candidate(search.candidates[each], f"{name}-front-{each}") for each in front]
-        files.write({f"{each.name.removeprefix(f'{name}-')}.toml": each.to_toml().encode() for each in found})
+            answers += [plan.candidate(search.candidates[c], f"{name}-front-{c}") for c in front]
+        files.write({f"{s.name.removeprefix(f'{name}-')}.toml": s.to_toml().encode() for s in answers})
 
         folders = {START: "start", answer: "start" if answer == START else f"candidate-{answer}"}
-        campaigns = {
-            folder: plan.fresh(search.candidates[each], f"{name}-{folder}") for each, folder in folders.items()
-        }
+        campaigns = {folder: plan.fresh(search.candidates[c], f"{name}-{folder}") for c, folder in folders.items()}
         finish = partial(fly_campaign, workers=workers, cluster=cluster, resume=True, report=report, watch=watch)
         tables = [finish(campaign, files.path / folder).table for folder, campaign in campaigns.items()]
         comparison = None
@@ -162,10 +160,10 @@ def _summary(
     both = np.isfinite(values).all(axis=(0, 2))
     objectives = []
     for i, objective in enumerate(plan.spec.objectives):
-        found = [(*search.scores[candidate].values, None, None)[i] for candidate in (START, answer)]
-        found += [float(each[both, i].mean()) if both.any() else None for each in values]
-        named = dict(zip(("start", "best", "fresh_start", "fresh_best"), found, strict=True))
-        difference = asdict(paired_difference(*(each[both, i] for each in values)))
+        numbers = [(*search.scores[candidate].values, None, None)[i] for candidate in (START, answer)]
+        numbers += [float(flights[both, i].mean()) if both.any() else None for flights in values]
+        named = dict(zip(("start", "best", "fresh_start", "fresh_best"), numbers, strict=True))
+        difference = asdict(paired_difference(*(flights[both, i] for flights in values)))
         objectives.append({**asdict(objective), **named, **difference})
     return {
         "tuning": plan.spec.name,
@@ -198,8 +196,8 @@ def _manifest(plan: TuningPlan) -> dict[str, Any]:
     tables = {k: v for k, v in asdict(plan.spec).items() if k not in _MAY_CHANGE}
     campaign = {k: v for k, v in asdict(plan.start.spec).items() if k not in OWN}
     scenario = json.loads(plan.start.scenario.model_dump_json())  # infinite bounds are null
-    own = {"format": "quadsim tuning", **tables, "campaign": campaign, "scenario": scenario}
-    return {**own, "optuna": require_optuna().__version__, **flown_by(plan.start)}
+    stated = {"format": "quadsim tuning", **tables, "campaign": campaign, "scenario": scenario}
+    return {**stated, "optuna": require_optuna().__version__, **flown_by(plan.start)}
 
 
 def _require_same(manifest: Mapping[str, Any], directory: Path) -> None:
@@ -241,9 +239,9 @@ def verdict(summary: Summary) -> str:
     if summary["answer"] == START:
         return f"No candidate of {summary['trials']} was better than the start"
     gains = []
-    for each in summary["objectives"]:
-        start, best, change = _compared(each["fresh_start"], each["fresh_best"])
-        gains.append(f"{label(each['name'], each['unit'])} {best} against {start} ({change})")
+    for objective in summary["objectives"]:
+        start, best, change = _compared(objective["fresh_start"], objective["fresh_best"])
+        gains.append(f"{label(objective['name'], objective['unit'])} {best} against {start} ({change})")
     return f"Candidate {summary['answer']} on fresh draws: {', '.join(gains)}"
 
 
@@ -288,13 +286,13 @@ def write_page(directory: Path, *, study: Study, summary: Summary) -> None:
     from optuna import visualization
     from optuna.importance import PedAnovaImportanceEvaluator
 
-    names = [label(each["name"], each["unit"]) for each in summary["objectives"]]
+    names = [label(entry["name"], entry["unit"]) for entry in summary["objectives"]]
     if len(names) > 1:
         plots = [_plot(visualization.plot_pareto_front(study, target_names=names), "candidates", "Pareto front", 430)]
     else:
         history = visualization.plot_optimization_history(study, target_name=names[0])
         plots = [_plot(history, "candidates", "candidates", 430)]
-    feasible = {each["candidate"] for each in summary["candidates"] if each["feasible"]}
+    feasible = {entry["candidate"] for entry in summary["candidates"] if entry["feasible"]}
     for i, name in enumerate(names if len(feasible) >= FEWEST and len(summary["search"]) > 1 else ()):
 
         def value(trial: FrozenTrial, i: int = i) -> float:  # infinite ones are left out

@@ -169,8 +169,8 @@ class TuningPlan:
     def objectives(self, rows: Sequence[Row]) -> Array:
         """(flights, objectives) of some flights; NaN for one that was not completed."""
         values = [
-            [value_of(each.expression, row) if row["status"] == "completed" else math.nan for row in rows]
-            for each in self.spec.objectives
+            [value_of(objective.expression, row) if row["status"] == "completed" else math.nan for row in rows]
+            for objective in self.spec.objectives
         ]
         return np.array(values, float).T
 
@@ -191,17 +191,17 @@ class TuningPlan:
 
     def shown(self, values: Values) -> dict[str, Value | str | None]:
         """The searched values of a candidate as tables have them; None where the start has no single one."""
-        own = values or self.start_values
-        return {entry.name: cell(own[entry.name]) if entry.name in own else None for entry in self.spec.search}
+        chosen = values or self.start_values
+        return {entry.name: cell(chosen[entry.name]) if entry.name in chosen else None for entry in self.spec.search}
 
     @cached_property
     def start_values(self) -> Values:
         """The start's values of what is searched; without entries for which it has no single one."""
         values: dict[str, Value] = {}
         for entry in self.spec.search:
-            given = [1.0 if entry.relative else get_field(merge(self.start.data, {}), each) for each in entry.fields]
-            if given[0] is not None and all(value == given[0] for value in given):
-                values[entry.name] = given[0]
+            modelled = [1.0 if entry.relative else get_field(merge(self.start.data, {}), path) for path in entry.fields]
+            if modelled[0] is not None and all(value == modelled[0] for value in modelled):
+                values[entry.name] = modelled[0]
         return values
 
     def check(self) -> None:
@@ -256,10 +256,12 @@ class SearchPlan(Plan):
     @cached_property
     def schema(self) -> pa.Schema:
         """The columns of all flights: a campaign's, and the candidate with its values."""
-        own = [("candidate", "-", pa.int64())]
-        own += [(f"search.{entry.name}", entry.unit, column_type(entry)) for entry in self.tuning.spec.search]
+        columns = [("candidate", "-", pa.int64())]
+        columns += [(f"search.{entry.name}", entry.unit, column_type(entry)) for entry in self.tuning.spec.search]
         first, *others = super().schema
-        return pa.schema([first, *(pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in own), *others])
+        return pa.schema(
+            [first, *(pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in columns), *others]
+        )
 
     def of(self, flight: int) -> Scenario:
         """The scenario of one flight; errors: `TuningPlan.candidate`."""
@@ -296,7 +298,7 @@ def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None
     spec = parse_table(TuningFile, data, path.name, file="tuning")
     try:
         campaign = _campaign(spec, source=f"{path.name}: campaign")
-        check_fields(spec.search, "search", {each: entry.name for entry in campaign.vary for each in entry.fields})
+        check_fields(spec.search, "search", {path: entry.name for entry in campaign.vary for path in entry.fields})
         plan = TuningPlan(spec, Plan(campaign, flown_scenario(campaign, path)))
         plan.check()
     except ScenarioError:
@@ -311,11 +313,11 @@ def _campaign(spec: TuningFile, *, source: str) -> CampaignFile:
     base = spec.campaign.get("base")
     if not isinstance(base, str | None):
         raise ParameterError("campaign", "base", base, "a campaign's name or a path ending in .toml")
-    if given := [name for name in OWN if name in spec.campaign]:
-        raise ParameterError("campaign", given[0], spec.campaign[given[0]], "absent: a tuning has its own")
-    own = {"name": spec.name, "description": spec.description, "flights": spec.flights[-1], "seed": spec.seed}
+    if stated := [name for name in OWN if name in spec.campaign]:
+        raise ParameterError("campaign", stated[0], spec.campaign[stated[0]], "absent: a tuning has its own")
+    fields = {"name": spec.name, "description": spec.description, "flights": spec.flights[-1], "seed": spec.seed}
     tables = {key: value for key, value in spec.campaign.items() if key != "base"}
-    return parse_campaign(merge(read_campaign(base) if base else {}, tables | own), source=source)
+    return parse_campaign(merge(read_campaign(base) if base else {}, tables | fields), source=source)
 
 
 _OPERATORS: Final[dict[type[ast.AST], Callable[..., float]]] = {
@@ -358,7 +360,7 @@ def _value(node: ast.expr, row: Mapping[str, Any]) -> float:
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
             return _OPERATORS[type(op)](_value(left, row), _value(right, row))
         case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in _FUNCTIONS:
-            return _FUNCTIONS[name](*(_value(each, row) for each in args))
+            return _FUNCTIONS[name](*(_value(argument, row) for argument in args))
         case ast.Name() | ast.Attribute():
             name = ast.unparse(node)
             if name not in row:

@@ -1,5 +1,7 @@
 """Two campaigns in pairs: what is found, and what is refused."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable
 from pathlib import Path
