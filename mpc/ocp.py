@@ -230,7 +230,7 @@ def _check_definite(name: str, matrix: Array, *, least: float) -> None:
     symmetric = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix.T)
     strict = least == 0.0
     if symmetric and np.all(np.isfinite(matrix)):
-        smallest, limit = np.linalg.eigvalsh(matrix)[0], least * np.abs(matrix).max(initial=0.0)
+        smallest, limit = np.linalg.eigvalsh(matrix).min(initial=math.inf), least * np.abs(matrix).max(initial=0.0)
         if smallest > limit or (not strict and smallest >= limit):
             return
     kind = "definite" if strict else "semidefinite"

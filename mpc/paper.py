@@ -67,9 +67,8 @@ class Cost:
 
 def cost(maps: Prediction, objective: Objective) -> Cost:
     """Build H and F1 to F4 from the prediction map and the weights."""
-    n = objective.C_r.shape[1]
     nu = objective.Q_u.shape[0]
-    horizon = maps.Phi.shape[0] // n
+    horizon = maps.Psi.shape[1] // nu
     outputs_of_inputs = _apply_blockwise(objective.C_r, maps.Psi, horizon)  # C_r Psi_i, stacked
     outputs_of_state = _apply_blockwise(objective.C_r, maps.Phi, horizon)  # C_r Phi_i, stacked
     weighted = _apply_blockwise(objective.Q_y, outputs_of_inputs, horizon)
@@ -87,8 +86,8 @@ def cost(maps: Prediction, objective: Objective) -> Cost:
 
 def _apply_blockwise(matrix: Array, stacked: Array, blocks: int) -> Array:
     """diag(matrix, ..., matrix) @ stacked, without forming the block-diagonal."""
-    rows = stacked.reshape(blocks, matrix.shape[1], -1)
-    return (matrix @ rows).reshape(blocks * matrix.shape[0], -1)
+    rows = stacked.reshape(blocks, matrix.shape[1], stacked.shape[1])
+    return (matrix @ rows).reshape(blocks * matrix.shape[0], stacked.shape[1])
 
 
 def slew_matrix(horizon: int, nu: int) -> Array:

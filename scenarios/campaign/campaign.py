@@ -35,12 +35,11 @@ from scenarios.campaign.store import (
     read_manifest,
     stored_plan,
 )
-from scenarios.flight import Flight, Outputs, to_pandas
+from scenarios.flight import Flight, to_pandas
 from scenarios.many import MEMORY, TIMEOUT, count_workers
 from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.run import run_scenario
 from scenarios.schema.scenario import Scenario
 
 REPORT_FILES: Final = ("index.html", "campaign.png")
@@ -334,7 +333,6 @@ class Replay(Result):
 
     recorded: Recorded  # as the campaign has it
     flight: Flight  # as it was flown now
-    directory: Path  # its run directory
     differing: Sequence[str]  # columns of the campaign's table that are not the same bit for bit
 
     @property
@@ -358,12 +356,9 @@ class Replay(Result):
         return self.flight.to_json()
 
 
-def replay_flight(
-    recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent, *, overwrite: bool = False
-) -> Replay:
-    """Fly it again and write its run directory; see `scenarios.run.run_scenario`."""
-    flight = run_scenario(recorded.scenario, target, outputs, progress, overwrite=overwrite)
+def held_against(flight: Flight, recorded: Recorded) -> Replay:
+    """A campaign's flight that was flown again, beside what the campaign has of it."""
     row = recorded.plan.row_of(recorded.number, flight)
     (again,) = make_table([row], recorded.plan.schema).to_pylist()
     differing = [name for name, value in recorded.row.items() if name not in again or again[name] != value]
-    return Replay(recorded=recorded, flight=flight, directory=target, differing=differing)
+    return Replay(recorded=recorded, flight=flight, differing=differing)

@@ -23,7 +23,7 @@ from scenarios.loading import check_parts, parse_scenario
 from scenarios.machine import processor_name
 from scenarios.many import ERROR, MEMORY, fly_many
 from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.problems import ScenarioError, parse_table
@@ -122,7 +122,7 @@ class Plan:
         """The row of a flight; one that cannot be flown has one too, with its reason."""
         started = clock.perf_counter()
         try:
-            flown = fly_scenario(self.of(flight))
+            flown = Rollout(self.of(flight)).fly()
         except QuadsimError as error:
             return self.failed(flight, str(error))
         if raised := flown.log.traceback:  # no more of such a flight is kept than that it raised

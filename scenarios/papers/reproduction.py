@@ -18,7 +18,7 @@ from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
 from scenarios.loading import check_parts, parse_scenario
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.base import MOST_ENTRIES, Pair
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import parse_table
@@ -248,7 +248,7 @@ def reproduce_paper(paper: Paper, progress: Progress = silent) -> Reproduction:
         progress(what, done, count)
         key = json.dumps([number.scenario, number.set], sort_keys=True, default=str)
         if key not in summaries:
-            summaries[key] = dict(fly_scenario(scenario).summary)
+            summaries[key] = dict(Rollout(scenario).fly().summary)
         reproduced.append(_measured(number, summaries[key]))
     progress(what, count, count)
     return Reproduction(paper=paper, numbers=tuple(reproduced))

@@ -27,7 +27,7 @@ from scenarios.papers.reproduction import (
     reproduce_paper,
 )
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.problems import ScenarioError
 from scenarios.shipped import paper_names, scenario_names
 
@@ -55,7 +55,7 @@ def written(folder: Path, *numbers: tuple[str, str]) -> str:
 def loop4(fly_once: Callable[..., Flight]) -> Reproduction:
     """The short flights of Torrente et al., as CI flies them; `test_library` has them, too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scenarios.papers.reproduction.fly_scenario", lambda scenario: fly_once(scenario.name))
+        patch.setattr(Rollout, "fly", lambda rollout: fly_once(rollout.scenario.name))
         paper = load_paper("torrente2021")
         short = [n for n in paper.numbers if n.scenario.startswith("torrente-loop4") and not n.set]
         return reproduce_paper(replace(paper, numbers=short))
@@ -76,7 +76,7 @@ def test_its_errors_have_the_digits_of_the_specification(loop4: Reproduction) ->
 
 def test_the_first_seconds_at_8_m_s_are_those_of_the_specification() -> None:
     """Positions under drag at 2 s and 5 s, where it is fastest; the heading has turned by then."""
-    flight = fly_scenario(load_scenario("torrente-loop8-drag", ["duration=5.02"]))
+    flight = Rollout(load_scenario("torrente-loop8-drag", ["duration=5.02"])).fly()
     positions = flight.log.control.truth[[100, 250], 0:6:2]
     expected = [[0.586204, -0.036271, 1.003212], [4.944455, -5.120605, 1.068593]]
     np.testing.assert_allclose(positions, expected, atol=1e-6)
