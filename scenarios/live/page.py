@@ -27,7 +27,7 @@ import numpy as np
 from quadsim.controller import OPTIMAL
 from quadsim.errors import InputError, MissingPackageError, OutputError, ParameterError
 from quadsim.flight.audit import Limit
-from quadsim.report.curves import BOUND, LINES
+from quadsim.report.figure import BOUND, LINES
 from quadsim.rotation import quaternion_to_euler
 from quadsim.vehicle import N_ROTORS
 from scenarios.live.guard import Guard

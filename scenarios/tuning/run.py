@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError, OutputError
-from quadsim.flight.summary import read_json
+from quadsim.flight.rundir import read_json
 from quadsim.outputs import SUMMARY_FILE, growing, to_json
 from quadsim.report.page import PAGE_FILE
 from scenarios.campaign.manifest import flown_by

@@ -16,8 +16,7 @@ from quadsim.flight.rundir import Run
 from quadsim.report.comparison import failure_sentences
 from quadsim.report.film import painter as ink
 from quadsim.report.film.frames import Footage, MarginTrack
-from quadsim.report.film.painter import Colour, Painter, Picture, shade, text_width
-from quadsim.report.film.topview import TopView
+from quadsim.report.film.painter import Colour, Painter, Picture, TopView, shade, text_width
 from quadsim.report.table import ABSENT
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
 
