@@ -109,16 +109,15 @@ _AROUND: Final = 1.0  # how much more is shown around where there are obstacles 
 class TopView:
     """A map of the course seen from above, width by height [design pixels], with the flight's height beside it.
 
-    Obstacles at the vehicle's height are bright, others faint.  Where `acting`, it shows the wind as an arrow towards
-    the vehicle, and the external force as one away from it.
+    Obstacles at the vehicle's height are bright, others faint.  The wind is an arrow towards the vehicle, the external
+    force one away from it.
     """
 
-    def __init__(self, run: Run, footage: Footage, width: float, height: float, *, acting: bool) -> None:
+    def __init__(self, run: Run, footage: Footage, width: float, height: float) -> None:
         self._footage, self.width, self.height = footage, width, height
         plant, none = run.log.plant, np.zeros((footage.times.size, 2))
         self._wind = none if plant.wind is None or footage.wind is None else _arrows(footage.wind, plant.wind)
         self._force = none if plant.wrench is None or footage.force is None else _arrows(footage.force, plant.wrench)
-        self._acting = acting
         self._obstacles, self._regions = obstacles_in(run.limits), list(region_edges(run))
         self._radius = run.vehicle.enclosing_radius
         low, high = footage.course.min(axis=0), footage.course.max(axis=0)
@@ -160,9 +159,8 @@ class TopView:
         yaw = footage.euler[i, 2]
         painter.line(np.stack([spot, spot + 11.0 * np.array([math.cos(yaw), -math.sin(yaw)])]), WHITE, width=2.5)
         painter.dot(spot, 4.0, WHITE)
-        if self._acting:
-            painter.arrow(spot - 1.25 * self._wind[i], self._wind[i], CYAN)
-            painter.arrow(spot, self._force[i], VIOLET)
+        painter.arrow(spot - 1.25 * self._wind[i], self._wind[i], CYAN)
+        painter.arrow(spot, self._force[i], VIOLET)
         longest = 0.22 * width / unit  # of 1, 2, 5 times a power of ten
         power = 10.0 ** math.floor(math.log10(longest))
         metres = max(power * factor for factor in (1.0, 2.0, 5.0) if power * factor <= longest)
