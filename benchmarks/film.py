@@ -9,8 +9,7 @@ from timing import Record, Stopwatch, options, run
 
 from quadsim.report.film.video import render_video, rendering_backend, worker_count
 from scenarios.app import load
-from scenarios.flight import Outputs
-from scenarios.run import run_scenario
+from scenarios.rollout import Rollout
 
 FPS = 30
 
@@ -26,8 +25,8 @@ def measure(name: str, quick: bool, workers: int | None) -> list[Record]:
     reports: list[tuple[int, int, float]] = []  # frames done, of how many, after how long [s]
     with tempfile.TemporaryDirectory() as scratch:
         directory = Path(scratch) / "run"
-        plain = Outputs(video=False, recording=False, figures=False)
-        run_scenario(load(name).replace({"duration": seconds, "constraints": []}), directory, plain)
+        rollout = Rollout(load(name).replace({"duration": seconds, "constraints": []}))
+        rollout.fly().save(directory, video=False, recording=False, figures=False)
         watch = Stopwatch()
         render_video(
             directory,

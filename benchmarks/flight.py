@@ -11,7 +11,7 @@ from scenarios.build import build_controller, build_plant
 from scenarios.parts.navigation import build_navigation
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.reference import build_reference
-from scenarios.run import closed_loop
+from scenarios.rollout import closed_loop
 
 
 def measure(name: str, quick: bool) -> list[Record]:

@@ -19,7 +19,7 @@ from quadsim.flight import metrics
 from quadsim.state import INDEX, POSITION
 from scenarios.app import load
 from scenarios.many import fly_many
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 from scenarios.shipped import scenario_path
 
@@ -90,7 +90,7 @@ def cells(quick: bool) -> list[tuple[str, str, Scenario]]:
 
 def fly(scenario: Scenario) -> Record:
     """One flight's numbers; those of nothing flown are None."""
-    log = fly_scenario(scenario).log
+    log = Rollout(scenario).fly().log
     control, period = log.control, scenario.control_period
     if not control.t.size:
         return {"fate": "lost, 0 s", "end_error": None, "peak_tilt": None, "violated_s": 0.0, "fallbacks": 0}

@@ -24,7 +24,7 @@ from scenarios.build import build_controller, build_plant
 from scenarios.catalogue import read_catalogue
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.reference import build_reference
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.controller import ConstrainedSpec
 from scenarios.schema.robust import RobustSpec
 from scenarios.schema.scenario import Scenario
@@ -86,7 +86,7 @@ def measure(name: str, quick: bool) -> list[Record]:
     if quick:
         scenario = scenario.replace({"duration": 2.0, "controller.horizon": 10, "constraints": []})
     vehicle = build_vehicle(scenario)
-    log = fly_scenario(scenario).log.control
+    log = Rollout(scenario).fly().log.control
     candidates: dict[str, Replayed] = {}
     setup: dict[str, float] = {}
     for solver, each in entries(scenario).items():

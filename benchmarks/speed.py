@@ -28,7 +28,7 @@ from scenarios.design.first_scenario import first_scenario
 from scenarios.feasibility_check import report
 from scenarios.loading import parse_scenario
 from scenarios.many import fly_many
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 Table = dict[str, Any]
 
@@ -152,7 +152,7 @@ def fly(cell: tuple[str, float, str, int]) -> Record:
     data |= {"seed": seed, "constraints": [], "lost": {"distance": world.size}, **copy.deepcopy(world.changes)}
     bound = min(STEEPEST, round(report(parse_scenario(data), vehicle).tilt + ROOM))
     data["controller"] = controllers(vehicle, tuned, period, bound)[law]
-    log = fly_scenario(parse_scenario(data)).log
+    log = Rollout(parse_scenario(data)).fly().log
     # A row of the plant covers the step that follows it; the last has none.
     states, speeds = log.plant.state[:-1], log.control.speeds
     beyond = np.degrees(np.abs(states[:, [INDEX["roll"], INDEX["pitch"]]]).max(axis=1)) > bound + TOLERANCE

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from scenarios.export.exporter import export as export
     from scenarios.export.in_the_loop import fly_exported as fly_exported
     from scenarios.flight import Flight as Flight
-    from scenarios.run import StartedFlight as StartedFlight
+    from scenarios.rollout import Rollout as Rollout
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
 
@@ -58,7 +58,7 @@ _MODULES = {
     "scenarios.export.exporter": "export",
     "scenarios.export.in_the_loop": "fly_exported",
     "scenarios.flight": "Flight",
-    "scenarios.run": "StartedFlight",
+    "scenarios.rollout": "Rollout",
     "scenarios.schema.json_schema": "scenario_schema",
     "scenarios.schema.scenario": "Scenario",
 }

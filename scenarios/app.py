@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from scenarios.progress import Progress
     from scenarios.reaudit import Reaudit
     from scenarios.results import Document, Listing, ScenarioFile
-    from scenarios.run import StartedFlight
+    from scenarios.rollout import Rollout
     from scenarios.schema.scenario import Scenario
     from scenarios.tuning.run import TuningResult
 
@@ -205,13 +205,10 @@ def fly(
         >>> quadsim.fly(scenario, controller=full_throttle).state["vz"][-1].round()
         np.float64(13.0)
     """
-    from scenarios import loading, user_code
-    from scenarios import run as runs
     from scenarios.progress import reporting
 
-    flown, law, own = user_code.set_up(loading.as_scenario(scenario), controller, forces)
     with reporting(progress) as report:
-        return runs.fly_scenario(flown, report, law, own)
+        return start(scenario, controller=controller, forces=forces).fly(report)
 
 
 @app.command
@@ -259,21 +256,26 @@ def run(
         ...     flown.outcome, flown.directory.name
         ('satisfied', 'run')
     """
-    from scenarios import loading, user_code
-    from scenarios import run as runs
-    from scenarios.flight import Outputs
+    from scenarios import loading
+    from scenarios.flight import require_rendering
     from scenarios.progress import reporting
 
-    flown, law, own = user_code.set_up(loading.as_scenario(scenario, changes, seed), controller, forces)
-    _announce(flown, progress)
-    outputs = Outputs(video=video, recording=recording, figures=figures)
-    with run_directory(flown.name, out, overwrite=overwrite) as directory, reporting(progress) as report:
-        try:
-            return runs.run_scenario(flown, directory, outputs, report, law, own, overwrite=overwrite)
-        except OutputError as error:
-            if error.path.parent == directory:  # a product that was asked for by name
-                error.result = read(directory)
-            raise
+    if video:
+        require_rendering()
+    flown = loading.as_scenario(scenario, changes, seed)
+    with run_directory(flown.name, out, overwrite=overwrite) as directory:
+        rollout = start(flown, controller=controller, forces=forces)
+        _announce(rollout.scenario, progress)
+        with reporting(progress) as report:
+            flight = replace(rollout.fly(report), directory=directory)
+            products: dict[str, Any] = {"video": video, "recording": recording, "figures": figures}
+            try:
+                flight.save(directory, overwrite=overwrite, progress=report, **products)
+            except OutputError as error:
+                if error.path.parent == directory:  # a product that was asked for by name
+                    error.result = flight
+                raise
+            return flight
 
 
 def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> AbstractContextManager[Path]:
@@ -304,7 +306,7 @@ def start(
     forces: Sequence[object] = (),
     live: bool = False,
     recorded: bool = True,
-) -> StartedFlight:
+) -> Rollout:
     """Build everything that a flight needs, for a script of one's own to fly it period by period.
 
     Args:
@@ -313,7 +315,7 @@ def start(
         forces: as of `fly`.
         live: whether anything may be applied to it that can happen to its vehicle; else what its scenario's events are
             of, and set-points, stalls, rotor losses and lags, and other controllers.
-        recorded: whether all periods are recorded, some 10 kB each; without them there is no `StartedFlight.flight`.
+        recorded: whether all periods are recorded, some 10 kB each; without them there is no `Rollout.flight`.
 
     Raises:
         InputError: the scenario cannot be flown, or the controller cannot be set up.
@@ -327,10 +329,10 @@ def start(
         'satisfied'
     """
     from scenarios import loading, user_code
-    from scenarios import run as runs
+    from scenarios.rollout import Rollout
 
     parts = user_code.set_up(loading.as_scenario(scenario), controller, forces)
-    return runs.start(*parts, live=live, recorded=recorded)
+    return Rollout(*parts, live=live, recorded=recorded)
 
 
 def read(directory: str | Path) -> Flight:
@@ -811,18 +813,24 @@ def replay(
         Traceback (most recent call last):
         quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
     """
-    from scenarios.campaign.replay import recorded_flight, replay_flight
-    from scenarios.flight import Outputs
+    from scenarios.campaign.replay import held_against, recorded_flight
+    from scenarios.flight import require_rendering
     from scenarios.progress import reporting
+    from scenarios.rollout import Rollout
+
+    if video:
+        require_rendering()
 
     if worst and flight is not None:
         raise ParameterError("", "--flight", flight, "absent with --worst")
     recorded = recorded_flight(Path(campaign), flight)
     for note in recorded.notes:
         _log.info(note)
-    outputs = Outputs(video=video, recording=recording, figures=figures)
+    products: dict[str, Any] = {"video": video, "recording": recording, "figures": figures}
     with reporting(progress) as report, run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
-        return replay_flight(recorded, directory, outputs, report, overwrite=overwrite)
+        flown = replace(Rollout(recorded.scenario).fly(report), directory=directory)
+        flown.save(directory, overwrite=overwrite, progress=report, **products)
+    return held_against(flown, recorded)
 
 
 @app.command

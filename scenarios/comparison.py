@@ -16,12 +16,12 @@ from quadsim.outputs import reserving
 from quadsim.report.table import Row
 from scenarios.campaign.manifest import is_campaign as is_campaign
 from scenarios.campaign.manifest import stored_plan
-from scenarios.flight import Flight, Outputs
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import reaudit
 from scenarios.results import Result, Shown
-from scenarios.run import run_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -129,10 +129,9 @@ def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool)
         return rundir.load_run(Path(target))
     scenario = target if isinstance(target, Scenario) else load_scenario(str(target))
     wanted = None if pictures else False
-    outputs = Outputs(video=wanted, recording=wanted, figures=wanted)
     with reserving(beside / scenario.name, free=True) as place:
-        run_scenario(scenario, place, outputs, progress)
-        return rundir.load_run(place)
+        flight = Rollout(scenario).fly(progress)
+        return rundir.load_run(flight.save(place, video=wanted, recording=wanted, figures=wanted, progress=progress))
 
 
 def compare_campaigns(

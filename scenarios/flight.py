@@ -51,30 +51,6 @@ _log: Final = logging.getLogger("quadsim")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outputs:
-    """Which products a run gets besides its summary, scenario and Parquet tables.
-
-    None is yes where it can be made: a failure is named in the summary.  True asks for it by name: a failure is an
-    error, after all else is made.
-    """
-
-    video: bool | None = None
-    recording: bool | None = None
-    figures: bool | None = None
-
-    def check(self) -> None:
-        """Refuse a video that is asked for by name and cannot be made here, before anything is flown.
-
-        Raises:
-            RenderingUnavailableError: so it is.
-        """
-        if self.video:
-            from quadsim.report.film.video import rendering_backend
-
-            rendering_backend()
-
-
-@dataclass(frozen=True, kw_only=True)
 class Flight(Result):
     """A flown scenario.
 
@@ -314,9 +290,29 @@ class Flight(Result):
         """
         if self.recorded is not None:
             raise OutputError(directory, f"this flight is on disk already, in {self.directory}; copy that directory")
-        outputs = Outputs(video=video, recording=recording, figures=figures)
-        outputs.check()
-        write_run(self, absolute(directory), outputs, progress, overwrite=overwrite)
+        if video:
+            require_rendering()
+        target, started = absolute(directory), clock.perf_counter() - self.simulate_s
+
+        def wall_s() -> dict[str, float]:
+            return {"simulate": self.simulate_s, "total": clock.perf_counter() - started}
+
+        def write_tables(*, overwrite: bool) -> None:
+            with writing(target, overwrite=overwrite) as partial:
+                (partial / rundir.SCENARIO_FILE).write_text(self.scenario.to_toml(), encoding="utf-8")
+                write_log(partial, self.log, plant_stride=self.scenario.plant_stride, metadata=self.metadata)
+                summary = to_json({**self.summary, "wall_s": wall_s()})
+                (partial / rundir.SUMMARY_FILE).write_text(summary, encoding="utf-8")
+
+        try:
+            write_tables(overwrite=overwrite)
+        except KeyboardInterrupt:  # no flight that was flown is lost by it
+            write_tables(overwrite=True)
+            video = recording = figures = False
+        failed = _add_products(self, target, {"recording": recording, "figures": figures, "video": video}, progress)
+        amend(target, {"wall_s": wall_s()})
+        for name, problem in failed.items():
+            raise OutputError(target / name, f"{problem}; all else is there")
         return Path(directory)
 
     @property
@@ -372,43 +368,15 @@ def to_pandas(table: pa.Table) -> Any:
     return table.to_pandas()
 
 
-def write_run(
-    flight: Flight,
-    directory: Path,
-    outputs: Outputs,
-    progress: Progress = silent,
-    *,
-    overwrite: bool = False,
-    since: float | None = None,
-) -> None:
-    """Write a run directory: scenario, Parquet tables and summary at once, then its products, one by one.
-
-    `since` is the clock's reading when the flight's work began [s], for the summary's total.
+def require_rendering() -> None:
+    """Refuse a video that is asked for by name and cannot be made here, before anything is flown.
 
     Raises:
-        OutputError: the directory cannot be written, or a product that was asked for by name failed.
+        RenderingUnavailableError: so it is.
     """
-    started = clock.perf_counter() - flight.simulate_s if since is None else since
+    from quadsim.report.film.video import rendering_backend
 
-    def wall_s() -> dict[str, float]:
-        return {"simulate": flight.simulate_s, "total": clock.perf_counter() - started}
-
-    def write_tables(*, overwrite: bool) -> None:
-        with writing(directory, overwrite=overwrite) as partial:
-            (partial / rundir.SCENARIO_FILE).write_text(flight.scenario.to_toml(), encoding="utf-8")
-            write_log(partial, flight.log, plant_stride=flight.scenario.plant_stride, metadata=flight.metadata)
-            summary = to_json({**flight.summary, "wall_s": wall_s()})
-            (partial / rundir.SUMMARY_FILE).write_text(summary, encoding="utf-8")
-
-    try:
-        write_tables(overwrite=overwrite)
-    except KeyboardInterrupt:  # no flight that was flown is lost by it
-        write_tables(overwrite=True)
-        outputs = Outputs(video=False, recording=False, figures=False)
-    failed = _add_products(flight, directory, outputs, progress)
-    amend(directory, {"wall_s": wall_s()})
-    for name, problem in failed.items():
-        raise OutputError(directory / name, f"{problem}; all else is there")
+    rendering_backend()
 
 
 def summarise(flight: Flight) -> dict[str, Any]:
@@ -460,7 +428,9 @@ def summarise(flight: Flight) -> dict[str, Any]:
     }
 
 
-def _add_products(flight: Flight, directory: Path, outputs: Outputs, progress: Progress) -> dict[str, str]:
+def _add_products(
+    flight: Flight, directory: Path, asked: Mapping[str, bool | None], progress: Progress
+) -> dict[str, str]:
     """Recording, figures and video, each made from the files that are there; of those asked for, which failed and why.
 
     Ctrl-C ends the one that is being made, and skips the others.
@@ -469,7 +439,7 @@ def _add_products(flight: Flight, directory: Path, outputs: Outputs, progress: P
     flown, interrupted = bool(run.log.control.t.size), flight.log.interrupted
 
     @contextlib.contextmanager
-    def product(name: str, asked: bool | None) -> Iterator[Path]:
+    def product(name: str, demanded: bool | None) -> Iterator[Path]:
         nonlocal interrupted
         try:
             with adding(directory, products={name: "made"}) as folder:
@@ -480,29 +450,29 @@ def _add_products(flight: Flight, directory: Path, outputs: Outputs, progress: P
             what = str(error) if isinstance(error, QuadsimError) else f"{type(error).__name__}: {error}"
             what = error.problem if isinstance(error, OutputError) else what  # its path is the product's
             problem = f"failed: {' '.join(printable(what).split())}"[:_LONGEST]
-            if asked:
+            if demanded:
                 failed[name] = problem
         else:
             return
         amend(directory, {"products": {name: problem}})
         _log.warning("%s %s", name, problem)
 
-    if outputs.recording is not False:
-        with product(rundir.RECORDING_FILE, outputs.recording) as folder:
+    if asked["recording"] is not False:
+        with product(rundir.RECORDING_FILE, asked["recording"]) as folder:
             from quadsim.report.recording import write_recording
 
             progress("recording", 0, 1)
             write_recording(run, folder / rundir.RECORDING_FILE)
         progress("recording", 1, 1)
-    if outputs.figures is not False and flown and (not interrupted or flight.log.interrupted):
-        with product(rundir.FIGURES_DIR, outputs.figures) as folder:
+    if asked["figures"] is not False and flown and (not interrupted or flight.log.interrupted):
+        with product(rundir.FIGURES_DIR, asked["figures"]) as folder:
             from quadsim.report.flight_figures import write_figures
 
             progress("figures", 0, 1)
             write_figures(run, folder / rundir.FIGURES_DIR)
             progress("figures", 1, 1)
-    if outputs.video is not False and flown and not interrupted:
-        with product(rundir.VIDEO_FILE, outputs.video) as folder:
+    if asked["video"] is not False and flown and not interrupted:
+        with product(rundir.VIDEO_FILE, asked["video"]) as folder:
             from quadsim.report.film.video import render_video
 
             render_video(

@@ -8,24 +8,21 @@ import os
 import pickle
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from support import draw_nothing, fly_here
+from support import NO_PRODUCTS, draw_nothing, fly_here
 
-from quadsim.controller import Controller
 from quadsim.flight import rundir
 from quadsim.flight.rundir import Run
-from quadsim.sim.effects import Force
 from quadsim.vehicle import Vehicle
-from scenarios.flight import Flight, Outputs
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent
-from scenarios.run import fly_scenario, run_scenario
-from scenarios.schema.scenario import Scenario
+from scenarios.rollout import Rollout
 from scenarios.shipped import scenario_names
 
 # Compiled code is cached, whatever the environment sets: the workers, and all processes that tests
@@ -37,7 +34,6 @@ sys.dont_write_bytecode = False
 settings.register_profile("quadsim", deadline=None, derandomize="CI" in os.environ)
 settings.load_profile("quadsim")
 
-NO_PRODUCTS = Outputs(video=False, recording=False, figures=False)
 LONG = (
     *("test_benchmarks.py", "test_commands.py", "quadsim/report/test_comparison_page.py"),
     "scenarios/campaign/report/test_campaign_page.py",
@@ -51,6 +47,8 @@ LONG = (
     *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/core/test_core.py"),
 )
 """Modules that take longest."""
+_fly = Rollout.fly
+"""Whatever stands in for it in a test."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -95,7 +93,7 @@ def fly_once(session_directory: Path) -> Fly:
             with path.with_suffix(".lock").open("w") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 if not path.exists():
-                    path.write_bytes(pickle.dumps(fly_scenario(load_scenario(name, settings)), protocol=-1))
+                    path.write_bytes(pickle.dumps(_fly(Rollout(load_scenario(name, settings))), protocol=-1))
             known[key] = pickle.loads(path.read_bytes())
         return known[key]
 
@@ -111,7 +109,7 @@ def vehicle() -> Vehicle:
 def short_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Six seconds of the constrained flight in a run directory with its summary, scenario and Parquet files."""
     directory = tmp_path_factory.mktemp("short") / "paper-constrained"
-    run_scenario(load_scenario("paper-constrained", ["duration=6.0"]), directory, NO_PRODUCTS)
+    Rollout(load_scenario("paper-constrained", ["duration=6.0"])).fly().save(directory, **NO_PRODUCTS)
     return rundir.load_run(directory)
 
 
@@ -134,18 +132,13 @@ def campaigns_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def fly_known(fly_once: Fly) -> Fly:
-    """Stands in for `scenarios.run.fly_scenario`: a scenario as the library has it is flown once per session."""
+    """Stands in for `Rollout.fly`: a scenario as the library has it is flown once per session."""
 
-    def fly(
-        scenario: Scenario,
-        progress: Progress = silent,
-        law: Controller | None = None,
-        forces: Sequence[Force] | None = None,
-    ) -> Flight:
-        known = scenario.name in scenario_names() and load_scenario(scenario.name) == scenario
-        if known and law is None and not forces:
+    def fly(rollout: Rollout, progress: Progress = silent) -> Flight:
+        scenario, substituted = rollout.scenario, rollout._events._build is None
+        if not substituted and scenario.name in scenario_names() and load_scenario(scenario.name) == scenario:
             return fly_once(scenario.name)
-        return fly_scenario(scenario, progress, law, forces)
+        return _fly(rollout, progress)
 
     return fly
 

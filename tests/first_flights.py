@@ -19,7 +19,7 @@ from quadsim.flight.metrics import peak_tilt, tracking
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
 from scenarios.loading import parse_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 REQUIREMENTS: Final = {
     "tracking": ("hold_x", "hold_y", "hold_z"),
@@ -66,7 +66,7 @@ def fly_first(vehicle: Vehicle, course: str, law: str) -> FirstFlight:
     made = first_scenario(vehicle, vehicle.name, course=course, law=law)
     numbers = {name: value for name in VEHICLE_UNITS if (value := getattr(vehicle, name)) is not None}
     given = {name: list(value) if isinstance(value, tuple) else value for name, value in numbers.items()}
-    flight = fly_scenario(parse_scenario(made.to_data() | {"vehicle": {"file": vehicle.name, **given}}))
+    flight = Rollout(parse_scenario(made.to_data() | {"vehicle": {"file": vehicle.name, **given}})).fly()
     failed = {finding.limit.name for finding in flight.findings if not finding.satisfied}
     requirements = tuple(name for name, constraints in REQUIREMENTS.items() if not failed.isdisjoint(constraints))
     if not flight.log.control.t.size:

@@ -20,7 +20,7 @@ from quadsim.flight.audit import Finding
 from quadsim.flight.metrics import peak_tilt, tracking
 from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.shipped import scenario_names
 
 GOLDEN: Final = Path(__file__).resolve().parent / "golden"
@@ -100,7 +100,7 @@ def paper_entry(flight: Flight) -> dict[str, Any]:
 
 def main(names: list[str]) -> None:
     """Fly these scenarios and write their entries; drop those of scenarios that are no more."""
-    flights = {name: fly_scenario(load_scenario(name)) for name in names}
+    flights = {name: Rollout(load_scenario(name)).fly() for name in names}
     library = read("library") | {name: library_entry(flight) for name, flight in flights.items()}
     write("library", {name: entry for name, entry in library.items() if name in scenario_names()})
     paper = {name: paper_entry(flight) for name, flight in flights.items() if name in PAPER}

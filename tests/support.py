@@ -29,8 +29,11 @@ from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.reference import build_reference
-from scenarios.run import closed_loop
+from scenarios.rollout import closed_loop
 from scenarios.schema.scenario import Scenario
+
+NO_PRODUCTS = {"video": False, "recording": False, "figures": False}
+"""Of a flight that is saved."""
 
 
 def fly_here(patch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support import fly_here
+from support import NO_PRODUCTS, fly_here
 from tuning_formula import write_tuning
 
 import quadsim
@@ -17,10 +17,10 @@ from quadsim.errors import RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
 from scenarios.app import app
 from scenarios.cli import main
-from scenarios.flight import Flight, Outputs
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED
-from scenarios.run import run_scenario
+from scenarios.rollout import Rollout
 
 ROOT = Path(__file__).resolve().parent.parent
 CAMPAIGN = ("--set", "duration=1.0", "--set", "constraints=[]", "--flights", "2", "--no-report")
@@ -82,16 +82,14 @@ def workplace(
     for name in ("paper-unconstrained", "paper-constrained"):
         shutil.copytree(flown, tmp_path / "runs" / name)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("scenarios.papers.reproduction.fly_scenario", fly_known)
-    monkeypatch.setattr("scenarios.run.fly_scenario", fly_known)
+    monkeypatch.setattr("scenarios.rollout.Rollout.fly", fly_known)
 
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of 0.1 s, which is 3 frames of film."""
     directory = tmp_path_factory.mktemp("flown") / "paper-constrained"
-    tables = Outputs(video=False, recording=False, figures=False)
-    run_scenario(load_scenario("paper-constrained", ["duration=0.1"]), directory, tables)
+    Rollout(load_scenario("paper-constrained", ["duration=0.1"])).fly().save(directory, **NO_PRODUCTS)
     return directory
 
 

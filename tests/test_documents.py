@@ -16,7 +16,7 @@ from golden_numbers import PAPER, paper_entry, read
 
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -72,13 +72,13 @@ def test_the_examples_in_the_page_on_effects_are_a_scenario(tmp_path: Path) -> N
     page = (ROOT / "docs/effects.md").read_text(encoding="utf-8")
     example, mismatch, events = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
     (tmp_path / "heavy-hover.toml").write_text(mismatch, encoding="utf-8")
-    heavy = fly_scenario(load_scenario(str(tmp_path / "heavy-hover.toml")))
+    heavy = Rollout(load_scenario(str(tmp_path / "heavy-hover.toml"))).fly()
     assert heavy.state["z"][-1] - heavy.reference["z"][-1] == pytest.approx(-0.2, abs=0.01)
     (tmp_path / "gusty.toml").write_text(example + events, encoding="utf-8")
     scenario = load_scenario(str(tmp_path / "gusty.toml"), ["duration=16.0"])
     assert scenario.effects.air is not None
     assert [event.type for event in scenario.events] == ["gust", "push", "setpoint", "controller"]
-    log = fly_scenario(scenario).log
+    log = Rollout(scenario).fly().log
     assert log.plant.wind is not None
     assert log.predicted is not None
     assert log.predicted.shape[1] == 30

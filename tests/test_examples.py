@@ -14,7 +14,7 @@ import pytest
 from scenarios.cli import main
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "examples"
@@ -29,7 +29,7 @@ def _forgotten() -> Iterator[None]:
 
 
 def flown() -> Flight:
-    return fly_scenario(load_scenario(SCENARIO))
+    return Rollout(load_scenario(SCENARIO)).fly()
 
 
 def test_it_follows_the_course_within_its_constraints() -> None:
@@ -42,7 +42,7 @@ def test_it_follows_the_course_within_its_constraints() -> None:
 
 
 def test_its_settings_are_taken_from_the_file() -> None:
-    late = fly_scenario(load_scenario(SCENARIO, ["controller.settings.lead=0"]))
+    late = Rollout(load_scenario(SCENARIO, ["controller.settings.lead=0"])).fly()
     assert late.outcome == "violated"
 
 
@@ -51,7 +51,7 @@ def test_an_installed_one_flies_by_the_name_of_its_entry_point(monkeypatch: pyte
     points = metadata.EntryPoints([point])
     monkeypatch.setattr(metadata, "entry_points", lambda *, group: points.select(group=group))
     monkeypatch.syspath_prepend(EXAMPLES)
-    flight = fly_scenario(load_scenario("waypoints", ["controller=example"]))
+    flight = Rollout(load_scenario("waypoints", ["controller=example"])).fly()
     assert flight.controller == "MyController"
     np.testing.assert_array_equal(flight.log.plant.state, flown().log.plant.state)
 
@@ -80,4 +80,4 @@ def test_the_scenarios_of_the_page_on_controllers_fly(tmp_path: Path, monkeypatc
     for block in blocks:
         (tmp_path / "one.toml").write_text(block, encoding="utf-8")
         scenario = load_scenario(str(tmp_path / "one.toml"), ["duration=1", "constraints=[]"])
-        assert fly_scenario(scenario).outcome == "satisfied"
+        assert Rollout(scenario).fly().outcome == "satisfied"

@@ -13,7 +13,7 @@ from scenarios.campaign.results.table import Row, failed_row, flown_row
 from scenarios.flight import Flight
 from scenarios.machine import processor_name
 from scenarios.many import MEMORY, fly_many
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 
 class Pilot(Protocol):
@@ -51,7 +51,7 @@ class CampaignPilot:
         """The row of a flight; one that cannot be flown has one too, with its reason."""
         started = clock.perf_counter()
         try:
-            flown = fly_scenario(self.plan.of(flight))
+            flown = Rollout(self.plan.of(flight)).fly()
         except QuadsimError as error:
             return self._row(flight, failed_row(str(error)))
         if raised := flown.log.traceback:  # no more of such a flight is kept than that it raised

@@ -14,11 +14,9 @@ from scenarios.campaign.plan import Plan
 from scenarios.campaign.results.store import FLIGHTS_FILE, read_flights
 from scenarios.campaign.results.table import make_table
 from scenarios.campaign.statistics.estimates import worst_flight
-from scenarios.flight import Flight, Outputs
+from scenarios.flight import Flight
 from scenarios.many import MEMORY, TIMEOUT
-from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.run import run_scenario
 from scenarios.schema.scenario import Scenario
 
 
@@ -68,7 +66,6 @@ class Replay(Result):
 
     recorded: Recorded  # as the campaign has it
     flight: Flight  # as it was flown now
-    directory: Path  # its run directory
     differing: Sequence[str]  # columns of the campaign's table that are not the same bit for bit
 
     @property
@@ -92,12 +89,9 @@ class Replay(Result):
         return self.flight.to_json()
 
 
-def replay_flight(
-    recorded: Recorded, target: Path, outputs: Outputs, progress: Progress = silent, *, overwrite: bool = False
-) -> Replay:
-    """Fly it again and write its run directory; see `scenarios.run.run_scenario`."""
-    flight = run_scenario(recorded.scenario, target, outputs, progress, overwrite=overwrite)
+def held_against(flight: Flight, recorded: Recorded) -> Replay:
+    """A campaign's flight that was flown again, beside what the campaign has of it."""
     row = CampaignPilot(recorded.plan).row_of(recorded.number, flight)
     (again,) = make_table([row], recorded.plan.schema).to_pylist()
     differing = [name for name, value in recorded.row.items() if name not in again or again[name] != value]
-    return Replay(recorded=recorded, flight=flight, directory=target, differing=differing)
+    return Replay(recorded=recorded, flight=flight, differing=differing)

@@ -15,17 +15,17 @@ from mpc.export.ctext import Precision
 from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Moment, stopped
-from quadsim.outputs import absolute
+from quadsim.outputs import reserving
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.export.emulation import Program, build, require_programs
 from scenarios.export.exporter import c_controller, exported_law, programs
 from scenarios.export.serial_line import SerialMPC
-from scenarios.flight import Flight, Outputs
+from scenarios.flight import Flight
 from scenarios.limits import with_bounds_stated
 from scenarios.loading import as_scenario
 from scenarios.progress import Progress, reporting
-from scenarios.run import fly_scenario, run_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 
@@ -119,8 +119,11 @@ def fly_exported(
             serial = SerialMPC(line, precision, problem.horizon)
             law = MPCInTheLoop(serial, problem, scenario.controller.type, machine)
             if out is None:
-                return fly_scenario(scenario, report, law)
-            return run_scenario(scenario, absolute(out), Outputs(video=False), report, law)
+                return Rollout(scenario, law).fly(report)
+            with reserving(out) as place:
+                flight = Rollout(scenario, law).fly(report)
+                flight.save(place, video=False, progress=report)
+                return replace(flight, directory=place)
 
 
 def _allowing(scenario: Scenario, spacing: float) -> Scenario:

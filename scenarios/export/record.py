@@ -23,7 +23,7 @@ from quadsim.errors import ExportError, PlanExhaustedError
 from quadsim.state import Array
 from scenarios.build import build_controller
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.scenario import Scenario
 
@@ -85,7 +85,7 @@ def record(scenario: Scenario) -> Recording:
     recorder = Recorder(inner)
     if isinstance(law, Guarded):
         law.inner = recorder
-    fly_scenario(scenario, law=law if isinstance(law, Guarded) else recorder)
+    Rollout(scenario, law if isinstance(law, Guarded) else recorder).fly()
     queries = recorder.queries
     if not queries:
         raise ExportError("its flight has no period in the air, with everything measured, to record")

@@ -29,7 +29,7 @@ from scenarios.gym.spaces import USUAL, Action, Actions, Observations
 from scenarios.limits import build_limits
 from scenarios.loading import as_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import StartedFlight, start
+from scenarios.rollout import Rollout
 from scenarios.schema.base import LARGEST_SEED
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.scenario import Scenario
@@ -125,7 +125,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         self.action_space, self.observation_space = self.actions.space, self.observations.space
         self.render_mode, self._size = render_mode, (width, height)
         self._preview, self._reward, self._action = preview, reward, action
-        self._flight: StartedFlight | None = None
+        self._flight: Rollout | None = None
         self._camera: Camera | None = None
         self.scenario, self.limits = self._base, build_limits(self._base)
 
@@ -135,7 +135,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return tuple(limit.name for limit in self.limits)
 
     @property
-    def started(self) -> StartedFlight:
+    def started(self) -> Rollout:
         """The flight of this episode.
 
         Raises:
@@ -170,7 +170,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             self.actions = Actions(self._action, scenario, build_vehicle(scenario))
         # events that change the controller need a real one
         law: Any = None if scenario.controller_changes else Agent(scenario.controller.horizon)
-        self._flight = start(scenario, law)
+        self._flight = Rollout(scenario, law)
         self.limits = self._flight.limits
         self._answered: tuple[int, Action, Command] | None = None  # in which period, by the controller
         self._seen, log = self._flight.observation, self._flight.loop.log()

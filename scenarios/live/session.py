@@ -25,7 +25,7 @@ from scenarios.build import preferring_core
 from scenarios.flight import Flight
 from scenarios.limits import with_bounds_stated
 from scenarios.parts.live import Successor, validated
-from scenarios.run import StartedFlight, start
+from scenarios.rollout import Rollout
 from scenarios.schema.base import Spec, Triple
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.scenario import Scenario
@@ -79,7 +79,7 @@ class Frame:
     k: int  # which period
     time: float  # when it began [s]
     samples: tuple[Sample | None, ...]
-    margins: tuple[Mapping[str, float], ...]  # see `StartedFlight.margins`
+    margins: tuple[Mapping[str, float], ...]  # see `Rollout.margins`
     horizons: tuple[Array | None, ...]  # (N + 1, 3) predicted positions [m], from the present one on
     pull: Array  # (3,) the force of the person's hand [N]; zero without one
     refused: tuple[str, ...]  # why inputs were refused
@@ -106,7 +106,7 @@ class Session:
     def __init__(self, scenario: Scenario, against: ControllerSpec | None = None) -> None:
         self.scenario, self._against = preferring_core(scenario), against
         self._queue: deque[tuple[Mapping[str, Any], str | None, Successor | None]] = deque()
-        self.flights: tuple[StartedFlight, ...] = ()
+        self.flights: tuple[Rollout, ...] = ()
         self.reset()
 
     def reset(self) -> None:
@@ -116,7 +116,7 @@ class Session:
         scenarios = [self.scenario]
         if self._against is not None:
             scenarios.append(with_bounds_stated(self.scenario).model_copy(update={"controller": self._against}))
-        self.flights = tuple(start(each, live=True) for each in scenarios)
+        self.flights = tuple(Rollout(each, live=True) for each in scenarios)
         self._held = _Hand()
         self.reason: str | None = None
 
@@ -278,7 +278,7 @@ def read_script(path: str | Path) -> Script:
     return script
 
 
-def _horizon(flight: StartedFlight, sample: Sample) -> Array | None:
+def _horizon(flight: Rollout, sample: Sample) -> Array | None:
     predict = getattr(flight.loop.controller, "predict", None)
     if predict is None or len(sample.command.plan) < 1:
         return None

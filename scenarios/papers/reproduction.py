@@ -13,7 +13,7 @@ from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
 from scenarios.papers.paper import NumberSpec, Paper, scenario_of
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 HEAD: Final = ("number", "unit", "published", "ours", "difference", "tolerance", "reproduced")
 _RULE: Final = "measure must lead to a number of the flight's summary"
@@ -155,7 +155,7 @@ def reproduce_paper(
         progress(f"{paper.name}: numbers", done, len(specs))
         key = json.dumps([spec.scenario, spec.set], sort_keys=True, default=str)
         if key not in flown:
-            flown[key] = dict(fly_scenario(scenario).summary)
+            flown[key] = dict(Rollout(scenario).fly().summary)
         found.append(_measured(spec, flown[key]))
     progress(f"{paper.name}: numbers", len(specs), len(specs))
     return Reproduction(paper=paper, numbers=tuple(found))

@@ -109,7 +109,7 @@ class FlightEvents:
         self._loop.before = self._build = None
 
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
-        """See `scenarios.run.StartedFlight.apply`."""
+        """See `scenarios.rollout.Rollout.apply`."""
         found = self._stamped(event)
         scenario = self._with(found)
         if isinstance(found, SetpointEvent):
@@ -140,7 +140,7 @@ class FlightEvents:
         return found
 
     def successor(self, fields: Mapping[str, Any]) -> Successor:
-        """See `scenarios.run.StartedFlight.successor`."""
+        """See `scenarios.rollout.Rollout.successor`."""
         return self._built(changed(self._spec, fields))
 
     def flown(self) -> Scenario:

@@ -15,7 +15,7 @@ from scenarios.export.emulation import Program, require_programs
 from scenarios.export.in_the_loop import fly_exported
 from scenarios.export.serial_line import SerialMPC
 from scenarios.loading import load_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 CASES = {
     "double": ("cortex-m7", "double", "paper-constrained", 1e-6),
@@ -35,7 +35,7 @@ def test_a_flight_by_the_target_is_the_flight_by_python(name: str) -> None:
         pytest.skip(f"{compiler} is not installed: make firmware")
     short = load_scenario(scenario, ["duration=6.0"])
     exact = short if scenario == "paper-unconstrained" else short.replace({"controller.solver": "core"})
-    found, wanted = fly_exported(short, target=target, precision=precision, progress=False), fly_scenario(exact)
+    found, wanted = fly_exported(short, target=target, precision=precision, progress=False), Rollout(exact).fly()
     assert found.log.control.status == wanted.log.control.status
     assert np.abs(found.command - wanted.command).max() <= apart
     assert [finding.satisfied for finding in found.findings] == [finding.satisfied for finding in wanted.findings]

@@ -11,7 +11,7 @@ import pytest
 from quadsim.flight.log import FlightLog
 from quadsim.state import Array
 from scenarios.loading import load_scenario
-from scenarios.run import start
+from scenarios.rollout import Rollout
 
 DISTURBED = ["effects.disturbance={force=[0.4, -0.3, 0.0], torque=[0.0, 0.0, 0.01]}", "effects.load.mass_factor=1.1"]
 LAWS: dict[str, tuple[str, list[str], dict[str, Any]]] = {
@@ -25,7 +25,7 @@ LAWS: dict[str, tuple[str, list[str], dict[str, Any]]] = {
 
 
 def flown(name: str, fields: dict[str, Any], changes: list[str], *, periods: int = 60, switch: int = 40) -> FlightLog:
-    with start(load_scenario(name, changes)) as started:
+    with Rollout(load_scenario(name, changes)) as started:
         while started.k < periods:
             if fields and started.k == switch:
                 started.apply({"type": "controller", "fields": fields})
@@ -62,7 +62,7 @@ def test_without_what_was_learnt_there_is_one(monkeypatch: pytest.MonkeyPatch) -
 def test_another_kind_of_controller_takes_over_the_disturbance() -> None:
     """From nonlinear to robust MPC and on to PID: each flies on, with plans of its own length."""
     changes = [*DISTURBED, "controller.offset_free={}"]
-    with start(load_scenario("robust", changes)) as started:
+    with Rollout(load_scenario("robust", changes)) as started:
         while started.k < 60:
             started.step()
         learnt = started.loop.controller.inner.disturbance  # type: ignore[attr-defined]
@@ -83,7 +83,7 @@ def test_another_kind_of_controller_takes_over_the_disturbance() -> None:
 def test_a_contract_s_level_of_fallback_goes_on() -> None:
     """Half a second without a position is level 2 of the fallback, before and after a change."""
     events = "events=[{type='sensor_fault', sensor='position', fault='nan', at=1.0, duration=3.0}]"
-    with start(load_scenario("robust", [events])) as started:
+    with Rollout(load_scenario("robust", [events])) as started:
         while started.k < 60:
             started.step()
         before = started.loop.last

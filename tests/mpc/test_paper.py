@@ -1,4 +1,4 @@
-"""Eqs. (2)-(10): the prediction map against recursion and MuJoCo, the condensed cost against the sum it condenses."""
+"""Eqs. (2)-(19): the prediction map against recursion and MuJoCo, cost and rows against what they condense."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from support import paper_problem, random_problem
 
+from mpc.condensing import Condensed
 from mpc.model import hover_model
-from mpc.ocp import Problem
-from mpc.paper import cost, prediction, rollout
+from mpc.ocp import Problem, Query
+from mpc.paper import cost, prediction, rollout, slew_matrix
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -110,3 +111,29 @@ def test_at_hover_on_the_reference_the_optimum_is_u_bar(name: str) -> None:
     as_printed = terms.F1 @ hover + terms.F2 @ desired.ravel() - terms.F3 @ u_bar
     last = np.linalg.solve(terms.H, -as_printed)[-4:]
     np.testing.assert_allclose(last, -u_bar, rtol=0.1)
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 9])
+def test_rows_are_the_printed_inequalities(horizon: int) -> None:
+    """A_ineq u <= G1 xi(k) + G2 u(k-1) + G3, with the offset of the linearisation.  Eqs. (14), (16)-(19)."""
+    rng = np.random.default_rng(horizon)
+    problem = random_problem(rng, horizon=horizon, n_c=2)
+    bounds, model = problem.bounds, problem.model
+    assert bounds is not None
+    state, before, plan = rng.normal(size=3), rng.normal(size=2), rng.normal(size=(horizon, 2))
+    qp = Condensed(problem).pose(Query(state, np.zeros((horizon, problem.objective.C_r.shape[0])), before)).qp
+    maps, steps = prediction(model, horizon), slew_matrix(horizon, 2)
+    of_outputs = np.kron(np.eye(horizon), bounds.C_c)
+    first = np.concatenate([before, np.zeros(2 * (horizon - 1))])
+    outputs = of_outputs @ (maps.Phi @ state + maps.Psi @ (plan - model.u_bar).ravel())
+    slews = steps @ plan.ravel() - first
+    slack = [
+        np.tile(bounds.y_max, horizon) - outputs,
+        outputs - np.tile(bounds.y_min, horizon),
+        np.tile(bounds.delta_max, horizon) - slews,
+        slews - np.tile(bounds.delta_min, horizon),
+    ]
+    values = qp.G @ plan.ravel()
+    ours = np.concatenate([qp.h_u - values, values - qp.h_l])
+    ours, printed = np.sort(ours[np.isfinite(ours)]), np.sort(np.concatenate(slack))
+    np.testing.assert_allclose(ours, printed, atol=1e-12)

@@ -23,7 +23,7 @@ from quadsim.controller import CORE, GAIN, SOLVED, Moment
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 ALWAYS = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "clarabel")
 """What `make setup` installs."""
@@ -119,7 +119,7 @@ def test_equality_rows_and_multipliers() -> None:
 
 
 def test_a_flight_by_daqp_holds_its_audit_and_is_the_same(constrained_flight: Flight) -> None:
-    flight = fly_scenario(load_scenario("paper-constrained", ["controller.solver=daqp"]))
+    flight = Rollout(load_scenario("paper-constrained", ["controller.solver=daqp"])).fly()
     assert (flight.solver, constrained_flight.solver) == ("daqp", "piqp-multistage")
     assert flight.satisfied
     assert flight.log.control.fallback.max() == 0

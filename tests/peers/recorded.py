@@ -13,7 +13,7 @@ from quadsim.state import Array
 from scenarios.build import build_problem
 from scenarios.loading import load_scenario
 from scenarios.reference import build_reference
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 SCENARIO: Final = "paper-constrained"
 
@@ -44,7 +44,7 @@ class Query:
 
 def record() -> tuple[Problem, tuple[Query, ...]]:
     """Fly the scenario; the optimisation, and every period's query."""
-    flight = fly_scenario(load_scenario(SCENARIO))
+    flight = Rollout(load_scenario(SCENARIO)).fly()
     log = flight.log.control
     problem = build_problem(flight.scenario, flight.vehicle)
     reference = build_reference(flight.scenario, log.t.size + problem.horizon)

@@ -5,9 +5,8 @@ import dataclasses
 import pytest
 
 from quadsim.flight.rundir import Run, load_run
-from scenarios.flight import Outputs
 from scenarios.loading import load_scenario
-from scenarios.run import run_scenario
+from scenarios.rollout import Rollout
 
 
 @pytest.fixture(scope="session")
@@ -21,6 +20,7 @@ def aborted_run(short_run: Run) -> Run:
 @pytest.fixture(scope="session")
 def empty_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A flight that ended before its first period was over: no numbers, no constraints reached."""
-    directory, tables = tmp_path_factory.mktemp("empty") / "run", Outputs(video=False, recording=False, figures=False)
-    run_scenario(load_scenario("paper-constrained", ["initial.euler=[60, 0, 0]"]), directory, tables)
+    directory = tmp_path_factory.mktemp("empty") / "run"
+    flight = Rollout(load_scenario("paper-constrained", ["initial.euler=[60, 0, 0]"])).fly()
+    flight.save(directory, video=False, recording=False, figures=False)
     return load_run(directory)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import NO_PRODUCTS
 
 import quadsim
 from quadsim.controller import Moment
@@ -17,11 +18,11 @@ from quadsim.report.comparison import comparison_rows
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import VEHICLE_UNITS
 from scenarios.build import build_plant, build_problem, resolve
-from scenarios.flight import Flight, Outputs
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.reaudit import reaudit
-from scenarios.run import run_scenario, start
+from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 BASE = [
@@ -71,7 +72,7 @@ def test_each_parameter_moves_the_plant_and_not_the_controller(name: str) -> Non
     for of in (lambda p: p.model.A, lambda p: p.model.B, lambda p: p.model.u_bar, lambda p: p.bounds.u_max):
         np.testing.assert_array_equal(of(first), of(second))
     speeds, state, target = np.full(4, 190.0), np.full(12, 0.02), np.full((modelled.controller.horizon, 4), 0.1)
-    with start(modelled) as one, start(real) as other:
+    with Rollout(modelled) as one, Rollout(real) as other:
         assert one.vehicle == other.vehicle
         laws = one.loop.controller, other.loop.controller
         for law in laws:
@@ -98,7 +99,7 @@ def test_the_same_mass_in_the_model_leaves_no_error(fly_once: Callable[..., Flig
 def test_both_vehicles_are_recorded_and_shown(tmp_path: Path) -> None:
     scenario = load_scenario("hover", ["duration=0.5", "actual.mass=4.4", "actual.arm_length=0.35"])
     directory = tmp_path / "heavy"
-    run_scenario(scenario, directory, Outputs(video=False, recording=False, figures=False))
+    Rollout(scenario).fly().save(directory, **NO_PRODUCTS)
     run, flight = rundir.load_run(directory), quadsim.read(directory)
     assert (run.summary["vehicle"]["mass"], run.summary["actual"]["mass"]) == (4.0, 4.4)
     assert (flight.vehicle.mass, flight.actual.mass, run.vehicle.arm_length) == (4.0, 4.4, 0.35)

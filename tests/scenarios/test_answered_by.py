@@ -16,7 +16,7 @@ from mpc.solvers import QPSolver
 from mpc.solvers.piqp import PiqpMultistage
 from scenarios.flight import summarise
 from scenarios.loading import load_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def test_as_many_periods_are_a_solvers_as_it_had_calls(
     calls = Counter[str]()
     real = PiqpMultistage.solve
     monkeypatch.setattr(PiqpMultistage, "solve", lambda *given: (calls.update(["piqp-multistage"]), real(*given))[1])
-    flight = fly_scenario(load_scenario(name, settings))
+    flight = Rollout(load_scenario(name, settings)).fly()
     counted: dict[str, Any] = summarise(flight)["controller"]
     assert counted["answered_by"] == answered_by == Counter(flight.log.control.answered_by)
     assert counted["answered_by"].get("piqp-multistage", 0) == calls["piqp-multistage"]
@@ -42,7 +42,7 @@ def test_as_many_periods_are_a_solvers_as_it_had_calls(
 
 def test_a_period_in_fallback_or_too_late_is_answered_by_the_fallback() -> None:
     for name in ("worn-rotor-hard-bounds", "stalled-solver"):
-        control = fly_scenario(load_scenario(name)).log.control
+        control = Rollout(load_scenario(name)).fly().log.control
         fallback = control.fallback > 0
         assert fallback.any()
         np.testing.assert_array_equal(np.array(control.answered_by) == "fallback", fallback)
@@ -51,7 +51,7 @@ def test_a_period_in_fallback_or_too_late_is_answered_by_the_fallback() -> None:
 @pytest.mark.parametrize("every", [1, 7, KKT_EVERY])
 def test_kkt_residuals_are_computed_as_often_as_stated(every: int) -> None:
     settings = ["duration=5", "controller.solver=core", f"controller.kkt_every={every}"]
-    control = fly_scenario(load_scenario("paper-constrained", settings)).log.control
+    control = Rollout(load_scenario("paper-constrained", settings)).fly().log.control
     expected = np.arange(control.t.size) % every == 0
     for name in ("kkt_stationarity", "kkt_complementarity", "kkt_dual"):
         values = getattr(control, name)

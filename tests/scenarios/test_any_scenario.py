@@ -24,7 +24,7 @@ from scenarios.build import resolve
 from scenarios.flight import summarise
 from scenarios.loading import check_parts, parse_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 
@@ -217,10 +217,10 @@ def test_any_valid_scenario_flies_and_its_resolved_file_flies_it_again(table: di
     assert reread == resolved
 
     try:
-        flight = fly_scenario(scenario)
+        flight = Rollout(scenario).fly()
     except InputError:  # what only building the controller shows, such as margins wider than their bounds
         return
-    again = fly_scenario(reread)
+    again = Rollout(reread).fly()
     control, plant = flight.log.control, flight.log.plant
     assert parquet(flight.log, scenario) == parquet(again.log, reread)
     assert flight.log.reason == again.log.reason

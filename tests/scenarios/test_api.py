@@ -71,7 +71,7 @@ def test_every_docstring_has_an_example_that_runs(
         except RenderingUnavailableError as error:
             pytest.skip(str(error))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("scenarios.papers.reproduction.fly_scenario", fly_known)
+    monkeypatch.setattr("scenarios.rollout.Rollout.fly", fly_known)
     public = functools.reduce(getattr, name.split("."), quadsim)
     runner = doctest.DocTestRunner(verbose=False)
     for example in doctest.DocTestFinder().find(public, name, module=sys.modules[public.__module__]):

@@ -286,7 +286,7 @@ def test_a_film_asked_for_by_name_is_refused_before_anything_is_flown_where_noth
 
     monkeypatch.setattr("quadsim.report.film.video.rendering_backend", nothing_renders)
     with monkeypatch.context() as grounded:
-        grounded.setattr("scenarios.run.fly_scenario", flown)
+        grounded.setattr("scenarios.rollout.Rollout.fly", flown)
         assert main(["run", "hover", "--video"]) == EXIT_WRONG_INPUT
     printed = capsys.readouterr()
     assert printed.err.startswith(

@@ -18,7 +18,7 @@ from quadsim.controller import FALLBACK, LAW, MISSED, STOPPED
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
 from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Lost, Scenario
 from scenarios.shipped import LIBRARY, scenario_names
@@ -54,7 +54,7 @@ def flown_here() -> list[str]:
 @pytest.fixture(scope="module", params=flown_here())
 def flight(request: pytest.FixtureRequest, fly_once: Callable[..., Flight]) -> Flight:
     """Each scenario, flown once for all tests that use it."""
-    return fly_once(request.param) if request.param in SHARED else fly_scenario(loaded()[request.param])
+    return fly_once(request.param) if request.param in SHARED else Rollout(loaded()[request.param]).fly()
 
 
 def flown_again(scenario: Scenario, periods: int) -> FlightLog:
@@ -64,7 +64,7 @@ def flown_again(scenario: Scenario, periods: int) -> FlightLog:
         if done == periods < total:
             raise KeyboardInterrupt
 
-    return fly_scenario(scenario, interrupt).log
+    return Rollout(scenario).fly(interrupt).log
 
 
 def periods_compared(scenario: Scenario) -> int:

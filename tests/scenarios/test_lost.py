@@ -10,7 +10,7 @@ from quadsim.flight import rundir
 from scenarios import cli
 from scenarios.flight import summarise
 from scenarios.loading import load_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 UNSTABLE = '''
 import numpy as np
@@ -75,7 +75,7 @@ def test_an_unstable_controller_ends_as_lost_with_exit_status_1(
     ],
 )
 def test_each_criterion_is_on_unless_it_is_switched_off(unstable: str, settings: list[str], lost: str | None) -> None:
-    flight = fly_scenario(load_scenario(unstable, settings))
+    flight = Rollout(load_scenario(unstable, settings)).fly()
     assert (flight.log.lost, summarise(flight)["lost"]) == (lost, lost)
     assert flight.outcome == ("satisfied" if lost is None else "lost")
     if lost is None:

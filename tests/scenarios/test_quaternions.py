@@ -17,12 +17,12 @@ from quadsim.sim.physics import physics_to_state
 from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, Array, YawTurns, tilt
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 
 @pytest.fixture(scope="module")
 def inverted() -> Flight:
-    return fly_scenario(load_scenario("inverted-start", ["duration=1", *ARRIVED]))
+    return Rollout(load_scenario("inverted-start", ["duration=1", *ARRIVED])).fly()
 
 
 ARRIVED = [f"constraints.{name}.start=0.9" for name in ("back_upright", "back_in_height")]
@@ -95,7 +95,7 @@ def _product(p: Array, q: Array) -> Array:
 @pytest.mark.parametrize("name", ["hover", "raw-sensors", "motion-capture"])
 def test_controllers_receive_the_attitude_that_belongs_to_their_state(name: str) -> None:
     law = Listener()
-    fly_scenario(load_scenario(name, ["duration=1"]), law=law)
+    Rollout(load_scenario(name, ["duration=1"]), law).fly()
     before = None
     for now, state in law.heard:
         assert now.attitude is not None

@@ -199,7 +199,7 @@ def test_what_a_run_records_is_what_its_tables_give(
     """
     flight = fly_once(name)
     scenario = flight.scenario.model_copy(update={"log_rate": rate})
-    monkeypatch.setattr("scenarios.run.fly_scenario", lambda *_: replace(flight, scenario=scenario))
+    monkeypatch.setattr("scenarios.rollout.Rollout.fly", lambda *_: replace(flight, scenario=scenario))
     out = str(tmp_path / "run")
     status = main(["run", name, "--set", f"log_rate={rate}", *TABLES, "--json", "--out", out])
     assert main(["check", out]) == status

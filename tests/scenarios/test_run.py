@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import NO_PRODUCTS
 
 from quadsim.assets import vehicle_path
 from quadsim.controller import SOLVED, UNCONSTRAINED
@@ -19,12 +20,10 @@ from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import Run
 from quadsim.sim import loop
-from scenarios.flight import Outputs
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.machine import PACKAGES
-from scenarios.run import fly_scenario, run_scenario
+from scenarios.rollout import Rollout
 
-TABLES = Outputs(video=False, recording=False, figures=False)
 SHORT = "duration=0.5"
 UPSIDE = "initial.euler=[60.0, 0.0, 0.0]"
 """A start from which no plan brings roll within its bound: the first QP is infeasible."""
@@ -51,7 +50,7 @@ CONTRACT = {
 
 
 def run(target: Path, *settings: str, name: str = "paper-constrained") -> Run:
-    run_scenario(load_scenario(name, settings), target, TABLES)
+    Rollout(load_scenario(name, settings)).fly().save(target, **NO_PRODUCTS)
     return rundir.load_run(target)
 
 
@@ -124,7 +123,8 @@ def test_a_flight_that_cannot_begin_is_recorded_with_its_reason(tmp_path: Path) 
 
 def test_ctrl_c_in_flight_keeps_what_was_flown(short_run: Run, tmp_path: Path) -> None:
     scenario = load_scenario("paper-constrained", ["duration=6.0"])
-    flight = run_scenario(scenario, tmp_path / "run", TABLES, interrupt_after(33))
+    flight = Rollout(scenario).fly(interrupt_after(33))
+    flight.save(tmp_path / "run", **NO_PRODUCTS)
     flown = rundir.load_run(tmp_path / "run")
     assert flight.log.interrupted
     assert flown.summary["reason"] == "at t = 1.650 s: interrupted (Ctrl-C)"
@@ -145,7 +145,7 @@ def test_a_run_whose_product_fails_keeps_all_else_and_names_it(
         raise error
 
     monkeypatch.setattr("quadsim.report.flight_figures.write_figures", failing)
-    run_scenario(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
+    Rollout(load_scenario("hover", [SHORT])).fly().save(tmp_path / "run", video=False)
     summary = rundir.read_summary(tmp_path / "run")
     assert summary["products"].keys() == {"figures", "flight.rrd"}
     assert summary["products"]["figures"].startswith(
@@ -169,7 +169,7 @@ def test_a_defect_of_our_own_is_not_taken_for_a_flight(tmp_path: Path, monkeypat
 
 @pytest.mark.usefixtures("undrawn")
 def test_outputs_are_made_as_requested(tmp_path: Path) -> None:
-    run_scenario(load_scenario("hover", [SHORT]), tmp_path / "run", Outputs(video=False))
+    Rollout(load_scenario("hover", [SHORT])).fly().save(tmp_path / "run", video=False)
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {
         "summary.json", "scenario.toml", FLIGHT_FILE, TIMING_FILE, PLANT_FILE, HORIZON_FILE, "flight.rrd", "figures",
@@ -182,8 +182,8 @@ def test_a_resolved_scenario_flies_without_its_vehicle_file(tmp_path: Path) -> N
     file = tmp_path / "mine.toml"
     file.write_text(vehicle_path("lopes2011").read_text().replace('name = "lopes2011"', 'name = "mine"'))
     settings = [f"vehicle.file={file}", "vehicle.mass=4.2", "duration=0.5"]
-    first = fly_scenario(load_scenario("hover", settings))
+    first = Rollout(load_scenario("hover", settings)).fly()
     file.unlink()
-    again = fly_scenario(parse_scenario(tomllib.loads(first.scenario.to_toml())))
+    again = Rollout(parse_scenario(tomllib.loads(first.scenario.to_toml()))).fly()
     assert again.vehicle == replace(first.vehicle, description="")
     assert again.log.control.speeds.tolist() == first.log.control.speeds.tolist()

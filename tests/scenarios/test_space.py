@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import NO_PRODUCTS
 
 from quadsim.controller import Phase
 from quadsim.errors import FileError
@@ -19,10 +20,10 @@ from quadsim.report.flight_figures import page_figures, write_figures
 from quadsim.report.recording import write_recording
 from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.space import Cylinder
-from scenarios.flight import Flight, Outputs, write_run
+from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 from scenarios.summary_tables import outcome
 
@@ -60,9 +61,9 @@ def scenario(changes: Mapping[str, Any] = {}) -> Scenario:
 
 @pytest.fixture(scope="module")
 def crashed() -> Flight:
-    return fly_scenario(
+    return Rollout(
         scenario({"obstacles": [PILLAR, BALL, WALL, LOG, CRATE], "corridors": [TUBE], "keep_in": FENCE})
-    )
+    ).fly()
 
 
 def test_tables_become_limits(crashed: Flight) -> None:
@@ -77,7 +78,7 @@ def test_tables_become_limits(crashed: Flight) -> None:
 
 def test_the_extent_is_the_vehicle_s_or_the_scenario_s() -> None:
     given = scenario({"obstacles": [PILLAR], "vehicle.extent": 0.05})
-    (finding,) = cleared(fly_scenario(given))
+    (finding,) = cleared(Rollout(given).fly())
     assert isinstance(finding.limit, SpaceLimit)
     assert finding.limit.radius == 0.05
 
@@ -98,7 +99,7 @@ def test_a_touch_is_a_crash_at_the_distance_that_the_audit_measures(crashed: Fli
 def test_obstacles_out_of_reach_change_nothing() -> None:
     """Steps are then taken one by one where they move; the numbers are those of a flight without."""
     far = {**PILLAR, "position": [50.0, 0.0, 1.0]}
-    plain, among = fly_scenario(scenario()), fly_scenario(scenario({"obstacles": [far]}))
+    plain, among = Rollout(scenario()).fly(), Rollout(scenario({"obstacles": [far]})).fly()
     np.testing.assert_allclose(among.log.plant.state, plain.log.plant.state, rtol=0.0, atol=1e-9)
     assert among.outcome == "satisfied"
 
@@ -107,7 +108,7 @@ def test_obstacles_out_of_reach_change_nothing() -> None:
 def test_a_run_with_shapes_is_read_audited_again_and_drawn(crashed: Flight, tmp_path: Path) -> None:
     directory = tmp_path / "run"
     directory.mkdir()
-    write_run(crashed, directory, Outputs(video=False, recording=False, figures=False))
+    crashed.save(directory, **NO_PRODUCTS)
     run = load_run(directory)
     assert run.limits == tuple(finding.limit for finding in crashed.findings)
     assert not reaudit(directory).satisfied
@@ -124,7 +125,7 @@ def test_a_run_with_shapes_is_read_audited_again_and_drawn(crashed: Flight, tmp_
 
 
 def test_a_shape_that_was_changed_is_noticed(crashed: Flight, tmp_path: Path) -> None:
-    write_run(crashed, tmp_path, Outputs(video=False, recording=False, figures=False))
+    crashed.save(tmp_path, **NO_PRODUCTS)
     text = (tmp_path / "summary.json").read_text()
     (tmp_path / "summary.json").write_text(text.replace('"radius": 0.1,', '"radius": 0.2,', 1))
     with pytest.raises(FileError, match="shape is recorded as"):
@@ -143,7 +144,7 @@ def test_the_robust_controller_keeps_clear_in_any_heading() -> None:
         "tightening": {"acceleration": 0.2, "angular_acceleration": 0.2},
     }  # fmt: skip
     among = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}], "initial.euler": [0.0, 0.0, 40.0]}
-    flight = fly_scenario(scenario({**among, "controller": robust}))
+    flight = Rollout(scenario({**among, "controller": robust})).fly()
     assert flight.outcome == "satisfied"
     assert 0.04 < cleared(flight)[0].worst_margin < 0.3
     assert abs(flight.state["y"]).max() > 0.1
@@ -153,7 +154,7 @@ def test_the_robust_controller_keeps_clear_in_any_heading() -> None:
 def test_the_nonlinear_controller_keeps_clear(more: Mapping[str, Any]) -> None:
     nonlinear = {"type": "nonlinear", "horizon": 30, "terminal": "lqr", "avoidance": {"soft": {}}, **more}
     pillar = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}]}
-    flight = fly_scenario(scenario({**pillar, "controller": nonlinear}))
+    flight = Rollout(scenario({**pillar, "controller": nonlinear})).fly()
     assert flight.outcome == "satisfied"
     assert 0.03 < cleared(flight)[0].worst_margin < 0.3
     assert abs(flight.state["y"]).max() > 0.1
@@ -165,7 +166,7 @@ OFFSET = {"name": "offset", "rows": [[0.0, -1.0, 0.0]], "upper": [-0.4]}  # y >=
 @cache
 def blind(speed: float) -> Flight:
     """A flight along the path that knows nothing of its corridor; over soon after the path."""
-    return fly_scenario(scenario(offset_at(speed)))
+    return Rollout(scenario(offset_at(speed))).fly()
 
 
 def offset_at(speed: float) -> dict[str, Any]:
@@ -190,7 +191,7 @@ def test_a_corridor_along_the_path_holds_where_the_reference_is(law: str, speed:
     np.testing.assert_array_equal(inside, (gone >= 0.9) & (gone <= 1.3))
     assert inside.any()
     assert not found.satisfied
-    flight = fly_scenario(scenario({**offset_at(speed), **laws[law]}))
+    flight = Rollout(scenario({**offset_at(speed), **laws[law]})).fly()
     (found,) = [each for each in flight.findings if each.limit.name == "offset"]
     assert found.satisfied
     assert abs(flight.state["y"][[0, -1]]).max() < 0.1  # offset there alone
@@ -198,8 +199,8 @@ def test_a_corridor_along_the_path_holds_where_the_reference_is(law: str, speed:
 
 def test_who_does_not_avoid_touches_and_who_does_keeps_clear() -> None:
     pillar = {"obstacles": [{**PILLAR, "position": [1.0, 0.2, 1.0]}]}
-    assert fly_scenario(scenario(pillar)).log.control.crashed
-    flight = fly_scenario(scenario({**pillar, **AVOIDANCE}))
+    assert Rollout(scenario(pillar)).fly().log.control.crashed
+    flight = Rollout(scenario({**pillar, **AVOIDANCE})).fly()
     assert flight.outcome == "satisfied"
     assert cleared(flight)[0].worst_margin > 0.04  # of a margin of 0.05, between the samples
 
@@ -212,7 +213,7 @@ def test_no_answer_among_obstacles_is_explained_by_their_names() -> None:
         "velocity": [0.0, -9.0, 0.0],
         "acceleration": [0.0] * 3,
     }
-    flight = fly_scenario(scenario({"obstacles": [thrown], **AVOIDANCE, "controller.fallback": {}}))
+    flight = Rollout(scenario({"obstacles": [thrown], **AVOIDANCE, "controller.fallback": {}})).fly()
     assert flight.diagnosis is not None
     assert "cannot hold together" in flight.diagnosis["sentence"]
     assert "obstacle ball" in flight.diagnosis["sentence"]

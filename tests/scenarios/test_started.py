@@ -16,7 +16,7 @@ from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.events import prepared
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import fly_scenario, start
+from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 PERIODS = 12
@@ -86,11 +86,11 @@ def written_and_read(scenario: Scenario) -> Scenario:
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_periods_by_hand_are_the_batch_flight(name: str) -> None:
     scenario = cut(name)
-    with start(scenario) as started:
+    with Rollout(scenario) as started:
         while not started.done:
             assert started.step().observation.k == started.k - 1
         stepped = started.flight()
-    flown = fly_scenario(scenario)
+    flown = Rollout(scenario).fly()
     assert_same_bits(stepped, flown)
     assert stepped.scenario == flown.scenario
 
@@ -100,7 +100,7 @@ def test_periods_by_hand_are_the_batch_flight(name: str) -> None:
 def test_what_was_applied_flies_again_to_the_bit(name: str, inputs: list[tuple[int, bool, dict[str, Any]]]) -> None:
     """Inputs of every kind at any period, before it is observed or after; what is refused changes nothing."""
     applied = 0
-    with start(cut(name), live=True) as started:
+    with Rollout(cut(name), live=True) as started:
         try:
             for k in range(PERIODS):
                 for _, observed, event in (each for each in inputs if each[0] == k):
@@ -119,24 +119,24 @@ def test_what_was_applied_flies_again_to_the_bit(name: str, inputs: list[tuple[i
             assert started.done
         flight = started.flight()
     assert len(flight.scenario.events) <= applied + len(prepared(cut(name), build_vehicle(cut(name))).events)
-    assert_same_bits(flight, fly_scenario(written_and_read(flight.scenario)))
+    assert_same_bits(flight, Rollout(written_and_read(flight.scenario)).fly())
 
 
 def test_a_shorter_flight_keeps_what_it_was_compiled_for() -> None:
     """The payload of 4 s, which is not in a flight of 1 s, changes the last bits of its first second."""
     scenario = load_scenario("payload-pickup", ["events=[{type='payload_pickup', at=4.0, mass=0.4}]"])
-    with start(scenario) as started:
+    with Rollout(scenario) as started:
         while started.k < 20:
             started.step()
         flight = started.flight()
     assert flight.scenario.duration == 1.0
     assert [event.type for event in flight.scenario.events] == ["mass"]
-    assert_same_bits(flight, fly_scenario(flight.scenario))
+    assert_same_bits(flight, Rollout(flight.scenario).fly())
 
 
 def test_a_flight_goes_on_beyond_its_scenario() -> None:
     scenario = cut("robust")
-    with start(scenario, live=True) as started:
+    with Rollout(scenario, live=True) as started:
         while started.k < 2 * PERIODS:
             started.step()
             if started.k == PERIODS:
@@ -144,11 +144,11 @@ def test_a_flight_goes_on_beyond_its_scenario() -> None:
                 started.apply({"type": "push", "duration": 0.1, "force": [1.0, 0.0, 0.0]})
         flight = started.flight()
     assert flight.scenario.periods == 2 * PERIODS
-    assert_same_bits(flight, fly_scenario(flight.scenario))
+    assert_same_bits(flight, Rollout(flight.scenario).fly())
 
 
 def test_a_controller_built_elsewhere_takes_over_as_one_built_here() -> None:
-    with start(cut("robust"), live=True) as one, start(cut("robust"), live=True) as other:
+    with Rollout(cut("robust"), live=True) as one, Rollout(cut("robust"), live=True) as other:
         fields = {"output_weights.x": 40.0}
         successor = one.successor(fields)
         for started, ready in ((one, successor), (other, None)):
@@ -161,7 +161,7 @@ def test_a_controller_built_elsewhere_takes_over_as_one_built_here() -> None:
 
 
 def test_a_flight_refuses_what_it_was_not_started_for() -> None:
-    with start(load_scenario("hover")) as started:
+    with Rollout(load_scenario("hover")) as started:
         for event in ({"type": "push", "duration": 0.1, "force": [1, 0, 0]}, {"type": "mass", "factor": 1.1}):
             with pytest.raises(InputError, match=r"event.type must be of a kind that the flight was started for.*live"):
                 started.apply(event)
@@ -175,7 +175,7 @@ def test_a_flight_refuses_what_it_was_not_started_for() -> None:
 
 
 def test_given_commands_fly_instead_of_the_controller() -> None:
-    with start(load_scenario("hover")) as started:
+    with Rollout(load_scenario("hover")) as started:
         for _ in range(10):
             sample = started.step(np.full(4, 215.0))
         assert sample.step_s == 0.0
@@ -193,7 +193,7 @@ def test_margins_of_a_period_are_those_of_the_audit() -> None:
     """The smallest of all periods' is the audit's, and each is that of its rows at the physics rate."""
     scenario = load_scenario("paper-constrained", ["duration=4.0"])
     found: list[dict[str, float]] = []
-    with start(scenario) as started:
+    with Rollout(scenario) as started:
         while not started.done:
             sample = started.step()
             found.append(started.margins())
@@ -214,7 +214,7 @@ def test_margins_of_a_period_are_those_of_the_audit() -> None:
 
 
 def test_without_a_record_there_is_no_log() -> None:
-    with start(load_scenario("hover"), recorded=False) as started:
+    with Rollout(load_scenario("hover"), recorded=False) as started:
         started.step()
         assert set(started.margins()) == {limit.name for limit in started.limits}
         with pytest.raises(InputError, match="no period of this flight was recorded"):

@@ -33,7 +33,7 @@ from scenarios.build import build_controller
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 PIQP = "piqp-multistage"
 
@@ -94,7 +94,7 @@ SCENARIOS = {  # periods by who answered them; what these would be, were they th
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_flights_are_exact_in_every_period_and_those_of_piqp(name: str) -> None:
     settings = [*SCENARIOS[name], "controller.kkt_every=1"]
-    flight, other = (fly_scenario(load_scenario(name, [*settings, f"controller.solver={by}"])) for by in (CORE, PIQP))
+    flight, other = (Rollout(load_scenario(name, [*settings, f"controller.solver={by}"])).fly() for by in (CORE, PIQP))
     control, theirs = flight.log.control, other.log.control
     ours = np.isin(control.answered_by, [GAIN, CORE])
     assert ours.mean() > 0.9 or name == "paper-constrained-lag20"
@@ -299,7 +299,7 @@ def test_without_a_library_the_reason_is_named_and_piqp(monkeypatch: pytest.Monk
     scenario = load_scenario("hover", [f"controller.solver={CORE}"])
     with pytest.raises(MissingCoreError, match=r"it was not compiled; or choose controller\.solver = 'piqp'"):
         build_controller(scenario, build_vehicle(scenario))
-    assert fly_scenario(load_scenario("hover", ["duration=0.2"])).satisfied
+    assert Rollout(load_scenario("hover", ["duration=0.2"])).fly().satisfied
 
 
 def test_half_spaces_are_no_matter_for_the_core() -> None:

@@ -23,12 +23,12 @@ from scenarios.campaign import run as module
 from scenarios.campaign.manifest import read_manifest
 from scenarios.campaign.pilot import Pilot
 from scenarios.campaign.plan import Plan, load_plan
-from scenarios.campaign.replay import recorded_flight, replay_flight
+from scenarios.campaign.replay import held_against, recorded_flight
 from scenarios.campaign.results.table import Row, read_table
 from scenarios.campaign.run import SUMMARY_FILE, Result, Standing
 from scenarios.campaign.spec import ChoiceSpec
-from scenarios.flight import Outputs
 from scenarios.machine import processor_name
+from scenarios.rollout import Rollout
 
 CAMPAIGN: dict[str, Any] = {
     "name": "little",
@@ -358,24 +358,20 @@ def test_a_report_of_fewer_flights_goes(plan: Plan, tmp_path: Path) -> None:
 # --- replay --------------------------------------------------------------------------------------------------------
 
 
-def test_a_replayed_flight_gives_the_campaigns_numbers(by_two: Result, tmp_path: Path) -> None:
+def test_a_replayed_flight_gives_the_campaigns_numbers(by_two: Result) -> None:
     worst = recorded_flight(by_two.directory, None)
     assert worst.number == by_two.summary["worst"][0]["flight"]
     for number in (None, 0, 7):
         recorded = recorded_flight(by_two.directory, number)
-        outputs = Outputs(video=False, recording=False, figures=False)
-        again = replay_flight(recorded, tmp_path / "runs" / str(number), outputs)
-        flight, differing = again.flight, again.differing
-        assert differing == []
+        flight = Rollout(recorded.scenario).fly()
+        assert held_against(flight, recorded).differing == []
         assert flight.log.control.t.size == 10
-        assert (tmp_path / "runs" / str(number) / "summary.json").is_file()
 
 
-def test_a_replay_reports_when_numbers_differ(whole: Result, tmp_path: Path) -> None:
+def test_a_replay_reports_when_numbers_differ(whole: Result) -> None:
     recorded = recorded_flight(whole.directory, 3)
     other = replace(recorded, row={**recorded.row, "rmse.z": 0.0, "draw.mass": 0.0, "gone": 1.0})
-    differing = replay_flight(other, tmp_path / "run", Outputs(video=False, recording=False, figures=False)).differing
-    assert sorted(differing) == ["draw.mass", "gone", "rmse.z"]
+    assert sorted(held_against(Rollout(other.scenario).fly(), other).differing) == ["draw.mass", "gone", "rmse.z"]
     ended = replace(recorded, otherwise=["code"], row={**recorded.row, "verdict": "timeout", "reason": "for ever"})
     assert ended.notes == [
         "other code flew that campaign, so numbers may differ",

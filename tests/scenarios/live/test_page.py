@@ -30,7 +30,7 @@ from scenarios.live.page import Page
 from scenarios.live.session import Frame, Session
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE = 60.0
@@ -270,7 +270,7 @@ def test_pause_stands_still_and_save_keeps_what_flies_again_to_the_bit(tab: Any,
     tab.get_by_role("button", name="Save", exact=True).click()
     tab.get_by_text("saved:").first.wait_for()
     flight = served.session.flight()
-    again = fly_scenario(flight.scenario)
+    again = Rollout(flight.scenario).fly()
     assert np.array_equal(again.command, flight.command)
     assert np.array_equal(again.log.plant.state, flight.log.plant.state)
     tab.get_by_role("button", name="Pause", exact=True).click()

@@ -21,7 +21,7 @@ from scenarios.live.pacing import LATE, Pace
 from scenarios.live.session import STRONGEST, Frame, Session, read_script
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 WINDY = load_scenario("steady-wind", ["controller.horizon=10"])
@@ -55,7 +55,7 @@ def flown(session: Session, periods: int) -> list[Frame]:
 
 def same_bits(session: Session, which: int = 0) -> bool:
     flight = session.flight(which)
-    again = fly_scenario(flight.scenario)
+    again = Rollout(flight.scenario).fly()
     return np.array_equal(again.log.plant.state, flight.log.plant.state) and np.array_equal(
         again.command, flight.command
     )

@@ -21,7 +21,7 @@ from scenarios.loading import load_scenario
 from scenarios.papers.paper import NumberSpec, load_paper, scenario_of
 from scenarios.papers.reproduction import Reproduced, Reproduction, reproduce_paper
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.problems import ScenarioError
 from scenarios.shipped import paper_names, scenario_names
 
@@ -49,7 +49,7 @@ def written(folder: Path, *numbers: tuple[str, str]) -> str:
 def loop4(fly_once: Callable[..., Flight]) -> Reproduction:
     """The short flights of Torrente et al., as CI flies them; `test_library` has them, too."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scenarios.papers.reproduction.fly_scenario", lambda scenario: fly_once(scenario.name))
+        patch.setattr(Rollout, "fly", lambda rollout: fly_once(rollout.scenario.name))
         return reproduce_paper(
             load_paper("torrente2021"), chosen=lambda spec: spec.scenario.startswith("torrente-loop4") and not spec.set
         )
@@ -70,7 +70,7 @@ def test_its_errors_have_the_digits_of_the_specification(loop4: Reproduction) ->
 
 def test_the_first_seconds_at_8_m_s_are_those_of_the_specification() -> None:
     """Positions under drag at 2 s and 5 s, where it is fastest; the heading has turned by then."""
-    flight = fly_scenario(load_scenario("torrente-loop8-drag", ["duration=5.02"]))
+    flight = Rollout(load_scenario("torrente-loop8-drag", ["duration=5.02"])).fly()
     positions = flight.log.control.truth[[100, 250], 0:6:2]
     expected = [[0.586204, -0.036271, 1.003212], [4.944455, -5.120605, 1.068593]]
     np.testing.assert_allclose(positions, expected, atol=1e-6)

@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import NO_PRODUCTS
 
 from quadsim.controller import Command, Moment
 from quadsim.errors import CommandError, InputError
 from quadsim.state import Array
 from scenarios.build import build_controller
-from scenarios.flight import Outputs
 from scenarios.loading import load_scenario
 from scenarios.parts.plugin import PluginController
 from scenarios.parts.vehicle import build_vehicle
-from scenarios.run import fly_scenario, run_scenario
+from scenarios.rollout import Rollout
 
 HOVER = """
 import numpy as np
@@ -85,9 +85,9 @@ def test_it_is_found_beside_the_scenario_and_called_with_what_is_documented(writ
 
 
 def test_a_resolved_file_flies_the_same_from_anywhere(written: Write, tmp_path: Path) -> None:
-    first = fly_scenario(load_scenario(written(HOVER)))
+    first = Rollout(load_scenario(written(HOVER))).fly()
     (tmp_path / "resolved.toml").write_text(first.scenario.to_toml())
-    again = fly_scenario(load_scenario(str(tmp_path / "resolved.toml")))
+    again = Rollout(load_scenario(str(tmp_path / "resolved.toml"))).fly()
     np.testing.assert_array_equal(again.log.plant.state, first.log.plant.state)
 
 
@@ -118,14 +118,14 @@ def test_it_is_found_by_an_entry_point(written: Write, monkeypatch: pytest.Monke
 
 
 def test_without_predict_a_run_has_no_horizon_and_with_it_has_one(written: Write, tmp_path: Path) -> None:
-    outputs = Outputs(video=False, recording=True, figures=False)
-    run_scenario(load_scenario(written(HOVER)), tmp_path / "without", outputs)
+    outputs = {**NO_PRODUCTS, "recording": True}
+    Rollout(load_scenario(written(HOVER))).fly().save(tmp_path / "without", **outputs)
     assert not (tmp_path / "without" / "horizon.parquet").exists()
     assert (tmp_path / "without" / "flight.rrd").is_file()
     predict = (
         "    def predict(self, states, plans):\n        return np.repeat(states[:, None], plans.shape[1], axis=1)\n"
     )
-    run_scenario(load_scenario(written(HOVER + predict)), tmp_path / "with", outputs)
+    Rollout(load_scenario(written(HOVER + predict))).fly().save(tmp_path / "with", **outputs)
     assert (tmp_path / "with" / "horizon.parquet").is_file()
 
 
@@ -146,7 +146,7 @@ class Hover:
 
 
 def test_what_it_has_is_used_and_what_it_is_given_is_a_copy(written: Write) -> None:
-    flight = fly_scenario(load_scenario(written(FULL)))
+    flight = Rollout(load_scenario(written(FULL))).fly()
     assert (flight.controller, flight.solver) == ("mine", "by-hand")
     assert set(flight.log.control.iterations.tolist()) == {3}
     assert np.isfinite(flight.log.control.state).all()
@@ -155,7 +155,7 @@ def test_what_it_has_is_used_and_what_it_is_given_is_a_copy(written: Write) -> N
 
 @pytest.mark.parametrize("answer", ["None", "[1.0, 2.0, 3.0]", "'fast'", "[[1.0] * 4]", "object()"])
 def test_an_answer_that_is_no_command_ends_the_flight_with_that_reason(written: Write, answer: str) -> None:
-    flight = fly_scenario(load_scenario(written(HOVER.replace("return self.speeds", f"return {answer}"))))
+    flight = Rollout(load_scenario(written(HOVER.replace("return self.speeds", f"return {answer}")))).fly()
     assert flight.outcome == "lost"
     shown = answer.replace("[1.0] * 4", "[1.0, 1.0, 1.0, 1.0]").replace("object()", "<object object")
     assert str(flight.log.reason).startswith(f"at t = 0.000 s: Hover answered {shown}")
@@ -163,7 +163,7 @@ def test_an_answer_that_is_no_command_ends_the_flight_with_that_reason(written: 
 
 
 def test_speeds_that_are_no_numbers_never_reach_the_plant(written: Write) -> None:
-    flight = fly_scenario(load_scenario(written(HOVER.replace("self.speeds\n", "self.speeds * np.nan\n"))))
+    flight = Rollout(load_scenario(written(HOVER.replace("self.speeds\n", "self.speeds * np.nan\n")))).fly()
     assert flight.log.reason == "at t = 0.000 s: the command is not finite: [nan, nan, nan, nan]"
 
 

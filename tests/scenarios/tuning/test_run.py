@@ -20,7 +20,7 @@ from quadsim.errors import InputError, MissingPackageError, OutputError
 from quadsim.outputs import SUMMARY_FILE
 from scenarios.campaign.results.table import read_table
 from scenarios.loading import load_scenario
-from scenarios.run import fly_scenario
+from scenarios.rollout import Rollout
 from scenarios.tuning import run as module
 from scenarios.tuning.page import sentences, verdict
 from scenarios.tuning.plan import START, TuningPlan, load_tuning
@@ -63,7 +63,7 @@ def test_a_known_optimum_is_found(whole: TuningResult) -> None:
     assert whole.holds
     found = load_scenario(str(whole.directory / "best.toml"))
     assert found == whole.best
-    assert fly_scenario(found).outcome == "satisfied"
+    assert Rollout(found).fly().outcome == "satisfied"
 
 
 def test_all_candidates_meet_the_same_draws(whole: TuningResult) -> None:

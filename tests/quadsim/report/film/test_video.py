@@ -15,6 +15,7 @@ import imageio.v3 as iio
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from support import NO_PRODUCTS
 
 from quadsim.errors import FileError, OutputError, RenderingUnavailableError
 from quadsim.flight.audit import Limit, audit
@@ -26,9 +27,8 @@ from quadsim.report.film.painter import RED
 from quadsim.report.film.video import render_gif, render_video, rendering_backend
 from quadsim.rotation import body_to_world
 from quadsim.state import EULER, INDEX, POSITION
-from scenarios.flight import Outputs
 from scenarios.loading import load_scenario
-from scenarios.run import run_scenario
+from scenarios.rollout import Rollout
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_a_flight_of_one_period_far_away_can_be_filmed_and_of_none_cannot(
     backend: str, empty_run: Run, tmp_path: Path
 ) -> None:
     far = load_scenario("paper-constrained", ["duration=0.05", "initial.position=[9e3, -9e3, 9e3]", "constraints=[]"])
-    run_scenario(far, tmp_path / "far", Outputs(video=False, recording=False, figures=False))
+    Rollout(far).fly().save(tmp_path / "far", **NO_PRODUCTS)
     render_video(tmp_path / "far", tmp_path / "film.mp4", width=320, height=180, fps=10, workers=1)
     frames, _ = decode(tmp_path / "film.mp4")
     assert frames.shape == (1, 180, 320, 3)

@@ -1,4 +1,4 @@
-"""The composition root: fly a scenario, audit it, write everything a person opens."""
+"""From a scenario to its flight: the one loop that batches, live sessions, learning environments and scripts step."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import math
 import os
 import time as clock
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,6 @@ from threadpoolctl import threadpool_limits
 from quadsim.controller import Command, Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import audit, smallest_margins
-from quadsim.outputs import reserving
 from quadsim.sim.effects import Force
 from quadsim.sim.loop import ClosedLoop, Observation, Reference, Sample, complete, one_period
 from quadsim.sim.navigation import Navigation
@@ -25,7 +22,7 @@ from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.build import build_controller, build_ground, build_plant, resolve
-from scenarios.flight import Flight, Outputs, write_run
+from scenarios.flight import Flight
 from scenarios.limits import build_limits
 from scenarios.parts.effects import build_computation
 from scenarios.parts.events import prepared
@@ -76,8 +73,19 @@ def needs_quaternions(scenario: Scenario) -> bool:
     return any(isinstance(spec, NonlinearSpec) for spec in specs)
 
 
-class StartedFlight:
-    """A flight that is flown period by period: everything built and checked, nothing flown yet.
+@contextlib.contextmanager
+def _staying() -> Iterator[None]:
+    """Come back to the working directory, even if it is gone by then."""
+    here = os.open(os.curdir, getattr(os, "O_PATH", os.O_RDONLY))
+    try:
+        yield
+    finally:
+        os.fchdir(here)
+        os.close(here)
+
+
+class Rollout:
+    """A scenario's flight, period by period; everything is built and checked before the first.
 
     What happens in flight comes from the scenario's events, and from `apply`.  A period depends on these and on the
     seed alone, never on a clock: the scenario of `flight` flies to the same bits.  Linear algebra is held to one
@@ -104,16 +112,31 @@ class StartedFlight:
         True
     """
 
+    @_staying()
     def __init__(
         self,
         scenario: Scenario,
         law: Controller | None = None,
         forces: Sequence[Force] | None = None,
         *,
+        live: bool = False,
         recorded: bool = True,
     ) -> None:
-        """Set up at t = 0; see `start`."""
-        self._started, self.vehicle, self.limits = scenario, build_vehicle(scenario), build_limits(scenario)
+        """Set up at t = 0.
+
+        Args:
+            scenario: what is flown.
+            law: flies it in place of the scenario's controller.
+            forces: act in place of the scenario's forces.
+            live: as of `scenarios.app.start`.
+            recorded: as of `scenarios.app.start`.
+
+        Raises:
+            InputError: something cannot be built.
+        """
+        self.vehicle = build_vehicle(scenario)
+        scenario = prepared(scenario, self.vehicle) if live else scenario
+        self._started, self.limits = scenario, build_limits(scenario)
         self.actual = build_actual(scenario, self.vehicle)
         threadpool_limits(limits=1)  # the matrices are small, and results do not depend on the number of cores
         if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
@@ -147,7 +170,7 @@ class StartedFlight:
         )
         self._longest = controller.horizon
 
-    def __enter__(self) -> StartedFlight:
+    def __enter__(self) -> Rollout:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -208,12 +231,18 @@ class StartedFlight:
         finally:
             self._simulate_s += clock.perf_counter() - started
 
-    def complete(self, progress: Progress = silent) -> None:
-        """Fly on to the scenario's end; a flight error or Ctrl-C ends it early, in order."""
-        started, periods = clock.perf_counter(), self.scenario.periods
-        progress("flight", self.k, periods)
-        complete(self.loop, periods=periods, progress=lambda done: progress("flight", done, periods))
-        self._simulate_s += clock.perf_counter() - started
+    @_staying()
+    def fly(self, progress: Progress = silent) -> Flight:
+        """Fly on to the scenario's end, audit it and close; a flight error or Ctrl-C ends it early, in order.
+
+        A controller that changes the working directory changes it for the flight alone.
+        """
+        with self:
+            started, periods = clock.perf_counter(), self.scenario.periods
+            progress("flight", self.k, periods)
+            complete(self.loop, periods=periods, progress=lambda done: progress("flight", done, periods))
+            self._simulate_s += clock.perf_counter() - started
+            return self.flight()
 
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
         """Let something happen from the next period on that is not observed yet, as an event of the file would.
@@ -285,74 +314,3 @@ class StartedFlight:
 
     def _build(self, spec: ControllerSpec) -> Controller:
         return build_controller(self._started.model_copy(update={"controller": spec}), self.vehicle)
-
-
-def start(
-    scenario: Scenario,
-    law: Controller | None = None,
-    forces: Sequence[Force] | None = None,
-    *,
-    live: bool = False,
-    recorded: bool = True,
-) -> StartedFlight:
-    """Build everything that a scenario's flight needs, and fly nothing yet; see `scenarios.app.start`.
-
-    `law` and `forces` take the place of what is built from the scenario's `controller` and `forces`.
-
-    Raises:
-        InputError: something cannot be built.
-    """
-    flown = prepared(scenario, build_vehicle(scenario)) if live else scenario
-    return StartedFlight(flown, law, forces, recorded=recorded)
-
-
-def fly_scenario(
-    scenario: Scenario,
-    progress: Progress = silent,
-    law: Controller | None = None,
-    forces: Sequence[Force] | None = None,
-) -> Flight:
-    """Fly a scenario and audit it, writing nothing.
-
-    A controller that changes the working directory changes it for the flight alone.  `law` and `forces` as of `start`.
-    """
-    with _staying(), start(scenario, law, forces) as started:
-        started.complete(progress)
-        return started.flight()
-
-
-@contextlib.contextmanager
-def _staying() -> Iterator[None]:
-    """Come back to the working directory, even if it is gone by then."""
-    here = os.open(os.curdir, getattr(os, "O_PATH", os.O_RDONLY))
-    try:
-        yield
-    finally:
-        os.fchdir(here)
-        os.close(here)
-
-
-def run_scenario(
-    scenario: Scenario,
-    target: Path,
-    outputs: Outputs,
-    progress: Progress = silent,
-    law: Controller | None = None,
-    forces: Sequence[Force] | None = None,
-    *,
-    overwrite: bool = False,
-) -> Flight:
-    """Fly a scenario and write its run directory: tables and summary first, then its products.
-
-    A flight that its pilot interrupted is written without its video.  Arguments as of `fly_scenario` and `write_run`.
-
-    Raises:
-        RenderingUnavailableError: a video is asked for by name and cannot be made; nothing was flown.
-        OutputError: the directory cannot be written, and nothing was flown; or see `scenarios.flight.write_run`.
-    """
-    started = clock.perf_counter()
-    outputs.check()
-    with reserving(target, overwrite=overwrite) as directory:
-        flight = replace(fly_scenario(scenario, progress, law, forces), directory=directory)
-        write_run(flight, directory, outputs, progress, overwrite=overwrite, since=started)
-    return flight
