@@ -6,19 +6,13 @@ import os
 import shutil
 import time as clock
 
-import numpy as np
-
 from mpc.solvers import solver_entries
 from quadsim.controller import SOLVED, Moment
 from quadsim.errors import FlightError, QuadsimError
 from quadsim.report.film.video import rendering_backend
 from quadsim.report.recording import viewer_problem
-from quadsim.vehicle import N_ROTORS
-from scenarios.build import build_controller
-from scenarios.loading import load_scenario
+from scenarios.loading import assemble
 from scenarios.machine import machine, versions
-from scenarios.parts.vehicle import build_initial_state, build_vehicle
-from scenarios.reference import build_reference
 
 
 def doctor() -> dict[str, dict[str, str]]:
@@ -60,15 +54,14 @@ def _rendering() -> str:
 
 def _try_solver(name: str) -> str:
     """Solve the first step of the paper's constrained flight."""
-    scenario = load_scenario("paper-constrained", [f"controller.solver={name}"])
-    vehicle = build_vehicle(scenario)
+    assembly = assemble("paper-constrained", [f"controller.solver={name}"])
     started = clock.perf_counter()
-    controller = build_controller(scenario, vehicle)
+    controller = assembly.controller()
     built = clock.perf_counter()
-    controller.reset(np.full(N_ROTORS, vehicle.hover_speed))
-    reference = build_reference(scenario, controller.horizon + 1)[1:]
+    controller.reset(assembly.initial_speeds)
+    reference = assembly.reference(controller.horizon + 1)[1:]
     try:
-        command = controller.step(Moment(), build_initial_state(scenario), reference)
+        command = controller.step(Moment(), assembly.initial_state(), reference)
     except FlightError as error:
         return f"fails: {error}"
     verdict = "works" if command.status == SOLVED else f"answers {command.status}"

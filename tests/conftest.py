@@ -18,9 +18,9 @@ from support import NO_PRODUCTS, draw_nothing, fly_here
 from quadsim.flight import rundir
 from quadsim.flight.rundir import Run
 from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.rollout import Rollout
 from scenarios.shipped import scenario_names
@@ -102,7 +102,7 @@ def fly_once(session_directory: Path) -> Fly:
 
 @pytest.fixture(scope="session")
 def vehicle() -> Vehicle:
-    return build_vehicle(load_scenario("paper-constrained"))
+    return Assembly(load_scenario("paper-constrained")).vehicle
 
 
 @pytest.fixture(scope="session")

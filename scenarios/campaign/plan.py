@@ -13,13 +13,12 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from quadsim.errors import FileError, InputError, ParameterError
+from scenarios.assembly import Assembly
 from scenarios.campaign.draws import Draws
 from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.results.table import DRAW, TIMES, Row, make_schema
 from scenarios.campaign.spec import CampaignSpec, Value, VaryBase
-from scenarios.limits import build_limits
-from scenarios.loading import check_parts, parse_scenario
-from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
+from scenarios.loading import parse_scenario
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.problems import ScenarioError, describe_all
@@ -49,7 +48,7 @@ class Plan:
     def schema(self) -> pa.Schema:
         """The columns of its results."""
         kinds = {entry.name: (column_type(entry), entry.unit) for entry in self.spec.vary}
-        return make_schema(kinds, build_limits(self.scenario))
+        return make_schema(kinds, Assembly(self.scenario).limits)
 
     @property
     def flies_user_code(self) -> bool:
@@ -103,13 +102,14 @@ class Plan:
         _ = self.failure
         check_ends(
             self.spec.vary,
-            lambda entry, value: check_parts(self._varied([(entry, value)], name=self.scenario.name, seed=0)),
+            lambda entry, value: Assembly(self._varied([(entry, value)], name=self.scenario.name, seed=0)).check(),
             table="vary",
         )
         refusals = []
         for flight in range(min(FIRST, self.spec.flights)):
             try:
-                return check_parts(self.of(flight))
+                Assembly(self.of(flight)).check()
+                return
             except InputError as error:
                 refusals.append(error)
         raise InputError(f"none of the first {len(refusals)} flights can be flown, the first since {refusals[0]}")
@@ -157,7 +157,7 @@ def make_plan(scenario: Scenario, data: Mapping[str, Any]) -> Plan:
         InputError: a field is not allowed, or what varies cannot be flown.
     """
     spec = parse_campaign({"name": scenario.name, **data, "scenario": scenario.name}, source="campaign")
-    plan = Plan(spec, resolve_vehicle(scenario, build_vehicle(scenario)))
+    plan = Plan(spec, Assembly(scenario).with_vehicle)
     plan.check()
     return plan
 
@@ -197,8 +197,8 @@ def flown_scenario(spec: CampaignSpec, path: Path, settings: Sequence[str] = ())
         scenario = parse_scenario(data, source=f"{path.name}, {file.name}", directory=file.parent)
     except OSError as error:
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
-    check_parts(scenario)
-    return resolve_vehicle(scenario, build_vehicle(scenario))
+    Assembly(scenario).check()
+    return Assembly(scenario).with_vehicle
 
 
 def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], ...]:

@@ -12,11 +12,11 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import ParameterError, UnknownNameError
+from scenarios.assembly import Assembly
 from scenarios.campaign.pilot import CampaignPilot, fly_flights
 from scenarios.campaign.plan import Plan, parse_campaign
 from scenarios.campaign.results.table import DRAW, make_table
 from scenarios.flight import to_pandas
-from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.schema.scenario import Scenario
 
@@ -73,7 +73,7 @@ def fly_sweep(
     count = math.prod(map(len, lists))
     data = {"name": scenario.name, "scenario": scenario.name, "flights": count, "vary": entries}
     spec = parse_campaign(data, source="sweep")
-    plan = Plan(spec, resolve_vehicle(scenario, build_vehicle(scenario)), one_seed=True)
+    plan = Plan(spec, Assembly(scenario).with_vehicle, one_seed=True)
     plan.check()
     progress("sweep", 0, count)
     rows = []

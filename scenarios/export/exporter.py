@@ -14,11 +14,11 @@ from mpc.export.source import CHANGES, DATA, CController, part
 from mpc.export.targets import TARGETS, Target
 from quadsim.errors import ParameterError
 from quadsim.outputs import absolute, reserving, writing
+from scenarios.assembly import Assembly
 from scenarios.export.reach import Reach, reach
 from scenarios.export.record import Recording, record
-from scenarios.loading import as_scenario
+from scenarios.loading import load_scenario
 from scenarios.parts.controllers import exportable
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 
 FACTS: Final = "export.json"
@@ -67,7 +67,7 @@ def export(
             raise ParameterError("", f"--{name}", value, f"one of {', '.join(allowed)}")
     if rows is not None and rows < 1:
         raise ParameterError("", "--rows", rows, "at least 1")
-    scenario = as_scenario(scenario)
+    scenario = load_scenario(scenario)
     with reserving(out, overwrite=overwrite) as directory:
         controller = c_controller(scenario, precision, rows)
         facts = _facts(controller)
@@ -96,7 +96,7 @@ def exported_law(scenario: Scenario) -> Exportable:
         ExportError: it cannot be exported.
     """
     shapes = (*scenario.obstacles, *scenario.regions)
-    return exportable(scenario.controller, build_vehicle(scenario), scenario.control_period, shapes)
+    return exportable(scenario.controller, Assembly(scenario).vehicle, scenario.control_period, shapes)
 
 
 def _facts(controller: CController) -> dict[str, Any]:

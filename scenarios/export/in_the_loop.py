@@ -18,12 +18,13 @@ from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Moment, s
 from quadsim.outputs import reserving
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
+from scenarios.assembly import Assembly
 from scenarios.export.emulation import Program, build, require_programs
 from scenarios.export.exporter import c_controller, exported_law, programs
 from scenarios.export.serial_line import SerialMPC
 from scenarios.flight import Flight
 from scenarios.limits import with_bounds_stated
-from scenarios.loading import as_scenario
+from scenarios.loading import load_scenario
 from scenarios.progress import Progress, reporting
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
@@ -103,7 +104,7 @@ def fly_exported(
         >>> import quadsim
         >>> flight = quadsim.fly_exported("hover", target="cortex-m4f", precision="float")  # doctest: +SKIP
     """
-    scenario = as_scenario(scenario)
+    scenario = load_scenario(scenario)
     machine = TARGETS[target]
     files = c_controller(scenario, precision).files | programs(machine, precision)
     require_programs(machine, "to fly an exported controller")
@@ -136,6 +137,6 @@ def _allowing(scenario: Scenario, spacing: float) -> Scenario:
         )
         if limit.signal in ("speed", "slew")
         else limit
-        for limit in with_bounds_stated(scenario).constraints
+        for limit in with_bounds_stated(Assembly(scenario)).constraints
     ]
     return scenario.model_copy(update={"constraints": limits})

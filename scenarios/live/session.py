@@ -21,10 +21,10 @@ from quadsim.fields import Fraction
 from quadsim.flight.audit import Limit
 from quadsim.sim.loop import Sample
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
-from scenarios.build import preferring_core
+from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
+from scenarios.flight_events import Successor, validated
 from scenarios.limits import with_bounds_stated
-from scenarios.parts.live import Successor, validated
 from scenarios.rollout import Rollout
 from scenarios.schema.base import Spec, Triple
 from scenarios.schema.controller import ControllerSpec
@@ -115,7 +115,8 @@ class Session:
         self._queue.clear()
         scenarios = [self.scenario]
         if self._against is not None:
-            scenarios.append(with_bounds_stated(self.scenario).model_copy(update={"controller": self._against}))
+            bounded = with_bounds_stated(Assembly(self.scenario))
+            scenarios.append(bounded.model_copy(update={"controller": self._against}))
         self.flights = tuple(Rollout(each, live=True) for each in scenarios)
         self._held = _Hand()
         self.reason: str | None = None

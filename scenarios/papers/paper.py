@@ -10,7 +10,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from quadsim.assets import read_toml
 from quadsim.fields import NonNegative, Number, Positive
-from scenarios.loading import check_parts, parse_scenario
+from scenarios.assembly import Assembly
+from scenarios.loading import parse_scenario
 from scenarios.schema.base import MOST_ENTRIES, Pair, Spec
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe_all
@@ -114,5 +115,5 @@ def scenario_of(paper: Paper, number: NumberSpec) -> Scenario:
     path = scenario_path(found)
     data = merge(read_scenario(path, scenario_path), number.set)
     scenario = parse_scenario(data, source=f"{number.name}: {path.name}", directory=path.parent)
-    check_parts(scenario)
+    Assembly(scenario).check()
     return scenario

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from quadsim.errors import InputError, ParameterError
 from quadsim.state import Array
+from scenarios.assembly import Assembly
 from scenarios.campaign.plan import (
     Plan,
     cell,
@@ -30,8 +31,7 @@ from scenarios.campaign.results.events import Event, is_number, parse_event
 from scenarios.campaign.results.table import Row
 from scenarios.campaign.spec import CampaignSpec, Value, VaryBase, check_fields
 from scenarios.campaign.statistics.requirement import Requirement, parse_requirement
-from scenarios.limits import build_limits
-from scenarios.loading import check_parts, parse_scenario
+from scenarios.loading import parse_scenario
 from scenarios.schema.bases import merge
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
@@ -131,13 +131,13 @@ class TuningPlan:
 
     def _check_at(self, entry: VaryBase, value: Value) -> None:
         scenario = self.candidate({entry.name: value}, self.spec.name)
-        if build_limits(scenario) != build_limits(self.start.scenario):
+        if Assembly(scenario).limits != Assembly(self.start.scenario).limits:
             rule = (
                 "of fields that leave alone what flights are audited against: constraints, obstacles, regions, and the "
                 "controller's bounds and polytopes"
             )
             raise ParameterError(f"search.{entry.name}", "fields", entry.fields, rule)
-        check_parts(scenario)
+        Assembly(scenario).check()
 
     def to_toml(self) -> str:
         """The file with every field, for a directory that has the start as `scenario.toml`."""

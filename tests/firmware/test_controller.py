@@ -18,11 +18,10 @@ from mpc.paper.condensed import Condensed
 from mpc.solvers import QPSolver
 from quadsim.controller import SOLVED
 from quadsim.state import Array
-from scenarios.build import build_problem
+from scenarios.assembly import Assembly
 from scenarios.export.exporter import c_controller
 from scenarios.export.record import REFUSED, Recording, record
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
@@ -121,7 +120,7 @@ def drawn(name: str = "paper-constrained") -> list[tuple[Array, Array, Array]]:
 def peers() -> list[tuple[Array | None, Array | None]]:
     """First commands of DAQP and of quadprog; None where they find none."""
     scenario = load_scenario("paper-constrained")
-    problem = build_problem(scenario, build_vehicle(scenario))
+    problem = Assembly(scenario).problem()
     daqp, form = QPSolver("daqp", problem), Condensed(problem)
     found: list[tuple[Array | None, Array | None]] = []
     for state, reference, acting in drawn():
