@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from mpc.model import hover_model as hover_model
     from mpc.nonlinear.controller import NonlinearMPC as NonlinearMPC
     from mpc.nonlinear.settings import NonlinearSettings as NonlinearSettings
+    from mpc.ocp import InfeasiblePeriod as InfeasiblePeriod
     from mpc.ocp import Objective as Objective
     from mpc.ocp import Problem as Problem
     from mpc.ocp import Query as Query
-    from mpc.ocp import Unanswered as Unanswered
     from mpc.robust.controller import RobustMPC as RobustMPC
     from mpc.robust.settings import RobustSettings as RobustSettings
     from mpc.solvers import QPSolver as QPSolver
@@ -38,7 +38,7 @@ _MODULES = {
     "mpc.model": ("LinearModel", "hover_model"),
     "mpc.nonlinear.controller": ("NonlinearMPC",),
     "mpc.nonlinear.settings": ("NonlinearSettings",),
-    "mpc.ocp": ("Objective", "Problem", "Query", "Unanswered"),
+    "mpc.ocp": ("Objective", "Problem", "Query", "InfeasiblePeriod"),
     "mpc.robust.controller": ("RobustMPC",),
     "mpc.robust.settings": ("RobustSettings",),
     "mpc.solvers": ("QPSolver",),

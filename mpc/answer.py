@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
+from mpc.condensing import states_rows
 from mpc.constraints import Bounds
 from mpc.ocp import Problem, Query, predicted
-from mpc.paper.condensed import row_maps
-from mpc.paper.prediction import prediction
+from mpc.paper import prediction
 from mpc.qp import kkt_residuals
 from mpc.solvers import Answer
 from quadsim.controller import ACCEPTED, FALLBACK, Command
@@ -126,15 +126,12 @@ class AnswerCheck:
 
     def __init__(self, problem: Problem, kkt_every: int) -> None:
         self._problem, self._every, self._periods = problem, kkt_every, 0
-        self._map: tuple[Indices | slice, Array, Array, Array] | None = None
-        rows, N, n, nu = problem.rows, problem.horizon, problem.model.n, problem.model.nu
+        self._map: tuple[Indices, Array, Array, Array] | None = None
+        rows, N, nu = problem.rows, problem.horizon, problem.model.nu
         at = np.flatnonzero(rows.on_states)
         if rows.C.ndim == 2 and at.size * N**2 * nu <= LARGEST_MAP:
-            part = rows.part(at, np.arange(n), nu)
-            maps = row_maps(part, prediction(problem.model, N))
-            contiguous = at.size > 0 and at[-1] - at[0] + 1 == at.size
-            there = slice(at[0], at[-1] + 1) if contiguous else at  # the former is much quicker
-            self._map = there, part.C, np.concatenate(maps.of_inputs), np.concatenate(maps.of_state)
+            maps = states_rows(rows.C[at], rows.of_states[at], prediction(problem.model, N), N)
+            self._map = at, rows.C[at], np.concatenate(maps.of_inputs), np.concatenate(maps.of_state)
 
     def reset(self) -> None:
         """The next period is the first."""
@@ -164,7 +161,7 @@ class AnswerCheck:
         steps = plan - np.concatenate((query.u_before[None], plan[:-1]))
         values = plan @ rows.D.T + steps @ rows.E.T
         if self._map is not None and problem is self._problem and query.steps is None:
-            (at, C, of_inputs, of_state), (x_s, u_s) = self._map, query.rest or problem.rest
+            (at, C, of_inputs, of_state), (x_s, u_s) = self._map, query.equilibrium or problem.equilibrium
             of_plan = of_inputs @ (plan - u_s).ravel() + of_state @ (query.state - x_s)
             values[:, at] += of_plan.reshape(len(plan), -1) + C @ x_s
         else:

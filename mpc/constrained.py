@@ -8,12 +8,11 @@ import numpy as np
 
 from mpc.answer import ActuatorBounds, AnswerCheck, command_of, rejection, shifted
 from mpc.handover import resized, within
-from mpc.ocp import Problem, Query, Unanswered
-from mpc.paper.prediction import rollout
+from mpc.obstacles import ObstacleQP, Space
+from mpc.ocp import InfeasiblePeriod, Problem, Query
+from mpc.paper import rollout
 from mpc.qp import KKT_EVERY
 from mpc.solvers import INVALID_DATA, Answer, Solver
-from mpc.space.clearing import Clearing
-from mpc.space.halfspaces import Space
 from quadsim.controller import GROUNDED, Command, Moment, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
@@ -48,7 +47,7 @@ class ConstrainedMPC:
     ) -> None:
         self.problem, self.horizon, self.solver = problem, problem.horizon, solver.name
         self._solver = solver
-        self._clearing = None if space is None else Clearing(problem, self._solver, space)
+        self._obstacles = None if space is None else ObstacleQP(problem, self._solver, space)
         self._bounds, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
         self.reset(problem.model.u_bar)
 
@@ -57,11 +56,11 @@ class ConstrainedMPC:
         self._before = np.array(speeds, float)
         self._plan: Array | None = None
         self._held = 0
-        self.unanswered: Unanswered | None = None
+        self.unanswered: InfeasiblePeriod | None = None
         self._solver.reset()
         self._check.reset()
-        if self._clearing is not None:
-            self._clearing.reset()
+        if self._obstacles is not None:
+            self._obstacles.reset()
 
     def adopt(self, previous: object) -> None:
         """Hold the plan of the law before, should no QP have an answer."""
@@ -84,15 +83,15 @@ class ConstrainedMPC:
             return stopped(self._before.copy(), self.horizon, now.phase)
         query = Query(state, self.problem.objective.desired(reference), self._before)
         problem = self.problem
-        if self._clearing is None:
+        if self._obstacles is None:
             answer = self._solver.solve(query)
         else:
-            answer, problem = self._clearing.solve(now.time, query)
+            answer, problem = self._obstacles.solve(now.time, query)
         refused = rejection(answer.status, answer.plan[0], answer.plan, self._bounds, self._before)
         answer, refused = self._check(problem, query, answer, refused)
         self.answer = answer
         if refused not in (None, INVALID_DATA) and self.unanswered is None:
-            self.unanswered = Unanswered(problem=problem, query=query, status=refused, time=now.time)
+            self.unanswered = InfeasiblePeriod(problem=problem, query=query, status=refused, time=now.time)
         if refused is None:
             self._plan, self._held = answer.plan, 0
         elif self._plan is None or self._held + 1 >= self.horizon:

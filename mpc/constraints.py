@@ -156,24 +156,6 @@ class Rows:
         """(m_s,) the first row of each slack; all soft ones where none is shared."""
         return self.soft[np.unique(self.slack[self.soft], return_index=True)[1]]
 
-    def part(self, rows: Indices, states: Indices, inputs: int) -> Rows:
-        """Some rows of states alone, on some states, of a problem with so many inputs."""
-        nothing = np.zeros((rows.size, inputs))
-        return replace(
-            self,
-            C=self.C[np.ix_(rows, states)],
-            D=nothing,
-            E=nothing,
-            lower=self.lower[:, rows],
-            upper=self.upper[:, rows],
-            l1=self.l1[rows],
-            l2=self.l2[rows],
-            slack=renumbered(self.slack[rows]),
-            of_states=self.of_states[rows],
-            input=self.input[rows],
-            names=tuple(self.names[row] for row in rows),
-        )
-
 
 def renumbered(slack: Indices) -> Indices:
     """Slacks' numbers (m,) without gaps, -1 of hard rows held."""

@@ -25,10 +25,10 @@ import numpy as np
 from scipy import sparse
 
 from mpc.constraints import Constraint, Penalty
-from mpc.ocp import Problem, Query, Unanswered
+from mpc.ocp import InfeasiblePeriod, Problem, Query
+from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import Solution
 from mpc.solvers import QPSolver
-from mpc.staged import Staged
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 
@@ -72,7 +72,7 @@ class Conflict:
         return not self.violated
 
 
-def find_conflict(unanswered: Unanswered) -> Conflict | None:
+def find_conflict(unanswered: InfeasiblePeriod) -> Conflict | None:
     """Which constraints cannot hold together; None where the elastic problem cannot be solved either."""
     problem, query, parts = unanswered.problem, unanswered.query, unanswered.problem.every_constraint
     sides, scales = _sides(problem), _scales(problem)
@@ -103,7 +103,7 @@ def find_conflict(unanswered: Unanswered) -> Conflict | None:
     return Conflict(total=total, violated=violated, blocking=tuple(sorted(held - violated.keys())))
 
 
-def smallest_widening(unanswered: Unanswered, sides: Collection[Side]) -> float | None:
+def smallest_widening(unanswered: InfeasiblePeriod, sides: Collection[Side]) -> float | None:
     """By how much these bounds have to be moved outwards, all by the same amount at all steps, for an answer.
 
     None where that does not help, however far they are moved.
@@ -119,7 +119,7 @@ def has_answer(problem: Problem, query: Query) -> bool:
     return _set_up(problem, query)(query)
 
 
-def recovery(unanswered: Unanswered, plan: Array) -> int | None:
+def recovery(unanswered: InfeasiblePeriod, plan: Array) -> int | None:
     """After how many periods of a plan (N, nu) the problem has an answer, by the model; None for not within it."""
     problem, query = unanswered.problem, unanswered.query
     is_solved, state = _set_up(problem, query), query.state
@@ -213,7 +213,7 @@ def _relaxed(
 
     slack = Penalty(l1=np.ones(1), l2=np.zeros(1))
     rows = tuple(replace(one, penalty=slack if side in elastic else None) for side, one in sides.items())
-    form = Staged(replace(problem, bounds=None, constraints=rows), changing=True)
+    form = PartiallyCondensed(replace(problem, bounds=None, constraints=rows), changing=True)
     qp = form.pose(query._replace(steps=_steps(problem, query))).qp
     named, columns = (
         [side for side in sides if side in elastic],
@@ -261,6 +261,6 @@ def _steps(problem: Problem, query: Query) -> tuple[Array, Array, Array]:
     """A (N, n, n), B (N, n, nu), c (N, n) of the predicted steps."""
     if query.steps is not None:
         return query.steps
-    model, N, (x_s, u_s) = problem.model, problem.horizon, query.rest or problem.rest
+    model, N, (x_s, u_s) = problem.model, problem.horizon, query.equilibrium or problem.equilibrium
     A, B, c = model.A, model.B, x_s - model.A @ x_s - model.B @ u_s
     return np.tile(A, (N, 1, 1)), np.tile(B, (N, 1, 1)), np.tile(c, (N, 1))

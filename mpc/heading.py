@@ -15,7 +15,7 @@ import numpy as np
 
 from mpc.equilibrium import Trim
 from mpc.model import LinearModel
-from mpc.paper.prediction import rollout
+from mpc.paper import rollout
 from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, Array
 
 _YAW: Final = INDEX["yaw"]

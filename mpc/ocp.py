@@ -4,7 +4,7 @@ Over N steps of a linear model, from x(k) and after the input u(k-1), minimised 
 
     sum_i |C_r x(k+i) - y_d(i)|^2_Qy + |u(k+i-1) - u_s|^2_Qu + |u(k+i-1) - u(k+i-2)|^2_Qd,    i = 1 .. N,
 
-where the last state may have a weight P of its own, about the rest state x_s (`Rest`), subject to a tuple of
+where the last state may have a weight P of its own, about the rest state x_s (`Equilibrium`), subject to a tuple of
 constraints, each a value.  What is built from a problem walks the rows of all its constraints and knows no kind.
 """
 
@@ -25,7 +25,7 @@ from quadsim.errors import ParameterError
 from quadsim.state import REFERENCE_STATES, Array
 
 
-class Rest(NamedTuple):
+class Equilibrium(NamedTuple):
     """Where the model rests, x_s = A x_s + B (u_s - u_bar), and what the cost pulls inputs to."""
 
     x: Array  # (n,) x_s
@@ -121,9 +121,9 @@ class Problem:
                 _check_shape(f"{constraint.name}.lower", constraint.lower, (self.horizon, m))
 
     @property
-    def rest(self) -> Rest:
+    def equilibrium(self) -> Equilibrium:
         """The equilibrium that the model is linearised at, the origin."""
-        return Rest(np.zeros(self.model.n), self.model.u_bar)
+        return Equilibrium(np.zeros(self.model.n), self.model.u_bar)
 
     @property
     def every_constraint(self) -> tuple[Constraint, ...]:
@@ -185,7 +185,7 @@ class Query(NamedTuple):
     state: Array  # (n,) x(k)
     desired: Array  # (N, n_r) y_d for x(k+1) .. x(k+N)
     u_before: Array  # (nu,) u(k-1) [rad/s]
-    rest: Rest | None = None  # where the model rests; None for the problem's
+    equilibrium: Equilibrium | None = None  # where the model rests; None for the problem's
     # A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's about `rest`
     steps: tuple[Array, Array, Array] | None = None
 
@@ -197,7 +197,7 @@ def predicted(problem: Problem, query: Query, plan: Array) -> Array:
         for i, (A, B, c, u) in enumerate(zip(*query.steps, plan, strict=True)):
             states[i] = state = A @ state + B @ u + c
         return states
-    model, (x_s, u_s) = problem.model, query.rest or problem.rest
+    model, (x_s, u_s) = problem.model, query.equilibrium or problem.equilibrium
     state = state - x_s
     for i, push in enumerate((plan - u_s) @ model.B.T):
         states[i] = state = model.A @ state + push
@@ -205,7 +205,7 @@ def predicted(problem: Problem, query: Query, plan: Array) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unanswered:
+class InfeasiblePeriod:
     """The first problem of a flight that had no answer, or whose SQP did not converge; `mpc.diagnosis` explains why."""
 
     problem: Problem  # what was to be solved
@@ -230,7 +230,7 @@ def _check_definite(name: str, matrix: Array, *, least: float) -> None:
     symmetric = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix.T)
     strict = least == 0.0
     if symmetric and np.all(np.isfinite(matrix)):
-        smallest, limit = np.linalg.eigvalsh(matrix)[0], least * np.abs(matrix).max(initial=0.0)
+        smallest, limit = np.linalg.eigvalsh(matrix).min(initial=math.inf), least * np.abs(matrix).max(initial=0.0)
         if smallest > limit or (not strict and smallest >= limit):
             return
     kind = "definite" if strict else "semidefinite"

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
+from mpc.condensing import condensed_cost
 from mpc.ocp import Problem
-from mpc.paper.condensed import condensed_cost
-from mpc.paper.prediction import prediction, rollout
+from mpc.paper import prediction, rollout
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Moment, stopped
 from quadsim.state import Array
 

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 from mpc.answer import ActuatorBounds
 from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
 from mpc.fallback.contract import Guarded
-from mpc.ocp import Unanswered
+from mpc.ocp import InfeasiblePeriod
 from quadsim.errors import InputError
 from quadsim.flight.audit import TERMS, sum_signal
 from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES
@@ -56,7 +56,7 @@ class _Bound:
     field: str = ""  # of the file, a list of numbers
 
 
-def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:
+def diagnose(unanswered: InfeasiblePeriod, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:
     """`diagnosis` of a flight's summary.
 
     Where the controller is one's own, its bounds are not a scenario file's: they are named by the problem, and the
@@ -80,7 +80,7 @@ def diagnose(unanswered: Unanswered, scenario: Scenario, vehicle: Vehicle) -> di
     return {**found, "sentence": _sentence(found), "advice": advice}
 
 
-def _unconverged(unanswered: Unanswered, converges: Callable[[int], bool], before: int) -> dict[str, Any]:
+def _unconverged(unanswered: InfeasiblePeriod, converges: Callable[[int], bool], before: int) -> dict[str, Any]:
     """`diagnose` where the QPs were solved, and sequential quadratic programming did not converge."""
     enough = next((count for count in ITERATIONS if count > before and converges(count)), None)
     suggestions = [] if enough is None else [{"settings": {"controller.iterations": enough}, "after": None}]
@@ -101,7 +101,7 @@ def _unconverged(unanswered: Unanswered, converges: Callable[[int], bool], befor
 class _Case:
     """One period's problem and the file that it is of."""
 
-    def __init__(self, unanswered: Unanswered, scenario: Scenario, spec: Any, vehicle: Vehicle) -> None:
+    def __init__(self, unanswered: InfeasiblePeriod, scenario: Scenario, spec: Any, vehicle: Vehicle) -> None:
         self._unanswered, self._spec, self._vehicle = unanswered, spec, vehicle
         self._period, self._file = scenario.control_period, scenario.to_toml()
 

@@ -41,7 +41,7 @@ from scenarios.schema.settings import leaves
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from mpc.ocp import Unanswered
+    from mpc.ocp import InfeasiblePeriod
     from scenarios.assembly import Assembly
 
 _LONGEST: Final = 500  # characters of why a product failed
@@ -86,7 +86,7 @@ class Flight(Result):
     tallies: Mapping[SensorName, Tally] = field(repr=False)
     directory: Path | None = None
     recorded: Mapping[str, Any] | None = field(default=None, repr=False)
-    unanswered: Unanswered | None = field(default=None, repr=False)
+    unanswered: InfeasiblePeriod | None = field(default=None, repr=False)
 
     @property
     def scenario(self) -> Scenario:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, get_args
 
 from pydantic import ValidationError
 
-from mpc.ocp import Unanswered
+from mpc.ocp import InfeasiblePeriod
 from quadsim.controller import Controller
 from quadsim.errors import InputError, ParameterError, printable
 from quadsim.sim.computation import Stall
@@ -105,7 +105,7 @@ class FlightEvents:
         self._plant, self._navigation, self._reference, self._loop = plant, navigation, reference, loop
         self._build = build
         self._recent: list[Event] = scenario.events  # those that the plant may still have to do with, and others
-        self.unanswered: Unanswered | None = None
+        self.unanswered: InfeasiblePeriod | None = None
         self._due: list[tuple[int, float, SetpointEvent | ControllerEvent, Successor | None]] = []
         for event in scenario.events:
             self._schedule(event)
@@ -214,7 +214,7 @@ class FlightEvents:
             else:
                 self._switch(changed(self._spec, event.fields), ready)
 
-    def first_unanswered(self) -> Unanswered | None:
+    def first_unanswered(self) -> InfeasiblePeriod | None:
         """Of all controllers so far: the first QP without an answer, or else the first SQP that did not converge."""
         found = [each for each in (self.unanswered, unanswered_by(self._loop.controller)) if each is not None]
         return min(found, key=lambda each: each.converges is not None, default=None)
@@ -243,10 +243,10 @@ class FlightEvents:
         return Successor(spec=spec, controller=self._build(spec))
 
 
-def unanswered_by(controller: Controller) -> Unanswered | None:
+def unanswered_by(controller: Controller) -> InfeasiblePeriod | None:
     """The first period whose QP had no answer; None where all had, or there is none."""
     found = getattr(controller, "unanswered", None)  # a controller of another kind has none
-    return found if isinstance(found, Unanswered) else None
+    return found if isinstance(found, InfeasiblePeriod) else None
 
 
 def _lasting(event: Event) -> float:

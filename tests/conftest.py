@@ -42,7 +42,7 @@ LONG = (
     *("scenarios/design/test_first_flights.py", "scenarios/test_api.py", "scenarios/test_diagnosis.py"),
     *("quadsim/report/film/test_video.py", "test_documents.py", "scenarios/test_process.py", "test_refusals.py"),
     *("scenarios/test_nothing_lost.py", "mpc/robust/test_robust.py", "scenarios/papers/test_reproduction.py"),
-    *("scenarios/test_any_scenario.py", "mpc/test_staged.py"),
+    *("scenarios/test_any_scenario.py", "mpc/test_partial_condensing.py"),
     *("scenarios/test_run.py", "scenarios/test_cli.py", "scenarios/test_reaudit.py", "test_packaging.py"),
     *("mpc/test_diagnosis.py", "mpc/robust/test_tightening.py", "mpc/core/test_core.py"),
 )

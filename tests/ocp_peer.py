@@ -1,7 +1,8 @@
 """The optimum of an optimal control problem from its definition alone: rolled out, probed, and solved as a dense QP.
 
-Nothing of `mpc.qp`, `mpc.staged` or `mpc.paper` that builds matrices is used: states by recursion, and every matrix by
-what unit inputs do.  A plan may have axes in front of its own two: many plans are then rolled out at once.
+Nothing of `mpc.qp`, `mpc.partial_condensing` or `mpc.paper` that builds matrices is used: states by recursion, and
+every matrix by what unit inputs do.  A plan may have axes in front of its own two: many plans are then rolled out at
+once.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from polish import polish
 from scipy.optimize import linprog
 
 from mpc.constraints import Constraint
-from mpc.ocp import Problem, Query, Rest
+from mpc.ocp import Equilibrium, Problem, Query
 from mpc.qp import QP, Solution, kkt_residuals
-from mpc.solvers.daqp_dense import DaqpDense
+from mpc.solvers.daqp import DaqpDense
 from quadsim.state import Array
 
 
@@ -42,17 +43,17 @@ class Period:
     state: Array
     desired: Array
     u_before: Array
-    rest: Rest
+    equilibrium: Equilibrium
 
     @property
     def query(self) -> Query:
         """The same for a solver whose model changes."""
-        return Query(self.state, self.desired, self.u_before, self.rest, (self.A, self.B, self.c))
+        return Query(self.state, self.desired, self.u_before, self.equilibrium, (self.A, self.B, self.c))
 
 
-def period(problem: Problem, state: Array, desired: Array, u_before: Array, rest: Rest | None = None) -> Period:
+def period(problem: Problem, state: Array, desired: Array, u_before: Array, rest: Equilibrium | None = None) -> Period:
     """Of the problem's own model, anchored at its rest state or another."""
-    model, N, (x_s, u_s) = problem.model, problem.horizon, problem.rest if rest is None else rest
+    model, N, (x_s, u_s) = problem.model, problem.horizon, problem.equilibrium if rest is None else rest
     c = x_s - model.A @ x_s - model.B @ u_s
     return Period(
         A=np.tile(model.A, (N, 1, 1)),
@@ -61,7 +62,7 @@ def period(problem: Problem, state: Array, desired: Array, u_before: Array, rest
         state=state,
         desired=desired,
         u_before=u_before,
-        rest=Rest(x_s, u_s),
+        equilibrium=Equilibrium(x_s, u_s),
     )
 
 
@@ -111,11 +112,11 @@ def residuals(problem: Problem, given: Period, plan: Array) -> Array:
     objective, states = problem.objective, trajectory(given, plan)
     errors = states[..., 1:, :] @ objective.C_r.T - given.desired
     summed = errors[..., : plan.shape[-2] - (objective.P is not None), :]
-    parts = [(summed, objective.Q_y), (plan - given.rest.u, objective.Q_u)]
+    parts = [(summed, objective.Q_y), (plan - given.equilibrium.u, objective.Q_u)]
     if objective.Q_d is not None:
         parts.append((moves(given, plan), objective.Q_d))
     if objective.P is not None:
-        x_s, inverse = given.rest.x, np.linalg.pinv(objective.C_r)
+        x_s, inverse = given.equilibrium.x, np.linalg.pinv(objective.C_r)
         wanted = x_s + inverse @ (given.desired[-1] - objective.C_r @ x_s)
         parts.append((states[..., -1:, :] - wanted, objective.P))
     return np.concatenate([_flat(part @ _root(weight)) for part, weight in parts], axis=-1)

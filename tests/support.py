@@ -14,7 +14,7 @@ from scipy.linalg import block_diag
 from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.model import LinearModel
 from mpc.nonlinear.model import NonlinearModel, advance
-from mpc.ocp import Objective, Problem, Query, Rest
+from mpc.ocp import Equilibrium, Objective, Problem, Query
 from quadsim.controller import Controller
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.sim.loop import complete
@@ -178,7 +178,7 @@ def changing_period(rng: np.random.Generator, problem: Problem) -> Period:
         state=0.2 * rng.normal(size=model.n),
         desired=rng.normal(size=(N, len(problem.objective.C_r))),
         u_before=model.u_bar,
-        rest=Rest(np.zeros(model.n), model.u_bar + 0.1 * rng.normal(size=model.nu)),
+        equilibrium=Equilibrium(np.zeros(model.n), model.u_bar + 0.1 * rng.normal(size=model.nu)),
     )
 
 

@@ -118,7 +118,7 @@ def test_controllers_know_vehicle_state_errors_and_protocol_alone(imports: list[
 
 
 def test_controllers_run_without_a_simulator() -> None:
-    optional = {"mpc.solvers.daqp_dense": "daqp", "mpc.solvers.qpsolvers_backend": "qpsolvers"}
+    optional = {"mpc.solvers.daqp": "daqp", "mpc.solvers.qpsolvers": "qpsolvers"}
     loaded = loaded_by("import " + ", ".join(name for name in set(modules()) - set(optional) if name.startswith("mpc")))
     assert {"mpc", "quadsim", "piqp"} <= loaded
     assert not loaded & {"mujoco", "scenarios", "pydantic", *OF_ONE_PLACE, *optional.values()}

@@ -15,8 +15,7 @@ are all of u and Q_d falls apart alike.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -26,8 +25,6 @@ from scipy.sparse.csgraph import connected_components
 
 from mpc.model import LinearModel
 from mpc.ocp import Objective, Problem
-from mpc.paper.condensed import CondensedCost, condensed_cost
-from mpc.paper.prediction import Prediction, prediction
 from quadsim.state import Array, Indices
 
 ROUNDING: Final = 1e-12
@@ -36,33 +33,13 @@ ROUNDING: Final = 1e-12
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    """One axis, as a problem of its own.
+    """One axis, as a problem of its own."""
 
-    Attributes:
-        problem: in w (N, m), without constraints; its u_bar is zero.
-        states: (n_g,) its states among those of the whole.
-        regulated: its rows of C_r.
-        outputs: the problem's rows (`mpc.constraints.Rows`) on its states.
-        T: (nu, m) the axis's part of u - u_s is T w; columns of unit length.
-        T_inverse: (m, nu) w of u - u_s, where the axes are all of u.
-    """
-
-    problem: Problem
-    states: Indices
-    regulated: Indices
-    outputs: Indices
-    T: Array
-    T_inverse: Array
-
-    @cached_property
-    def maps(self) -> Prediction:
-        """How its states follow from its inputs."""
-        return prediction(self.problem.model, self.problem.horizon)
-
-    @cached_property
-    def cost(self) -> CondensedCost:
-        """In its inputs alone."""
-        return condensed_cost(self.problem, self.maps)
+    problem: Problem  # in w (N, m), without constraints; its u_bar is zero
+    states: Indices  # (n_g,) its states among those of the whole
+    regulated: Indices  # its rows of C_r
+    outputs: Indices  # the problem's rows (`mpc.constraints.Rows`) on its states
+    T: Array  # (nu, m) the axis's part of u - u_s is T w; columns of unit length
 
 
 def axes(problem: Problem) -> list[Axis]:
@@ -86,47 +63,30 @@ def axes(problem: Problem) -> list[Axis]:
         size = np.sqrt(np.abs(objective.P.diagonal()))
         tied |= np.abs(objective.P) > ROUNDING * np.outer(size, size)
     count, label = connected_components(csr_matrix(tied), directed=False)
-    whole = _axis(problem, np.eye(model.nu), np.arange(model.n), np.arange(len(C_r)), np.flatnonzero(bounded))
+    whole = axis_of(problem, np.eye(model.nu), np.arange(model.n), np.arange(len(C_r)), np.flatnonzero(bounded))
     on_nothing = not (C_r.any(axis=1).all() and bounded[rows.of_states].all())
     if count == 1 or on_nothing:
         return [whole]
-    found = []
+    parts = []
     for states in (np.flatnonzero(label == g) for g in range(count)):
         regulated, outputs = C_r[:, states].any(axis=1), bounded & C[:, states].any(axis=1)
         if reach[:, states].any() and regulated.any():
             directions, sizes, _ = np.linalg.svd(reach[:, states], full_matrices=False)
             T = _normalised(np.linalg.solve(root.T, directions[:, sizes > ROUNDING]))
-            found.append(_axis(problem, T, states, np.flatnonzero(regulated), np.flatnonzero(outputs)))
+            parts.append(axis_of(problem, T, states, np.flatnonzero(regulated), np.flatnonzero(outputs)))
         elif outputs.any():
             return [whole]
-    if objective.Q_d is None:
-        return found
-    T = np.hstack([axis.T for axis in found])
-    if T.shape[0] != T.shape[1]:
-        return [whole]
-    across, start = T.T @ objective.Q_d @ T, 0
-    inverse, parted = np.linalg.inv(T), []
-    for axis in found:
-        own = slice(start, start + axis.T.shape[1])
-        others = np.delete(across[own], np.arange(own.start, own.stop), axis=1)
-        if np.abs(others).max(initial=0.0) > ROUNDING * np.abs(across).max():
+    if objective.Q_d is not None:
+        T, of = np.hstack([axis.T for axis in parts]), np.repeat(range(len(parts)), [axis.T.shape[1] for axis in parts])
+        moves = np.abs(T.T @ objective.Q_d @ T)
+        if T.shape[0] != T.shape[1] or (moves[of[:, None] != of] > ROUNDING * moves.max()).any():
             return [whole]
-        parted.append(replace(axis, T_inverse=np.asarray(inverse[own], np.float64)))
-        start = own.stop
-    return parted
+    return parts
 
 
-def _axis(problem: Problem, T: Array, states: Indices, regulated: Indices, outputs: Indices) -> Axis:
+def axis_of(problem: Problem, T: Array, states: Indices, regulated: Indices, outputs: Indices) -> Axis:
+    """The axis of inputs along T, with these states, rows of C_r and rows."""
     model, objective = problem.model, problem.objective
-
-    def of_inputs(weight: Array | None) -> Array | None:
-        if weight is None:
-            return None
-        own = T.T @ weight @ T
-        return np.asarray(0.5 * (own + own.T))
-
-    Q_u = of_inputs(objective.Q_u)
-    assert Q_u is not None
     return Axis(
         problem=Problem(
             model=LinearModel(
@@ -139,8 +99,8 @@ def _axis(problem: Problem, T: Array, states: Indices, regulated: Indices, outpu
             objective=Objective(
                 C_r=objective.C_r[np.ix_(regulated, states)],
                 Q_y=objective.Q_y[np.ix_(regulated, regulated)],
-                Q_u=Q_u,
-                Q_d=of_inputs(objective.Q_d),
+                Q_u=symmetric(T.T @ objective.Q_u @ T),
+                Q_d=None if objective.Q_d is None else symmetric(T.T @ objective.Q_d @ T),
                 P=None if objective.P is None else objective.P[np.ix_(states, states)],
             ),
         ),
@@ -148,8 +108,12 @@ def _axis(problem: Problem, T: Array, states: Indices, regulated: Indices, outpu
         regulated=regulated,
         outputs=outputs,
         T=T,
-        T_inverse=np.eye(T.shape[1], T.shape[0]),
     )
+
+
+def symmetric(matrix: Array) -> Array:
+    """The symmetric part of a matrix, which products leave but for rounding."""
+    return np.asarray(0.5 * (matrix + matrix.T))
 
 
 def _normalised(matrix: Array) -> Array:

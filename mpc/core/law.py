@@ -19,7 +19,7 @@ from mpc.fallback.completion import CompletedMoment
 from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model
 from mpc.nonlinear.model import SUBSTEPS
-from mpc.paper.prediction import rollout
+from mpc.paper import rollout
 from mpc.robust.settings import LONGEST_SPAN
 from quadsim.controller import CORE, FALLBACK, GAIN, GROUNDED, SOLVED, UNCONSTRAINED, Command, Moment, Phase, stopped
 from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
@@ -86,8 +86,8 @@ class _Shared:
         numbers, robust = controller_numbers(law), None
         self._C_r = np.ascontiguousarray(numbers.pop("C_r"))
         if law.settings is not None:
-            found = robust_numbers(law, self.problem.tables.modes)
-            robust = _Robust(**{name: _plain(value) for name, value in found.items()})
+            members = robust_numbers(law, self.problem.tables.modes)
+            robust = _Robust(**{name: _plain(value) for name, value in members.items()})
         self._robust = robust
         self.struct = _Controller(
             problem=ctypes.addressof(self.problem.struct),
@@ -134,16 +134,16 @@ class CompiledMPC:
         self._trim, self._lift, self._twist = map(
             np.ctypeslib.as_array, (self._mpc.trim, self._mpc.lift, self._mpc.twist)
         )
-        found = shared.problem.tables
-        self._soft = any(math.isfinite(row.l1) for row in found.rows)
+        tables = shared.problem.tables
+        self._soft = any(math.isfinite(row.l1) for row in tables.rows)
         self._lower, self._upper = (
-            np.broadcast_to(bound, (N, bound.shape[1])).ravel() for bound in (found.lower, found.upper)
+            np.broadcast_to(bound, (N, bound.shape[1])).ravel() for bound in (tables.lower, tables.upper)
         )
         self._state, self._path, self._acting, self._command = (
             np.zeros(shape) for shape in (N_STATES, (N, 4), N_ROTORS, N_ROTORS)
         )
-        given = self._state, self._path, self._acting, self._command
-        self._arguments = at, *(array.ctypes.data for array in given)
+        arrays = self._state, self._path, self._acting, self._command
+        self._arguments = at, *(array.ctypes.data for array in arrays)
         self._step, self._restart = library.quadsim_mpc_step, library.quadsim_mpc_reset
         self.reset(shared.nominal.u_bar)
 

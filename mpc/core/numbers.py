@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
 from mpc.answer import ActuatorBounds
+from mpc.core.tables import NO_BOUND
 from mpc.equilibrium import LEAST_LIFT
 from mpc.fallback.completion import PLAUSIBLE
 from mpc.heading import slope
@@ -19,25 +19,15 @@ from mpc.robust.settings import RobustSettings
 from quadsim.state import REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-NO_BOUND: Final = 1e30
-"""In place of infinity."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Exportable:
-    """What a law in C is made from.
-
-    Attributes:
-        name: of the law.
-        problem: its optimisation.
-        vehicle: that modelled.
-        settings: the parts of the robust controller; None for the paper's controllers.
-    """
+    """What a law in C is made from."""
 
     name: str
     problem: Problem
-    vehicle: Vehicle
-    settings: RobustSettings | None = None
+    vehicle: Vehicle  # that modelled
+    settings: RobustSettings | None = None  # the parts of the robust controller; None for the paper's controllers
 
 
 def controller_numbers(law: Exportable) -> dict[str, Array]:
@@ -46,8 +36,8 @@ def controller_numbers(law: Exportable) -> dict[str, Array]:
     limits = {"speed_min": -free, "speed_max": free, "step_min": -free, "step_max": free}
     if problem.every_constraint:
         bounds = ActuatorBounds.of_problem(problem)
-        found = bounds.u_min, bounds.u_max, bounds.delta_min, bounds.delta_max
-        limits = {name: np.clip(bound, -NO_BOUND, NO_BOUND) for name, bound in zip(limits, found, strict=True)}
+        sides = bounds.u_min, bounds.u_max, bounds.delta_min, bounds.delta_max
+        limits = {name: np.clip(side, -NO_BOUND, NO_BOUND) for name, side in zip(limits, sides, strict=True)}
     return {"C_r": problem.objective.C_r, "hover": problem.model.u_bar, **limits}
 
 

@@ -5,27 +5,23 @@ from __future__ import annotations
 import ctypes
 import math
 import time as clock
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, cached_property, lru_cache, partial
-from typing import Final, Generic, NoReturn, TypeVar
+from typing import Any, Final, Generic, NoReturn, TypeVar
 
 import numpy as np
 
+from mpc.condensing import Condensed
 from mpc.core.library import check_mirrors, load
-from mpc.core.tables import Tables, tables
+from mpc.core.tables import members, tables
 from mpc.ocp import Problem, Query
-from mpc.paper.condensed import Condensed
 from mpc.qp import QP, Solution
 from mpc.solvers import Answer, Method, QPSolver
 from quadsim.controller import CORE, GAIN, SOLVED, UNCONSTRAINED
-from quadsim.errors import ParameterError
 from quadsim.state import N_STATES, Array, read_only
 from quadsim.vehicle import N_ROTORS
 
-MOST_STATES: Final = 20
-"""Of an axis, with the inputs before where changes cost something; as in quadsim_core.h."""
-MOST_ROWS: Final = 256
-"""Rows of a step, which are numbered in bytes."""
 MOST_CHANGES: Final = 3000
 """Of the active set in a search, before it is given up; the most seen is 2507, of a state drawn far off."""
 PROBLEMS: Final = 16
@@ -33,49 +29,51 @@ PROBLEMS: Final = 16
 WAYS: Final = (Method.FREE, Method.AXES, Method.WHOLE)
 """By `enum quadsim_found`; beyond these there is no optimum."""
 
-NO_BOUND: Final = 1e30
-"""In place of infinity."""
-TINY: Final = 1e-18
-"""Share of the largest response below which one is taken for zero: arithmetic on the least numbers is slow."""
+Made = TypeVar("Made")
+Filled = TypeVar("Filled", bound=ctypes.Structure)
 
 _INT, _REAL, _AT = ctypes.c_int, ctypes.c_double, ctypes.c_void_p
 
 
-def _members(kind: type, names: str) -> list[tuple[str, type]]:
+def _of(kind: type, names: str) -> list[tuple[str, type]]:
     return [(name, kind) for name in names.split()]
 
 
 class _Axis(ctypes.Structure):
     _fields_ = [
-        *_members(_INT, "states inputs first outputs targets before"),
-        *_members(_AT, "state target row B closed K inverse W W_end C responses"),
+        *_of(_INT, "states inputs first outputs targets before"),
+        *_of(_AT, "state target row B closed K inverse W W_end C responses"),
     ]
 
 
 class _Row(ctypes.Structure):
-    _fields_ = [*_members(_INT, "axis output later first past soft"), *_members(_REAL, "l1 compliance")]
+    _fields_ = [*_of(_INT, "axis output later first past soft"), *_of(_REAL, "l1 compliance")]
 
 
 class _Term(ctypes.Structure):
-    _fields_ = [*_members(_REAL, "coefficient"), *_members(_INT, "input lag")]
+    _fields_ = [*_of(_REAL, "coefficient"), *_of(_INT, "input lag")]
 
 
 class _Problem(ctypes.Structure):
     _fields_ = [
-        *_members(_INT, "horizon states step_rows parts regulated room changes bounds_differ mixed"),
-        *_members(_AT, "axes rows terms T T_inverse lower upper scale tolerance"),
+        *_of(_INT, "horizon states step_rows parts regulated room changes bounds_differ mixed"),
+        *_of(_AT, "axes rows terms T T_inverse lower upper scale tolerance"),
     ]
+
+
+STRUCTS: Final = {"axes": _Axis, "rows": _Row, "terms": _Term}
+"""Of the lists among a problem's members."""
 
 
 class Work(ctypes.Structure):
     """A `quadsim_work`."""
 
     _fields_ = [
-        *(*_members(_AT, "p"), *_members(_INT, "changes refused")),
-        *_members(_AT, "plan multiplier value shift last side start"),
+        *(*_of(_AT, "p"), *_of(_INT, "changes refused")),
+        *_of(_AT, "plan multiplier value shift last side start"),
         ("axes", _REAL * N_ROTORS),
-        *(*_members(_AT, "w dw u pull push"), *_members(_INT, "count spent solved passed_over")),
-        *(*_members(_REAL, "slack largest"), *_members(_AT, "row z goal forward pivot column sums factor")),
+        *(*_of(_AT, "w dw u pull push"), *_of(_INT, "count spent solved passed_over")),
+        *(*_of(_REAL, "slack largest"), *_of(_AT, "row z goal forward pivot column sums factor")),
     ]
 
 
@@ -107,87 +105,31 @@ class CoreProblem:
     """
 
     def __init__(self, problem: Problem) -> None:
-        _refuse_shared_slacks(problem)
         self._problem, self.tables = problem, tables(problem)
         self._kept: list[object] = []
-        found, N = self.tables, problem.horizon
-        _refuse_large(found)
-        axes = (_Axis * len(found.axes))()
-        for axis, part in zip(axes, found.axes, strict=True):
-            axis.states, axis.inputs, axis.first, axis.outputs = *part.B.shape, part.first, len(part.rows)
-            axis.targets, axis.before = len(part.regulated), part.before
-            axis.state, axis.target, axis.row = map(self._bytes, (part.states, part.regulated, part.rows))
-            axis.B, axis.closed, axis.K, axis.inverse = map(self._reals, (part.B, part.closed, part.K, part.inverse))
-            axis.W, axis.W_end, axis.C = map(self._reals, (part.W, part.W_end, part.C))
-            responses = part.responses[np.tril_indices(len(part.responses))]
-            tiny = np.abs(responses) < TINY * np.abs(responses).max(initial=0.0)
-            axis.responses = self._reals(np.where(tiny, 0.0, responses))
-        rows, terms = (_Row * len(found.rows))(), list[_Term]()
-        for i, (row, kind) in enumerate(zip(rows, found.rows, strict=True)):
-            row.axis, row.later, row.first, row.past = kind.axis, kind.later, len(terms), len(terms) + len(kind.terms)
-            row.output = found.axes[kind.axis].rows.index(i) if kind.axis >= 0 else 0
-            row.soft = math.isfinite(kind.l1)
-            row.l1, row.compliance = kind.l1 if row.soft else 0.0, kind.compliance
-            terms += [_Term(*term) for term in kind.terms]
-        all_terms = (_Term * len(terms))(*terms)
-        self._kept += [axes, rows, all_terms]
         # Hard rows that are independent are no more than inputs; soft ones beyond their bounds may add their number.
-        at_most = N * (N_ROTORS + sum(row.soft for row in rows))
-        self.struct = _Problem(
-            horizon=N,
-            states=problem.model.n,
-            step_rows=len(rows),
-            parts=len(axes),
-            regulated=len(problem.objective.C_r),
-            room=min(N * len(rows), at_most) + 1,
-            changes=MOST_CHANGES,
-            bounds_differ=len(found.lower) > 1,
-            mixed=any(row.axis >= 0 and row.terms for row in found.rows),
-            axes=ctypes.addressof(axes),
-            rows=ctypes.addressof(rows),
-            terms=ctypes.addressof(all_terms),
-            T=self._reals(found.T),
-            T_inverse=self._reals(found.T_inverse),
-            lower=self._reals(np.clip(found.lower, -NO_BOUND, NO_BOUND)),
-            upper=self._reals(np.clip(found.upper, -NO_BOUND, NO_BOUND)),
-            scale=self._reals(found.scale),
-            tolerance=self._reals(found.tolerance),
-        )
+        N, rows = problem.horizon, self.tables.rows
+        at_most = N * (N_ROTORS + sum(math.isfinite(row.l1) for row in rows))
+        room = min(N * len(rows), at_most) + 1
+        self.struct = self._filled(_Problem, members(self.tables, room=room, changes=MOST_CHANGES))
+
+    def _filled(self, kind: type[Filled], values: Mapping[str, Any]) -> Filled:
+        """A struct; what its pointers point to is kept."""
+        return kind(**{name: self._member(name, value) for name, value in values.items()})
+
+    def _member(self, name: str, value: Any) -> int | float:
+        if isinstance(value, list):
+            kind = STRUCTS[name]
+            value = (kind * len(value))(*(self._filled(kind, entry) for entry in value))
+        elif not isinstance(value, np.ndarray):
+            return value
+        self._kept.append(value)
+        return value.ctypes.data if isinstance(value, np.ndarray) else ctypes.addressof(value)
 
     @cached_property
     def condensed(self) -> Condensed:
         """The QP that the optimum's KKT residuals are of."""
         return Condensed(self._problem)
-
-    def _reals(self, values: Array) -> int:
-        kept = np.array(values if np.size(values) else [0.0], np.float64, order="C")
-        self._kept.append(kept)
-        return kept.ctypes.data
-
-    def _bytes(self, values: list[int]) -> int:
-        kept = np.array(values or [0], np.uint8)
-        self._kept.append(kept)
-        return kept.ctypes.data
-
-
-def _refuse_shared_slacks(problem: Problem) -> None:
-    if problem.every_constraint and problem.rows.slacks.size < problem.rows.soft.size:
-        raise ParameterError("controller", "constraints", "soft rows that share a slack", "each with its own")
-
-
-def _refuse_large(found: Tables) -> None:
-    """Refuse what has no place in the core's arrays."""
-    if found.problem.model.nu != N_ROTORS:
-        raise ParameterError("controller", "problem", f"{found.problem.model.nu} inputs", f"of {N_ROTORS} inputs")
-    for name, count, most in (
-        ("states of an axis", max(len(part.B) for part in found.axes), MOST_STATES),
-        ("rows of a step", len(found.rows), MOST_ROWS),
-    ):
-        if count > most:
-            raise ParameterError("controller", "problem", f"{count} {name}", f"such that there are at most {most}")
-
-
-Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -241,7 +183,7 @@ class Core:
     def __init__(self, problem: Problem) -> None:
         self._library, self._shared = core_library(), core_problem(problem)
         self.formulation = self._shared.condensed
-        self._problem, self._rest, self._C_r = problem, problem.rest, problem.objective.C_r
+        self._problem, self._equilibrium, self._C_r = problem, problem.equilibrium, problem.objective.C_r
         self._modes = self._shared.tables.modes if problem.model.n > N_STATES else None
         self._piqp: QPSolver | None = None
         p, rows = self._shared.struct, problem.rows
@@ -283,7 +225,7 @@ class Core:
     def solve(self, query: Query) -> Answer:
         """See `mpc.solvers.Solver.solve`."""
         started, (state, desired, u_before, rest, _) = clock.perf_counter(), query
-        x_s, u_s = self._rest if rest is None else rest
+        x_s, u_s = self._equilibrium if rest is None else rest
         self._state[:], self._x_s[:], self._u_s[:], self._before[:] = state, x_s, u_s, u_before
         np.subtract(desired, 0.0 if rest is None else self._C_r @ x_s, out=self._wanted)
         if self._modes is not None:

@@ -15,18 +15,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import scipy.linalg
 
+from mpc.condensing import condensed_cost, states_rows
 from mpc.constraints import Constraint, Rows
-from mpc.core.axes import Axis, axes
+from mpc.core.axes import Axis, axes, axis_of, symmetric
 from mpc.ocp import Problem
-from mpc.paper.condensed import condensed_cost, row_maps
-from mpc.paper.prediction import prediction
+from mpc.paper import prediction
 from quadsim.errors import ParameterError
 from quadsim.state import N_STATES, Array
+from quadsim.vehicle import N_ROTORS
 
 ROUNDING: Final = 1e-13
 """Share of the largest number of a row of C_r, D, E, or T below which one is taken for a product of rounding."""
@@ -34,6 +35,14 @@ LARGEST: Final = 2**20
 """Entries of all responses beyond which a problem is not one for the core: 8 MiB."""
 LEAST_QUADRATIC: Final = 1e-9
 """Share of l1 that replaces a quadratic penalty of zero, for which a step has no length."""
+MOST_STATES: Final = 20
+"""Of an axis, with the inputs before where changes cost something; as in quadsim_core.h."""
+MOST_ROWS: Final = 256
+"""Rows of a step, which are numbered in bytes."""
+NO_BOUND: Final = 1e30
+"""In place of infinity."""
+TINY: Final = 1e-18
+"""Share of the largest response below which one is taken for zero: arithmetic on the least numbers is slow."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +55,6 @@ class AxisTables:
     first: int  # where w is among all axes' inputs
     rows: list[int]  # which of the problem's rows have its states, o of them
     regulated: list[int]  # its rows of C_r, r of them
-    A: Array  # (n, n)
     B: Array  # (n, m)
     closed: Array  # (N, n, n) A - B K_i
     K: Array  # (N, m, n) w_i = k_i - K_i x_i
@@ -64,7 +72,6 @@ class RowTables:
     The row's value is C x + sum of coefficient u_input(step - lag).
     """
 
-    name: str
     axis: int  # -1 for a row without states
     later: bool  # C x is that at the step's end
     terms: list[tuple[float, int, int]]  # coefficient, input, lag
@@ -92,34 +99,42 @@ def tables(problem: Problem) -> Tables:
     """The numbers of a problem.
 
     Raises:
-        ParameterError: it is too large, or its rows differ from step to step.
+        ParameterError: it is not one for the core: too large, rows that differ from step to step, shared slacks.
     """
     problem = with_constraints(problem)
-    modes = np.eye(problem.model.nu)
+    N, modes = problem.horizon, np.eye(problem.model.nu)
     if problem.model.n == N_STATES + problem.model.nu:
         modes = _modes(problem)
         problem = _in_modes(problem, modes)
     rows = problem.rows
     if rows.C.ndim == 3:
         raise ParameterError("controller", "constraints", "rows that differ from step to step", "the same at all steps")
+    if rows.slacks.size < rows.soft.size:
+        raise ParameterError("controller", "constraints", "soft rows that share a slack", "each with its own")
+    if problem.model.nu != N_ROTORS:
+        raise ParameterError("controller", "problem", f"{problem.model.nu} inputs", f"of {N_ROTORS} inputs")
     parts, T = _all_axes(problem)
-    entries = sum((problem.horizon * (part.T.shape[1] + part.outputs.size)) ** 2 // 2 for part in parts)
+    entries = sum((N * (part.T.shape[1] + part.outputs.size)) ** 2 // 2 for part in parts)
     if entries > LARGEST:
         rule = f"so short that its responses have at most {LARGEST} numbers; they have {entries}"
-        raise ParameterError("controller", "horizon", problem.horizon, rule)
+        raise ParameterError("controller", "horizon", N, rule)
     T_inverse = np.array(np.linalg.inv(T), float)
     T_inverse[np.abs(T_inverse) < ROUNDING * np.abs(T_inverse).max()] = 0.0
-    found, first = [], 0
-    for part in parts:
-        found.append(_axis(problem, rows, part, first))
-        first += part.T.shape[1]
-    row_tables = [_row(rows, i, found) for i in range(rows.l1.size)]
+    first = np.cumsum([0, *(part.T.shape[1] for part in parts)]).tolist()
+    axis_tables = [_axis(rows, part, at, N) for part, at in zip(parts, first, strict=False)]
+    row_tables = [_row(rows, i, axis_tables) for i in range(rows.l1.size)]
+    for name, count, most in (
+        ("states of an axis", max(len(part.B) for part in axis_tables), MOST_STATES),
+        ("rows of a step", len(row_tables), MOST_ROWS),
+    ):
+        if count > most:
+            raise ParameterError("controller", "problem", f"{count} {name}", f"such that there are at most {most}")
     alike = bool((rows.lower == rows.lower[0]).all() and (rows.upper == rows.upper[0]).all())
     steps = slice(0, 1) if alike else slice(None)
-    scale = _scale(found, row_tables, T, problem.horizon)
+    scale = _scale(axis_tables, row_tables, T, N)
     return Tables(
         problem=problem,
-        axes=found,
+        axes=axis_tables,
         rows=row_tables,
         lower=rows.lower[steps],
         upper=rows.upper[steps],
@@ -129,6 +144,69 @@ def tables(problem: Problem) -> Tables:
         T_inverse=T_inverse,
         modes=modes,
     )
+
+
+def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
+    """Those of a `quadsim_problem`: integers, arrays of numbers or bytes, and lists of structs' members.
+
+    Args:
+        tables: the numbers.
+        room: for so many active rows, and one more.
+        changes: of the active set in a search, after which it is given up.
+    """
+    problem, rows = tables.problem, tables.rows
+    past = np.cumsum([len(row.terms) for row in rows]).tolist()
+    reals = {name: getattr(tables, name) for name in ("T", "T_inverse", "scale", "tolerance")}
+    limits = {name: np.clip(getattr(tables, name), -NO_BOUND, NO_BOUND) for name in ("lower", "upper")}
+    return {
+        "horizon": problem.horizon,
+        "states": problem.model.n,
+        "step_rows": len(rows),
+        "parts": len(tables.axes),
+        "regulated": len(problem.objective.C_r),
+        "room": room,
+        "changes": changes,
+        "bounds_differ": int(len(tables.lower) > 1),
+        "mixed": int(any(row.axis >= 0 and row.terms for row in rows)),
+        **{name: np.array(value, float, order="C") for name, value in (reals | limits).items()},
+        "axes": [_axis_members(part, bounded=bool(rows)) for part in tables.axes],
+        "rows": [
+            {
+                "axis": row.axis,
+                "output": tables.axes[row.axis].rows.index(r) if row.axis >= 0 else 0,
+                "later": int(row.later),
+                "first": end - len(row.terms),
+                "past": end,
+                "soft": int(math.isfinite(row.l1)),
+                "l1": row.l1 if math.isfinite(row.l1) else 0.0,
+                "compliance": row.compliance,
+            }
+            for r, (row, end) in enumerate(zip(rows, past, strict=True))
+        ],
+        "terms": [
+            {"coefficient": coefficient, "input": j, "lag": lag} for row in rows for coefficient, j, lag in row.terms
+        ],
+    }
+
+
+def _axis_members(part: AxisTables, *, bounded: bool) -> dict[str, Any]:
+    """Those of a `quadsim_axis`; its responses only where there are rows."""
+    n, m = part.B.shape
+    responses = part.responses[np.tril_indices(len(part.responses))]
+    responses[np.abs(responses) < TINY * np.abs(responses).max(initial=0.0)] = 0.0
+    reals = {name: getattr(part, name) for name in ("B", "closed", "K", "inverse", "W", "W_end", "C")}
+    places = {"state": part.states, "target": part.regulated, "row": part.rows}
+    return {
+        "states": n,
+        "inputs": m,
+        "first": part.first,
+        "outputs": len(part.rows),
+        "targets": len(part.regulated),
+        "before": int(part.before),
+        **{name: np.array(values, np.uint8) for name, values in places.items()},
+        **{name: np.array(value, float, order="C") for name, value in reals.items()},
+        "responses": responses if bounded else np.zeros(0),
+    }
 
 
 def with_constraints(problem: Problem) -> Problem:
@@ -162,7 +240,7 @@ def _in_modes(problem: Problem, modes: Array) -> Problem:
     A, B = to @ model.A @ back, to @ model.B
     for matrix in (A, B):
         matrix[np.abs(matrix) < ROUNDING * np.abs(matrix).max()] = 0.0
-    P = None if objective.P is None else _symmetric(back.T @ objective.P @ back)
+    P = None if objective.P is None else symmetric(back.T @ objective.P @ back)
     return Problem(
         model=replace(model, A=A, B=B),
         horizon=problem.horizon,
@@ -179,56 +257,35 @@ def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:
     missing = nu - T.shape[1]
     if missing:
         _, _, rest = np.linalg.svd((problem.objective.Q_u @ T).T)
-        parts.append(_idle(problem, rest[-missing:].T))
+        nothing = np.zeros(0, np.int64)
+        parts.append(axis_of(problem, rest[-missing:].T, nothing, nothing, nothing))
         T = np.array(np.hstack([T, rest[-missing:].T]), float)
     return parts, T
 
 
-def _idle(problem: Problem, T: Array) -> Axis:
-    """The axis of inputs that move nothing."""
-    nothing = np.zeros(0, np.int64)
-    return Axis(problem=problem, states=nothing, regulated=nothing, outputs=nothing, T=T, T_inverse=T.T)
-
-
-def _axis(problem: Problem, rows: Rows, part: Axis, first: int) -> AxisTables:
-    objective, N, m = problem.objective, problem.horizon, part.T.shape[1]
-    Q_u = _symmetric(part.T.T @ objective.Q_u @ part.T)
-    moves = objective.Q_d is not None
-    n = part.states.size
-    if n:
-        A, B = part.problem.model.A, part.problem.model.B
-        (Q, W), (Q_end, W_end) = part.problem.objective.weights, part.problem.objective.terminal_weights
-    else:
-        A, B, Q, Q_end = np.zeros((0, 0)), np.zeros((0, m)), np.zeros((0, 0)), np.zeros((0, 0))
-        W, W_end = np.zeros((0, 0)), np.zeros((0, 0))
-    C = rows.C[np.ix_(part.outputs, part.states)]
-    R, S = Q_u, np.zeros((m, n))
-    if moves:
-        Q_d = _symmetric(part.T.T @ np.asarray(objective.Q_d) @ part.T)
-        A = scipy.linalg.block_diag(A, np.zeros((m, m)))
-        B = np.vstack([B, np.eye(m)])
-        Q, Q_end = scipy.linalg.block_diag(Q, Q_d), scipy.linalg.block_diag(Q_end, np.zeros((m, m)))
+def _axis(rows: Rows, part: Axis, first: int, N: int) -> AxisTables:
+    (n, m), objective, model = (part.states.size, part.T.shape[1]), part.problem.objective, part.problem.model
+    A, B, R, S, C = model.A, model.B, objective.Q_u, np.zeros((m, n)), rows.C[np.ix_(part.outputs, part.states)]
+    (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
+    if objective.Q_d is not None:
+        A, B = scipy.linalg.block_diag(A, np.zeros((m, m))), np.vstack([B, np.eye(m)])
+        Q, Q_end = scipy.linalg.block_diag(Q, objective.Q_d), scipy.linalg.block_diag(Q_end, np.zeros((m, m)))
         W, W_end = (np.vstack([weight, np.zeros((m, weight.shape[1]))]) for weight in (W, W_end))
         C = np.hstack([C, np.zeros((len(C), m))])
-        R, S = Q_u + Q_d, np.hstack([S, -Q_d])
+        R, S = R + objective.Q_d, np.hstack([S, -objective.Q_d])
     K, inverse = _gains(A, B, Q, Q_end, R, S, N)
-    if n:
-        maps = prediction(part.problem.model, N)
-        H = condensed_cost(part.problem, maps).H
-        own = rows.part(part.outputs, part.states, m)
-        G = row_maps(own, maps).of_inputs
-    else:
-        H, G = np.asarray(2.0 * np.kron(np.eye(N), Q_u), float), np.zeros((N, 0, N * m))
+    maps = prediction(model, N)
+    G = states_rows(rows.C[np.ix_(part.outputs, part.states)], rows.of_states[part.outputs], maps, N).of_inputs
     channels = np.concatenate([np.eye(N * m).reshape(N, m, N * m), G], axis=1).reshape(-1, N * m)
+    H = condensed_cost(part.problem, maps).H
     half = scipy.linalg.solve_triangular(np.linalg.cholesky(H), channels.T, lower=True)
     return AxisTables(
         states=part.states.tolist(),
-        before=moves,
+        before=objective.Q_d is not None,
         inputs=m,
         first=first,
         rows=part.outputs.tolist(),
         regulated=part.regulated.tolist(),
-        A=A,
         B=B,
         closed=A - B @ K,
         K=K,
@@ -244,26 +301,21 @@ def _gains(A: Array, B: Array, Q: Array, Q_end: Array, R: Array, S: Array, N: in
     """K_i (N, m, n) and (R + B' P_{i+1} B)^-1 (N, m, m) of the Riccati recursion, costs x'Qx + 2 u'Sx + u'Ru."""
     K, inverse, P = np.zeros((N, *B.T.shape)), np.zeros((N, *R.shape)), Q_end
     for i in reversed(range(N)):
-        inverse[i] = _symmetric(np.array(np.linalg.inv(R + B.T @ P @ B), float))
+        inverse[i] = symmetric(np.array(np.linalg.inv(R + B.T @ P @ B), float))
         M = B.T @ P @ A + S
         K[i] = inverse[i] @ M
-        P = _symmetric(Q + A.T @ P @ A - M.T @ K[i])
+        P = symmetric(Q + A.T @ P @ A - M.T @ K[i])
     return K, inverse
 
 
-def _symmetric(matrix: Array) -> Array:
-    return np.asarray(0.5 * (matrix + matrix.T))
-
-
-def _row(rows: Rows, i: int, found: list[AxisTables]) -> RowTables:
-    axis = next((g for g, part in enumerate(found) if i in part.rows), -1)
+def _row(rows: Rows, i: int, axes: list[AxisTables]) -> RowTables:
+    axis = next((g for g, part in enumerate(axes) if i in part.rows), -1)
     now, before = rows.D[i] + rows.E[i], -rows.E[i]
     terms = [(float(now[j]), j, 0) for j in np.flatnonzero(now).tolist()]
     terms += [(float(before[j]), j, 1) for j in np.flatnonzero(before).tolist()]
     l1, l2 = float(rows.l1[i]), float(rows.l2[i])
     hard = math.isinf(l1)
     return RowTables(
-        name=rows.names[i],
         axis=axis,
         later=bool(rows.of_states[i]),
         terms=terms,
@@ -272,12 +324,12 @@ def _row(rows: Rows, i: int, found: list[AxisTables]) -> RowTables:
     )
 
 
-def _scale(found: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> Array:
+def _scale(axes: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> Array:
     """(N, m) 1 over the root of each row's response to itself."""
     scale = np.zeros((N, len(rows)))
     for r, row in enumerate(rows):
         total = np.zeros(N)
-        for g, part in enumerate(found):
+        for g, part in enumerate(axes):
             width = part.inputs + len(part.rows)
             entries = [(1.0, part.inputs + part.rows.index(r), 0)] if row.axis == g else []
             entries += [(c * T[j, part.first + a], a, lag) for c, j, lag in row.terms for a in range(part.inputs)]

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from mpc.core.solver import NO_BOUND, TINY
 from quadsim.state import Array
 
 Precision = Literal["double", "float"]
 LEAST_FLOAT: Final = 1.2e-38
 """Magnitude below which a number is 0: single precision would truncate it, which is an error of some compilers."""
+STRUCTS: Final = {"axes": "quadsim_axis", "rows": "quadsim_row", "terms": "quadsim_term"}
+"""What lists among the members of a struct are of."""
 
 
 @dataclass(frozen=True)
@@ -42,45 +42,35 @@ class CText:
             return "{" + ", ".join(map(self.number, value.ravel().tolist())) + "}"
         return str(value) if isinstance(value, int) else self.number(value)
 
-    def reals(self, name: str, values: ArrayLike) -> str:
-        """A constant array of numbers, row by row; of one zero where there are none."""
-        numbers = np.ravel(np.asarray(values, float)).tolist() or [0.0]
-        return self._array("quadsim_real", name, map(self.number, numbers))
+    def array(self, name: str, values: Array) -> str:
+        """A constant array of bytes or numbers, row by row; of one zero where there are none."""
+        kind, text = ("unsigned char", str) if values.dtype == np.uint8 else ("quadsim_real", self.number)
+        entries = ", ".join(map(text, values.ravel().tolist() or [0]))
+        return self._array(kind, name, values.size, textwrap.wrap(entries, 116, break_on_hyphens=False))
 
-    def small_integers(self, name: str, values: Iterable[int]) -> str:
-        """A constant array of integers of 0 to 255; of one zero where there are none."""
-        return self._array("unsigned char", name, map(str, [*values] or [0]))
-
-    def struct(self, kind: str, name: str, **members: object) -> str:
+    def struct(self, kind: str, name: str, **members: str) -> str:
         """A constant struct, by names of members."""
         wrap = textwrap.TextWrapper(120, initial_indent="    ", subsequent_indent="        ")
         lines = [wrap.fill(f".{member} = {value},") for member, value in members.items()]
         return "\n".join([f"static const {kind} {name} = {{", *lines, "};\n"])
 
-    def structs(self, kind: str, name: str, entries: Iterable[str]) -> str:
-        """A constant array of structs, each an initialiser; of one of zeros where there are none."""
-        listed = [*entries] or ["{0}"]
-        body = ",\n".join(f"    {entry}" for entry in listed)
-        return f"static const {kind} {self.prefix}{name}[{len(listed)}] = {{\n{body}\n}};\n"
+    def members(self, values: Mapping[str, Any], suffix: str = "") -> tuple[list[str], dict[str, str]]:
+        """The arrays that a struct's members point to, their names ending in `suffix`, and its initialisers."""
+        blocks, initialisers = list[str](), dict[str, str]()
+        for name, value in values.items():
+            initialisers[name] = f"{self.prefix}{name}{suffix}"
+            if isinstance(value, list):
+                parts = [self.members(part, f"_{i}") for i, part in enumerate(value)]
+                blocks += [block for inner, _ in parts for block in inner]
+                entries = ["{" + ", ".join(f".{k} = {v}" for k, v in part.items()) + "}" for _, part in parts]
+                lines = ",\n".join(entries or ["{0}"]).splitlines()
+                blocks.append(self._array(STRUCTS[name], name, len(value), lines))
+            elif isinstance(value, np.ndarray):
+                blocks.append(self.array(f"{name}{suffix}", value))
+            else:
+                initialisers[name] = self.value(value)
+        return blocks, initialisers
 
-    def _array(self, kind: str, name: str, entries: Iterable[str]) -> str:
-        listed = [*entries]
-        lines = textwrap.wrap(", ".join(listed), 116, break_long_words=False, break_on_hyphens=False)
+    def _array(self, kind: str, name: str, size: int, lines: Iterable[str]) -> str:
         body = "\n".join(f"    {line}" for line in lines)
-        return f"static const {kind} {self.prefix}{name}[{len(listed)}] = {{\n{body}\n}};\n"
-
-
-def initialiser(**members: object) -> str:
-    """Of a struct, by names of members."""
-    return "{" + ", ".join(f".{name} = {value}" for name, value in members.items()) + "}"
-
-
-def bounded(values: Array) -> Array:
-    """Bounds with `NO_BOUND` for infinity."""
-    return np.clip(values, -NO_BOUND, NO_BOUND)
-
-
-def lower_packed(matrix: Array) -> Array:
-    """The lower part of a symmetric matrix, row by row, without products of rounding."""
-    packed = matrix[np.tril_indices(len(matrix))]
-    return np.where(np.abs(packed) < TINY * np.abs(packed).max(initial=0.0), 0.0, packed)
+        return f"static const {kind} {self.prefix}{name}[{max(size, 1)}] = {{\n{body}\n}};\n"

@@ -8,12 +8,10 @@ from functools import cached_property
 from importlib import resources
 from typing import Final
 
-from numpy.typing import ArrayLike
-
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
 from mpc.core.solver import core_problem
-from mpc.core.tables import AxisTables, Tables
-from mpc.export.ctext import CText, Precision, bounded, initialiser, lower_packed
+from mpc.core.tables import Tables, members
+from mpc.export.ctext import CText, Precision
 from quadsim.vehicle import N_ROTORS
 
 CORE: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_math.h", "quadsim_mpc.h", "quadsim_mpc.c")
@@ -34,19 +32,12 @@ def part(name: str, package: str = "mpc.export") -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class CController:
-    """A controller as C.
+    """A controller as C."""
 
-    Attributes:
-        law: what it is made from.
-        precision: of all numbers.
-        title: a line that identifies it, in ASCII.
-        asked: active rows that there is to be room for; None for 2.56 per step of the horizon, and at least 64.
-    """
-
-    law: Exportable
-    precision: Precision = "double"
-    title: str = ""
-    asked: int | None = None
+    law: Exportable  # what it is made from
+    precision: Precision = "double"  # of all numbers
+    title: str = ""  # a line that identifies it, in ASCII
+    asked: int | None = None  # active rows with room; None for 2.56 per step of the horizon, and at least 64
 
     @cached_property
     def tables(self) -> Tables:
@@ -98,86 +89,19 @@ class CController:
         return head.replace("@NUMBERS@\n", "\n".join([*numbers, *_controller(text, self.law, self.tables)]))
 
 
-def _axis(text: CText, g: int, axis: AxisTables, *, bounded: bool) -> tuple[str, list[str]]:
-    """The initialiser of an axis, and its arrays; its responses only where there are rows."""
-    n, m = axis.B.shape
-    integers = {"state": axis.states, "target": axis.regulated, "row": axis.rows}
-    reals: dict[str, ArrayLike] = {
-        "B": axis.B,
-        "closed": axis.closed,
-        "K": axis.K,
-        "inverse": axis.inverse,
-        "W": axis.W,
-        "W_end": axis.W_end,
-        "C": axis.C,
-        "responses": lower_packed(axis.responses) if bounded else [],
-    }
-    arrays = [text.small_integers(f"{name}_{g}", values) for name, values in integers.items()]
-    arrays += [text.reals(f"{name}_{g}", values) for name, values in reals.items()]
-    sizes = {"states": n, "inputs": m, "first": axis.first, "outputs": len(axis.rows), "targets": len(axis.regulated)}
-    names = {name: f"{text.prefix}{name}_{g}" for name in (*integers, *reals)}
-    return initialiser(**sizes, before=int(axis.before), **names), arrays
-
-
-def _rows(text: CText, found: Tables) -> list[str]:
-    terms, rows = list[str](), list[str]()
-    for r, row in enumerate(found.rows):
-        soft = math.isfinite(row.l1)
-        place = {
-            "axis": row.axis,
-            "output": found.axes[row.axis].rows.index(r) if row.axis >= 0 else 0,
-            "later": int(row.later),
-            "first": len(terms),
-            "past": len(terms) + len(row.terms),
-        }
-        penalty = {"l1": text.number(row.l1 if soft else 0.0), "compliance": text.number(row.compliance)}
-        rows.append(initialiser(**place, soft=int(soft), **penalty))
-        for coefficient, j, lag in row.terms:
-            terms.append(initialiser(coefficient=text.number(coefficient), input=j, lag=lag))
-    return [text.structs("quadsim_term", "terms", terms), text.structs("quadsim_row", "rows", rows)]
-
-
-def problem_data(text: CText, found: Tables, room: int) -> list[str]:
+def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
     """The optimisation's numbers, the last of them its `quadsim_problem`."""
-    problem = found.problem
-    reals = {
-        "T": found.T,
-        "T_inverse": found.T_inverse,
-        "lower": bounded(found.lower),
-        "upper": bounded(found.upper),
-        "scale": found.scale,
-        "tolerance": found.tolerance,
-    }
-    blocks, axes = [text.reals(name, values) for name, values in reals.items()], []
-    for g, axis in enumerate(found.axes):
-        entry, arrays = _axis(text, g, axis, bounded=bool(found.rows))
-        axes.append(entry)
-        blocks += arrays
-    blocks += [text.structs("quadsim_axis", "axes", axes), *_rows(text, found)]
-    members = text.struct(
-        "quadsim_problem",
-        f"{text.prefix}problem",
-        horizon=problem.horizon,
-        states=problem.model.n,
-        step_rows=len(found.rows),
-        parts=len(axes),
-        regulated=len(problem.objective.C_r),
-        room=room,
-        changes=CHANGES,
-        bounds_differ=int(len(found.lower) > 1),
-        mixed=int(any(row.axis >= 0 and row.terms for row in found.rows)),
-        **{name: text.prefix + name for name in ("axes", "rows", "terms", *reals)},
-    )
-    return [*blocks, members]
+    blocks, entries = text.members(members(tables, room=room, changes=CHANGES))
+    return [*blocks, text.struct("quadsim_problem", f"{text.prefix}problem", **entries)]
 
 
-def _controller(text: CText, law: Exportable, found: Tables) -> list[str]:
+def _controller(text: CText, law: Exportable, tables: Tables) -> list[str]:
     """The numbers besides those of the optimisation, the last of them the `quadsim_controller`."""
     numbers, robust = controller_numbers(law), "NULL"
-    blocks = [text.reals("C_r", numbers.pop("C_r"))]
+    blocks = [text.array("C_r", numbers.pop("C_r"))]
     if law.settings is not None:
-        members = {name: text.value(value) for name, value in robust_numbers(law, found.modes).items()}
-        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **members))
+        values = {name: text.value(value) for name, value in robust_numbers(law, tables.modes).items()}
+        blocks.append(text.struct("quadsim_robust", f"{text.prefix}robust", **values))
         robust = f"&{text.prefix}robust"
     addresses = {"problem": f"&{text.prefix}problem", "robust": robust, "C_r": f"{text.prefix}C_r"}
     limits = {name: text.value(value) for name, value in numbers.items()}

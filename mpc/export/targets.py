@@ -14,25 +14,15 @@ TICK: Final = 40
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """A machine: how its programs are compiled, and how they are run.
+    """A machine: how its programs are compiled, and how they are run."""
 
-    Attributes:
-        name: what `--target` calls it.
-        title: what a person calls it.
-        sources: the file that implements `target.h`, and others that it takes.
-        compiler: command.
-        machine: flags that choose the processor.
-        link: flags of the linker.
-        board: what QEMU calls the machine to emulate; none where programs are run as they are.
-    """
-
-    name: str
-    title: str
-    sources: tuple[str, ...]
+    name: str  # what `--target` calls it
+    title: str  # what a person calls it
+    sources: tuple[str, ...]  # the file that implements `target.h`, and others that it takes
     compiler: str
-    machine: str = ""
-    link: str = ""
-    board: str = ""
+    machine: str = ""  # flags that choose the processor
+    link: str = ""  # flags of the linker
+    board: str = ""  # what QEMU calls the machine to emulate; none where programs are run as they are
 
     @property
     def emulation(self) -> tuple[str, ...]:

@@ -35,7 +35,7 @@ from mpc.fallback.settings import FallbackSettings as FallbackSettings
 from mpc.handover import hand_over, resized, within
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
-from mpc.ocp import Unanswered
+from mpc.ocp import InfeasiblePeriod
 from quadsim.controller import (
     ACCEPTED,
     FALLBACK,
@@ -146,10 +146,10 @@ class Guarded:
         return trim if isinstance(trim, Trim) else self._level
 
     @property
-    def unanswered(self) -> Unanswered | None:
+    def unanswered(self) -> InfeasiblePeriod | None:
         """The first period since `reset` whose QP had no answer; None where all had, or there is no QP."""
         found = getattr(self.inner, "unanswered", None)
-        return found if isinstance(found, Unanswered) else None
+        return found if isinstance(found, InfeasiblePeriod) else None
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; by the hover model where the inner controller cannot."""

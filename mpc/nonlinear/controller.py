@@ -43,11 +43,10 @@ from mpc.nonlinear.rigidbody import (
 )
 from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
 from mpc.observer import DisturbanceObserver
-from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
+from mpc.obstacles import ObstacleQP, Space
+from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
 from mpc.solvers import INVALID_DATA, Answer, QPSolver
-from mpc.space.clearing import Clearing
-from mpc.space.halfspaces import Space
 from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, SQP, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.rotation import (
@@ -141,7 +140,7 @@ class NonlinearMPC:
         small = self.problem.horizon * (N_ROTORS + self.problem.rows.slacks.size) <= LARGEST_CONDENSED
         self.solver = settings.solver or ("piqp-dense" if small else "piqp-multistage")
         self._qp = QPSolver(self.solver, self.problem, changing=True, free_first=True)
-        self._clearing = None if space is None else Clearing(self.problem, self._qp, space, changing=True)
+        self._obstacles = None if space is None else ObstacleQP(self.problem, self._qp, space, changing=True)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self._ramp: RampObserver | None = None
         if settings.ramp is not None:
@@ -265,10 +264,10 @@ class NonlinearMPC:
         self._acting = np.array(speeds, float)
         self._rotors = self._rotors_before = self._shares(self._acting)
         self._forget()
-        if self._clearing is not None:
-            self._clearing.reset()
+        if self._obstacles is not None:
+            self._obstacles.reset()
         self._check.reset()
-        self.unanswered: Unanswered | None = None
+        self.unanswered: InfeasiblePeriod | None = None
 
     def _forget(self) -> None:
         """Start without a plan, and assume no disturbance."""
@@ -281,7 +280,7 @@ class NonlinearMPC:
         if self._ramp is not None:
             self._ramp.reset(self._acting)
             self._model = replace(self._model, drag=np.array(self.settings.drag))
-        self._believe(np.zeros(6))
+        self._update_disturbance(np.zeros(6))
 
     def adopt(self, previous: object) -> None:
         """Go on from what the law before knew: rotor speeds, disturbance, plan."""
@@ -304,7 +303,7 @@ class NonlinearMPC:
         estimate = observed(previous) if own is None else own.estimate
         if self._observer is not None and estimate is not None:
             self._observer.adopt(estimate)
-            self._believe(self._observer.estimate)
+            self._update_disturbance(self._observer.estimate)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.
@@ -348,7 +347,7 @@ class NonlinearMPC:
         answer, status = self._check(problem, query, answer, self._rejection(answer))
         if status is not None:
             if status != INVALID_DATA and (self.unanswered is None or self.unanswered.converges is not None):
-                self.unanswered = Unanswered(problem=problem, query=query, status=status, time=now.time)
+                self.unanswered = InfeasiblePeriod(problem=problem, query=query, status=status, time=now.time)
             self._plan = None
             return refused(self._acting, self.horizon, status, answer)
         assert sqp is not None
@@ -357,7 +356,7 @@ class NonlinearMPC:
             status = NOT_CONVERGED
             if self.unanswered is None:
                 converges = partial(_converges, self._again, self.settings, start, now.time, measured, nodes)
-                self.unanswered = Unanswered(
+                self.unanswered = InfeasiblePeriod(
                     problem=problem, query=query, status=status, time=now.time, converges=converges
                 )
         speeds = self._speeds(self._clip(answer.plan))
@@ -401,9 +400,9 @@ class NonlinearMPC:
             x = np.concatenate([x[:N_BODY], self._rotors_before])
         expected = advance_nodes(model, x, self._shares(self._acting))
         self._observer.learn(np.concatenate([measured[V] - expected[V], measured[W] - expected[W]]))
-        self._believe(self._observer.estimate)
+        self._update_disturbance(self._observer.estimate)
 
-    def _believe(self, estimate: Array) -> None:
+    def _update_disturbance(self, estimate: Array) -> None:
         """Predict with this disturbance (6,) from now on."""
         self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=estimate[3:])
 
@@ -462,15 +461,15 @@ class NonlinearMPC:
         elif self._shift:
             x, u = self._plan
             self._plan = np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
-        rest, before = Rest(wanted[-1], inputs), self._shares(self._acting)
+        rest, before = Equilibrium(wanted[-1], inputs), self._shares(self._acting)
         share, largest, last, least, patience = 1.0, 1.0, np.zeros(0), math.inf, PATIENCE
         for _ in range(self.settings.iterations):
             x, u = self._plan
             query = Query(s0, desired, before, rest, self._steps(x, u, frames))
-            if self._clearing is None:
+            if self._obstacles is None:
                 answer, problem = self._qp.solve(query), self.problem
             else:
-                answer, problem = self._clearing.solve(time, query, along=x[1:, P])
+                answer, problem = self._obstacles.solve(time, query, along=x[1:, P])
             if answer.states is None or answer.status not in ACCEPTED:
                 return query, answer, problem, None
             states, plan = answer.states[:, :n], answer.plan

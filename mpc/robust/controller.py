@@ -28,13 +28,12 @@ from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
 from mpc.observer import DisturbanceObserver, thrust_axis
 from mpc.observer import ObserverSettings as ObserverSettings
-from mpc.ocp import Objective, Problem, Query, Rest, Unanswered, lqr_terminal_weight
+from mpc.obstacles import ObstacleQP, Space
+from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
 from mpc.robust.settings import LONGEST_SPAN
 from mpc.robust.settings import RobustSettings as RobustSettings
 from mpc.solvers import INVALID_DATA, Answer, Solver
-from mpc.space.clearing import Clearing
-from mpc.space.halfspaces import Space
 from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, all_true
@@ -124,7 +123,7 @@ class RobustMPC:
         self._of_twist = np.ascontiguousarray(np.linalg.inv(slope(self._nominal))[:, 1:])
         self._actuators, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
         self._solver, self.solver = solver, solver.name
-        self._clearing = None if space is None else Clearing(problem, self._solver, space)
+        self._obstacles = None if space is None else ObstacleQP(problem, self._solver, space)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
 
@@ -135,11 +134,11 @@ class RobustMPC:
         self._rotors = self._acting.copy()
         self._ahead: Array | None = None
         self._called_at = self._measured = -math.inf
-        self.unanswered: Unanswered | None = None
+        self.unanswered: InfeasiblePeriod | None = None
         self._check.reset()
         self._solver.reset()
-        if self._clearing is not None:
-            self._clearing.reset()
+        if self._obstacles is not None:
+            self._obstacles.reset()
         self._forget()
 
     def adopt(self, previous: object) -> None:
@@ -154,7 +153,7 @@ class RobustMPC:
         estimate = observed(previous) if own is None else own.estimate
         if self._observer is not None and estimate is not None:
             self._observer.adopt(estimate)
-            self._believe()
+            self._update_trim()
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
@@ -163,16 +162,16 @@ class RobustMPC:
         if isinstance(query, Command):
             return query
         problem = self.problem
-        if self._clearing is None:
+        if self._obstacles is None:
             answer = self._solver.solve(query)
         else:
-            answer, problem = self._clearing.solve(now.time + self.settings.delay, query, self._yaw)
+            answer, problem = self._obstacles.solve(now.time + self.settings.delay, query, self._yaw)
         reason = rejection(answer.status, answer.plan[0], answer.plan, self._actuators, self._acting)
         answer, reason = self._check(problem, query, answer, reason)
         self.answer = answer
         if reason is not None:
             if reason != INVALID_DATA and self.unanswered is None:
-                self.unanswered = Unanswered(
+                self.unanswered = InfeasiblePeriod(
                     problem=problem, query=query, status=reason, time=now.time, delay=self.settings.delay
                 )
             return refused(self._acting, self.horizon, reason, answer)
@@ -209,7 +208,7 @@ class RobustMPC:
             expected = self._after(rest, ahead, before)
             if all_true(np.isfinite(expected)):
                 self._observer.update(state, expected)
-                self._believe()
+                self._update_trim()
         x0 = self._after(self.settings.delay, state, rotors)
         if not all_true(np.isfinite(x0)):
             return refused(self._acting, self.horizon, INVALID_DATA)
@@ -228,7 +227,7 @@ class RobustMPC:
         x_s = self.trim.state(self._yaw, self._model.n)
         x_s[N_STATES:] = u_s[: self._model.n - N_STATES]
         desired = self.problem.objective.desired(seen_from(reference, self._yaw))
-        return Query(x0, desired, self._acting, Rest(x_s, u_s))
+        return Query(x0, desired, self._acting, Equilibrium(x_s, u_s))
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`.
@@ -247,14 +246,14 @@ class RobustMPC:
         """Assume no disturbance."""
         if self._observer is not None:
             self._observer.reset()
-        self._believe()
+        self._update_trim()
 
     @property
     def _estimate(self) -> Array:
         """(6,) see `mpc.observer.DisturbanceObserver.estimate`."""
         return np.zeros(6) if self._observer is None else self._observer.estimate
 
-    def _believe(self) -> None:
+    def _update_trim(self) -> None:
         """Rest against the disturbance that is estimated now."""
         estimate, gravity = self._estimate, self._model.gravity
         (x, y), twist = estimate[:2].tolist(), estimate[3:] / gravity

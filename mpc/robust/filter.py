@@ -27,11 +27,11 @@ from mpc.answer import ActuatorBounds, command_of, refused, rejection
 from mpc.constraints import Constraint, Penalty
 from mpc.equilibrium import Trim
 from mpc.ocp import Objective, Problem, Query
+from mpc.partial_condensing import PartiallyCondensed
 from mpc.robust.controller import RobustMPC
 from mpc.robust.tightening import observed
 from mpc.solvers import Answer
-from mpc.solvers.piqp_backends import PiqpMultistage
-from mpc.staged import Staged
+from mpc.solvers.piqp import PiqpMultistage
 from quadsim.controller import ACCEPTED, UNCONSTRAINED, Command, Moment
 from quadsim.state import Array
 
@@ -116,7 +116,7 @@ class _Nearest:
     """The QP of a problem whose first input is to be near a wanted one."""
 
     def __init__(self, problem: Problem, standing: Array) -> None:
-        self._form = form = Staged(problem)
+        self._form = form = PartiallyCondensed(problem)
         self._horizon, self._at_rest = problem.horizon, standing
         self._first = form.inputs(np.arange(form.qp.c.size, dtype=np.float64))[0].astype(np.intp)
         self._P = form.qp.P.copy()
@@ -130,9 +130,9 @@ class _Nearest:
         """The plan whose first input is nearest to `wanted` (4,) [rad/s]."""
         qp = replace(self._form.pose(query).qp, P=self._P)
         qp.c[self._first] -= 2.0 * wanted
-        if query.rest is not None:
+        if query.equilibrium is not None:
             for side in (qp.h_l, qp.h_u):
-                side.reshape(self._horizon, -1)[-1, self._ends] += self._at_rest @ query.rest.x
+                side.reshape(self._horizon, -1)[-1, self._ends] += self._at_rest @ query.equilibrium.x
         return Answer.of(self._form, qp, self._backend.solve(qp), SafetyFilter.solver)
 
 

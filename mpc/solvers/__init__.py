@@ -12,16 +12,16 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
+from mpc.condensing import Condensed
 from mpc.ocp import Problem, Query
-from mpc.paper.condensed import Condensed
+from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Backend, KKTResiduals, Solution
 from mpc.solvers.free import FreeOptimum
-from mpc.staged import Staged
 from quadsim.controller import ACCEPTED, CORE, GAIN
 from quadsim.errors import InputError, MissingCoreError, MissingPackageError, ParameterError, UnknownNameError
 from quadsim.state import Array
 
-Formulation: TypeAlias = Condensed | Staged
+Formulation: TypeAlias = Condensed | PartiallyCondensed
 """The ways to write an MPC's optimisation as a QP."""
 
 
@@ -39,7 +39,7 @@ class SolverEntry:
         """The form of the problem that it takes, for a model that is `changing` from period to period or not."""
         if self.dense:
             return Condensed(problem)
-        return Staged(problem, steps_per_stage=self.steps_per_stage, changing=changing)
+        return PartiallyCondensed(problem, steps_per_stage=self.steps_per_stage, changing=changing)
 
     @property
     def installed(self) -> bool:
@@ -139,14 +139,14 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
     if not entry.installed:
         raise MissingPackageError(f"the solver {name!r}", entry.package, extra=entry.extra)
     if entry.package == "piqp":
-        from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
+        from mpc.solvers.piqp import PiqpDense, PiqpMultistage
 
         return (PiqpDense if entry.dense else PiqpMultistage)(changing=changing)
     if entry.package == "daqp":
-        from mpc.solvers.daqp_dense import DaqpDense
+        from mpc.solvers.daqp import DaqpDense
 
         return DaqpDense()
-    from mpc.solvers.qpsolvers_backend import AnyOfQpsolvers
+    from mpc.solvers.qpsolvers import AnyOfQpsolvers
 
     return AnyOfQpsolvers(name)
 
@@ -248,7 +248,7 @@ class QPSolver:
         self.name, self._changing = ALIASES.get(name, name), changing
         self.formulation = find_solver(name).formulate(problem, changing=changing)
         self._free: tuple[Condensed, FreeOptimum] | None = None
-        if free_first and not (changing and isinstance(self.formulation, Staged)):
+        if free_first and not (changing and isinstance(self.formulation, PartiallyCondensed)):
             form = self.formulation if isinstance(self.formulation, Condensed) else Condensed(problem)
             self._free = form, FreeOptimum(form, changing=changing)
         self.reset()

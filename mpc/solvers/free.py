@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from scipy.linalg import lapack
 
-from mpc.paper.condensed import Condensed
+from mpc.condensing import Condensed
 from mpc.qp import QP, Solution
 from quadsim.controller import UNCONSTRAINED
 

@@ -32,9 +32,9 @@ from scenarios.schema.robust import RobustSpec
 
 if TYPE_CHECKING:
     from mpc.core.numbers import Exportable
+    from mpc.obstacles import Shape, Space
     from mpc.robust.controller import RobustMPC
     from mpc.robust.filter import SafetyFilter
-    from mpc.space.halfspaces import Shape, Space
 
 FALLBACK_SHARE: Final = 0.8
 """Tilt of the fallback over the tightest bound on it: the controller finds a vehicle that it can take over."""
@@ -298,7 +298,7 @@ def make_space(
     """
     if spec.avoidance is None or not shapes:
         return None
-    from mpc.space.halfspaces import Space
+    from mpc.obstacles import Space
 
     soft = spec.avoidance.soft
     return Space(

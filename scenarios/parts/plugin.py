@@ -52,7 +52,7 @@ class PluginController:
 
     @property
     def unanswered(self) -> object:
-        """The first problem without an answer, an `mpc.Unanswered`, where the law keeps one."""
+        """The first problem without an answer, an `mpc.InfeasiblePeriod`, where the law keeps one."""
         try:
             return getattr(self._law, "unanswered", None)
         except Exception as error:  # after the flight, which is not to be lost by it

@@ -10,9 +10,9 @@ from typing import Annotated, Final, Literal
 from annotated_types import Len, MaxLen, doc
 from pydantic import Field, model_validator
 
+from mpc.obstacles import AvoidanceSettings
 from mpc.qp import KKT_EVERY
 from mpc.solvers import ALIASES, CORE_OR_PIQP, SOLVERS, find_solver
-from mpc.space.halfspaces import AvoidanceSettings
 from quadsim.controller import CORE
 from quadsim.errors import UnknownNameError
 from quadsim.fields import NonNegative, Number, Weight

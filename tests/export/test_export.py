@@ -11,12 +11,12 @@ import pytest
 import scipy.linalg
 
 import quadsim
+from mpc.condensing import Condensed
 from mpc.core.solver import Core
 from mpc.core.tables import AxisTables, tables
 from mpc.export.ctext import CText
 from mpc.export.source import CORE, DATA
 from mpc.ocp import Query
-from mpc.paper.condensed import Condensed
 from mpc.solvers import Method
 from quadsim.errors import ExportError, OutputError, ParameterError
 from quadsim.state import REFERENCE_STATES, Array

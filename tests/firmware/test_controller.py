@@ -12,9 +12,9 @@ import pytest
 import quadprog
 from exported_c import HOST, Host, Reply, replay
 
+from mpc.condensing import Condensed
 from mpc.export.ctext import Precision
 from mpc.ocp import Query
-from mpc.paper.condensed import Condensed
 from mpc.solvers import QPSolver
 from quadsim.controller import SOLVED
 from quadsim.state import Array

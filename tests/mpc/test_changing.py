@@ -37,9 +37,9 @@ PARTS = ("A", "B", "c", "state", "desired", "u_before", "u_rest")
 def corrupted(now: Period, part: str, number: float) -> Period:
     """With one number of it another."""
     if part == "u_rest":
-        u = now.rest.u.copy()
+        u = now.equilibrium.u.copy()
         u.flat[0] = number
-        return replace(now, rest=now.rest._replace(u=u))
+        return replace(now, equilibrium=now.equilibrium._replace(u=u))
     wrong = getattr(now, part).copy()
     wrong.flat[0] = number
     return replace(now, **{part: wrong})
@@ -100,8 +100,8 @@ def test_condensed_and_staged_forms_have_one_optimum(solver: str, terminal: floa
     ways = changing(problem), changing(problem, solver), changing(problem, solver, free_first=True)
     for _ in range(8):
         now = changing_period(rng, problem)
-        u = now.rest.u + 0.2 * rng.normal(size=(problem.horizon, problem.model.nu))
-        now = replace(now, rest=now.rest._replace(u=u))
+        u = now.equilibrium.u + 0.2 * rng.normal(size=(problem.horizon, problem.model.nu))
+        now = replace(now, equilibrium=now.equilibrium._replace(u=u))
         staged, condensed, free_first = (solved(way, now) for way in ways)
         for other in (condensed, free_first):
             assert {staged.status, other.status} <= ACCEPTED

@@ -14,31 +14,31 @@ from support import changing_period, random_problem, with_terms
 from mpc.constraints import Constraint, Penalty
 from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
 from mpc.model import LinearModel
-from mpc.ocp import Objective, Problem, Query, Unanswered
+from mpc.ocp import InfeasiblePeriod, Objective, Problem, Query
 
 TERMS = ((), ("constraints",), ("margins", "constraints"), ("soft",), ("soft", "margins", "constraints", "P", "Q_d"))
 NEAR = 1e-4
 """Violation, as a share, that is too little for an independent solver to be sure of."""
 
 
-def posed(seed: int, terms: tuple[str, ...], *, changing: bool, far: float) -> Unanswered:
+def posed(seed: int, terms: tuple[str, ...], *, changing: bool, far: float) -> InfeasiblePeriod:
     """A random problem from a state that is so far from the origin."""
     rng = np.random.default_rng(seed)
     problem = with_terms(rng, random_problem(rng, horizon=6, n=4, nu=2, n_c=2), terms)
     state, desired = far * rng.normal(size=4), rng.normal(size=(6, 4))
     before = problem.model.u_bar + rng.uniform(-3.0, 3.0, 2)
     now = changing_period(rng, problem)
-    query = Query(state, desired, before, now.rest, (now.A, now.B, now.c) if changing else None)
-    return Unanswered(problem=problem, query=query, status="unsolved", time=0.0)
+    query = Query(state, desired, before, now.equilibrium, (now.A, now.B, now.c) if changing else None)
+    return InfeasiblePeriod(problem=problem, query=query, status="unsolved", time=0.0)
 
 
-def period(unanswered: Unanswered) -> ocp_peer.Period:
+def period(unanswered: InfeasiblePeriod) -> ocp_peer.Period:
     problem, query = unanswered.problem, unanswered.query
-    now = ocp_peer.period(problem, query.state, query.desired, query.u_before, query.rest)
+    now = ocp_peer.period(problem, query.state, query.desired, query.u_before, query.equilibrium)
     return now if query.steps is None else replace(now, **dict(zip("ABc", query.steps, strict=True)))
 
 
-def conflict_of(unanswered: Unanswered) -> Conflict:
+def conflict_of(unanswered: InfeasiblePeriod) -> Conflict:
     conflict = find_conflict(unanswered)
     assert conflict is not None
     return conflict
@@ -125,7 +125,7 @@ def widened(problem: Problem, sides: set[Side], amount: float) -> Problem:
     return replace(problem, bounds=None, constraints=tuple(parts))
 
 
-def integrator(*constraints: Constraint) -> Unanswered:
+def integrator(*constraints: Constraint) -> InfeasiblePeriod:
     """x(k+1) = x(k) + u(k) over four steps from 3, with |u| <= 1."""
     model = LinearModel(A=np.eye(1), B=np.eye(1), u_bar=np.zeros(1), period=1.0)
     inputs = Constraint(name="inputs", lower=-np.ones(1), upper=np.ones(1), D=np.eye(1))
@@ -136,7 +136,7 @@ def integrator(*constraints: Constraint) -> Unanswered:
         constraints=(inputs, *constraints),
     )
     query = Query(np.array([3.0]), np.zeros((4, 1)), np.zeros(1))
-    return Unanswered(problem=problem, query=query, status="unsolved", time=0.0)
+    return InfeasiblePeriod(problem=problem, query=query, status="unsolved", time=0.0)
 
 
 BAND = Constraint(name="band", lower=-np.ones(1), upper=np.ones(1), C=np.eye(1))
@@ -178,6 +178,8 @@ def test_soft_constraints_are_never_in_conflict() -> None:
 def test_what_is_stored_of_a_period_is_a_copy() -> None:
     state, before = np.zeros(1), np.zeros(1)
     problem = integrator().problem
-    stored = Unanswered(problem=problem, query=Query(state, np.zeros((4, 1)), before), status="unsolved", time=0.0)
+    stored = InfeasiblePeriod(
+        problem=problem, query=Query(state, np.zeros((4, 1)), before), status="unsolved", time=0.0
+    )
     state[:], before[:] = 1.0, 1.0
     assert (stored.query.state, stored.query.u_before) == (0.0, 0.0)

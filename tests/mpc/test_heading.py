@@ -13,7 +13,7 @@ from mpc.equilibrium import equilibrium, twisted
 from mpc.heading import advance, anchored, predict_in_heading_frame, turn, turn_horizontally
 from mpc.model import hover_model
 from mpc.nonlinear.model import nonlinear_model
-from mpc.paper.prediction import rollout
+from mpc.paper import rollout
 from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle
 

@@ -9,13 +9,13 @@ import pytest
 from polish import polish
 from support import flight_queries, paper_problem, paper_reference
 
+from mpc.condensing import Condensed
 from mpc.constraints import Constraint
 from mpc.ocp import Query
-from mpc.paper.condensed import Condensed
+from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Backend, Solution, kkt_residuals
 from mpc.solvers import SOLVERS, Formulation, QPSolver, make_backend
-from mpc.solvers.piqp_backends import PiqpDense
-from mpc.staged import Staged
+from mpc.solvers.piqp import PiqpDense
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 from scenarios.flight import Flight
@@ -94,7 +94,7 @@ def test_answers_are_copies_that_the_next_solve_leaves_alone() -> None:
         np.testing.assert_array_equal(now, then)
 
 
-@pytest.mark.parametrize("build", [Condensed, Staged])
+@pytest.mark.parametrize("build", [Condensed, PartiallyCondensed])
 def test_a_problem_without_bounds_needs_no_qp(build: object) -> None:
     with pytest.raises(ValueError, match="needs a problem with bounds"):
         build(paper_problem("paper-unconstrained"))  # type: ignore[operator]

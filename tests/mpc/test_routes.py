@@ -19,7 +19,7 @@ from support import changing_period, paper_problem, random_problem, random_rows
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Constraint, Penalty, tightened
 from mpc.model import LinearModel, continuous_model, discretise
-from mpc.ocp import Objective, Problem, Query, Rest, lqr_terminal_weight
+from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.solvers import SOLVERS, Method, QPSolver, find_solver, make_solver, solver_entries
 from quadsim.controller import ACCEPTED, CORE, SOLVED, UNCONSTRAINED, Moment
@@ -270,7 +270,7 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
     state = make_state(euler=(0.01, -0.02, 0.0))
     state[1] = 0.05
     x0 = np.concatenate([state, hover])[: base.model.n]
-    rest = Rest(np.zeros(base.model.n), hover)
+    rest = Equilibrium(np.zeros(base.model.n), hover)
     rest.x[12:] = hover[: base.model.n - 12]
     given = ocp_peer.period(base, x0, base.objective.desired(reference), hover, rest)
     row = coupled(base, given, soft=kind == "soft", share=0.7)

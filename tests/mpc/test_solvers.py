@@ -10,15 +10,15 @@ import pytest
 import qpsolvers
 from support import flight_queries, paper_problem, paper_reference, random_problem
 
+from mpc.condensing import Condensed
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Penalty
 from mpc.ocp import Query
-from mpc.paper.condensed import Condensed
+from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import kkt_residuals
 from mpc.solvers import CORE_OR_PIQP, SOLVERS, Answer, QPSolver, find_solver, make_backend, make_solver, solver_entries
-from mpc.solvers.daqp_dense import DaqpDense
-from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
-from mpc.staged import Staged
+from mpc.solvers.daqp import DaqpDense
+from mpc.solvers.piqp import PiqpDense, PiqpMultistage
 from quadsim.controller import CORE, GAIN, SOLVED, Moment
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
 from scenarios.flight import Flight
@@ -101,7 +101,7 @@ def test_equality_rows_and_multipliers() -> None:
         problem = random_problem(rng, horizon=6, n=3, nu=2, n_c=1)
         query = (0.1 * rng.normal(size=3), rng.normal(size=(6, 3)), problem.model.u_bar)
         plans = []
-        for formulation in (Staged(problem, steps_per_stage=2), Condensed(problem)):
+        for formulation in (PartiallyCondensed(problem, steps_per_stage=2), Condensed(problem)):
             backend, peer = DaqpDense(), PiqpDense()
             qp = formulation.pose(Query(*query)).qp
             backend.setup(formulation.qp)

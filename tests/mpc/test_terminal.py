@@ -10,12 +10,12 @@ import scipy.linalg
 from polish import polish
 from support import paper_problem, random_problem
 
+from mpc.condensing import Condensed
 from mpc.core.axes import axes
-from mpc.ocp import Objective, Problem, Query, Rest, lqr_terminal_weight
-from mpc.paper.condensed import Condensed
+from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
+from mpc.partial_condensing import PartiallyCondensed
 from mpc.solvers import Formulation, Method, QPSolver
-from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
-from mpc.staged import Staged
+from mpc.solvers.piqp import PiqpDense, PiqpMultistage
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 
@@ -47,12 +47,12 @@ def gain(problem: Problem) -> Array:
     return np.asarray(K)
 
 
-def first_inputs(problem: Problem, query: tuple[Array, Array, Array, Rest]) -> dict[str, Array]:
+def first_inputs(problem: Problem, query: tuple[Array, Array, Array, Equilibrium]) -> dict[str, Array]:
     """By the free optimum, the condensed QP and the staged one."""
     answer = QPSolver("piqp-multistage", problem, free_first=True).solve(Query(*query))
     assert answer.method is Method.FREE
     found = {"free": answer.plan[0]}
-    forms: tuple[Formulation, ...] = (Condensed(problem), Staged(problem, steps_per_stage=3))
+    forms: tuple[Formulation, ...] = (Condensed(problem), PartiallyCondensed(problem, steps_per_stage=3))
     for form in forms:
         backend = PiqpDense() if isinstance(form, Condensed) else PiqpMultistage()
         backend.setup(form.qp)
@@ -68,7 +68,7 @@ def test_the_first_input_is_the_infinite_horizons(horizon: int, elsewhere: bool)
     for seed in range(5):
         rng = np.random.default_rng(seed)
         problem = terminated(without_bounds(random_problem(rng, horizon=horizon, n=4, nu=2, n_c=2)))
-        rest = Rest(rng.normal(size=4), rng.normal(size=2)) if elsewhere else problem.rest
+        rest = Equilibrium(rng.normal(size=4), rng.normal(size=2)) if elsewhere else problem.equilibrium
         state, desired = rest.x + rng.normal(size=4), np.tile(rest.x, (horizon, 1))
         expected = rest.u - gain(problem) @ (state - rest.x)
         for name, found in first_inputs(problem, (state, desired, problem.model.u_bar, rest)).items():
@@ -86,7 +86,7 @@ def test_the_papers_vehicle_flies_to_a_set_point_as_by_the_infinite_horizons_law
     goal[[0, 2, 4, 10]] = reference
     tilted = np.zeros(12)
     tilted[[6, 8]] = 0.05, -0.03
-    for rest in (problem.rest, Rest(tilted, u_bar + 1.0)):
+    for rest in (problem.equilibrium, Equilibrium(tilted, u_bar + 1.0)):
         expected = rest.u - K @ (state - rest.x - goal)
         desired = problem.objective.desired(np.tile(reference, (horizon, 1)))
         for name, found in first_inputs(problem, (state, desired, u_bar, rest)).items():

@@ -11,8 +11,8 @@ from peers.checks import Check
 from peers.qpoases import Qpoases
 from peers.recorded import Query
 
+from mpc.condensing import Condensed
 from mpc.ocp import Problem
-from mpc.paper.condensed import Condensed
 from mpc.qp import KKTResiduals, kkt_residuals
 from mpc.solvers import SOLVERS, find_solver, make_backend
 from quadsim.controller import SOLVED

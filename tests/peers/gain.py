@@ -17,8 +17,7 @@ import scipy.linalg
 from peers.checks import Check
 
 from mpc.ocp import Problem
-from mpc.paper.cost import cost
-from mpc.paper.prediction import prediction
+from mpc.paper import cost, prediction
 from mpc.unconstrained import sequence_gains
 from quadsim.state import Array
 

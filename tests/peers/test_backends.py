@@ -8,7 +8,7 @@ from support import paper_problem, paper_reference
 
 from mpc.ocp import Query
 from mpc.solvers import SOLVERS, QPSolver, find_solver, make_backend
-from mpc.solvers.qpsolvers_backend import UNSOLVED
+from mpc.solvers.qpsolvers import UNSOLVED
 from quadsim.controller import SOLVED
 from scenarios.cli import main
 from scenarios.results import EXIT_DONE

@@ -13,7 +13,7 @@ from mpc.answer import INFEASIBLE, AnswerCheck
 from mpc.ocp import Query, predicted
 from mpc.qp import KKT_EVERY
 from mpc.solvers import QPSolver
-from mpc.solvers.piqp_backends import PiqpMultistage
+from mpc.solvers.piqp import PiqpMultistage
 from scenarios.flight import summarise
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout

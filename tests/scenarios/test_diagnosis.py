@@ -21,7 +21,7 @@ import quadsim
 from mpc.constrained import ConstrainedMPC
 from mpc.fallback.contract import Guarded
 from mpc.nonlinear.controller import CONVERGED
-from mpc.ocp import Unanswered
+from mpc.ocp import InfeasiblePeriod
 from quadsim.controller import ACCEPTED, Command, Controller, Moment
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import INDEX, Array, make_state
@@ -118,7 +118,7 @@ class Queried:
     vehicle: Vehicle
     controller: Controller
     status: str
-    unanswered: Unanswered | None
+    unanswered: InfeasiblePeriod | None
 
     @cached_property
     def found(self) -> dict[str, Any]:
@@ -268,7 +268,7 @@ def test_a_solver_that_fails_where_all_constraints_can_hold_is_distinguished(fil
     controller = query_cached(file, "start beyond the tilt bound").unanswered
     assert controller is not None
     level = controller.query._replace(state=make_state())
-    failed = Unanswered(problem=controller.problem, query=level, status="max_iterations", time=1.0)
+    failed = InfeasiblePeriod(problem=controller.problem, query=level, status="max_iterations", time=1.0)
     found = diagnose(failed, queried.scenario, queried.vehicle)
     assert found is not None
     assert (found["feasible"], found["conflict"], found["suggestions"], found["advice"]) == (True, [], [], "")
@@ -330,7 +330,7 @@ class Keeping:
         )
         self.problem = replace(law.problem, horizon=horizon, bounds=roll)
         self.inner = ConstrainedMPC(self.problem, mpc.QPSolver("piqp-multistage", self.problem))
-        self.unanswered: Unanswered | None = None
+        self.unanswered: InfeasiblePeriod | None = None
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
         try:

@@ -23,7 +23,7 @@ from mpc.core import library
 from mpc.core import solver as module
 from mpc.core.axes import axes
 from mpc.core.solver import PROBLEMS, Core, core_library, core_problem
-from mpc.ocp import Problem, Query, Rest, lqr_terminal_weight
+from mpc.ocp import Equilibrium, Problem, Query, lqr_terminal_weight
 from mpc.qp import kkt_residuals
 from mpc.solvers import Answer, Method, QPSolver, make_solver, solver_entries
 from quadsim.controller import ACCEPTED, CORE, GAIN, SOLVED, UNCONSTRAINED
@@ -44,7 +44,7 @@ def drawn_query(rng: np.random.Generator, problem: Problem) -> Query:
     state = np.zeros(n)
     state[:12] = size * rng.normal(size=12) * np.tile([1.0, 0.5, 1.0, 0.5, 1.0, 0.5, 0.03, 0.1, 0.03, 0.1, 0.3, 0.3], 1)
     desired = np.tile(problem.objective.desired(size * rng.normal(size=(1, 4)) * [3.0, 3.0, 2.0, 0.5]), (N, 1))
-    return Query(state, desired, u_bar + rng.uniform(-5.0, 5.0, 4), problem.rest)
+    return Query(state, desired, u_bar + rng.uniform(-5.0, 5.0, 4), problem.equilibrium)
 
 
 def worst(problem: Problem, answer: Answer) -> float:
@@ -114,9 +114,9 @@ def drawn(rng: np.random.Generator, terms: Collection[str], *, size: float, room
         objective = replace(objective, Q_d=3.0 * objective.Q_u)
     if "P" in terms:
         objective = replace(objective, P=lqr_terminal_weight(model, objective))
-    rest = problem.rest
+    rest = problem.equilibrium
     if "rest" in terms:
-        rest = Rest(0.1 * rng.normal(size=7), model.u_bar + 0.1 * room * rng.normal(size=4))
+        rest = Equilibrium(0.1 * rng.normal(size=7), model.u_bar + 0.1 * room * rng.normal(size=4))
     before = model.u_bar + 0.01 * rng.normal(size=4)
     query = Query(size * rng.normal(size=7), size * rng.normal(size=(5, 7)), before, rest)
     return replace(problem, objective=objective), query

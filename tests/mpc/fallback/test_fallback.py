@@ -21,7 +21,7 @@ from scripted_controller import (
 
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.settings import FallbackSettings
-from mpc.solvers.piqp_backends import STATUS
+from mpc.solvers.piqp import STATUS
 from quadsim.controller import ACCEPTED, Moment, Phase
 from quadsim.errors import CommandError
 from quadsim.state import INDEX, VELOCITY, Array

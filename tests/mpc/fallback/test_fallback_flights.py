@@ -20,7 +20,7 @@ from mpc.fallback.contract import Guarded
 from mpc.fallback.settings import FallbackSettings
 from mpc.ocp import Query
 from mpc.solvers import Answer, QPSolver
-from mpc.solvers.piqp_backends import STATUS
+from mpc.solvers.piqp import STATUS
 from quadsim.controller import ACCEPTED
 from quadsim.flight.ground import clearance
 from quadsim.flight.log import FlightLog

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from support import paper_problem
 
+from mpc.condensing import Condensed
 from mpc.constraints import Bounds
 from mpc.ocp import Objective, Query
-from mpc.paper.condensed import Condensed
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.robust.filter import STANDING, SafetyFilter
 from mpc.solvers import make_backend, make_solver

@@ -24,15 +24,15 @@ from support import (
     with_terms,
 )
 
+from mpc.condensing import Condensed
 from mpc.constraints import Penalty
 from mpc.nonlinear.model import nonlinear_model
-from mpc.ocp import Problem, Query, Rest
-from mpc.paper.condensed import Condensed
+from mpc.ocp import Equilibrium, Problem, Query
+from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Solution, kkt_residuals
 from mpc.solvers import Formulation, QPSolver
-from mpc.solvers.daqp_dense import DaqpDense
-from mpc.solvers.piqp_backends import PiqpDense, PiqpMultistage
-from mpc.staged import Staged
+from mpc.solvers.daqp import DaqpDense
+from mpc.solvers.piqp import PiqpDense, PiqpMultistage
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -45,7 +45,7 @@ LAG = 0.05
 class Changing:
     """A problem whose model changes, staged and solved again each time, in any number of steps per stage."""
 
-    form: Staged
+    form: PartiallyCondensed
     backend: PiqpMultistage
 
     def qp(self, now: Period) -> QP:
@@ -65,7 +65,7 @@ class Changing:
 
 
 def changing(problem: Problem, steps: int) -> Changing:
-    form, backend = Staged(problem, steps_per_stage=steps, changing=True), PiqpMultistage(changing=True)
+    form, backend = PartiallyCondensed(problem, steps_per_stage=steps, changing=True), PiqpMultistage(changing=True)
     backend.setup(form.qp)
     return Changing(form, backend)
 
@@ -76,9 +76,9 @@ def softened(problem: Problem, l1: list[float], l2: list[float], *, largest: boo
     return replace(problem, bounds=replace(problem.bounds, penalty=penalty))
 
 
-def exact(form: Formulation, query: tuple[Array, Array, Array, Rest]) -> tuple[Array, Array, float]:
+def exact(form: Formulation, query: tuple[Array, Array, Array, Equilibrium]) -> tuple[Array, Array, float]:
     """Plan and slacks at a form's optimum, with its KKT residual over the size of its multipliers."""
-    backend = PiqpMultistage() if isinstance(form, Staged) else PiqpDense()
+    backend = PiqpMultistage() if isinstance(form, PartiallyCondensed) else PiqpDense()
     backend.setup(form.qp)
     qp = form.pose(Query(*query)).qp
     solution = backend.solve(qp)
@@ -105,10 +105,14 @@ def test_it_has_the_condensed_optimum(
     rng = np.random.default_rng(seed)
     problem = with_terms(rng, random_problem(rng, horizon=horizon, n=n, nu=nu, n_c=2), terms)
     model = problem.model
-    rest = Rest(0.1 * rng.normal(size=n), model.u_bar + 0.05 * rng.normal(size=nu)) if elsewhere else problem.rest
+    rest = (
+        Equilibrium(0.1 * rng.normal(size=n), model.u_bar + 0.05 * rng.normal(size=nu))
+        if elsewhere
+        else problem.equilibrium
+    )
     before = model.u_bar + 0.05 * rng.normal(size=nu)
     query = 0.1 * rng.normal(size=n), rng.normal(size=(horizon, len(problem.objective.C_r))), before, rest
-    staged = Staged(problem, steps_per_stage=steps)
+    staged = PartiallyCondensed(problem, steps_per_stage=steps)
     solver = PiqpMultistage()
     solver.setup(staged.qp)
     peer = ocp_peer.optimum(problem, ocp_peer.period(problem, *query[:4]))
@@ -130,7 +134,7 @@ def test_stages_cover_the_horizon(steps: int) -> None:
     problem = paper_problem()
     query = np.zeros(12), problem.objective.desired(paper_reference(51)[1:]), problem.model.u_bar
     expected = QPSolver("piqp-dense", problem).solve(Query(*query)).plan
-    formulation, backend = Staged(problem, steps_per_stage=steps), PiqpMultistage()
+    formulation, backend = PartiallyCondensed(problem, steps_per_stage=steps), PiqpMultistage()
     backend.setup(formulation.qp)
     solution = backend.solve(formulation.pose(Query(*query)).qp)
     np.testing.assert_allclose(formulation.inputs(solution.x)[0], expected[0], atol=1e-3)
@@ -143,8 +147,8 @@ def test_every_stage_length_gives_the_condensed_optimum(steps: int) -> None:
     problem = paper_problem("paper-constrained", "controller.horizon=17")
     state = np.zeros(12)
     state[10] = np.pi / 6
-    query = state, problem.objective.desired(paper_reference(18)[1:]), problem.model.u_bar, problem.rest
-    plan, _, residual = exact(Staged(problem, steps_per_stage=steps), query)
+    query = state, problem.objective.desired(paper_reference(18)[1:]), problem.model.u_bar, problem.equilibrium
+    plan, _, residual = exact(PartiallyCondensed(problem, steps_per_stage=steps), query)
     other, _, _ = exact(Condensed(problem), query)
     assert residual < 1e-8
     np.testing.assert_allclose(plan, other, atol=1e-6)
@@ -152,7 +156,7 @@ def test_every_stage_length_gives_the_condensed_optimum(steps: int) -> None:
 
 def test_products_of_rounding_are_left_out() -> None:
     """Rotors on body x do not roll the vehicle, though cos(90 deg) is not zero in binary."""
-    qp = Staged(paper_problem()).qp
+    qp = PartiallyCondensed(paper_problem()).qp
     outputs = abs(qp.G[:100]).tocsr()
     for row in (outputs[i].data for i in range(outputs.shape[0]) if outputs[i].nnz):
         assert row.min() > 1e-12 * row.max()
@@ -165,7 +169,7 @@ def test_products_of_rounding_are_left_out() -> None:
 def test_constant_matrices_make_the_papers_plan(constrained_flight: Flight, steps: int) -> None:
     problem = paper_problem()
     solver = changing(problem, steps)
-    formulation, backend = Staged(problem), DaqpDense()
+    formulation, backend = PartiallyCondensed(problem), DaqpDense()
     backend.setup(formulation.qp)
     pressing = 0
     for query in flight_queries(constrained_flight, problem, stride=100):
@@ -261,8 +265,8 @@ def along_flight(flight: Flight, vehicle: Vehicle, problem: Problem, stride: int
     for state, desired, before, *_ in flight_queries(flight, problem, stride):
         x0 = np.concatenate([state, before])
         A, B, c = (np.repeat(part[None], 50, axis=0) for part in linearised(model, x0, hover))
-        rest = Rest(np.zeros(16), hover)
-        yield Period(A=A, B=B, c=c, state=x0, desired=desired, u_before=before, rest=rest)
+        rest = Equilibrium(np.zeros(16), hover)
+        yield Period(A=A, B=B, c=c, state=x0, desired=desired, u_before=before, equilibrium=rest)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 5])

@@ -10,15 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import paper_problem
 
+from mpc.condensing import Condensed
+from mpc.obstacles import AvoidanceSettings, ObstacleQP, Shape, Space
 from mpc.ocp import Problem, Query
-from mpc.paper.condensed import Condensed
-from mpc.paper.prediction import prediction
+from mpc.paper import prediction
 from mpc.qp import kkt_residuals
 from mpc.robust.tightening import TighteningSettings, position_margins
 from mpc.solvers import Answer, QPSolver, make_solver
-from mpc.solvers.piqp_backends import PiqpDense
-from mpc.space.clearing import Clearing
-from mpc.space.halfspaces import AvoidanceSettings, Shape, Space
+from mpc.solvers.piqp import PiqpDense
 from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
 from quadsim.space import Capsule, Corridor, Cylinder, Fence, Sphere
@@ -52,7 +51,9 @@ def query(problem: Problem, *, goal: float = 2.0, speed: float = 0.8) -> Query:
     return Query(state, problem.objective.desired(reference), problem.model.u_bar)
 
 
-def clearing(problem: Problem, among: Space, calls: list[Answer] | None = None, *, changing: bool = False) -> Clearing:
+def clearing(
+    problem: Problem, among: Space, calls: list[Answer] | None = None, *, changing: bool = False
+) -> ObstacleQP:
     solver = QPSolver("piqp-multistage", problem, free_first=True)
     find = solver.solve
 
@@ -63,7 +64,7 @@ def clearing(problem: Problem, among: Space, calls: list[Answer] | None = None, 
         return answer
 
     solver.solve = solve  # type: ignore[method-assign]
-    return Clearing(problem, solver, among, changing=changing)
+    return ObstacleQP(problem, solver, among, changing=changing)
 
 
 def by_dense_qp(problem: Problem, posed: Query, normals: Array, bounds: Array) -> Array:
@@ -149,7 +150,7 @@ def test_rows_are_added_until_all_half_spaces_are_satisfied(problem: Problem) ->
 
 
 def test_where_the_way_is_clear_the_answer_is_the_solver_s(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Clearing, "_form", None)  # no QP of its own
+    monkeypatch.setattr(ObstacleQP, "_form", None)  # no QP of its own
     calls: list[Answer] = []
     beside = replace(PILLAR, position=(0.9, 3.0, 0.0))
     assert clearing(problem, space(beside, FENCE), calls).solve(0.0, query(problem))[0].plan is calls[0].plan

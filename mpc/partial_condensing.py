@@ -12,7 +12,7 @@ the horizon.  The model may differ from step to step,
 
     x(k+i+1) = A_i x(k+i) + B_i u(k+i) + c_i.
 
-The pattern of the matrices is fixed when a `Staged` is built; where they change, only their values do.
+The pattern of the matrices is fixed when a `PartiallyCondensed` is built; where they change, only their values do.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem, Query
-from mpc.paper.prediction import condense_stages
 from mpc.qp import QP, Posed, QPRows, Solution
 from quadsim.errors import ParameterError
 from quadsim.state import Array, Indices
@@ -123,13 +122,29 @@ class Matrices:
     own: QPRows  # what these are
 
 
+def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
+    """(J, L + 1, n, m + 1) states of J stages of L steps, as functions of the variables, the inputs the last, and of 1.
+
+    From the first of them (J, n, m + 1) by A (J, L, n, n), B (J, L, n, nu) and c (J, L, n).
+    """
+    (count, steps, n, nu), columns = B.shape, start.shape[2]
+    states = np.empty((count, steps + 1, n, columns))
+    states[:, 0] = start
+    for t in range(steps):
+        np.matmul(A[:, t], states[:, t], out=states[:, t + 1])
+        at = columns - 1 - (steps - t) * nu
+        states[:, t + 1, :, at : at + nu] = B[:, t]
+        states[:, t + 1, :, -1] += c[:, t]
+    return states
+
+
 def condense(at: Layout, start: Array, free: Array, *steps: Array) -> tuple[Array, Array]:
     """The first stage from `start` and the others from `free` on; see `condense_stages`."""
     head = condense_stages(start, *(part[None, : at.L] for part in steps))
     return head, condense_stages(free, *(part[at.L :].reshape(len(free), at.M, *part.shape[1:]) for part in steps))
 
 
-class Staged:
+class PartiallyCondensed:
     """The partially condensed QP of a problem.
 
     Args:
@@ -280,7 +295,7 @@ class Staged:
 
     def pose(self, query: Query, problem: Problem | None = None) -> Posed:
         """The QP of a period; `problem` differs in numbers of its constraints' rows alone."""
-        rest = query.rest or self._problem.rest
+        rest = query.equilibrium or self._problem.equilibrium
         if query.steps is None:
             A, B = self._problem.model.A, self._problem.model.B
             offset = rest.x - A @ rest.x - B @ rest.u

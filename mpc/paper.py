@@ -1,4 +1,4 @@
-"""The condensed cost.  Eqs. (5)-(10)."""
+"""The paper's prediction and cost, condensed to the inputs alone, as printed.  Eqs. (2)-(10)."""
 
 from __future__ import annotations
 
@@ -6,9 +6,46 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpc.model import LinearModel
 from mpc.ocp import Objective
-from mpc.paper.prediction import Prediction
 from quadsim.state import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """Stacked future states [xi(k+1); ...; xi(k+N)] = Phi xi(k) + Psi (u - u_bar).
+
+    The paper's Phi_i and Psi_i are the i-th block rows; its selections Pi_i are the block columns themselves.
+    """
+
+    Phi: Array  # (N n, n)
+    Psi: Array  # (N n, N nu), block lower triangular
+
+
+def prediction(model: LinearModel, horizon: int) -> Prediction:
+    """Build Phi and Psi for a horizon of N steps, from A^i and A^i B."""
+    n, nu = model.n, model.nu
+    Phi = np.empty((horizon, n, n))
+    responses = np.empty((horizon, n, nu))  # A^i B
+    power = np.eye(n)
+    for i in range(horizon):
+        responses[i] = power @ model.B
+        power = model.A @ power
+        Phi[i] = power
+    Psi = np.zeros((horizon, n, horizon, nu))
+    for i in range(horizon):
+        Psi[i, :, : i + 1] = responses[i::-1].transpose(1, 0, 2)
+    return Prediction(Phi=Phi.reshape(horizon * n, n), Psi=Psi.reshape(horizon * n, horizon * nu))
+
+
+def rollout(model: LinearModel, states: Array, plans: Array) -> Array:
+    """States (K, N, n) xi(k+1) .. xi(k+N) from states (K, n) under plans (K, N, nu), by recursion."""
+    predicted = np.empty((*plans.shape[:2], model.n))
+    state = states
+    for i in range(plans.shape[1]):
+        state = state @ model.A.T + (plans[:, i] - model.u_bar) @ model.B.T
+        predicted[:, i] = state
+    return predicted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +67,8 @@ class Cost:
 
 def cost(maps: Prediction, objective: Objective) -> Cost:
     """Build H and F1 to F4 from the prediction map and the weights."""
-    n = objective.C_r.shape[1]
     nu = objective.Q_u.shape[0]
-    horizon = maps.Phi.shape[0] // n
+    horizon = maps.Psi.shape[1] // nu
     outputs_of_inputs = _apply_blockwise(objective.C_r, maps.Psi, horizon)  # C_r Psi_i, stacked
     outputs_of_state = _apply_blockwise(objective.C_r, maps.Phi, horizon)  # C_r Phi_i, stacked
     weighted = _apply_blockwise(objective.Q_y, outputs_of_inputs, horizon)
@@ -50,5 +86,10 @@ def cost(maps: Prediction, objective: Objective) -> Cost:
 
 def _apply_blockwise(matrix: Array, stacked: Array, blocks: int) -> Array:
     """diag(matrix, ..., matrix) @ stacked, without forming the block-diagonal."""
-    rows = stacked.reshape(blocks, matrix.shape[1], -1)
-    return (matrix @ rows).reshape(blocks * matrix.shape[0], -1)
+    rows = stacked.reshape(blocks, matrix.shape[1], stacked.shape[1])
+    return (matrix @ rows).reshape(blocks * matrix.shape[0], stacked.shape[1])
+
+
+def slew_matrix(horizon: int, nu: int) -> Array:
+    """(N nu, N nu) matrix taking inputs to their steps u(k+i) - u(k+i-1), the upper half of Eq. (16)."""
+    return np.kron(np.eye(horizon) - np.eye(horizon, k=-1), np.eye(nu)).astype(np.float64)

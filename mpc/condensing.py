@@ -8,17 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 import scipy.linalg
 
-from mpc.constraints import Rows
 from mpc.ocp import Problem, Query, predicted
-from mpc.paper.constraints import slew_matrix
-from mpc.paper.cost import cost
-from mpc.paper.prediction import Prediction, prediction
+from mpc.paper import Prediction, cost, prediction, slew_matrix
 from mpc.qp import QP, Posed, QPRows, Solution
 from quadsim.state import Array, Indices
+
+Flags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,23 +59,34 @@ class RowMaps:
     of_state: Array  # (N, m, n) in dx = x(k) - x_s
 
 
-def row_maps(rows: Rows | QPRows, maps: Prediction) -> RowMaps:
-    """The rows' values as functions of inputs and state."""
-    n = maps.Phi.shape[1]
-    Psi, Phi = maps.Psi.reshape(-1, n, maps.Psi.shape[1]), maps.Phi.reshape(-1, n, n)
-    N, nu = len(Psi), Psi.shape[2] // len(Psi)
-    # Rows of states alone are for x(k+1) .. x(k+N), the others for x(k) .. x(k+N-1).
+def states_rows(C: Array, of_states: Flags, maps: Prediction, N: int) -> RowMaps:
+    """Values of rows C (m, n) on states, for x(k+1) .. x(k+N) where of the state alone, else for x(k) .. x(k+N-1)."""
+    n, columns = C.shape[1], maps.Psi.shape[1]
+    Psi = np.concatenate([np.zeros((1, n, columns)), maps.Psi.reshape(N, n, columns)])
+    Phi = np.concatenate([np.eye(n)[None], maps.Phi.reshape(N, n, n)])
+    return RowMaps(of_inputs=_on_states(C, of_states, Psi), of_state=_on_states(C, of_states, Phi))
+
+
+def row_maps(rows: QPRows, maps: Prediction) -> RowMaps:
+    """The rows' values as functions of inputs and state.  Eqs. (14), (16)-(19) for any rows."""
     if rows.C.ndim == 3:
-        raise ValueError("a condensed QP takes rows that are the same at all steps; solve these by the staged one")
-    later, now = (rows.C * chosen[:, None] for chosen in (rows.of_states, ~rows.of_states))
-    of_inputs, of_state = later @ Psi, later @ Phi
-    of_inputs[1:] += now @ Psi[:-1]
-    of_state[0] += now
-    of_state[1:] += now @ Phi[:-1]
-    by_step = of_inputs.reshape(N, len(rows.C), N, nu)
+        raise ValueError("a condensed QP takes rows that are the same at all steps; partial condensing takes any")
+    values = states_rows(rows.C, rows.of_states, maps, len(rows.lower))
+    return replace(values, of_inputs=_with_inputs(values.of_inputs, rows))
+
+
+def _on_states(C: Array, of_states: Flags, S: Array) -> Array:
+    """(N, m, columns) of rows C on states x(k) .. x(k+N), of which S (N + 1, n, columns) are the slopes."""
+    return np.asarray((C * of_states[:, None]) @ S[1:] + (C * ~of_states[:, None]) @ S[:-1])
+
+
+def _with_inputs(values: Array, rows: QPRows) -> Array:
+    """Rows' slopes (N, m, N nu) by the inputs through the states, with those of D u + E du added."""
+    N, nu = len(values), rows.D.shape[1]
+    by_step = values.reshape(N, len(rows.D), N, nu)
     by_step[range(N), :, range(N)] += rows.D + rows.E
     by_step[range(1, N), :, range(N - 1)] -= rows.E
-    return RowMaps(of_inputs=of_inputs, of_state=of_state)
+    return by_step.reshape(values.shape)
 
 
 class Condensed:
@@ -152,7 +163,7 @@ class Condensed:
             return self._pose_changed(query)
         terms, values, rows = self.cost, self._values, self._rows
         state, desired, u_before = query[:3]
-        x_s, u_s = query.rest or self._problem.rest
+        x_s, u_s = query.equilibrium or self._problem.equilibrium
         dx, dy, du = state - x_s, desired - self._problem.objective.C_r @ x_s, u_before - u_s
         c = self._linear.copy()
         c[: self._inputs] += terms.F_x @ dx + terms.F_y @ dy.ravel() + terms.F_d @ du - self._pull @ u_s
@@ -166,7 +177,7 @@ class Condensed:
         """The same in absolute states and inputs, with a model that changes."""
         assert query.steps is not None
         (A, B, c), (state, desired, u_before) = query.steps, query[:3]
-        rest, blank = query.rest or self._problem.rest, self._blank
+        rest, blank = query.equilibrium or self._problem.equilibrium, self._blank
         objective, rows, m = self._problem.objective, self._rows, self._inputs
         N, n, nu = B.shape
         (target, root_end, H, inputs), count, root = self._changing, len(rows.C), self._changing[0] @ objective.C_r
@@ -196,10 +207,10 @@ class Condensed:
         gradient[:nu] -= 2.0 * objective.move_weight @ u_before
         G, h_l, h_u = blank.G, blank.h_l, blank.h_u
         if count:
-            values = _row_values(rows, S)
+            values = _on_states(rows.C, rows.of_states, S)
             values[0, :, -1] -= rows.E @ u_before
             filled, known = np.array(blank.G, order="C"), values[:, :, m]
-            filled.reshape(N, count, -1)[:, :, :m] = values[:, :, :m]
+            filled.reshape(N, count, -1)[:, :, :m] = _with_inputs(values[:, :, :m], rows)
             G, h_l, h_u = np.asfortranarray(filled), (rows.lower - known).ravel(), (rows.upper - known).ravel()
         qp = replace(blank, P=P, c=gradient, G=G, h_l=h_l, h_u=h_u)
         return Posed(qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m])
@@ -235,14 +246,3 @@ def _root(weight: Array) -> Array | None:
     values, vectors = np.linalg.eigh(weight)
     there = values > 1e-14 * max(values[-1], 0.0)
     return (vectors[:, there] * np.sqrt(values[there])).T if there.any() else None
-
-
-def _row_values(rows: QPRows, S: Array) -> Array:
-    """(N, m, N nu + 1) of rows, of the states' slopes S (N + 1, n, N nu + 1) by the inputs and 1."""
-    N, nu = len(S) - 1, (S.shape[2] - 1) // (len(S) - 1)
-    values = (rows.C * rows.of_states[:, None]) @ S[1:] + (rows.C * ~rows.of_states[:, None]) @ S[:-1]
-    by_step = values[:, :, :-1].reshape(N, len(rows.C), N, nu)
-    by_step[range(N), :, range(N)] += rows.D + rows.E
-    by_step[range(1, N), :, range(N - 1)] -= rows.E
-    values[:, :, :-1] = by_step.reshape(N, len(rows.C), -1)
-    return values

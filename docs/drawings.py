@@ -1,0 +1,93 @@
+"""Drawings of the pages, made from the code that they explain: `python docs/drawings.py` writes docs/assets/*.svg."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from quadsim import load_vehicle
+
+ASSETS = Path(__file__).parent / "assets"
+INK, SOFT, FORWARD, TURN = "#3f51b5", "#8a94b8", "#d9534f", "#2e8b57"
+STYLE = "font: 13px sans-serif; fill: " + SOFT
+
+
+def svg(width: int, height: int, parts: list[str]) -> str:
+    """An image of these parts that has no background, for light and dark pages."""
+    marker = "".join(
+        f'<marker id="{name}" viewBox="0 0 8 8" refX="6" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+        f'<path d="M0 0 8 4 0 8z" fill="{colour}"/></marker>'
+        for name, colour in (("forward", FORWARD), ("turn", TURN), ("soft", SOFT), ("ink", INK))
+    )
+    lines = "\n".join(parts)
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}">\n'
+        f"<defs>{marker}</defs>\n{lines}\n</svg>\n"
+    )
+
+
+def text(x: float, y: float, words: str, anchor: str = "middle", colour: str = SOFT) -> str:
+    """Words at a point."""
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" style="{STYLE}; fill: {colour}">{words}</text>'
+
+
+def arrow(x1: float, y1: float, x2: float, y2: float, kind: str = "forward") -> str:
+    """A straight arrow."""
+    colour = {"forward": FORWARD, "turn": TURN, "soft": SOFT, "ink": INK}[kind]
+    ends = f'x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"'
+    return f'<line {ends} stroke="{colour}" stroke-width="2" marker-end="url(#{kind})"/>'
+
+
+def beam(x1: float, y1: float, x2: float, y2: float) -> str:
+    """An arm of a vehicle, or all of it from the side."""
+    ends = f'x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"'
+    return f'<line {ends} stroke="{INK}" stroke-width="4" opacity=".6"/>'
+
+
+def from_above(vehicle_name: str, cx: float, cy: float) -> list[str]:
+    """A vehicle from above, x up the page: rotors with their numbers and the sense in which they turn."""
+    vehicle = load_vehicle(vehicle_name)
+    parts = [arrow(cx, cy, cx, cy - 52), text(cx + 12, cy - 40, "x", colour=FORWARD)]
+    parts += [arrow(cx, cy, cx - 52, cy), text(cx - 42, cy - 8, "y", colour=FORWARD)]
+    for i, (azimuth, spin) in enumerate(zip(vehicle.rotor_azimuths, vehicle.rotor_spins, strict=True), 1):
+        angle = math.radians(azimuth)
+        x, y = cx - 95 * math.sin(angle), cy - 95 * math.cos(angle)
+        parts.append(beam(cx, cy, x, y))
+        parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="34" fill="none" stroke="{INK}" stroke-width="2"/>')
+        # A reaction torque about +z is that of a rotor which turns clockwise, seen from above.
+        sweep, (start, end) = (1, (-1, 1)) if spin > 0 else (0, (1, -1))
+        at = 24 * math.cos(math.radians(35)), 24 * math.sin(math.radians(35))
+        arc = f"M{x + start * at[0]:.1f} {y - at[1]:.1f} A24 24 0 0 {sweep} {x + end * at[0]:.1f} {y - at[1]:.1f}"
+        parts.append(f'<path d="{arc}" fill="none" stroke="{TURN}" stroke-width="2" marker-end="url(#turn)"/>')
+        parts.append(text(x + 11, y + 25, f"{i}", colour=INK))
+    return [*parts, text(cx, cy + 160, f"{vehicle.name}, from above")]
+
+
+def tilted(cx: float, cy: float, title: str, towards: str, side: int) -> list[str]:
+    """A vehicle from the side, tilted by a positive angle towards one side of the page."""
+    angle = math.radians(18) * side
+    dx, dy = 80 * math.cos(angle), 80 * math.sin(angle)
+    up = 70 * math.sin(angle), -70 * math.cos(angle)
+    return [
+        beam(cx - dx, cy - dy, cx + dx, cy + dy),
+        arrow(cx, cy, cx + up[0], cy + up[1], "turn"),
+        text(cx + up[0] * 1.2, cy + up[1] * 1.2, "thrust", colour=TURN),
+        arrow(cx + 40 * side, cy + 55, cx + 100 * side, cy + 55),
+        text(cx + 70 * side, cy + 75, towards, colour=FORWARD),
+        text(cx, cy + 96, title),
+    ]
+
+
+def frames() -> str:
+    """Body axes, rotor numbers and spins, and what a positive roll and pitch do."""
+    parts = [*from_above("lopes2011", 160, 160), *from_above("crazyflie2", 460, 160)]
+    parts += tilted(740, 95, "pitch above 0, from the right", "+x, forward", 1)
+    parts += tilted(740, 295, "roll above 0, from behind", "-y, to the right", 1)
+    return svg(880, 415, parts)
+
+
+DRAWINGS = {"frames.svg": frames}
+
+if __name__ == "__main__":
+    for name, draw in DRAWINGS.items():
+        (ASSETS / name).write_text(draw(), encoding="utf-8")

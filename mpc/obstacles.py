@@ -1,0 +1,253 @@
+"""Keeping clear of obstacles, and inside corridors and a fence, by half-spaces along the predicted positions.
+
+An obstacle's convex solid is avoided at each predicted instant by the plane through its nearest point to where
+the last plan was to be then, p_i, at distance d_i and with the outward normal n_i:
+
+    n_i . p >= n_i . p_i - d_i + r + m_i,
+
+r the radius of the vehicle's bounding ball and m_i the margin.  Where p_i is inside, d_i is negative and the
+plane is that of the nearest way out.  Behind the plane lies all of the solid, so that what satisfies the half-space
+keeps clear at that instant, wherever p_i was: the restriction is safe, and it is conservative.  A moving obstacle is
+where it will be at that instant.  Corridors and the fence are half-spaces themselves, and exact.
+
+The planes change with the plan, so that the QP is solved again along the new one, a few times per period at most
+(sequential convex programming; Schulman et al., 2014, "Motion planning with sequential convex optimization and convex
+collision checking").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Final, TypeAlias
+
+import numpy as np
+from annotated_types import Ge, Le, doc
+
+from mpc.constraints import Constraint, Penalty
+from mpc.ocp import Problem, Query, predicted
+from mpc.partial_condensing import PartiallyCondensed
+from mpc.solvers import Answer, Solver
+from mpc.solvers.piqp import PiqpMultistage
+from quadsim.controller import ACCEPTED
+from quadsim.fields import NonNegative
+from quadsim.space import AnyObstacle, Corridor, Fence, Obstacle, Solids
+from quadsim.state import POSITION, Array
+
+Shape: TypeAlias = AnyObstacle | Corridor | Fence
+
+LOOSE: Final = 1e3
+"""By how much [m] a half-space that is not in force is left open."""
+SOLVER: Final = "piqp-multistage"  # solves QPs with half-spaces, whatever solves those without
+ROUNDING: Final = 1e-6
+"""Violation of a half-space [m] that is taken for rounding."""
+NEAR: Final = 1e-2
+"""Distance from a half-space [m] within which a plan is taken to touch it."""
+SETTLED: Final = 1e-2
+"""Change of all predicted positions [m] below which planes are not recomputed in the same period."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AvoidanceSettings:
+    """How obstacles, corridors and the fence are enforced, and how closely."""
+
+    margin: Annotated[NonNegative, doc("[m] added: planes change from instant to instant")] = 0.05
+    rows: Annotated[
+        int,
+        Ge(1),
+        Le(50),
+        doc("[-] half-spaces per predicted instant that the QP has, the tightest; more where it takes more"),
+    ] = 6
+    iterations: Annotated[int, Ge(1), Le(50), doc("[-] QPs per period at most, each along the last one's plan")] = 3
+
+
+class Space:
+    """Obstacles and regions as half-spaces.
+
+    Args:
+        shapes: the obstacles and regions.
+        radius: of the vehicle's bounding ball [m].
+        period: from one predicted instant to the next [s].
+        horizon: N.
+        settings: see `AvoidanceSettings`.
+        margins: (N, 3) further ones along x, y, z at each predicted instant [m], as of a disturbance; None for none.
+        penalty: l1 [1/m] and l2 [1/m^2] of violating a half-space; None for hard ones.
+        largest: whether it is of the largest violation at each instant, instead of all.
+        positions: which of the states are x, y, z.
+    """
+
+    def __init__(
+        self,
+        shapes: Sequence[Shape],
+        *,
+        radius: float,
+        period: float,
+        horizon: int,
+        settings: AvoidanceSettings,
+        margins: Array | None = None,
+        penalty: tuple[float, float] | None = None,
+        positions: Sequence[int] = POSITION,
+        largest: bool = False,
+    ) -> None:
+        self._largest = largest
+        self.settings, self.penalty, self.period, self.positions = settings, penalty, period, list(positions)
+        self._shapes, self._distance = tuple(shapes), radius + settings.margin
+        self._margins = np.zeros((horizon, 3)) if margins is None else margins
+        self._solids = Solids([shape for shape in self._shapes if isinstance(shape, Obstacle)])
+        counts = [len(s.solids) if isinstance(s, Obstacle) else len(s.half_spaces[1]) for s in self._shapes]
+        places = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        self._names = np.repeat(np.array([shape.name for shape in self._shapes], str), counts)
+        self._of_solids = np.repeat(np.array([isinstance(s, Obstacle) for s in self._shapes], bool), counts)
+        shaped = zip(self._shapes, places, strict=False)
+        self._regions = [(shape, at) for shape, at in shaped if not isinstance(shape, Obstacle)]
+
+    def half_spaces(self, t: Array, positions: Array) -> tuple[Array, Array]:
+        """Normals (S, N, 3) and bounds (S, N) [m] of normal . p >= bound, at times (N,) along positions (N, 3)."""
+        normals, bounds = np.empty((len(self._names), len(t), 3)), np.empty((len(self._names), len(t)))
+        distance, normal = self._solids.clearances(t, positions)
+        normals[self._of_solids], bounds[self._of_solids] = normal, (normal * positions).sum(axis=2) - distance
+        for region, at in self._regions:
+            rows, upper = region.half_spaces
+            normals[at] = -rows[:, None, :]
+            # Also at the instants just before and after: what is between two of them is then inside as well.
+            in_force = (t > region.start - self.period) & (t < region.stop + self.period)
+            bounds[at] = np.where(in_force, -upper[:, None], (normals[at] * positions).sum(axis=2) - LOOSE)
+        return normals, bounds + self._distance + (np.abs(normals) * self._margins).sum(axis=2)
+
+    def constraint(self, normals: Array, bounds: Array, states: int, *, name: str = "space") -> Constraint:
+        """Half-spaces (m, N, 3), (m, N) as rows on so many states."""
+        C = np.zeros((bounds.shape[1], len(bounds), states))
+        C[:, :, self.positions] = normals.transpose(1, 0, 2)
+        lower, (l1, l2) = bounds.T, (0.0, 0.0) if self.penalty is None else self.penalty
+        penalty = Penalty(l1=np.full(len(bounds), l1), l2=np.full(len(bounds), l2), largest=self._largest)
+        return Constraint(
+            name=name,
+            lower=lower,
+            upper=np.full_like(lower, np.inf),
+            C=C,
+            penalty=None if self.penalty is None else penalty,
+        )
+
+    def constraints(self, normals: Array, bounds: Array, states: int) -> tuple[Constraint, ...]:
+        """All half-spaces, one constraint per obstacle or region, by its name."""
+        found = []
+        for shape in self._shapes:
+            at = self._names == shape.name
+            found.append(self.constraint(normals[at], bounds[at], states, name=_titled(shape)))
+        return tuple(found)
+
+
+def _titled(shape: Shape) -> str:
+    kind = "obstacle" if isinstance(shape, Obstacle) else "corridor" if isinstance(shape, Corridor) else ""
+    return f"{kind} {shape.name}".strip()
+
+
+class ObstacleQP:
+    """A solver's optimum where it keeps all half-spaces, and else the optimum with them.
+
+    The optimum of fewer constraints that satisfies all is the optimum: so is the solver's wherever the way is clear.
+    Where it is not, the whole QP is solved with the tightest half-spaces of each instant, and with twice as many as
+    long as the plan violates one that was left out.
+
+    The problem and its solver know no half-spaces; queries of a `changing` one have steps of their own.
+    """
+
+    def __init__(self, problem: Problem, solver: Solver, space: Space, *, changing: bool = False) -> None:
+        self.problem, self._solver, self._space = problem, solver, space
+        self._changing = changing
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last plan."""
+        self._forms: dict[int, tuple[PartiallyCondensed, PiqpMultistage]] = {}
+        self._last: Array | None = None
+
+    def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> tuple[Answer, Problem]:
+        """The optimum for a query, with its `Answer.states`, and the problem that it is of.
+
+        Args:
+            time: of its x(k) [s].
+            query: the state, reference and last input.
+            yaw: by which the states' axes x and y are turned from the world's [rad].
+            along: (N, 3) positions of the plan that planes are made along [m]; where absent, those of the last optimum,
+                moved on by an instant.
+        """
+        turn = np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+        t = time + self._space.period * np.arange(1, self.problem.horizon + 1, dtype=np.float64)
+        last, self._last = self._last, None
+        problem, among = self.problem, False
+        if self._changing and along is not None:
+            # Where the last plan touched half-spaces, this one is all but sure to: it is sought among them at once.
+            among = bool((_room(*self._space.half_spaces(t, along), along) < NEAR).any())
+        if along is None or not among:
+            answer = self._solver.solve(query)
+            if answer.status not in ACCEPTED:
+                return answer, problem
+            answer, planned = self._predicted(query, answer, turn)
+            if along is None:
+                along = planned if last is None else np.concatenate([last[1:], 2.0 * last[-1:] - last[-2:-1]])
+        else:
+            planned = along
+        for i in range(self._space.settings.iterations):
+            normals, bounds = self._space.half_spaces(t, along)
+            room = _room(normals, bounds, planned)
+            if (room >= -ROUNDING).all() and not (among and i == 0):
+                break
+            answer, problem, planned = self._whole(query, normals, bounds, room, turn)
+            if answer.status not in ACCEPTED:
+                named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
+                constraints = (*self.problem.constraints, *named)
+                return answer, replace(problem, constraints=constraints)
+            if np.abs(planned - along).max() < SETTLED:
+                break
+            along = planned
+        self._last = planned
+        return answer, problem
+
+    def _predicted(self, query: Query, answer: Answer, turn: Array) -> tuple[Answer, Array]:
+        """The answer with its states, and their positions in the world (N, 3)."""
+        states = predicted(self.problem, query, answer.plan)
+        return answer._replace(states=states), states[:, self._space.positions] @ turn
+
+    def _posed(self, normals: Array, bounds: Array) -> Problem:
+        """The problem with chosen half-spaces (m, N, 3), (m, N) in the states' axes."""
+        added = self._space.constraint(normals, bounds, self.problem.model.n)
+        return replace(self.problem, constraints=(*self.problem.constraints, added))
+
+    def _whole(
+        self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array
+    ) -> tuple[Answer, Problem, Array]:
+        """The optimum with half-spaces of the world, and its positions; `room` (S, N) gives the tightest."""
+        count = self._space.settings.rows
+        while True:
+            at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
+            problem = self._posed(normals[at] @ turn.T, bounds[at])
+            form, backend = self._form(len(at[0]))
+            qp = form.pose(query, problem).qp
+            answer = Answer.of(form, qp, backend.solve(qp), SOLVER)
+            if answer.status not in ACCEPTED:
+                return answer, problem, np.empty(0)
+            answer, planned = self._predicted(query, answer, turn)
+            room = _room(normals, bounds, planned)
+            violated = room < -ROUNDING
+            violated[at] = False
+            if not violated.any():
+                return answer, problem, planned
+            room[at] = -LOOSE  # what was there stays
+            count *= 2
+
+    def _form(self, count: int) -> tuple[PartiallyCondensed, PiqpMultistage]:
+        """The QP with so many half-spaces at each instant, and what solves it."""
+        if count not in self._forms:
+            normals = np.full((count, self.problem.horizon, 3), 3.0**-0.5)  # in general position
+            form = PartiallyCondensed(self._posed(normals, np.zeros(normals.shape[:2])), changing=self._changing)
+            backend = PiqpMultistage(changing=True)
+            backend.setup(form.qp)
+            self._forms[count] = form, backend
+        return self._forms[count]
+
+
+def _room(normals: Array, bounds: Array, positions: Array) -> Array:
+    """(S, N) how far positions (N, 3) are inside half-spaces [m]."""
+    return np.asarray((normals * positions).sum(axis=2) - bounds)

@@ -1,1 +1,0 @@
-"""The optimisation as the paper prints it, condensed to the inputs alone.  Eqs. (2)-(29)."""
