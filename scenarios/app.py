@@ -20,7 +20,7 @@ from cyclopts import App, Parameter
 from quadsim import __version__
 from quadsim.assets import vehicle_names
 from quadsim.errors import FileError, InputError, OutputError, ParameterError
-from scenarios import shipped
+from scenarios.catalogue import campaign_names, paper_names, scenario_names, tuning_names
 
 if TYPE_CHECKING:
     from quadsim.controller import Controller
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
     from scenarios.campaign.sweep import Sweep
     from scenarios.catalogue import Catalogue
-    from scenarios.comparison import Comparison
     from scenarios.design.vehicle_figures import VehicleReport
     from scenarios.flight import Flight
+    from scenarios.flight_comparison import FlightComparison
     from scenarios.papers.reproduction import Reproductions
     from scenarios.progress import Progress
     from scenarios.reaudit import Reaudit
@@ -72,13 +72,13 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
             raise ValueError(f"must be a whole number; got {text!r:.100}")
         return int(text)
 
-    CampaignComparison = CampaignResult = Catalogue = Comparison = Document = Flight = Listing = Reaudit = Any
+    CampaignComparison = CampaignResult = Catalogue = FlightComparison = Document = Flight = Listing = Reaudit = Any
     Replay = Reproductions = ScenarioFile = TuningResult = VehicleReport = Any
     File = Path
     VehicleName = _one_of(vehicle_names)
-    Target = ScenarioName = _one_of(shipped.scenario_names)
-    CampaignName, PaperName = _one_of(shipped.campaign_names), _one_of(shipped.paper_names)
-    TuningName = _one_of(shipped.tuning_names)
+    Target = ScenarioName = _one_of(scenario_names)
+    CampaignName, PaperName = _one_of(campaign_names), _one_of(paper_names)
+    TuningName = _one_of(tuning_names)
     Changes = Annotated[Sequence[str], Parameter(name="--set")]
     Whole = Annotated[int, Parameter(converter=_whole)]
     Flag = Annotated[bool, Parameter(negative="")]
@@ -438,7 +438,7 @@ def compare(
     overwrite: Flag = False,
     markdown: Flag = False,
     progress: Watched = True,
-) -> Comparison | CampaignComparison | Document:
+) -> FlightComparison | CampaignComparison | Document:
     """Flights, or two campaigns flight by flight, side by side: table, figures, HTML page.
 
     Args:
@@ -460,14 +460,14 @@ def compare(
         True
     """
     from quadsim.outputs import absolute
-    from scenarios.comparison import compare_campaigns, compare_flights, is_campaign
+    from scenarios.flight_comparison import compare_campaigns, compare_flights, is_campaign
     from scenarios.progress import reporting
     from scenarios.results import Document
 
     if not targets:
         raise InputError("compare needs runs, scenarios, or two campaigns")
     page = None if out is None else absolute(out)
-    compared: Comparison | CampaignComparison
+    compared: FlightComparison | CampaignComparison
     if any(isinstance(target, str | Path) and is_campaign(Path(target)) for target in targets):
         compared = compare_campaigns([Path(str(target)) for target in targets], page, overwrite=overwrite)
     else:
@@ -929,7 +929,7 @@ def reproduce(
     from scenarios.progress import reporting
 
     file = None if junit is None else junit_file(junit)
-    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else shipped.paper_names())]
+    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
     with reporting(progress) as report:
         found = Reproductions(reproduce_paper(each, report) for each in papers)
     if file is not None:
@@ -1040,7 +1040,7 @@ def scenario(
     for option, value in choice.items():
         raise ParameterError("", "--course" if option == "course" else "--controller", value, "given with --for alone")
     if name is None:
-        names = ", ".join(shipped.scenario_names())
+        names = ", ".join(scenario_names())
         raise InputError(f"scenario needs a name or a TOML file, or --schema (there are: {names})")
     whole = loading.assemble(name, changes, seed).resolved.scenario
     if isinstance(whole.reference, Csv):  # another table may take the place of its own
@@ -1167,7 +1167,7 @@ def doctor() -> Listing:
         >>> sorted(found)
         ['machine', 'packages', 'rendering', 'solvers', 'viewer']
     """
+    from scenarios.machine import capabilities
     from scenarios.results import Listing
-    from scenarios.self_check import doctor as check_machine
 
-    return Listing(check_machine())
+    return Listing(capabilities())

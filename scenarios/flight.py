@@ -139,7 +139,7 @@ class Flight(Result):
             return self.recorded.get("diagnosis")
         if self.unanswered is None or (self.unanswered.status == NOT_CONVERGED and self.satisfied):
             return None
-        from scenarios.diagnosis import diagnose
+        from scenarios.infeasibility import diagnose
 
         spec = self.scenario.controller_at(self.unanswered.time)
         posed = self.scenario.model_copy(update={"controller": spec, "events": []})

@@ -9,12 +9,12 @@ from typing import Any
 
 from quadsim.errors import FileError, InputError
 from scenarios.assembly import Assembly
+from scenarios.catalogue import LIBRARY, scenario_path
 from scenarios.courses.csv_course import Csv
 from scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import apply_setting
-from scenarios.shipped import LIBRARY, scenario_path
 
 
 def load_scenario(

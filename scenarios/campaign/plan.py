@@ -18,13 +18,13 @@ from scenarios.campaign.draws import Draws
 from scenarios.campaign.results.events import Event, parse_event
 from scenarios.campaign.results.table import DRAW, TIMES, Row, make_schema
 from scenarios.campaign.spec import CampaignSpec, Value, VaryBase
+from scenarios.catalogue import campaign_path, scenario_path
 from scenarios.loading import parse_scenario
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import NOT_DESCRIBED, apply_setting, differences, get_field, note_changes, set_field
-from scenarios.shipped import campaign_path, scenario_path
 
 FIRST: Final = 5  # flights of which one at least has to be possible
 Change = tuple[VaryBase, Value]

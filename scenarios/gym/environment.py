@@ -24,6 +24,7 @@ from quadsim.sim.loop import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.campaign.plan import Plan, make_plan, read_campaign
+from scenarios.catalogue import scenario_names, scenario_path
 from scenarios.flight import Flight
 from scenarios.gym.spaces import USUAL, Action, Actions, Observations
 from scenarios.loading import load_scenario, parse_scenario
@@ -31,7 +32,6 @@ from scenarios.rollout import Rollout
 from scenarios.schema.base import LARGEST_SEED
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import scenario_names, scenario_path
 
 Reward = Callable[[Array, Array, Array], float]
 """From the true state (12,) after a step, the reference (4,) there, and the rotor speeds commanded (4,) [rad/s]."""

@@ -11,6 +11,7 @@ from typing import Any
 
 from scenarios import console
 from scenarios.app import run_directory
+from scenarios.catalogue import scenario_names
 from scenarios.live.guard import LOOPBACK
 from scenarios.live.pacing import Pace
 from scenarios.live.session import Session, read_script
@@ -18,7 +19,6 @@ from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Document
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import scenario_names
 
 
 def fly_live(

@@ -11,12 +11,12 @@ from pydantic import Field, ValidationError, model_validator
 from quadsim.assets import read_toml
 from quadsim.fields import NonNegative, Number, Positive
 from scenarios.assembly import Assembly
+from scenarios.catalogue import paper_path, scenario_path
 from scenarios.loading import parse_scenario
 from scenarios.schema.base import MOST_ENTRIES, Pair, Spec
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import paper_path, scenario_path
 
 Text = Annotated[str, Field(min_length=1, max_length=300)]
 

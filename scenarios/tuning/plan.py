@@ -31,13 +31,13 @@ from scenarios.campaign.results.events import Event, is_number, parse_event
 from scenarios.campaign.results.table import Row
 from scenarios.campaign.spec import CampaignSpec, Value, VaryBase, check_fields
 from scenarios.campaign.statistics.requirement import Requirement, parse_requirement
+from scenarios.catalogue import tuning_path
 from scenarios.loading import parse_scenario
 from scenarios.schema.bases import merge
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
 from scenarios.schema.writing import to_toml
-from scenarios.shipped import tuning_path
 from scenarios.tuning.objective import value_of
 from scenarios.tuning.spec import TuningSpec
 

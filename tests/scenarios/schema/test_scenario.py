@@ -16,10 +16,10 @@ from support import scenario_table
 from quadsim.assets import vehicle_path
 from quadsim.errors import UnknownNameError
 from scenarios.assembly import Assembly
+from scenarios.catalogue import LIBRARY
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import LIBRARY
 
 
 def reread(scenario: Scenario) -> Scenario:

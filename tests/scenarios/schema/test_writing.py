@@ -9,10 +9,10 @@ import pytest
 from support import scenario_table
 
 from scenarios.assembly import Assembly
+from scenarios.catalogue import scenario_names
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import is_absent
-from scenarios.shipped import scenario_names
 
 
 def present(value: Any) -> Any:

@@ -27,13 +27,13 @@ from quadsim.errors import PlanExhaustedError
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
 from scenarios.assembly import Assembly
-from scenarios.diagnosis import diagnose
+from scenarios.catalogue import scenario_path
 from scenarios.flight import Flight
+from scenarios.infeasibility import diagnose
 from scenarios.loading import load_scenario
 from scenarios.parts.controllers import make_controller
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
-from scenarios.shipped import scenario_path
 
 TILTED = make_state(euler=(math.radians(20.0), 0.0, 0.0))
 FENCE = '{ name = "fence", of = ["x", "y"], rows = [[1.0, 1.0]], upper = [6.8] }'
