@@ -19,8 +19,8 @@ from mpc.solvers import CORE_OR_PIQP
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import filled
-from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
 from quadsim.flight.metrics import CourseStep
+from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.computation import Computation, ComputationTime, Stall
 from quadsim.sim.effects import LOADING, Change, Effects, Force, Push, PushChange
@@ -28,11 +28,10 @@ from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics, RotorLoss
 from quadsim.sim.effects.wind import Air, Gust, WindChange, WindField
 from quadsim.sim.navigation import Navigation
-from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.physics import physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.sim.rigid_body import check_free
-from quadsim.sim.sensing.sensor import AXES, FaultKind, Sensor, SensorFault, SensorName
+from quadsim.sim.sensing import AXES, FaultKind, Sensor, SensorFault, SensorName
 from quadsim.space import Corridor, Fence, Region
 from quadsim.state import POSITION, REFERENCE_NAMES, Array, make_state
 from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle

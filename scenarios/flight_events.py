@@ -28,7 +28,7 @@ from quadsim.sim.effects.wind import Air, Gust, WindChange
 from quadsim.sim.loop import ClosedLoop
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
-from quadsim.sim.sensing.sensor import SensorName
+from quadsim.sim.sensing import SensorName
 from scenarios.schema.base import Spec
 from scenarios.schema.controller import ControllerSpec, changed
 from scenarios.schema.events import (
