@@ -83,7 +83,7 @@ class Catalogue(Result):
             for group in get_args(Group)
             if (
                 lines := {
-                    n: each.description + _MEANT.get(each.expect, "") for n, each in shipped if each.group == group
+                    n: entry.description + _MEANT.get(entry.expect, "") for n, entry in shipped if entry.group == group
                 }
             )
         }
@@ -94,7 +94,7 @@ class Catalogue(Result):
         """As plain values, those of scenarios by their field."""
         shipped = self.scenarios.items()
         columns = {"scenarios": "description", "groups": "group", "expected": "expect"}
-        by_field = {title: {name: getattr(each, field) for name, each in shipped} for title, field in columns.items()}
+        by_field = {title: {name: getattr(entry, field) for name, entry in shipped} for title, field in columns.items()}
         return {**by_field, **{title: value for title, value in asdict(self).items() if title != "scenarios"}}
 
 

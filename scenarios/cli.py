@@ -45,9 +45,9 @@ def _parse(
 def _show(result: object, json: bool) -> int:
     """Print a result; returns its exit status."""
     if isinstance(result, Path):
-        from scenarios.console import shown
+        from scenarios.console import short_path
 
-        result = Document(f"written to {printable(shown(result))}\n", str(result))
+        result = Document(f"written to {printable(short_path(result))}\n", str(result))
     if not isinstance(result, Result):
         return 0
     if json:

@@ -191,15 +191,15 @@ class Flight(Result):
         """
         plant, t = self.log.plant, self.time
         starts = np.minimum(np.searchsorted(plant.t, t - 1e-9), max(plant.t.size - 1, 0))
-        found: dict[str, Array] = {}
+        margins: dict[str, Array] = {}
         for finding in self.findings:
             limit, signal = finding.limit, finding.limit.source
             if signal.plant is None or not t.size:
-                found[limit.name] = margins_sampled(limit, self.log)
+                margins[limit.name] = margins_sampled(limit, self.log)
             else:
                 between = margins_at(limit, plant.t, signal.plant(plant))
-                found[limit.name] = np.fmin.reduceat(between, starts)
-        return found
+                margins[limit.name] = np.fmin.reduceat(between, starts)
+        return margins
 
     @cached_property
     def summary(self) -> Mapping[str, Any]:
@@ -209,8 +209,10 @@ class Flight(Result):
     @cached_property
     def metrics(self) -> dict[str, float]:
         """The flight's numbers by name, e.g. `rmse.x`, `speed_max`, `step_ms.p99`; units as in `summary`."""
-        found = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self.summary[name]))
-        return {name: value for name, value in found if isinstance(value, int | float) and not isinstance(value, bool)}
+        numbers = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self.summary[name]))
+        return {
+            name: value for name, value in numbers if isinstance(value, int | float) and not isinstance(value, bool)
+        }
 
     @property
     def run(self) -> rundir.Run:

@@ -64,7 +64,7 @@ class FlightComparison(Result):
         ]
         yield console.table("comparison", ["", *self.names], lines)
         if self.page is not None:
-            yield console.styled("every number, plots and films: ", (console.shown(self.page), "bold"))
+            yield console.styled("every number, plots and films: ", (console.short_path(self.page), "bold"))
 
     def to_json(self) -> list[dict[str, Any]]:
         """A row per quantity, with a text for each flight."""

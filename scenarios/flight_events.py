@@ -216,13 +216,13 @@ class FlightEvents:
 
     def first_unanswered(self) -> InfeasiblePeriod | None:
         """Of all controllers so far: the first QP without an answer, or else the first SQP that did not converge."""
-        found = [each for each in (self.unanswered, unanswered_by(self._loop.controller)) if each is not None]
-        return min(found, key=lambda each: each.converges is not None, default=None)
+        periods = [period for period in (self.unanswered, unanswered_by(self._loop.controller)) if period is not None]
+        return min(periods, key=lambda period: period.converges is not None, default=None)
 
     def _switch(self, spec: ControllerSpec, ready: Successor | None) -> None:
-        found = ready if ready is not None and ready.spec == spec else self._built(spec)
+        successor = ready if ready is not None and ready.spec == spec else self._built(spec)
         self.unanswered = self.first_unanswered()
-        self._loop.switch(found.controller)
+        self._loop.switch(successor.controller)
         self._spec = spec
         self._loop.computation = self.assembly.computation(spec)
 
@@ -230,9 +230,9 @@ class FlightEvents:
         """Schedule a change of the controller, once it and later ones of the file are known to be possible."""
         specs = [spec for at, spec in scenario.controller_changes if at >= event.at]
         before = sum(at == event.at for at, _ in self.scenario.controller_changes)
-        found, *later = specs[before:]
-        if ready is None or ready.spec != found:
-            ready = self._built(found)
+        succeeding, *later = specs[before:]
+        if ready is None or ready.spec != succeeding:
+            ready = self._built(succeeding)
         for spec in later:
             self._built(spec)
         self._schedule(event, ready)
@@ -245,8 +245,8 @@ class FlightEvents:
 
 def unanswered_by(controller: Controller) -> InfeasiblePeriod | None:
     """The first period whose QP had no answer; None where all had, or there is none."""
-    found = getattr(controller, "unanswered", None)  # a controller of another kind has none
-    return found if isinstance(found, InfeasiblePeriod) else None
+    period = getattr(controller, "unanswered", None)  # a controller of another kind has none
+    return period if isinstance(period, InfeasiblePeriod) else None
 
 
 def _lasting(event: Event) -> float:

@@ -47,17 +47,17 @@ def with_bounds_stated(assembly: Assembly) -> Scenario:
 
 def controller_bounds(spec: ControllerSpec, vehicle: Vehicle) -> dict[str, Range]:
     """The bounds that a controller has on signals of the audit, hard or soft, in their units."""
-    found: dict[str, Range] = {name: (pair[0], pair[1]) for name, pair in getattr(spec, "output_bounds", {}).items()}
+    bounds: dict[str, Range] = {name: (pair[0], pair[1]) for name, pair in getattr(spec, "output_bounds", {}).items()}
     if isinstance(spec, NonlinearSpec) and spec.tilt is not None:
-        found["tilt"] = (-math.inf, spec.tilt)
+        bounds["tilt"] = (-math.inf, spec.tilt)
     if isinstance(spec, NonlinearSpec) and spec.body_rate is not None:
         largest = spec.body_rate if isinstance(spec.body_rate, list) else [spec.body_rate] * 3
-        found |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", largest, strict=True)}
+        bounds |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", largest, strict=True)}
     inputs = getattr(spec, "input_bounds", None)
     if inputs is not None:
         pairs = {"speed": inputs.speed or (vehicle.speed_min, vehicle.speed_max), "slew": inputs.slew}
-        found |= {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
-    return found
+        bounds |= {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
+    return bounds
 
 
 def audit_notes(assembly: Assembly) -> list[str]:

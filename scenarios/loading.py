@@ -68,15 +68,15 @@ def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data
     """Why fields of a table are missing, or are too many: another type was requested than `read` from the file."""
     unfit = (problem for problem in problems if problem.endswith(" is missing") or " is not a field of " in problem)
     wrong = {problem.partition(".")[0] for problem in unfit}
-    given = retyped(read, data)
-    for name, before in given.items():
+    types_before = retyped(read, data)
+    for name, before in types_before.items():
         if name in wrong:
             changed = f"--set changed its type from {before!r} to {data[name]['type']!r}, and all other fields stayed"
             base = path.stem if path.parent == LIBRARY else path.name
             yield f'{name}: {changed}; a file with base = "{base}" and a whole [{name}] replaces them'
     missing = {problem.partition(".")[0] for problem in problems if problem.endswith(" is missing")}
     for name, before in replaced_tables(path, scenario_path).items():
-        if name in missing - {*given}:
+        if name in missing - {*types_before}:
             yield f"{name}: of another type than that of its base ({before}), it replaces it whole and inherits nothing"
 
 

@@ -149,8 +149,8 @@ def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> 
 
 def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     """Files in a run's directory that its summary does not list, sorted."""
-    found = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
-    return sorted(found - {rundir.SUMMARY_FILE, *summary["files"]})
+    files = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
+    return sorted(files - {rundir.SUMMARY_FILE, *summary["files"]})
 
 
 def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:

@@ -202,7 +202,7 @@ def fly_live(
             nonlocal replaced
             session.flight().save(directory, overwrite=replaced, video=video)
             replaced = True  # the next time it is this session's own
-            return console.shown(directory)
+            return console.short_path(directory)
 
         try:
             while onward and session.reason is None and session.k < scenario.periods:
