@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from tuning_formula import TUNING, write_tuning
 
 from quadsim.errors import InputError
+from scenarios.catalogue import tuning_names
 from scenarios.cli import main
-from scenarios.shipped import tuning_names
 from scenarios.tuning.tuning_plan import load_tuning, value_of
 
 
