@@ -462,10 +462,7 @@ def _frozen(value: Any) -> Any:
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
-def footprint(solid: Solid, low: float, high: float) -> Array | None:
-    """(n, 2) outline from above of a solid that reaches between two heights, relative to its obstacle; None: not."""
-    bottom, top = solid.support(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))[:, 2]
-    if bottom > high or top < low:
-        return None
+def footprint(solid: Solid) -> Array:
+    """(n, 2) outline of a solid from above, relative to its obstacle."""
     around = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
     return solid.support(np.stack([np.cos(around), np.sin(around), np.zeros(around.size)], axis=1))[:, :2]

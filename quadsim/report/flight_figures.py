@@ -195,7 +195,7 @@ def space(run: Run) -> list[Figure]:
         t, values = clearances[obstacle.name]
         near = t[values < _NEAR]
         for instant in np.arange(near[0], near[-1], _EVERY) if obstacle.moves and near.size else [0.0]:
-            for outline, _ in outlines(obstacle, instant, 0.0, np.inf):
+            for outline in outlines(obstacle, instant):
                 opacity = 0.3 if obstacle.moves else 0.55
                 areas.append(Area(outline=outline, colour=OBSTACLE, opacity=opacity, label="obstacle"))
     regions = [
