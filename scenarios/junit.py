@@ -14,8 +14,8 @@ from quadsim.report.comparison import failure_sentences
 from quadsim.report.table import format_number
 
 if TYPE_CHECKING:
-    from scenarios.campaign.run import CampaignResult
-    from scenarios.campaign.statistics.requirement import Judgement
+    from scenarios.campaign.campaign import CampaignResult
+    from scenarios.campaign.statistics import Judgement
     from scenarios.papers.reproduction import Reproduction
     from scenarios.reaudit import Reaudit
 
