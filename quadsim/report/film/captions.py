@@ -63,6 +63,7 @@ class Overlay:
 
         longest = max(text_width(text, size, scale=self._scale) for text, size, _ in lines)
         shade(frame, 16, 16, 24 + longest, 14 + 27 * len(lines), scale=self._scale)
+        shade(frame, self._width - 246, 16, 230, 30, scale=self._scale)
         shade(frame, 0, strip, self._width, _STRIP, scale=self._scale)
 
         image = Image.fromarray(frame)
