@@ -26,13 +26,11 @@ if TYPE_CHECKING:
     from quadsim.controller import Controller
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
-    from scenarios.campaign.replay import Replay
-    from scenarios.campaign.run import CampaignResult
-    from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
-    from scenarios.campaign.sweep import Sweep
+    from scenarios.campaign.campaign import CampaignResult, Replay, Sweep
+    from scenarios.campaign.paired import Comparison as CampaignComparison
     from scenarios.catalogue import Catalogue
     from scenarios.comparison import Comparison
-    from scenarios.design.vehicle_figures import VehicleReport
+    from scenarios.design.vehicle_report import VehicleReport
     from scenarios.flight import Flight
     from scenarios.papers.reproduction import Reproductions
     from scenarios.progress import Progress
@@ -40,7 +38,7 @@ if TYPE_CHECKING:
     from scenarios.results import Document, Listing, ScenarioFile
     from scenarios.rollout import Rollout
     from scenarios.schema.scenario import Scenario
-    from scenarios.tuning.run import TuningResult
+    from scenarios.tuning.tuning import TuningResult
 
     File: TypeAlias = str | Path
     PaperName: TypeAlias = File
@@ -353,7 +351,7 @@ def read(directory: str | Path) -> Flight:
         (True, 'satisfied')
     """
     from quadsim.flight import rundir
-    from quadsim.flight.summary import finding_from_json
+    from quadsim.flight.rundir import finding_from_json
     from quadsim.vehicle import Vehicle
     from scenarios.flight import Flight
     from scenarios.reaudit import stored_scenario
@@ -410,7 +408,7 @@ def check(
         (True, ())
     """
     from scenarios import loading, reaudit
-    from scenarios.campaign.manifest import is_campaign
+    from scenarios.campaign.store import is_campaign
     from scenarios.junit import junit_file, write_junit
 
     file = None if junit is None else junit_file(junit)
@@ -564,7 +562,7 @@ def view(run: File, /, *, web: Flag = False) -> None:
         runs/not-flown-yet: no such run or recording
     """
     from quadsim.flight import rundir
-    from quadsim.flight.summary import require_inside
+    from quadsim.flight.rundir import require_inside
     from quadsim.report.recording import open_viewer
 
     path = Path(run)
@@ -617,7 +615,7 @@ def live(
         Traceback (most recent call last):
         quadsim.errors.ParameterError: --port must be from 1 to 65535, or 0 for any that is free; got 70000
     """
-    from scenarios.live.serve import fly_live
+    from scenarios.live.serving import fly_live
     from scenarios.loading import as_scenario
     from scenarios.reaudit import reaudit, stored_scenario
 
@@ -668,7 +666,7 @@ def sweep(
         >>> found["controller.horizon"].tolist(), found["verdict"].tolist()
         ([20.0, 40.0], ['satisfied', 'satisfied'])
     """
-    from scenarios.campaign.sweep import fly_sweep
+    from scenarios.campaign.campaign import fly_sweep
     from scenarios.loading import as_scenario
     from scenarios.progress import reporting
     from scenarios.user_code import importable
@@ -740,10 +738,10 @@ def campaign(
         >>> found.table["verdict"].to_pylist()
         ['satisfied', 'satisfied', 'satisfied']
     """
+    from scenarios.campaign.campaign import fly_campaign
+    from scenarios.campaign.events import parse_event
     from scenarios.campaign.plan import load_plan, make_plan
-    from scenarios.campaign.results.events import parse_event
-    from scenarios.campaign.run import fly_campaign
-    from scenarios.campaign.statistics.requirement import judge, parse_requirement
+    from scenarios.campaign.statistics import judge, parse_requirement
     from scenarios.junit import junit_file, write_junit
     from scenarios.schema.scenario import Scenario
     from scenarios.user_code import importable
@@ -813,7 +811,7 @@ def replay(
         Traceback (most recent call last):
         quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
     """
-    from scenarios.campaign.replay import held_against, recorded_flight
+    from scenarios.campaign.campaign import held_against, recorded_flight
     from scenarios.flight import require_rendering
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
@@ -878,9 +876,9 @@ def tune(
         Traceback (most recent call last):
         quadsim.errors.ParameterError: --workers must be 1 or more; got 0
     """
-    from scenarios.tuning.plan import load_tuning
-    from scenarios.tuning.run import tune as carry_out
     from scenarios.tuning.search import require_optuna
+    from scenarios.tuning.tuning import tune as carry_out
+    from scenarios.tuning.tuning_plan import load_tuning
 
     require_optuna()
     plan = load_tuning(str(tuning), trials=trials, seed=seed)
@@ -929,8 +927,7 @@ def reproduce(
         (True, 250.0, 250.0)
     """
     from scenarios.junit import junit_file, write_junit
-    from scenarios.papers.paper import load_paper
-    from scenarios.papers.reproduction import Reproductions, reproduce_paper
+    from scenarios.papers.reproduction import Reproductions, load_paper, reproduce_paper
     from scenarios.progress import reporting
 
     file = None if junit is None else junit_file(junit)
@@ -1094,7 +1091,7 @@ def vehicle_report(
     from quadsim.report.film.video import render_portrait
     from quadsim.vehicle import vehicle_sources
     from scenarios import loading, results
-    from scenarios.design import shortfalls, vehicle_figures
+    from scenarios.design import shortfalls, vehicle_report
 
     if template:
         return results.Document((Path(__file__).parent / "design/vehicle_template.toml").read_text(encoding="utf-8"))
@@ -1107,10 +1104,10 @@ def vehicle_report(
         if Path(out).suffix != ".png":
             raise ParameterError("", "--out", str(out), "a file ending in .png")
         render_portrait(loaded, Path(out), overwrite=overwrite)
-    return vehicle_figures.VehicleReport(
+    return vehicle_report.VehicleReport(
         vehicle=loaded,
         sources=vehicle_sources(vehicle_path(str(name))),
-        figures=vehicle_figures.make_sheet(loaded),
+        figures=vehicle_report.make_sheet(loaded),
         scenario=None if against is None else against.name,
         shortfalls=None if against is None else shortfalls.shortfalls(against, loaded),
         picture=None if out is None else Path(out),

@@ -14,8 +14,8 @@ from quadsim.errors import InputError
 from quadsim.flight import rundir
 from quadsim.outputs import reserving
 from quadsim.report.table import Row
-from scenarios.campaign.manifest import is_campaign as is_campaign
-from scenarios.campaign.manifest import stored_plan
+from scenarios.campaign.store import is_campaign as is_campaign
+from scenarios.campaign.store import stored_plan
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
@@ -25,7 +25,7 @@ from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
-    from scenarios.campaign.statistics.comparison import Comparison as CampaignComparison
+    from scenarios.campaign.paired import Comparison as CampaignComparison
 
 _log: Final = logging.getLogger("quadsim")
 _BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "answered by", "statuses", "whole step, m")
@@ -143,10 +143,9 @@ def compare_campaigns(
         InputError: they are not two finished campaigns.
         OutputError: the directory cannot be written.
     """
+    from scenarios.campaign.paired import compare
     from scenarios.campaign.plan import plan_differences
-    from scenarios.campaign.report.campaign_page import write_comparison_report
-    from scenarios.campaign.results.store import FLIGHTS_FILE, read_flights
-    from scenarios.campaign.statistics.comparison import compare
+    from scenarios.campaign.store import FLIGHTS_FILE, read_flights
 
     if len(directories) != 2:
         raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")
@@ -158,4 +157,4 @@ def compare_campaigns(
     comparison = compare(a, b, names, failures, plan_differences(*plans))
     if out is None:
         return comparison
-    return replace(comparison, page=write_comparison_report(comparison, out, overwrite=overwrite))
+    return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))

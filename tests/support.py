@@ -24,7 +24,7 @@ from quadsim.state import INDEX, N_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios import many
 from scenarios.build import build_problem
-from scenarios.campaign.results.table import Row
+from scenarios.campaign.rows import Row
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
 from scenarios.parts.vehicle import build_vehicle
@@ -46,7 +46,7 @@ def fly_here(patch: pytest.MonkeyPatch) -> None:
             except Exception as error:
                 yield place, {"verdict": many.ERROR, "reason": many.describe(error)}
 
-    for user in ("scenarios.many", "scenarios.campaign.pilot"):
+    for user in ("scenarios.many", "scenarios.campaign.plan"):
         patch.setattr(f"{user}.fly_many", fly_many)
 
 

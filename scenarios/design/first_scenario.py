@@ -15,7 +15,7 @@ from mpc.baselines.bandwidths import lag_to_allow_for
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.errors import UnknownNameError, printable
 from quadsim.vehicle import Vehicle
-from scenarios.design.tuning import (
+from scenarios.design.rules import (
     HEADING_RATIO,
     HEADING_STEP,
     HEIGHT_RATIO,
@@ -155,7 +155,7 @@ def _notes(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> str:
     option, what = "", "The loop's bandwidth for x and y"
     then = (
         f"Without bounds it tolerates {1e3 * delay_margin(vehicle, tuning):.3g} ms more delay than it knows of.\n"
-        "# Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: scenarios/design/tuning.py."
+        "# Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: scenarios/design/rules.py."
     )
     if law != "robust":
         option, what = f" --controller {law}", "The course is made for a robust MPC, whose bandwidth for x and y"

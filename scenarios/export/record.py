@@ -112,7 +112,7 @@ def _answers(
     if isinstance(law, UnconstrainedMPC):
         return np.zeros(len(queries), np.int64), _free_commands(law, queries)
     law.reset(speeds)
-    found: list[tuple[int, Array]] = []
+    answers: list[tuple[int, Array]] = []
     for k, (state, acting, reference) in enumerate(queries):
         answer = REFUSED, acting
         with contextlib.suppress(PlanExhaustedError):
@@ -122,8 +122,8 @@ def _answers(
                 answer = WAYS[law.answer.method], command.speeds
                 if command.answered_by not in (GAIN, CORE):
                     break
-        found.append(answer)
-    status, commands = zip(*found, strict=True)
+        answers.append(answer)
+    status, commands = zip(*answers, strict=True)
     return np.array(status), np.array(commands)
 
 

@@ -338,13 +338,13 @@ class Agent:
 
 def _margins(limits: Sequence[Limit], log: FlightLog, begin: int = 0) -> tuple[Array, Array]:
     """(m,) smallest margins of a log, from this row of the plant on, and at its end; inf where there is none."""
-    found = np.full((2, len(limits)), np.inf)
+    smallest = np.full((2, len(limits)), np.inf)
     for i, limit in enumerate(limits):
         t, values = limit.source.finest(log)
         margins = np.where(limit.holds_at(t), limit.margin(values), np.inf)[begin * (limit.source.plant is not None) :]
         if margins.size:
-            found[:, i] = margins.min(), margins[-1]
-    return found[0], found[1]
+            smallest[:, i] = margins.min(), margins[-1]
+    return smallest[0], smallest[1]
 
 
 def _varying(scenario: Scenario, campaign: str) -> Plan:

@@ -19,7 +19,7 @@ from quadsim.state import INDEX, N_STATES, make_state
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import authority
 from scenarios.design.first_scenario import SHARE, first_scenario, largest_eight
-from scenarios.design.tuning import FASTEST, PERIOD_SHARE, delay_margin, gain, is_stable, tune
+from scenarios.design.rules import FASTEST, PERIOD_SHARE, delay_margin, gain, is_stable, tune
 from scenarios.loading import parse_scenario
 from scenarios.parts.controllers import make_controller
 

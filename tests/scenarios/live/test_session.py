@@ -17,7 +17,7 @@ import scenarios.parts.live
 from quadsim.errors import InputError
 from scenarios.cli import main
 from scenarios.live.knobs import knobs
-from scenarios.live.pacing import LATE, Pace
+from scenarios.live.serving import LATE, Pace
 from scenarios.live.session import STRONGEST, Frame, Session, read_script
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT

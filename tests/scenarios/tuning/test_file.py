@@ -16,8 +16,7 @@ from tuning_formula import TUNING, write_tuning
 from quadsim.errors import InputError
 from scenarios.cli import main
 from scenarios.shipped import tuning_names
-from scenarios.tuning.objective import value_of
-from scenarios.tuning.plan import load_tuning
+from scenarios.tuning.tuning_plan import load_tuning, value_of
 
 
 def entry(**changes: Any) -> list[dict[str, Any]]:
