@@ -160,7 +160,7 @@ class DivergenceError(FlightError):
 
 
 class LostError(FlightError):
-    """The vehicle is beyond one of the flight's loss criteria; see `quadsim.sim.phase.CRITERIA`."""
+    """The vehicle is beyond one of the flight's loss criteria; see `quadsim.flight.phase.CRITERIA`."""
 
     def __init__(self, criterion: str, quantity: str, unit: str, *, value: float, limit: float, time: float) -> None:
         message = f"lost: {quantity} {value:.5g} {unit}, beyond lost.{criterion} = {limit:g} {unit}"

@@ -351,7 +351,7 @@ def read(directory: str | Path) -> Flight:
         (True, 'satisfied')
     """
     from quadsim.flight import rundir
-    from quadsim.flight.summary import finding_from_json
+    from quadsim.flight.rundir import finding_from_json
     from quadsim.vehicle import Vehicle
     from scenarios.flight import Flight
     from scenarios.reaudit import stored_scenario
@@ -562,7 +562,7 @@ def view(run: File, /, *, web: Flag = False) -> None:
         runs/not-flown-yet: no such run or recording
     """
     from quadsim.flight import rundir
-    from quadsim.flight.summary import require_inside
+    from quadsim.flight.rundir import require_inside
     from quadsim.report.recording import open_viewer
 
     path = Path(run)

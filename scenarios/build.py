@@ -8,9 +8,9 @@ from mpc.ocp import Problem
 from mpc.solvers import CORE_OR_PIQP
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
+from quadsim.flight.phase import PhaseMonitor
 from quadsim.sim.airframe import outline
 from quadsim.sim.effects import Force
-from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
 from quadsim.vehicle import Vehicle
 from scenarios.parts.controllers import make_controller, make_problem

@@ -22,11 +22,11 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import HELD, SIGNALS, Finding, margins_at, margins_sampled
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import log_tables, write_log
-from quadsim.flight.summary import limit_to_json
+from quadsim.flight.rundir import limit_to_json
 from quadsim.outputs import absolute, adding, amend, to_json, writing
 from quadsim.sim.airframe import outline
-from quadsim.sim.estimation.filter import Tally
-from quadsim.sim.sensing.sensor import SensorName
+from quadsim.sim.estimator import Tally
+from quadsim.sim.sensing import SensorName
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.feasibility_check import report

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from quadsim.errors import FileError, InputError, ParameterError
-from quadsim.flight.ground import AIRBORNE, TOUCH, clearance
+from quadsim.flight.phase import AIRBORNE, TOUCH, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.sim.rigid_body import check_free

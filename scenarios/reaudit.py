@@ -22,7 +22,7 @@ from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
-from quadsim.flight.summary import constraint_verdict, limit_to_json
+from quadsim.flight.rundir import constraint_verdict, limit_to_json
 from quadsim.report.comparison import verdict
 from quadsim.sim.effects.rotors import LagChange
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array

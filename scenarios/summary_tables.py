@@ -13,7 +13,7 @@ from rich.text import Text
 
 from quadsim.controller import OPTIMAL, Phase, counts, law_name
 from quadsim.flight.audit import HELD
-from quadsim.flight.summary import constraint_verdict, deciding_margin
+from quadsim.flight.rundir import constraint_verdict, deciding_margin
 from quadsim.report.comparison import (
     crash,
     event_sentences,

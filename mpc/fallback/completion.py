@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.equilibrium import Trim
-from mpc.fallback.hover import require_quadrotor
 from mpc.fallback.settings import by_group
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
@@ -92,13 +91,9 @@ class StateCompletion:
 
     Attributes:
         unseen: (12,) periods since each channel was last measured; infinite before it ever was.
-
-    Raises:
-        ParameterError: the model is not a quadrotor's.
     """
 
     def __init__(self, model: LinearModel) -> None:
-        require_quadrotor(model)
         self._model = model
         self._measured_covariance = read_only(np.diag(NOISE**2))
         self._process = read_only(_process_noise(model.period))

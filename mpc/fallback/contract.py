@@ -66,9 +66,6 @@ class Guarded:
     Attributes:
         inner: the controller called first; one that falls back by itself does no harm.
         law: what levels 1 to 3 are made of.
-
-    Raises:
-        ParameterError: the model is not a quadrotor's.
     """
 
     def __init__(

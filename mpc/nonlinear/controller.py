@@ -99,9 +99,6 @@ class NonlinearMPC:
         problem: the optimisation; its states and inputs are those of the module.
         unanswered: the first period since `reset` whose QP had no answer; where all had, the first whose plan had not
             converged; None where all had.
-
-    Raises:
-        ParameterError: a number is not possible.
     """
 
     name: Final = "nonlinear"

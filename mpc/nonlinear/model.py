@@ -23,7 +23,6 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from quadsim.errors import ParameterError
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -52,13 +51,6 @@ class NonlinearModel:
     acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
     angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha of the disturbance, body frame [rad/s^2]
 
-    def __post_init__(self) -> None:
-        check_steps("period", self.period, self.substeps, self.rotor_lag)
-        for name in ("acceleration", "angular_acceleration"):
-            value = getattr(self, name)
-            if np.shape(value) != (3,) or not all(map(math.isfinite, value)):
-                raise ParameterError("controller", name, value, "three finite numbers")
-
     @property
     def n(self) -> int:
         """Number of states."""
@@ -70,24 +62,10 @@ class NonlinearModel:
         return read_only(np.array(np.linalg.inv(self.effectiveness), float))
 
 
-def check_steps(name: str, step: float, substeps: int, rotor_lag: float | None) -> None:
-    """Refuse steps in time [s] that cannot be integrated over."""
-    if not 0.0 < step < math.inf:
-        raise ParameterError("controller", name, step, "positive and finite")
-    if not isinstance(substeps, int) or substeps < 1:
-        raise ParameterError("controller", "substeps", substeps, "a whole number >= 1")
-    if rotor_lag is not None and not 0.0 < rotor_lag < math.inf:
-        raise ParameterError("controller", "rotor_lag", rotor_lag, "positive and finite, or None")
-
-
 def nonlinear_model(
     vehicle: Vehicle, period: float, *, substeps: int = SUBSTEPS, rotor_lag: float | None = None
 ) -> NonlinearModel:
-    """The vehicle's model, undisturbed; see `NonlinearModel`.
-
-    Raises:
-        ParameterError: a number is not possible.
-    """
+    """The vehicle's model, undisturbed; see `NonlinearModel`."""
     ixx, iyy, izz = vehicle.inertia
     return NonlinearModel(
         effectiveness=read_only(vehicle.allocation / np.array([vehicle.mass, ixx, iyy, izz])[:, None]),

@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from mpc.nonlinear.model import check_steps, zero
+from mpc.nonlinear.model import zero
 from quadsim.state import Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -62,9 +62,6 @@ class RigidBody:
     acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
     angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha of the disturbance, body frame [rad/s^2]
 
-    def __post_init__(self) -> None:
-        check_steps("node", self.step, self.substeps, self.rotor_lag)
-
     @cached_property
     def features(self) -> Array:
         """(11, 100): takes (q, omega, T q) to F, the Jacobian of (q, v, omega)' but for drag, by (q, v, omega)."""
@@ -92,11 +89,7 @@ class RigidBody:
 
 
 def rigid_body(vehicle: Vehicle, step: float, **others: object) -> RigidBody:
-    """The vehicle's model, undisturbed; `others` are fields of `RigidBody`.
-
-    Raises:
-        ParameterError: a number is not possible.
-    """
+    """The vehicle's model, undisturbed; `others` are fields of `RigidBody`."""
     resistance = np.array([vehicle.mass, *vehicle.inertia])
     return RigidBody(
         effectiveness=read_only(vehicle.allocation / vehicle.thrust_coefficient / resistance[:, None]),

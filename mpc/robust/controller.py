@@ -57,9 +57,6 @@ def robust_problem(
     """The optimisation of the hover model, its states perhaps with the rotor speeds; see `RobustMPC`.
 
     Objective, bounds and constraints are for the paper's 12 states.
-
-    Raises:
-        ParameterError: a number or a shape is not possible.
     """
     if settings.delay > period:
         raise ParameterError("controller", "delay", settings.delay, f"at most the control period of {period} s")
@@ -98,9 +95,6 @@ class RobustMPC:
         trim: what holds the vehicle at rest against the disturbance that is estimated.
         unanswered: the first period since `reset` whose QP had no answer; None where all had.
         answer: of the last period that had one to solve; None before the first.
-
-    Raises:
-        ParameterError: a number or a shape is not possible.
     """
 
     name: Final = "robust"

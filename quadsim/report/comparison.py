@@ -15,7 +15,7 @@ import numpy as np
 from quadsim.controller import Phase, law_name
 from quadsim.errors import printable
 from quadsim.flight.audit import HELD
-from quadsim.flight.summary import constraint_verdict, deciding_margin
+from quadsim.flight.rundir import constraint_verdict, deciding_margin
 from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
 from quadsim.space import SHAPES, Obstacle
 

@@ -12,10 +12,17 @@ import numpy as np
 from quadsim.flight.audit import SIGNALS, SpaceLimit
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import distinct_courses, run_names
-from quadsim.report.curves import (
+from quadsim.report.figure import (
     BOUND,
     OBSTACLE,
     REFERENCE,
+    Area,
+    Band,
+    Bound,
+    Figure,
+    Panel,
+    Scene,
+    Series,
     bounds_of,
     break_at_wraps,
     commanded_speeds,
@@ -23,7 +30,6 @@ from quadsim.report.curves import (
     line_colour,
     reference_curve,
 )
-from quadsim.report.figure import Area, Band, Bound, Figure, Panel, Scene, Series
 from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.report.to_matplotlib import write_pngs
 from quadsim.state import POSITION, REFERENCE_NAMES, STATE_NAMES, Array

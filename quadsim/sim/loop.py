@@ -16,17 +16,17 @@ import numpy as np
 from quadsim.controller import FALLBACK, MISSED, Command, Controller, InnerLoop, Moment, Phase
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.phase import check_loss
 from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
-from quadsim.sim.phase import check_loss
 from quadsim.sim.physics import Segment, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
+    from quadsim.flight.phase import PhaseMonitor
     from quadsim.sim.navigation import Navigation
-    from quadsim.sim.phase import PhaseMonitor
 
 _BODY_RATES: Final = slice(11, 14)  # in the plant's own state; see `quadsim.sim.physics.physics_to_state`
 _log: Final = logging.getLogger("quadsim")
@@ -141,7 +141,7 @@ class ClosedLoop:
             computation: how long commands take, in simulated time; none where absent.
             rng: what `computation` draws from.
             ground: what knows where the flight stands with ground and obstacles; it is flying throughout where absent.
-            loss: limits by the names of `quadsim.sim.phase.CRITERIA`, checked once per control period until it has
+            loss: limits by the names of `quadsim.flight.phase.CRITERIA`, checked once per control period until it has
                 crashed; none where absent.
             motion: of the reference from t_0 on, for controllers that use it; absent where only positions are known.
             quaternions: whether attitude and body rates are logged beside Euler angles and their rates.

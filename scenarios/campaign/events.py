@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from quadsim.report.curves import BOUND, LINES, REFERENCE
+from quadsim.report.figure import BOUND, LINES, REFERENCE
 from scenarios.many import DIED, ERROR, MEMORY, TIMEOUT
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 from mpc.core.library import why_missing
 from quadsim.assets import models_dir
 from quadsim.errors import FileError, InputError
-from quadsim.flight.summary import read_json, require_inside
+from quadsim.flight.rundir import read_json, require_inside
 from quadsim.outputs import SUMMARY_FILE, Growing, digest_of, to_json
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import Plan, load_plan

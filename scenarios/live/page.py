@@ -25,7 +25,7 @@ import numpy as np
 from quadsim.controller import OPTIMAL
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.flight.audit import Limit
-from quadsim.report.curves import BOUND, LINES
+from quadsim.report.figure import BOUND, LINES
 from quadsim.rotation import quaternion_to_euler
 from quadsim.vehicle import N_ROTORS
 from scenarios.live.knobs import Knob, Value, knobs

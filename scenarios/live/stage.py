@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from quadsim.flight.audit import SpaceLimit
-from quadsim.report.curves import BOUND, LINES, OBSTACLE, REFERENCE
+from quadsim.report.figure import BOUND, LINES, OBSTACLE, REFERENCE
 from quadsim.sim.airframe import BODY, compile_model
 from quadsim.space import Obstacle, Region
 from quadsim.state import Array

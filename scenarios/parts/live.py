@@ -18,7 +18,7 @@ from quadsim.sim.effects.wind import Gust, WindChange
 from quadsim.sim.loop import ClosedLoop
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
-from quadsim.sim.sensing.sensor import SensorName
+from quadsim.sim.sensing import SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.parts.effects import build_changes, build_computation, check_changes, moving_air, winds_of
 from scenarios.parts.events import neutral

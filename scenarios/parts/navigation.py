@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from quadsim.sim.navigation import Navigation
-from quadsim.sim.sensing.sensor import AXES, FaultKind, Sensor, SensorFault, SensorName
+from quadsim.sim.sensing import AXES, FaultKind, Sensor, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.parts.randomness import generator
 from scenarios.schema.events import SensorFaultEvent

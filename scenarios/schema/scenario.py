@@ -128,7 +128,7 @@ class Lost:
 
     @property
     def limits(self) -> dict[str, float]:
-        """The criteria that are on; see `quadsim.sim.phase`."""
+        """The criteria that are on; see `quadsim.flight.phase`."""
         return {name: limit for name, limit in vars(self).items() if limit is not False}
 
 

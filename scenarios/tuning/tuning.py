@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError, OutputError
-from quadsim.flight.summary import read_json
+from quadsim.flight.rundir import read_json
 from quadsim.outputs import SUMMARY_FILE, growing, to_json
 from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line

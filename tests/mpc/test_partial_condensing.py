@@ -128,19 +128,6 @@ def test_it_has_the_condensed_optimum(
     np.testing.assert_allclose(plan, peer.plan, rtol=0.0, atol=1e-7 * size)
 
 
-@pytest.mark.parametrize("steps", [1, 4, 5, 50, 60])
-def test_stages_cover_the_horizon(steps: int) -> None:
-    """Whatever M, and whatever is left for the first stage and the last, the QP is the same."""
-    problem = paper_problem()
-    query = np.zeros(12), problem.objective.desired(paper_reference(51)[1:]), problem.model.u_bar
-    expected = QPSolver("piqp-dense", problem).solve(Query(*query)).plan
-    formulation, backend = PartiallyCondensed(problem, steps_per_stage=steps), PiqpMultistage()
-    backend.setup(formulation.qp)
-    solution = backend.solve(formulation.pose(Query(*query)).qp)
-    np.testing.assert_allclose(formulation.inputs(solution.x)[0], expected[0], atol=1e-3)
-    np.testing.assert_allclose(formulation.inputs(solution.x), expected, atol=0.05)
-
-
 @pytest.mark.parametrize("steps", [1, 3, 5, 7, 50, 80])
 def test_every_stage_length_gives_the_condensed_optimum(steps: int) -> None:
     """Also where the horizon is no multiple of it, and where one stage holds it all."""

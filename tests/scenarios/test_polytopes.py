@@ -10,7 +10,7 @@ import pytest
 
 from mpc.ocp import Problem
 from quadsim.flight.audit import SUM, audit
-from quadsim.flight.summary import limit_from_json, limit_to_json
+from quadsim.flight.rundir import limit_from_json, limit_to_json
 from quadsim.state import INDEX
 from scenarios.build import build_controller, build_problem
 from scenarios.limits import build_limits

@@ -16,7 +16,7 @@ from quadsim.flight.log import BODY_RATES, QUATERNION
 from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import comparison_rows, fallback_sentence
-from quadsim.report.curves import (
+from quadsim.report.figure import (
     break_at_wraps,
     commanded_speeds,
     effect_curves,

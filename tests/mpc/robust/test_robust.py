@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import linearised, paper_problem, paper_reference
+from support import paper_problem, paper_reference
 
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Penalty
-from mpc.equilibrium import equilibrium
 from mpc.fallback.completion import CompletedMoment
 from mpc.heading import turn_horizontally
-from mpc.model import continuous_model, discretise, hover_model
 from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
 from mpc.observer import ObserverSettings
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
@@ -80,7 +78,7 @@ def believing(controller: RobustMPC, estimate: Array) -> None:
     """Let it have estimated (6,)."""
     assert controller._observer is not None
     controller._observer.estimate = estimate
-    controller._believe()
+    controller._update_trim()
 
 
 def moments(flight: Flight, first: int, periods: int) -> Iterator[tuple[Moment, Array, Array]]:
@@ -101,19 +99,6 @@ def test_without_parts_it_is_the_papers_controller(constrained_flight: Flight, v
         np.testing.assert_allclose(command.speeds, expected.speeds, atol=5e-3)
         active += command.active
     assert active > 100
-
-
-def test_the_hover_matrices_are_the_papers_without_lag_and_the_nonlinear_models_with(vehicle: Vehicle) -> None:
-    A, B = discretise(*continuous_model(vehicle), PERIOD)
-    model = hover_model(vehicle, PERIOD)
-    np.testing.assert_array_equal(A, model.A)
-    np.testing.assert_array_equal(B, model.B)
-    lagging = nonlinear_model(vehicle, PERIOD, substeps=20, rotor_lag=0.03)
-    rest = equilibrium(lagging)
-    x, u = rest.state(n=16), rest.speeds
-    hover = discretise(*continuous_model(vehicle, 0.03), PERIOD)
-    for ours, exact in zip(hover, linearised(lagging, x, u)[:2], strict=True):
-        np.testing.assert_allclose(ours, exact, atol=1e-7)
 
 
 @pytest.mark.parametrize("parts", [{}, {"penalty": SOFT}, EVERYTHING])

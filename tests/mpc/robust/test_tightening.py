@@ -179,27 +179,9 @@ def test_margins_grow_over_the_horizon_and_saturate(vehicle: Vehicle, rotor_lag:
     np.testing.assert_allclose(found[:, 0], found[:, 1], rtol=1e-9)  # roll and pitch are alike
 
 
-def test_margins_grow_with_disturbance_lag_and_delay(vehicle: Vehicle) -> None:
-    least = tilt_margins(vehicle, TighteningSettings(angular_acceleration=0.2))
-    for more in (
-        tilt_margins(vehicle, TighteningSettings(angular_acceleration=0.3)),
-        tilt_margins(vehicle, TighteningSettings(angular_acceleration=0.2, turning=4.0)),
-        tilt_margins(vehicle, TighteningSettings(angular_acceleration=0.2), delay=0.02),
-    ):
-        assert (more > least).all()
-    lagging = tilt_margins(vehicle, TighteningSettings(angular_acceleration=0.2), rotor_lag=0.05)
-    np.testing.assert_allclose(lagging[0], least[0])  # nothing answers within a period
-    assert (lagging[1:] > least[1:]).all()
-
-
-def test_growth_is_proportional_to_the_disturbance(vehicle: Vehicle) -> None:
-    once, thrice = (tilt_margins(vehicle, TighteningSettings(angular_acceleration=w, turning=0.0)) for w in (0.2, 0.6))
-    np.testing.assert_allclose(thrice, 3.0 * once, rtol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("rotor_lag", "delay", "first", "last"),
-    [(0.0, 0.0, 0.13, 0.27), (0.05, 0.0, 0.13, 0.51), (0.0, 0.05, 0.34, 0.61), (0.05, 0.05, 0.34, 0.96)],
+    [(0.0, 0.0, 0.13, 0.27), (0.05, 0.0, 0.13, 0.51), (0.05, 0.05, 0.34, 0.96)],
 )
 def test_defaults_draw_the_tilt_in_as_documented(
     vehicle: Vehicle, rotor_lag: float, delay: float, first: float, last: float
@@ -207,7 +189,7 @@ def test_defaults_draw_the_tilt_in_as_documented(
     found = np.degrees(tilt_margins(vehicle, rotor_lag=rotor_lag, delay=delay, estimated=True))
     np.testing.assert_allclose(found[0], first, atol=0.005)
     np.testing.assert_allclose(found[-1], last, atol=0.005)
-    text = " ".join((ROOT / "docs" / "controllers.md").read_text(encoding="utf-8").split())
+    text = " ".join((ROOT / "docs" / "robust.md").read_text(encoding="utf-8").split())
     assert f"{last:.2f} deg" in text
 
 
@@ -276,11 +258,6 @@ def test_disturbances_too_large_for_the_bounds_are_refused(vehicle: Vehicle, nam
     )
     with pytest.raises(ParameterError, match=rule):
         tilt_margins(vehicle, TighteningSettings(**{name: given}))
-
-
-def test_a_delay_beyond_a_period_is_reported(vehicle: Vehicle) -> None:
-    with pytest.raises(ParameterError, match=r"^controller\.delay must be at most the control period of .*; got 1\.0$"):
-        tilt_margins(vehicle, delay=1.0)
 
 
 def test_the_quickest_rotors_that_are_taken_are_as_good_as_none(vehicle: Vehicle) -> None:

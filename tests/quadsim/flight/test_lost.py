@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadsim.errors import LostError
-from quadsim.sim.phase import check_loss
+from quadsim.flight.phase import check_loss
 from quadsim.state import INDEX, Array, make_state
 
 LIMITS = {"tilt": 120.0, "distance": 100.0, "depth": 50.0, "speed": 30.0}

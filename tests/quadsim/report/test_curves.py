@@ -9,7 +9,7 @@ import pytest
 from support import small_log
 
 from quadsim.flight.log import FlightLog
-from quadsim.report.curves import LEAST_SPANS, break_at_wraps, commanded_speeds, effect_curves, least_range
+from quadsim.report.figure import LEAST_SPANS, break_at_wraps, commanded_speeds, effect_curves, least_range
 from quadsim.state import Array
 
 

@@ -11,8 +11,7 @@ from matplotlib.image import imread
 from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
 from quadsim.flight.rundir import Run
 from quadsim.report import flight_figures
-from quadsim.report.curves import BOUND
-from quadsim.report.figure import Band, Bound, Figure, Panel, Series
+from quadsim.report.figure import BOUND, Band, Bound, Figure, Panel, Series
 from quadsim.report.flight_figures import effects, inputs, overview, page_figures, states, times, write_figures
 from quadsim.report.to_matplotlib import draw, to_png
 from quadsim.report.to_plotly import thin, to_plot

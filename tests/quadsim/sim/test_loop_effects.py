@@ -11,15 +11,15 @@ import pytest
 from quadsim.controller import GROUNDED, MISSED, Command, Moment, Phase, stopped
 from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import computation, estimation, ground
+from quadsim.flight.phase import PhaseMonitor
 from quadsim.sim.airframe import outline
 from quadsim.sim.computation import Computation, Stall
 from quadsim.sim.effects import Effects, Ground
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.loop import fly
 from quadsim.sim.navigation import Navigation
-from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
-from quadsim.sim.sensing.sensor import FaultKind, Sensor, SensorFault, SensorName
+from quadsim.sim.sensing import FaultKind, Sensor, SensorFault, SensorName
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 

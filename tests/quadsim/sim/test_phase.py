@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from quadsim.controller import Phase
-from quadsim.flight.ground import AIRBORNE, TOUCH, Outline, clearance, takeoff_time, touchdown
+from quadsim.flight.phase import AIRBORNE, REST, TOUCH, Outline, PhaseMonitor, clearance, takeoff_time, touchdown
 from quadsim.rotation import body_to_world
-from quadsim.sim.phase import REST, PhaseMonitor
 from quadsim.state import INDEX, POSITION, Array, make_state, tilt
 
 FEET = np.array([[0.2, 0.0, -0.12], [-0.2, 0.0, -0.12], [0.0, 0.2, -0.12], [0.0, -0.2, -0.12]])

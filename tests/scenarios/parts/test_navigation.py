@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from support import scenario_table
 
-from quadsim.sim.sensing.sensor import FaultKind, SensorFault, SensorName
+from quadsim.sim.sensing import FaultKind, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
 from scenarios.loading import parse_scenario
 from scenarios.parts.navigation import build_fault, build_navigation, build_sensors

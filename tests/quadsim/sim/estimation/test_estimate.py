@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from quadsim.sim.estimation.estimate import difference, retract
+from quadsim.sim.error_state import difference, retract
 
 means = st.integers(0, 2**32 - 1).map(
     lambda seed: np.concatenate(

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from quadsim.errors import ParameterError
-from quadsim.sim.estimation.estimate import EstimatorSettings
-from quadsim.sim.estimation.filter import ErrorStateFilter
-from quadsim.sim.sensing.sampler import Sample
-from quadsim.sim.sensing.sensor import FaultKind, Outliers, Sensor, SensorFault, SensorName
+from quadsim.sim.error_state import EstimatorSettings
+from quadsim.sim.estimator import ErrorStateFilter
+from quadsim.sim.sensing import FaultKind, Outliers, Sample, Sensor, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
 
 SETTINGS = EstimatorSettings(acceleration_noise=0.1, angular_acceleration_noise=0.5)

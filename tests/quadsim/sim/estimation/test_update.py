@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quadsim.sim.estimation.estimate import Estimate
-from quadsim.sim.estimation.update import OBSERVATION, doubt, innovation, update
-from quadsim.sim.sensing.sensor import SensorName
+from quadsim.sim.error_state import OBSERVATION, Estimate, doubt, innovation, update
+from quadsim.sim.sensing import SensorName
 from quadsim.state import Array
 
 R = np.diag([0.01, 0.04, 0.09])

@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from quadsim.rotation import euler_to_quaternion
-from quadsim.sim.sensing.sampler import Sample, Sampler, truth
-from quadsim.sim.sensing.sensor import FaultKind, Outliers, Sensor, SensorFault, SensorName
+from quadsim.sim.sensing import FaultKind, Outliers, Sample, Sampler, Sensor, SensorFault, SensorName, truth
 from quadsim.state import Array
 
 TIMESTEP = 1e-3

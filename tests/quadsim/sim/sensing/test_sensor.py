@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from quadsim.errors import ParameterError
-from quadsim.sim.sensing.sensor import FaultKind, Sensor, SensorFault, SensorName
+from quadsim.sim.sensing import FaultKind, Sensor, SensorFault, SensorName
 
 RIGHT: dict[str, Any] = {"name": SensorName.POSITION, "rate": 20.0}
 FAULT: dict[str, Any] = {"sensor": SensorName.RATES, "kind": FaultKind.NAN, "start": 1.0, "stop": 2.0}

@@ -18,11 +18,21 @@ from typing import Final
 import numpy as np
 
 from quadsim.errors import ParameterError
-from quadsim.sim.estimation.estimate import N_ERRORS, Estimate, EstimatorSettings, retract
-from quadsim.sim.estimation.prediction import Drive, drive, lifts, motion_model, predict, stand
-from quadsim.sim.estimation.update import doubt, update
-from quadsim.sim.sensing.sampler import Sample
-from quadsim.sim.sensing.sensor import AXES, Sensor, SensorName
+from quadsim.sim.error_state import (
+    N_ERRORS,
+    Drive,
+    Estimate,
+    EstimatorSettings,
+    doubt,
+    drive,
+    lifts,
+    motion_model,
+    predict,
+    retract,
+    stand,
+    update,
+)
+from quadsim.sim.sensing import AXES, Sample, Sensor, SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
