@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from quadsim.vehicle import Vehicle
     from scenarios.assembly import Assembly
     from scenarios.campaign.campaign import CampaignResult, Replay, Sweep
-    from scenarios.campaign.paired import Comparison as CampaignComparison
+    from scenarios.campaign.paired import PairedComparison
     from scenarios.catalogue import Catalogue
     from scenarios.design.vehicle_report import VehicleReport
     from scenarios.flight import Flight
@@ -70,7 +70,7 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
             raise ValueError(f"must be a whole number; got {text!r:.100}")
         return int(text)
 
-    CampaignComparison = CampaignResult = Catalogue = FlightComparison = Document = Flight = Listing = Reaudit = Any
+    PairedComparison = CampaignResult = Catalogue = FlightComparison = Document = Flight = Listing = Reaudit = Any
     Replay = Reproductions = ScenarioFile = TuningResult = VehicleReport = Any
     File = Path
     VehicleName = _one_of(vehicle_names)
@@ -436,7 +436,7 @@ def compare(
     overwrite: Flag = False,
     markdown: Flag = False,
     progress: Watched = True,
-) -> FlightComparison | CampaignComparison | Document:
+) -> FlightComparison | PairedComparison | Document:
     """Flights, or two campaigns flight by flight, side by side: table, figures, HTML page.
 
     Args:
@@ -465,7 +465,7 @@ def compare(
     if not targets:
         raise InputError("compare needs runs, scenarios, or two campaigns")
     page = None if out is None else absolute(out)
-    compared: FlightComparison | CampaignComparison
+    compared: FlightComparison | PairedComparison
     if any(isinstance(target, str | Path) and is_campaign(Path(target)) for target in targets):
         compared = compare_campaigns([Path(str(target)) for target in targets], page, overwrite=overwrite)
     else:
@@ -872,14 +872,14 @@ def tune(
         quadsim.errors.ParameterError: --workers must be 1 or more; got 0
     """
     from scenarios.tuning.search import require_optuna
-    from scenarios.tuning.tuning import tune as carry_out
+    from scenarios.tuning.tuning import fly_tuning
     from scenarios.tuning.tuning_plan import load_tuning
 
     require_optuna()
     plan = load_tuning(str(tuning), trials=trials, seed=seed)
     target = Path("runs") / "tunings" / plan.spec.name if out is None else Path(out)
     with _growing(target, progress, resume=resume, overwrite=overwrite) as options:
-        return carry_out(plan, workers=workers, cluster=cluster, report=report, **options)
+        return fly_tuning(plan, workers=workers, cluster=cluster, report=report, **options)
 
 
 @contextmanager

@@ -7,16 +7,13 @@ live flight and in the one that is saved of it, whether or not anything of its k
 
 from __future__ import annotations
 
-import json
 import math
 from bisect import insort
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Final, TypeVar, get_args
-
-from pydantic import ValidationError
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 from mpc.ocp import InfeasiblePeriod
 from quadsim.controller import Controller
@@ -29,7 +26,6 @@ from quadsim.sim.loop import ClosedLoop
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing import SensorName
-from scenarios.schema.base import Spec
 from scenarios.schema.controller import ControllerSpec, changed
 from scenarios.schema.events import (
     MOST_EVENTS,
@@ -39,7 +35,7 @@ from scenarios.schema.events import (
     SensorText,
     SetpointEvent,
 )
-from scenarios.schema.problems import ScenarioError, describe_all
+from scenarios.schema.problems import parse_table
 
 if TYPE_CHECKING:
     from scenarios.assembly import Assembly
@@ -60,25 +56,11 @@ class Successor:
     controller: Controller
 
 
-class _Listed(Spec):
+@dataclass(frozen=True, kw_only=True)
+class _Listed:
     """A table that has events, for messages to name them."""
 
     events: list[Event]
-
-
-T = TypeVar("T", bound=Spec)
-
-
-def validated(kind: type[T], data: Mapping[str, Any], name: str) -> T:
-    """A table of this kind.
-
-    Raises:
-        ScenarioError: it is none; the message starts with `name`.
-    """
-    try:
-        return kind.model_validate_json(json.dumps(data, default=lambda _: math.inf))
-    except ValidationError as error:
-        raise ScenarioError(name, describe_all(error, data, kind)) from error
 
 
 class FlightEvents:
@@ -173,7 +155,7 @@ class FlightEvents:
         step, first = self.scenario.plant.timestep, self._loop.k + self._loop.observed
         at = round(first * self.scenario.control_period, 9)
         if isinstance(event, Mapping):
-            event = validated(_Listed, {"events": [{**event, "at": at}]}, "event").events[0]
+            event = parse_table(_Listed, {"events": [{**event, "at": at}]}, "event").events[0]
         if isinstance(event, SensorFaultEvent):  # what is sensed at the period's begin has been sensed
             at = round(at + step, 9)
         if isinstance(event, Stall) and self._loop.answered >= at:  # a command that has come was not held up

@@ -194,6 +194,13 @@ def linearised(model: NonlinearModel, x: Array, u: Array) -> tuple[Array, Array,
     return A, B, after(joint) - A @ x - B @ u
 
 
+def derivative(model: NonlinearModel, x: Array, u: Array) -> Array:
+    """dx/dt (..., n) of states x (..., n) under inputs u (..., 4), by central differences over short periods."""
+    h, points = 1e-5, list(zip(x.reshape(-1, x.shape[-1]), u.reshape(-1, 4), strict=True))
+    ends = [np.array([advance(replace(model, period=s), *point) for point in points]) for s in (h, -h)]
+    return np.asarray((ends[0] - ends[1]) / (2.0 * h)).reshape(x.shape)
+
+
 def flight_queries(flight: Flight, problem: Problem, stride: int) -> list[Query]:
     """xi(k), y_d, u(k-1) of every `stride`-th period of a flight."""
     log, N = flight.log.control, problem.horizon

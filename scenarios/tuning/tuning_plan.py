@@ -33,7 +33,7 @@ from scenarios.campaign.campaign_file import (
     Varied,
     check_fields,
 )
-from scenarios.campaign.events import Event, is_number, parse_event
+from scenarios.campaign.events import Event, is_comparable, parse_event
 from scenarios.campaign.plan import (
     Plan,
     cell,
@@ -222,7 +222,7 @@ class TuningPlan:
             _ = self.guard
         for objective in self.spec.objectives:
             with _field(f"objectives.{objective.name}.expression"):
-                value_of(objective.expression, {name: 1.0 for name, kind in columns.items() if is_number(kind)})
+                value_of(objective.expression, {name: 1.0 for name, kind in columns.items() if is_comparable(kind)})
         check_ends(self.spec.search, self._check_at, table="search")
 
     def _check_at(self, entry: Varied, value: Value) -> None:

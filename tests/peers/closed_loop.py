@@ -38,17 +38,11 @@ class Quantity:
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedLoop:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        scenario: what was flown.
-        mujoco: the flight on our plant.
-        rotorpy: the flight on RotorPy's.
-    """
-
-    scenario: Scenario
-    mujoco: FlightLog
-    rotorpy: FlightLog
+    scenario: Scenario  # what was flown
+    mujoco: FlightLog  # the flight on our plant
+    rotorpy: FlightLog  # the flight on RotorPy's
 
     @property
     def peaks(self) -> tuple[Quantity, ...]:

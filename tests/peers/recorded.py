@@ -19,21 +19,13 @@ SCENARIO: Final = "paper-constrained"
 
 @dataclass(frozen=True, kw_only=True)
 class Query:
-    """One control period's.
+    """One control period's."""
 
-    Attributes:
-        state: (12,) xi(k).
-        desired: (N, n_r) y_d(k+1) .. y_d(k+N).
-        u_before: (4,) u(k-1) [rad/s].
-        status: how the controller found its answer.
-        speeds: (4,) the answer, u(k) [rad/s].
-    """
-
-    state: Array
-    desired: Array
-    u_before: Array
-    status: str
-    speeds: Array
+    state: Array  # (12,) xi(k)
+    desired: Array  # (N, n_r) y_d(k+1) .. y_d(k+N)
+    u_before: Array  # (4,) u(k-1) [rad/s]
+    status: str  # how the controller found its answer
+    speeds: Array  # (4,) the answer, u(k) [rad/s]
 
     @property
     def posed(self) -> ocp.Query:
