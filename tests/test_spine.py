@@ -144,7 +144,7 @@ def test_the_longest_chain_of_imports_is_short() -> None:
     ("code", "most"), [("import quadsim", 0.1), ("import scenarios.cli as c; c.main(['-h'])", 0.3)]
 )
 def test_what_answers_at_once_does(code: str, most: float) -> None:
-    """Processor time of the fastest of five, without the interpreter's own; a busy machine takes up to twice as long."""
+    """Processor time of the fastest of five, without the interpreter's own; twice that on a busy machine."""
 
     def seconds(text: str) -> float:
         before = os.times()
