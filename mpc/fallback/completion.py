@@ -78,19 +78,18 @@ def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) ->
     Its attitude and body rates are left out where the state's are predicted.  Next to a pitch of 90 deg the rates of
     Euler angles are implausibly large; those of the body are not.
     """
-    found = {**vars(now), "acting": acting, "unseen": unseen}
+    values = {**vars(now), "acting": acting, "unseen": unseen}
     if unseen[ANGLES].any():
-        found["attitude"] = None
+        values["attitude"] = None
     if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
-        found["body_rates"] = None
-    return CompletedMoment(**found)
+        values["body_rates"] = None
+    return CompletedMoment(**values)
 
 
 class StateCompletion:
     """Completes one state after the other, one per control period.
 
-    Attributes:
-        unseen: (12,) periods since each channel was last measured; infinite before it ever was.
+    `unseen` (12,) is the number of periods since each channel was last measured; infinite before it ever was.
     """
 
     def __init__(self, model: LinearModel) -> None:

@@ -31,7 +31,6 @@ from mpc.ocp import Equilibrium, Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Solution, kkt_residuals
 from mpc.solvers import Formulation, QPSolver
-from mpc.solvers.daqp import DaqpDense
 from mpc.solvers.piqp import PiqpDense, PiqpMultistage
 from quadsim.controller import SOLVED
 from quadsim.state import Array
@@ -150,24 +149,6 @@ def test_products_of_rounding_are_left_out() -> None:
 
 
 # Models that change from step to step
-
-
-@pytest.mark.parametrize("steps", [1, 2, 5])
-def test_constant_matrices_make_the_papers_plan(constrained_flight: Flight, steps: int) -> None:
-    problem = paper_problem()
-    solver = changing(problem, steps)
-    formulation, backend = PartiallyCondensed(problem), DaqpDense()
-    backend.setup(formulation.qp)
-    pressing = 0
-    for query in flight_queries(constrained_flight, problem, stride=100):
-        solution = solver.solve(ocp_peer.period(problem, *query[:4]))
-        optimum = backend.solve(formulation.pose(Query(*query)).qp)
-        assert solution.status == optimum.status == SOLVED
-        plan, expected = solver.plan(solution), formulation.inputs(optimum.x)
-        np.testing.assert_allclose(plan[:10], expected[:10], atol=1e-3)
-        np.testing.assert_allclose(plan, expected, atol=1e-2)
-        pressing += optimum.active
-    assert pressing > 100
 
 
 @pytest.mark.parametrize("horizon", [1, 3, 7, 10])

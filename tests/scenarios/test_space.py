@@ -24,7 +24,7 @@ from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
-from scenarios.summary_tables import outcome
+from scenarios.summary_tables import outcome_line
 
 PILLAR = {"type": "cylinder", "name": "pillar", "position": [1.0, 0.0, 1.0], "radius": 0.1, "height": 3.0}
 BALL = {
@@ -84,7 +84,9 @@ def test_the_extent_is_the_vehicle_s_or_the_scenario_s() -> None:
 
 def test_a_touch_is_a_crash_at_the_distance_that_the_audit_measures(crashed: Flight) -> None:
     assert crashed.outcome == "violated"
-    assert outcome(crashed.summary).plain.startswith("crashed, touched pillar, a required constraint does not hold")
+    assert outcome_line(crashed.summary).plain.startswith(
+        "crashed, touched pillar, a required constraint does not hold"
+    )
     assert not cleared(crashed)[0].satisfied
     log, limit = crashed.log, cleared(crashed)[0].limit
     clearance = limit.source.finest(log)[1]
