@@ -15,7 +15,7 @@ import tomlkit
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.rows import Row
 from scenarios.schema.scenario import Scenario
-from scenarios.tuning.tuning import TuningResult, tune
+from scenarios.tuning.tuning import TuningResult, fly_tuning
 from scenarios.tuning.tuning_plan import TuningPlan
 
 BEST_SPEED, BEST_Z = 0.05, 300.0  # where the formula is smallest
@@ -82,7 +82,7 @@ def tune_by(formula: Formula, plan: TuningPlan, directory: Path, **options: Any)
     """A tuning whose rows come from a formula."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Plan, "fly_all", lambda plan, flights, **_: formula.fly(plan, flights))
-        return tune(plan, directory, **options)
+        return fly_tuning(plan, directory, **options)
 
 
 def write_tuning(directory: Path, **changes: Any) -> Path:

@@ -132,7 +132,7 @@ def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> 
     raise ParameterError(f"event {text!r}", "number", threshold, "a finite number")
 
 
-def is_number(kind: pa.DataType) -> bool:
+def is_comparable(kind: pa.DataType) -> bool:
     """Whether a column's values, numbers or truth values, can be compared with a number."""
     from pyarrow import types
 
@@ -141,8 +141,8 @@ def is_number(kind: pa.DataType) -> bool:
 
 def _require_number(event: str, column: str, columns: Mapping[str, pa.DataType]) -> None:
     if column not in columns:
-        raise UnknownNameError("column", column, [name for name, kind in columns.items() if is_number(kind)])
-    if not is_number(columns[column]):
+        raise UnknownNameError("column", column, [name for name, kind in columns.items() if is_comparable(kind)])
+    if not is_comparable(columns[column]):
         raise _no_number(event, column)
 
 

@@ -93,7 +93,7 @@ class MetricComparison:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison(Result):
+class PairedComparison(Result):
     """What two campaigns on the same draws show of each other."""
 
     names: tuple[str, str]  # of the first and the second campaign
@@ -208,13 +208,13 @@ class Comparison(Result):
         }
 
 
-def compare(
+def compare_pairs(
     table_a: pa.Table,
     table_b: pa.Table,
     names: tuple[str, str],
     failures: tuple[Sequence[str], Sequence[str]] | None = None,
     differences: Differences | None = None,
-) -> Comparison:
+) -> PairedComparison:
     """Compare two campaigns, pairing their flights by number.
 
     Args:
@@ -255,7 +255,7 @@ def compare(
                     "with the other's seed, sampling and [[vary]]"
                 )
     completed = (texts(a, "status") == "completed") & (texts(b, "status") == "completed")
-    return Comparison(
+    return PairedComparison(
         names=names,
         flights=a.num_rows,
         left_out=table_a.num_rows + table_b.num_rows - 2 * a.num_rows,
@@ -329,7 +329,7 @@ def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> Me
     )
 
 
-def _event_table(comparison: Comparison) -> Grid:
+def _event_table(comparison: PairedComparison) -> Grid:
     a, b = comparison.names
     lines = []
     for event in comparison.events:
@@ -350,7 +350,7 @@ def _event_table(comparison: Comparison) -> Grid:
     )
 
 
-def _metric_table(comparison: Comparison) -> Grid:
+def _metric_table(comparison: PairedComparison) -> Grid:
     a, b = comparison.names
     lines = []
     for metric in comparison.metrics:

@@ -240,11 +240,11 @@ def estimate(table: pa.Table) -> dict[str, Any]:
     """Everything in a campaign's summary about its flights, as plain data for JSON.
 
     Keys: `flights`; `confidence` of every interval; `verdicts`, flights of each; `events` and `constraints`, by name,
-    as `proportion`, a constraint's being that it did not hold, among the flights that reached
-    it or were lost before; `metrics`, over the flights that have each; `parameters`, how the outcome depends on each
-    varied parameter (`parameters`); `worst`, the ten worst flights.
+    as `proportion`, a constraint's being that it did not hold, among the flights that reached it or were lost before;
+    `metrics`, over the flights that have each; `parameters`, how the outcome depends on each varied parameter;
+    `worst`, the ten worst flights.
 
-    Incomplete flights are neither failures nor successes (`results.table.is_counted`): the shares of failure and
+    Incomplete flights are neither failures nor successes (`rows.is_counted`): the shares of failure and
     violation, and `parameters`, leave them out.
     """
     return {
@@ -400,7 +400,6 @@ def _groups(values: Array, failed: Flags) -> list[dict[str, Any]]:
 EXAMPLE: Final = "P(violation) < 0.01 @ 95%"
 _SHARES: Final = (Decimal("1e-9"), 1 - Decimal("1e-9"))
 _CONFIDENCES: Final = (Decimal("0.5"), Decimal("0.999999"))
-_MOST_REPORTED: Final = 10**9  # flights beyond which a message states only that it takes more
 _FORM: Final = re.compile(
     r"P\s*\((?P<event>[^()]*)\)\s*(?P<operation><=|>=|<|>)\s*(?P<share>[^<>=@]+?)\s*@\s*(?P<confidence>[^@%]+?)\s*%",
     re.IGNORECASE,
@@ -450,10 +449,8 @@ class Judgement:
         )
         if self.flights >= self.least_flights:
             return phrase
-        least = f"at least {count_of(self.least_flights, 'flight')}"
-        if self.least_flights > _MOST_REPORTED:
-            least = f"more than {_MOST_REPORTED:,} flights"
-        return f"{phrase} It takes {least}, {'none' if required.at_most else 'all'} of them with that event."
+        least = count_of(self.least_flights, "flight")
+        return f"{phrase} It takes at least {least}, {'none' if required.at_most else 'all'} of them with that event."
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for `summary.json`."""
@@ -490,7 +487,7 @@ def judge(table: pa.Table, requirement: Requirement) -> Judgement:
     """Hold a campaign's flights, `flights.parquet`, against a requirement.
 
     It holds when the one-sided Clopper-Pearson bound at its confidence is on the required side; so it takes
-    flights enough, and no flights support nothing.  Incomplete flights do not count (`results.table.is_counted`).
+    flights enough, and no flights support nothing.  Incomplete flights do not count (`rows.is_counted`).
 
     Raises:
         UnknownNameError: the table has no column that the event names.

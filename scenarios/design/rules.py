@@ -58,7 +58,7 @@ MOVE_RATIO: Final = 4.0  # frequency at which changes of rotor speeds cost as mu
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tuning:
+class Design:
     """Numbers of `[controller] type = "robust"` for a vehicle."""
 
     authority: Authority  # what they follow from
@@ -82,7 +82,7 @@ class Tuning:
         return math.tan(self.tilt)
 
 
-def tune(vehicle: Vehicle) -> Tuning:
+def design_for(vehicle: Vehicle) -> Design:
     """The numbers for a vehicle; see the module.
 
     Raises:
@@ -106,7 +106,7 @@ def tune(vehicle: Vehicle) -> Tuning:
     deviation = vehicle.gravity * math.tan(tilt) / bandwidth**2
     place = deviation**-2.0
     speed = place * (vehicle.gravity * min(roll, pitch)) ** 2 / bandwidth**8
-    return Tuning(
+    return Design(
         authority=can,
         period=period,
         horizon=math.ceil(HORIZON_TIMES / (bandwidth * period)),
@@ -146,7 +146,7 @@ def _reached(period: float, lag: float | None) -> float:
     return 1.0 if lag is None else 1.0 - math.exp(-period / lag)
 
 
-def gain(vehicle: Vehicle, tuning: Tuning) -> Array:
+def gain(vehicle: Vehicle, tuning: Design) -> Array:
     """K (4, n + 4) of u = -K [x; u(k-1)], deviations from hover: the weights' optimum over an infinite horizon.
 
     Changes of inputs are part of the cost, so the last input is a state; n is 12, or 16 with rotors that lag.
@@ -165,7 +165,7 @@ def gain(vehicle: Vehicle, tuning: Tuning) -> Array:
     return np.asarray(np.linalg.solve(R + D + B.T @ P @ B, B.T @ P @ A + cross.T))
 
 
-def is_stable(vehicle: Vehicle, tuning: Tuning, K: Array, delay: float) -> bool:
+def is_stable(vehicle: Vehicle, tuning: Design, K: Array, delay: float) -> bool:
     """Whether the loop of a gain is stable where commands act some time [s] later than it knows of."""
     A_c, B_c = continuous_model(vehicle, vehicle.rotor_rise or 0.0)
     n, period = len(A_c), tuning.period
@@ -189,7 +189,7 @@ def is_stable(vehicle: Vehicle, tuning: Tuning, K: Array, delay: float) -> bool:
     return float(np.abs(np.linalg.eigvals(closed)).max()) < 1.0
 
 
-def delay_margin(vehicle: Vehicle, tuning: Tuning) -> float:
+def delay_margin(vehicle: Vehicle, tuning: Design) -> float:
     """Shortest delay [s] beyond what the model knows of at which the loop is no longer stable, to a thousandth."""
     K = gain(vehicle, tuning)
     low, high = 0.0, 1e-3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -14,13 +13,14 @@ import numpy as np
 from mpc.model import continuous_model, discretise
 from quadsim.errors import ParameterError
 from quadsim.report.table import Cell, Grid, format_number
-from quadsim.state import INDEX, Array
+from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import TorqueRange, authority, torque_ranges
-from scenarios.design.rules import delay_margin, tune
+from scenarios.design.rules import delay_margin, design_for
 from scenarios.results import Result, Shown
 
 SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
+CHAINS: Final = (4, 4, 2, 2)  # of integrators in the model at hover: x over pitch, y over roll, z, yaw
 _RPM: Final = 60.0 / (2.0 * math.pi)
 
 
@@ -127,7 +127,7 @@ def make_sheet(vehicle: Vehicle) -> VehicleSheet:
         input_slopes={
             name: float(np.abs(B_c[INDEX[name]]).max()) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
         },
-        integrator_chains=integrator_chains(A_c),
+        integrator_chains=CHAINS,
         # A_c permutes to a strictly upper triangular matrix: chains of integrators, whose poles are its diagonal.
         continuous_poles=tuple(np.diag(A_c).tolist()),
         discrete_poles=tuple(np.diag(A).tolist()),
@@ -141,7 +141,7 @@ def make_sheet(vehicle: Vehicle) -> VehicleSheet:
 
 def _designed(vehicle: Vehicle) -> Designed | None:
     try:
-        tuning = tune(vehicle)
+        tuning = design_for(vehicle)
     except ParameterError:
         return None
     return Designed(
@@ -153,17 +153,6 @@ def _designed(vehicle: Vehicle) -> Designed | None:
         period=tuning.period,
         delay_margin=delay_margin(vehicle, tuning),
     )
-
-
-def integrator_chains(A_c: Array) -> tuple[int, ...]:
-    """Sizes of the Jordan blocks of a nilpotent matrix (n, n), longest first: its chains of integrators.
-
-    rank A^(k-1) - rank A^k counts the blocks of size k or more.
-    """
-    ranks = [np.linalg.matrix_rank(np.linalg.matrix_power(A_c, k)) for k in range(A_c.shape[0] + 1)]
-    assert ranks[-1] == 0, "the hover model has poles away from zero"
-    at_least = [int(before - after) for before, after in itertools.pairwise(ranks)]
-    return tuple(sum(count > i for count in at_least) for i in range(at_least[0]))
 
 
 def vehicle_tables(report: VehicleReport) -> list[Grid]:

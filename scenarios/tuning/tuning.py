@@ -25,7 +25,7 @@ from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from quadsim.report.to_plotly import Plot, embed
 from scenarios.campaign.campaign import Standing, Watch, fly_campaign, put_report
-from scenarios.campaign.paired import Comparison, compare
+from scenarios.campaign.paired import PairedComparison, compare_pairs
 from scenarios.campaign.plan import plan_differences
 from scenarios.campaign.statistics import judge, label, paired_difference
 from scenarios.campaign.store import flown_by
@@ -60,7 +60,7 @@ class TuningResult(Result):
     best: Scenario
     table: pa.Table
     summary: Mapping[str, Any]
-    comparison: Comparison | None
+    comparison: PairedComparison | None
 
     @property
     def holds(self) -> bool:
@@ -87,7 +87,7 @@ class TuningResult(Result):
         return dict(self.summary)
 
 
-def tune(
+def fly_tuning(
     plan: TuningPlan,
     directory: Path,
     *,
@@ -138,7 +138,7 @@ def tune(
         tables = [finish(campaign, files.path / folder).table for folder, campaign in campaigns.items()]
         comparison = None
         if answer != START:
-            comparison = compare(
+            comparison = compare_pairs(
                 tables[0], tables[1], ("start", "best"), differences=plan_differences(*campaigns.values())
             )
             if report:

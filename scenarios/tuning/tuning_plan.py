@@ -19,6 +19,7 @@ from pydantic import Field
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.state import Array
+from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import (
     MOST_FLIGHTS,
     CampaignFile,
@@ -32,7 +33,7 @@ from scenarios.campaign.campaign_file import (
     Varied,
     check_fields,
 )
-from scenarios.campaign.events import Event, is_number, parse_event
+from scenarios.campaign.events import Event, is_comparable, parse_event
 from scenarios.campaign.plan import (
     Plan,
     cell,
@@ -45,14 +46,13 @@ from scenarios.campaign.plan import (
 )
 from scenarios.campaign.rows import Row
 from scenarios.campaign.statistics import Requirement, parse_requirement
-from scenarios.limits import build_limits
-from scenarios.loading import check_parts, parse_scenario
+from scenarios.catalogue import tuning_path
+from scenarios.loading import parse_scenario
 from scenarios.schema.bases import merge
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
 from scenarios.schema.writing import to_toml
-from scenarios.shipped import tuning_path
 
 START: Final = 0  # the candidate that is the scenario as it is
 Searched = Annotated[Uniform | LogUniform | Integer | Choice, Field(discriminator="distribution")]
@@ -222,18 +222,18 @@ class TuningPlan:
             _ = self.guard
         for objective in self.spec.objectives:
             with _field(f"objectives.{objective.name}.expression"):
-                value_of(objective.expression, {name: 1.0 for name, kind in columns.items() if is_number(kind)})
+                value_of(objective.expression, {name: 1.0 for name, kind in columns.items() if is_comparable(kind)})
         check_ends(self.spec.search, self._check_at, table="search")
 
     def _check_at(self, entry: Varied, value: Value) -> None:
         scenario = self.candidate({entry.name: value}, self.spec.name)
-        if build_limits(scenario) != build_limits(self.start.scenario):
+        if Assembly(scenario).limits != Assembly(self.start.scenario).limits:
             rule = (
                 "of fields that leave alone what flights are audited against: constraints, obstacles, regions, and the "
                 "controller's bounds and polytopes"
             )
             raise ParameterError(f"search.{entry.name}", "fields", entry.fields, rule)
-        check_parts(scenario)
+        Assembly(scenario).check()
 
     def to_toml(self) -> str:
         """The file with every field, for a directory that has the start as `scenario.toml`."""

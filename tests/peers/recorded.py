@@ -10,9 +10,8 @@ import numpy as np
 from mpc import ocp
 from mpc.ocp import Problem
 from quadsim.state import Array
-from scenarios.build import build_problem
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
-from scenarios.reference import build_reference
 from scenarios.rollout import Rollout
 
 SCENARIO: Final = "paper-constrained"
@@ -38,8 +37,8 @@ def record() -> tuple[Problem, tuple[Query, ...]]:
     """Fly the scenario; the optimisation, and every period's query."""
     flight = Rollout(load_scenario(SCENARIO)).fly()
     log = flight.log.control
-    problem = build_problem(flight.scenario, flight.vehicle)
-    reference = build_reference(flight.scenario, log.t.size + problem.horizon)
+    problem = Assembly(flight.scenario).problem()
+    reference = Assembly(flight.scenario).reference(log.t.size + problem.horizon)
     desired = problem.objective.desired(reference)
     before = np.vstack([log.speeds_before, log.speeds[:-1]])
     queries = tuple(

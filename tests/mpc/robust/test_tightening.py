@@ -35,9 +35,8 @@ from quadsim.controller import ACCEPTED, Moment
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_plant
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
-from scenarios.reference import build_reference
 
 ROOT = Path(__file__).resolve().parents[3]
 TILTS = [INDEX["roll"], INDEX["pitch"]]
@@ -312,9 +311,9 @@ def peak_tilt(vehicle: Vehicle, *sets: str, tight: bool = True, rotor_lag: float
     scenario = load_scenario("paper-constrained", ["duration=13.5", *sets])
     drawn_in = tilt_margins(vehicle, rotor_lag=rotor_lag, estimated=True) if tight else None
     controller = robust(vehicle, drawn_in, rotor_lag=rotor_lag)
-    reference = build_reference(scenario, scenario.periods + HORIZON)
-    with build_plant(scenario, vehicle) as plant:
-        log = fly_once(scenario, vehicle, plant, controller, reference, navigation=None)
+    reference = Assembly(scenario).reference(scenario.periods + HORIZON)
+    with Assembly(scenario).plant() as plant:
+        log = fly_once(scenario, plant, controller, reference, navigation=None)
     assert log.reason is None
     assert len(log.plant.t) > 13_499  # each physics step
     tilts = np.abs(log.plant.state[:, [INDEX["roll"], INDEX["pitch"]]])

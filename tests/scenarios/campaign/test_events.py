@@ -142,13 +142,6 @@ def test_numbers_out_of_range_are_refused(text: str, message: str) -> None:
     assert message in str(raised.value)
 
 
-def test_an_unknown_event_is_refused() -> None:
-    with pytest.raises(UnknownNameError, match="did you mean 'violation'"):
-        parse_requirement("P(violaton) < 0.1 @ 95%")
-    with pytest.raises(UnknownNameError, match=r"no column named 'rmse\.q'"):
-        judge(flown(10, 0), parse_requirement("P(rmse.q > 1) < 0.1 @ 95%"))
-
-
 def test_it_takes_299_clean_flights_for_one_percent() -> None:
     parsed = parse_requirement("P(violation) < 0.01 @ 95%")
     assert least_flights(parsed) == 299  # the rule of three gives 300
@@ -159,36 +152,6 @@ def test_it_takes_299_clean_flights_for_one_percent() -> None:
     assert found.sentence == (
         "P(violation) < 0.01 @ 95% holds: violation in 0 of 299 flights (0 %), so with 95 % confidence at most 0.997 %."
     )
-
-
-@pytest.mark.parametrize(
-    "text", ["P(lost) < 0.5 @ 50%", "P(lost) <= 0.5 @ 50%", "P(lost) < 0.2 @ 90%", "P(lost) > 0.9 @ 99%"]
-)
-def test_the_least_number_is_the_least(text: str) -> None:
-    parsed = parse_requirement(text)
-    found = least_flights(parsed)
-
-    def enough(n: int) -> bool:
-        side = "less" if parsed.at_most else "greater"
-        interval = stats.binomtest(0 if parsed.at_most else n, n, alternative=side).proportion_ci(parsed.confidence)
-        return parsed.supported_by(interval.high if parsed.at_most else interval.low)
-
-    assert enough(found)
-    assert found == 1 or not enough(found - 1)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "P(violation) < 1e-9 @ 99.9999%",
-        "P(violation) > 0.999999999 @ 99.9999%",
-        "P(violated) >= 99.9999999% @ 99.9999%",
-    ],
-)
-def test_the_largest_requirement_is_reported(text: str) -> None:
-    parsed = parse_requirement(text)
-    assert least_flights(parsed) == pytest.approx(6.0 * np.log(10.0) * 1e9, rel=1e-6)
-    assert "It takes more than 1,000,000,000 flights, " in judge(flown(3, 0), parsed).sentence
 
 
 @given(
@@ -202,23 +165,6 @@ def test_the_least_number_supports_and_one_less_does_not(share: float, confidenc
     assert judge(flown(n, 0 if parsed.at_most else n), parsed).holds if n < 1000 else n > 1
     exact = np.log1p(-parsed.confidence) / (np.log1p(-share) if parsed.at_most else np.log(share))
     assert exact - 1e-6 * n <= n <= exact + 1.0 + 1e-6 * n
-
-
-def test_too_few_flights_are_reported() -> None:
-    found = judge(flown(100, 0), parse_requirement("P(violation) < 0.01 @ 95%"))
-    assert not found.holds
-    assert found.sentence == (
-        "P(violation) < 0.01 @ 95% does not hold: violation in 0 of 100 flights (0 %), so with 95 % confidence at most "
-        "2.95 %. It takes at least 299 flights, none of them with that event."
-    )
-    found = judge(flown(20, 20), parse_requirement("P(rmse.z < 0.5) > 0.9 @ 95%"))
-    assert found.sentence.endswith("at least 86.1 %. It takes at least 29 flights, all of them with that event.")
-
-
-def test_many_flights_with_too_many_events_are_not_reported_as_too_few() -> None:
-    found = judge(flown(1000, 12), parse_requirement("P(violation) < 0.01 @ 95%"))
-    assert not found.holds
-    assert found.sentence.endswith("violation in 12 of 1000 flights (1.2 %), so with 95 % confidence at most 1.94 %.")
 
 
 def test_the_bound_is_one_sided() -> None:
@@ -250,10 +196,3 @@ def test_no_flights_support_nothing() -> None:
         found = judge(flown(0, 0), parse_requirement(text))
         assert not found.holds
         assert "in 0 of 0 flights, so" in found.sentence
-
-
-def test_a_judgement_is_plain_data() -> None:
-    found = judge(flown(299, 0), parse_requirement("P(violation) < 0.01 @ 95%")).to_json()
-    assert found["holds"] is True
-    assert found["requirement"]["event"] == "violation"
-    assert found["sentence"].startswith("P(violation) < 0.01 @ 95% holds")

@@ -15,7 +15,7 @@ from scipy import stats
 
 from quadsim.errors import InputError, ParameterError
 from scenarios.campaign.campaign_report import driver_sentence, driver_table, event_table, verdict_sentence
-from scenarios.campaign.paired import compare
+from scenarios.campaign.paired import compare_pairs
 from scenarios.campaign.statistics import (
     Dependence,
     dependence,
@@ -299,7 +299,7 @@ def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(smal
     assert found["events"]["failure"]["flights"] == found["constraints"]["roll"]["not_satisfied"]["flights"] == 0
     assert not judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).holds
     with pytest.raises(InputError, match="no pair of flights of which both reached every required constraint"):
-        compare(table, table, ("one", "other"))
+        compare_pairs(table, table, ("one", "other"))
 
 
 def test_the_worst_flights_come_first(small: pa.Table) -> None:

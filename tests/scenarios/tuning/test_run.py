@@ -31,7 +31,7 @@ def tune(plan: TuningPlan, directory: Path, by: Formula | int, **options: Any) -
     """Without a report; flown by a formula, or by so many workers."""
     if isinstance(by, Formula):
         return tune_by(by, plan, directory, report=False, **options)
-    return module.tune(plan, directory, workers=by, report=False, **options)
+    return module.fly_tuning(plan, directory, workers=by, report=False, **options)
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
-    from scenarios.campaign.paired import Comparison as CampaignComparison
+    from scenarios.campaign.paired import PairedComparison
 
 _log: Final = logging.getLogger("quadsim")
 _BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "answered by", "statuses", "whole step, m")
@@ -36,7 +36,7 @@ Target = Flight | Scenario | str | Path
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison(Result):
+class FlightComparison(Result):
     """Flights side by side."""
 
     runs: tuple[rundir.Run, ...]  # the flights
@@ -64,7 +64,7 @@ class Comparison(Result):
         ]
         yield console.table("comparison", ["", *self.names], lines)
         if self.page is not None:
-            yield console.styled("every number, plots and films: ", (console.shown(self.page), "bold"))
+            yield console.styled("every number, plots and films: ", (console.short_path(self.page), "bold"))
 
     def to_json(self) -> list[dict[str, Any]]:
         """A row per quantity, with a text for each flight."""
@@ -85,7 +85,7 @@ def compare_flights(
     progress: Progress = silent,
     *,
     overwrite: bool = False,
-) -> Comparison:
+) -> FlightComparison:
     """Compare flights, and write the page to `out`; what has to be flown is saved beside it, in `OUT-runs`.
 
     Raises:
@@ -104,7 +104,7 @@ def compare_flights(
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
         runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
         page = None if out is None else write_comparison(runs, out, overwrite=overwrite)
-    return Comparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page)
+    return FlightComparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page)
 
 
 def _check(target: Target) -> None:
@@ -136,14 +136,14 @@ def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool)
 
 def compare_campaigns(
     directories: Sequence[Path], out: Path | None = None, *, overwrite: bool = False
-) -> CampaignComparison:
+) -> PairedComparison:
     """Compare two campaigns flight by flight, and write the report where a directory is given.
 
     Raises:
         InputError: they are not two finished campaigns.
         OutputError: the directory cannot be written.
     """
-    from scenarios.campaign.paired import compare
+    from scenarios.campaign.paired import compare_pairs
     from scenarios.campaign.plan import plan_differences
     from scenarios.campaign.store import FLIGHTS_FILE, read_flights
 
@@ -154,7 +154,7 @@ def compare_campaigns(
     names = (plans[0].spec.name, plans[1].spec.name)
     failures = (plans[0].spec.failure, plans[1].spec.failure)
     a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
-    comparison = compare(a, b, names, failures, plan_differences(*plans))
+    comparison = compare_pairs(a, b, names, failures, plan_differences(*plans))
     if out is None:
         return comparison
     return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))
