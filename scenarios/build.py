@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from mpc.bounded import Bounded, Weighted
 from mpc.ocp import Problem
 from mpc.solvers import CORE_OR_PIQP
 from quadsim.controller import Controller
@@ -13,13 +14,11 @@ from quadsim.sim.effects import Force
 from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
 from quadsim.vehicle import Vehicle
-from scenarios.parts.controllers import make_controller, make_problem
 from scenarios.parts.effects import build_changes, build_wind
-from scenarios.parts.plugin import import_plugin, make_force
 from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import actual_effects, build_actual, resolve_vehicle, saturates
+from scenarios.plugin import import_plugin, make_force
 from scenarios.reference import timed_regions
-from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
 from scenarios.schema.scenario import Scenario
 
 
@@ -31,7 +30,7 @@ def resolve(scenario: Scenario, vehicle: Vehicle) -> Scenario:
 def preferring_core(scenario: Scenario) -> Scenario:
     """The scenario with `core-or-piqp` in place of `piqp`, the default: for where a step's time matters."""
     controller = scenario.controller
-    if isinstance(controller, BoundedSpec) and controller.solver == "piqp":
+    if isinstance(controller, Bounded) and controller.solver == "piqp":
         return scenario.replace({"controller.solver": CORE_OR_PIQP})
     return scenario
 
@@ -81,9 +80,9 @@ def build_problem(scenario: Scenario, vehicle: Vehicle) -> Problem:
         InputError: the controller has none.
     """
     spec = scenario.controller
-    if not isinstance(spec, WeightedSpec):
+    if not isinstance(spec, Weighted):
         raise ParameterError("controller", "type", spec.type, "one that minimises over a horizon")
-    return make_problem(spec, vehicle, scenario.control_period)
+    return spec.problem(vehicle, scenario.control_period)
 
 
 def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
@@ -93,4 +92,4 @@ def build_controller(scenario: Scenario, vehicle: Vehicle) -> Controller:
         InputError: it cannot be made from these numbers, or its code cannot be found or called.
     """
     shapes = (*scenario.obstacles, *timed_regions(scenario))
-    return make_controller(scenario.controller, vehicle, scenario.control_period, shapes)
+    return scenario.controller.build(vehicle, scenario.control_period, shapes)

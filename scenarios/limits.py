@@ -16,11 +16,8 @@ from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
 from quadsim.report.table import format_number
 from scenarios.parts.vehicle import build_actual, build_vehicle
 from scenarios.reference import timed_regions
-from scenarios.schema.controller import NonlinearSpec
 
 if TYPE_CHECKING:
-    from quadsim.vehicle import Vehicle
-    from scenarios.schema.controller import ControllerSpec
     from scenarios.schema.scenario import Scenario
 
 Range = tuple[float, float]
@@ -31,7 +28,7 @@ SHARE, SHARE_SAMPLED, ROUNDING = 0.01, 0.002, 1e-6
 
 def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
     """What the flight is audited against: its constraints, the bounds of its controller, obstacles and regions."""
-    bounds = controller_bounds(scenario.controller, build_vehicle(scenario))
+    bounds = scenario.controller.audited(build_vehicle(scenario))
     return (
         *_stated(scenario, bounds),
         *_unnamed(scenario, bounds),
@@ -42,29 +39,14 @@ def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
 
 def with_bounds_stated(scenario: Scenario) -> Scenario:
     """The scenario with its controller's bounds as constraints, for another controller to be held to the same."""
-    bounds = controller_bounds(scenario.controller, build_vehicle(scenario))
+    bounds = scenario.controller.audited(build_vehicle(scenario))
     return scenario.model_copy(update={"constraints": [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]})
-
-
-def controller_bounds(spec: ControllerSpec, vehicle: Vehicle) -> dict[str, Range]:
-    """The bounds that a controller has on signals of the audit, hard or soft, in their units."""
-    found: dict[str, Range] = {name: (pair[0], pair[1]) for name, pair in getattr(spec, "output_bounds", {}).items()}
-    if isinstance(spec, NonlinearSpec) and spec.tilt is not None:
-        found["tilt"] = (-math.inf, spec.tilt)
-    if isinstance(spec, NonlinearSpec) and spec.body_rate is not None:
-        largest = spec.body_rate if isinstance(spec.body_rate, list) else [spec.body_rate] * 3
-        found |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", largest, strict=True)}
-    inputs = getattr(spec, "input_bounds", None)
-    if inputs is not None:
-        pairs = {"speed": inputs.speed or (vehicle.speed_min, vehicle.speed_max), "slew": inputs.slew}
-        found |= {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
-    return found
 
 
 def audit_notes(scenario: Scenario) -> list[str]:
     """What a reader of the audit has to know: bounds that no constraint names, and others than the controller's."""
     vehicle = build_vehicle(scenario)
-    bounds = controller_bounds(scenario.controller, vehicle)
+    bounds = scenario.controller.audited(vehicle)
     unnamed = [limit.name for limit in _unnamed(scenario, bounds)]
     absent = [entry.name for entry in scenario.constraints if not (entry.has_bounds or entry.signal in bounds)]
     notes = []
@@ -77,7 +59,7 @@ def audit_notes(scenario: Scenario) -> list[str]:
     if absent:
         notes.append(f"{', '.join(absent)}: not audited, the controller has no such bound and the entry states none")
     audited = [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]
-    changes = [(0.0, bounds)] + [(at, controller_bounds(spec, vehicle)) for at, spec in scenario.controller_changes]
+    changes = [(0.0, bounds)] + [(at, spec.audited(vehicle)) for at, spec in scenario.controller_changes]
     for limit in audited:
         for (at, now), (_, before) in zip(changes, [(0.0, {}), *changes], strict=False):
             pair = now.get(limit.signal)

@@ -32,7 +32,7 @@ from scenarios.parts.randomness import generator
 from scenarios.parts.vehicle import build_actual, build_initial_speeds, build_initial_state, build_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.reference import build_motion, follow_course
-from scenarios.schema.controller import ControllerSpec, NonlinearSpec
+from scenarios.schema.controllers import AnyController
 from scenarios.schema.events import ControllerEvent, Event
 from scenarios.schema.scenario import LONGEST_FLIGHT, MOST_STEPS, Scenario
 
@@ -70,7 +70,7 @@ def closed_loop(
 def needs_quaternions(scenario: Scenario) -> bool:
     """Whether one of its controllers flies at any attitude."""
     specs = (scenario.controller, *(spec for _, spec in scenario.controller_changes))
-    return any(isinstance(spec, NonlinearSpec) for spec in specs)
+    return any(spec.any_attitude for spec in specs)
 
 
 @contextlib.contextmanager
@@ -312,5 +312,5 @@ class Rollout:
             unanswered=self._events.first_unanswered(),
         )
 
-    def _build(self, spec: ControllerSpec) -> Controller:
+    def _build(self, spec: AnyController) -> Controller:
         return build_controller(self._started.model_copy(update={"controller": spec}), self.vehicle)

@@ -20,8 +20,8 @@ from scenarios.campaign.spec import CampaignSpec, Value, VaryBase
 from scenarios.limits import build_limits
 from scenarios.loading import check_parts, parse_scenario
 from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
+from scenarios.plugin import Plugin
 from scenarios.schema.bases import locate_files, merge, read_scenario
-from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import NOT_DESCRIBED, apply_setting, differences, get_field, note_changes, set_field
@@ -56,7 +56,7 @@ class Plan:
         """Whether a controller or a force of the user's flies, in some flight at least."""
         drawn = {field for entry in self.spec.vary for field in entry.fields}
         chosen = not drawn.isdisjoint(("controller", "controller.type", "forces"))
-        return chosen or isinstance(self.scenario.controller, PluginSpec) or bool(self.scenario.forces)
+        return chosen or isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
 
     @property
     def columns(self) -> dict[str, pa.DataType]:

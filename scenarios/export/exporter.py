@@ -8,16 +8,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, get_args
 
+from mpc.bounded import Weighted
 from mpc.core.numbers import Exportable
 from mpc.export.ctext import CText, Precision
 from mpc.export.source import CHANGES, DATA, CController, part
 from mpc.export.targets import TARGETS, Target
-from quadsim.errors import ParameterError
+from quadsim.errors import ExportError, ParameterError
 from quadsim.outputs import absolute, reserving, writing
 from scenarios.export.reach import Reach, reach
 from scenarios.export.record import Recording, record
 from scenarios.loading import as_scenario
-from scenarios.parts.controllers import exportable
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 
@@ -95,8 +95,10 @@ def exported_law(scenario: Scenario) -> Exportable:
     Raises:
         ExportError: it cannot be exported.
     """
-    shapes = (*scenario.obstacles, *scenario.regions)
-    return exportable(scenario.controller, build_vehicle(scenario), scenario.control_period, shapes)
+    controller, shapes = scenario.controller, (*scenario.obstacles, *scenario.regions)
+    if not isinstance(controller, Weighted):
+        raise ExportError(f"it is {controller.type!r}; exported are unconstrained, constrained and robust")
+    return controller.exportable(build_vehicle(scenario), scenario.control_period, shapes)
 
 
 def _facts(controller: CController) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mpc.bounded import Bounded
 from mpc.constrained import ConstrainedMPC
 from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
@@ -24,7 +25,6 @@ from quadsim.state import Array
 from scenarios.build import build_controller
 from scenarios.parts.vehicle import build_vehicle
 from scenarios.rollout import Rollout
-from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.scenario import Scenario
 
 MPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
@@ -77,7 +77,7 @@ class Recorder:
 def record(scenario: Scenario) -> Recording:
     """Fly a scenario, record each period, and compute the answers of a controller that starts with the first."""
     scenario = scenario.replace({"controller.compiled": False})
-    if isinstance(scenario.controller, BoundedSpec):
+    if isinstance(scenario.controller, Bounded):
         scenario = scenario.replace({"controller.solver": CORE})
     law = build_controller(scenario, build_vehicle(scenario))
     inner = law.inner if isinstance(law, Guarded) else law

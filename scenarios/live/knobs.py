@@ -6,8 +6,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.controllers import AnyController
 from scenarios.schema.json_schema import scenario_schema
+from scenarios.schema.writing import plain
 
 Value = float | int | bool | str | tuple[float, ...]
 
@@ -24,10 +25,10 @@ class Knob:
     choices: tuple[str, ...] = ()  # of a text
 
 
-def knobs(spec: ControllerSpec) -> tuple[Knob, ...]:
+def knobs(spec: AnyController) -> tuple[Knob, ...]:
     """Every field of a controller that has a value, but its type, longer lists and what a user's controller reads."""
     root = scenario_schema()
-    values = spec.model_dump(mode="json", exclude_none=True, exclude={"type"})
+    values = {name: value for name, value in plain(spec).items() if name != "type"}
     return tuple(_walk("", values, root["$defs"][type(spec).__name__], "", root))
 
 

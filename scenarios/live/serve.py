@@ -16,14 +16,14 @@ from scenarios.live.pacing import Pace
 from scenarios.live.session import Session, read_script
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Document
-from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.controllers import AnyController
 from scenarios.schema.scenario import Scenario
 from scenarios.shipped import scenario_names
 
 
 def fly_live(
     scenario: Scenario,
-    against: ControllerSpec | None,
+    against: AnyController | None,
     script: str | Path | None,
     *,
     onward: bool,
@@ -92,9 +92,9 @@ def _serve(session: Session, save: Callable[[Session], str], *, host: str, port:
         pace.drive(session, page)
 
 
-def _others(scenario: Scenario) -> dict[str, ControllerSpec]:
+def _others(scenario: Scenario) -> dict[str, AnyController]:
     """Controllers of the library that fly the same vehicle at the same period."""
-    found: dict[str, ControllerSpec] = {}
+    found: dict[str, AnyController] = {}
     for name in scenario_names():
         other = load_scenario(name)
         same = (other.vehicle, other.control_period) == (scenario.vehicle, scenario.control_period)

@@ -27,7 +27,7 @@ from scenarios.limits import with_bounds_stated
 from scenarios.parts.live import Successor, validated
 from scenarios.rollout import Rollout
 from scenarios.schema.base import Spec, Triple
-from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.controllers import AnyController
 from scenarios.schema.scenario import Scenario
 
 STIFFNESS: Final = 0.4  # of the spring that a person pulls by, in weights of the vehicle per metre
@@ -103,7 +103,7 @@ class Session:
         reason: why the first has ended; None while it has not.
     """
 
-    def __init__(self, scenario: Scenario, against: ControllerSpec | None = None) -> None:
+    def __init__(self, scenario: Scenario, against: AnyController | None = None) -> None:
         self.scenario, self._against = preferring_core(scenario), against
         self._queue: deque[tuple[Mapping[str, Any], str | None, Successor | None]] = deque()
         self.flights: tuple[Rollout, ...] = ()

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from operator import itemgetter
 from typing import TYPE_CHECKING, TypeVar
 
-from mpc.fallback.settings import FallbackSettings
+from mpc.bounded import FallbackSettings
 from quadsim.errors import ParameterError
 from quadsim.fields import filled
 from quadsim.sim.computation import Computation, ComputationTime, Stall

@@ -27,7 +27,7 @@ from scenarios.parts.effects import build_changes, build_computation, check_chan
 from scenarios.parts.events import neutral
 from scenarios.parts.navigation import build_faults
 from scenarios.schema.base import Spec
-from scenarios.schema.controller import ControllerSpec, changed
+from scenarios.schema.controllers import AnyController, changed
 from scenarios.schema.events import (
     MOST_EVENTS,
     ControllerEvent,
@@ -49,7 +49,7 @@ _DEPENDENT: Final = (ControllerEvent, PayloadDrop, PayloadPickup, SensorFaultEve
 class Successor:
     """A controller that is ready to take over, and the table of a scenario file that it is made of."""
 
-    spec: ControllerSpec
+    spec: AnyController
     controller: Controller
 
 
@@ -91,7 +91,7 @@ class FlightEvents:
         navigation: Navigation | None,
         reference: FollowedCourse,
         loop: ClosedLoop,
-        build: Callable[[ControllerSpec], Controller] | None,
+        build: Callable[[AnyController], Controller] | None,
     ) -> None:
         """Set up, before the first period; `build` makes a controller, None where the user's own one flies."""
         self.scenario, self._vehicle, self._spec = scenario, vehicle, scenario.controller
@@ -207,7 +207,7 @@ class FlightEvents:
         found = [each for each in (self.unanswered, unanswered_by(self._loop.controller)) if each is not None]
         return min(found, key=lambda each: each.converges is not None, default=None)
 
-    def _switch(self, spec: ControllerSpec, ready: Successor | None) -> None:
+    def _switch(self, spec: AnyController, ready: Successor | None) -> None:
         found = ready if ready is not None and ready.spec == spec else self._built(spec)
         self.unanswered = self.first_unanswered()
         self._loop.switch(found.controller)
@@ -225,7 +225,7 @@ class FlightEvents:
             self._built(spec)
         self._schedule(event, ready)
 
-    def _built(self, spec: ControllerSpec) -> Successor:
+    def _built(self, spec: AnyController) -> Successor:
         if self._build is None:
             raise ParameterError("event", "type", "controller", "another one where the controller is one's own")
         return Successor(spec=spec, controller=self._build(spec))

@@ -19,8 +19,8 @@ from scripted_controller import (
     random_state,
 )
 
+from mpc.bounded import FallbackSettings
 from mpc.fallback.completion import CompletedMoment
-from mpc.fallback.settings import FallbackSettings
 from mpc.solvers.piqp import STATUS
 from quadsim.controller import ACCEPTED, Moment, Phase
 from quadsim.errors import CommandError

@@ -15,7 +15,7 @@ from scripted_controller import (
     model,
 )
 
-from mpc.fallback.settings import FallbackSettings
+from mpc.bounded import FallbackSettings
 from quadsim.controller import Command, Moment, Phase
 from quadsim.errors import CommandError
 from quadsim.state import Array

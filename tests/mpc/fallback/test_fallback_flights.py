@@ -15,9 +15,9 @@ from scripted_controller import (
 )
 from support import paper_reference
 
+from mpc.bounded import FallbackSettings
 from mpc.constrained import ConstrainedMPC
 from mpc.fallback.contract import Guarded
-from mpc.fallback.settings import FallbackSettings
 from mpc.ocp import Query
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers.piqp import STATUS

@@ -19,8 +19,8 @@ from quadsim.errors import CommandError, InputError
 from quadsim.state import Array
 from scenarios.build import build_controller
 from scenarios.loading import load_scenario
-from scenarios.parts.plugin import PluginController
 from scenarios.parts.vehicle import build_vehicle
+from scenarios.plugin import PluginController
 from scenarios.rollout import Rollout
 
 HOVER = """
