@@ -68,13 +68,13 @@ class Space:
     Args:
         shapes: the obstacles and regions.
         radius: of the vehicle's bounding ball [m].
-        period: from one predicted instant to the next [s].
+        period: from one of the N = `horizon` predicted instants to the next [s].
         horizon: N.
-        settings: see `AvoidanceSettings`.
+        settings: how closely.
         margins: (N, 3) further ones along x, y, z at each predicted instant [m], as of a disturbance; None for none.
         penalty: l1 [1/m] and l2 [1/m^2] of violating a half-space; None for hard ones.
-        largest: whether it is of the largest violation at each instant, instead of all.
         positions: which of the states are x, y, z.
+        largest: whether the penalty is of the largest violation at each instant, instead of all.
     """
 
     def __init__(
@@ -131,16 +131,12 @@ class Space:
 
     def constraints(self, normals: Array, bounds: Array, states: int) -> tuple[Constraint, ...]:
         """All half-spaces, one constraint per obstacle or region, by its name."""
-        found = []
+        constraints = []
         for shape in self._shapes:
-            at = self._names == shape.name
-            found.append(self.constraint(normals[at], bounds[at], states, name=_titled(shape)))
-        return tuple(found)
-
-
-def _titled(shape: Shape) -> str:
-    kind = "obstacle" if isinstance(shape, Obstacle) else "corridor" if isinstance(shape, Corridor) else ""
-    return f"{kind} {shape.name}".strip()
+            kind = "obstacle" if isinstance(shape, Obstacle) else "corridor" if isinstance(shape, Corridor) else ""
+            at, name = self._names == shape.name, f"{kind} {shape.name}".strip()
+            constraints.append(self.constraint(normals[at], bounds[at], states, name=name))
+        return tuple(constraints)
 
 
 class ObstacleQP:

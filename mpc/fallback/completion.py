@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from mpc.bounded import by_group
 from mpc.equilibrium import Trim
-from mpc.fallback.hover import require_quadrotor
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
 from quadsim.controller import Moment
@@ -79,26 +78,21 @@ def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) ->
     Its attitude and body rates are left out where the state's are predicted.  Next to a pitch of 90 deg the rates of
     Euler angles are implausibly large; those of the body are not.
     """
-    found = {**vars(now), "acting": acting, "unseen": unseen}
+    values = {**vars(now), "acting": acting, "unseen": unseen}
     if unseen[ANGLES].any():
-        found["attitude"] = None
+        values["attitude"] = None
     if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
-        found["body_rates"] = None
-    return CompletedMoment(**found)
+        values["body_rates"] = None
+    return CompletedMoment(**values)
 
 
 class StateCompletion:
     """Completes one state after the other, one per control period.
 
-    Attributes:
-        unseen: (12,) periods since each channel was last measured; infinite before it ever was.
-
-    Raises:
-        ParameterError: the model is not a quadrotor's.
+    `unseen` (12,) is the number of periods since each channel was last measured; infinite before it ever was.
     """
 
     def __init__(self, model: LinearModel) -> None:
-        require_quadrotor(model)
         self._model = model
         self._measured_covariance = read_only(np.diag(NOISE**2))
         self._process = read_only(_process_noise(model.period))

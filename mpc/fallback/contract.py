@@ -65,9 +65,6 @@ class Guarded:
     Attributes:
         inner: the controller called first; one that falls back by itself does no harm.
         law: what levels 1 to 3 are made of.
-
-    Raises:
-        ParameterError: the model is not a quadrotor's.
     """
 
     def __init__(
@@ -147,8 +144,8 @@ class Guarded:
     @property
     def unanswered(self) -> InfeasiblePeriod | None:
         """The first period since `reset` whose QP had no answer; None where all had, or there is no QP."""
-        found = getattr(self.inner, "unanswered", None)
-        return found if isinstance(found, InfeasiblePeriod) else None
+        period = getattr(self.inner, "unanswered", None)
+        return period if isinstance(period, InfeasiblePeriod) else None
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; by the hover model where the inner controller cannot."""

@@ -86,9 +86,9 @@ class DaqpDense:
         later = self._qp.later
         if later is None:
             return None
-        found = (multipliers != 0.0) * (_ACTIVE + _LOWER * (multipliers < 0.0))
+        active = (multipliers != 0.0) * (_ACTIVE + _LOWER * (multipliers < 0.0))
         sense = np.full(multipliers.size, _EQUALITY, dtype=np.intc)
-        sense[: later.size] = np.where(later == np.arange(later.size), 0, found[later])
+        sense[: later.size] = np.where(later == np.arange(later.size), 0, active[later])
         return sense
 
 

@@ -40,11 +40,7 @@ def region_edges(run: Run) -> Iterator[tuple[SpaceLimit, Array]]:
         yield limit, limit.shape.edges(points.min(axis=0) - _ROUND, points.max(axis=0) + _ROUND)
 
 
-def outlines(obstacle: Obstacle, t: float, z: float, radius: float) -> Iterator[tuple[Array, bool]]:
-    """From above, each solid's outline (n, 2) [m] at a time, and whether it is as high as a ball of a radius at z."""
+def outlines(obstacle: Obstacle, t: float) -> list[Array]:
+    """From above, each solid's outline (n, 2) [m] at a time."""
     place = obstacle.positions(np.array([t]))[0]
-    for solid in obstacle.solids:
-        outline = footprint(solid, -np.inf, np.inf)
-        assert outline is not None
-        meets = footprint(solid, z - radius - place[2], z + radius - place[2]) is not None
-        yield place[:2] + outline, meets
+    return [place[:2] + footprint(solid) for solid in obstacle.solids]

@@ -31,7 +31,6 @@ from mpc.ocp import Equilibrium, Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Solution, kkt_residuals
 from mpc.solvers import Formulation, QPSolver
-from mpc.solvers.daqp import DaqpDense
 from mpc.solvers.piqp import PiqpDense, PiqpMultistage
 from quadsim.controller import SOLVED
 from quadsim.state import Array
@@ -128,19 +127,6 @@ def test_it_has_the_condensed_optimum(
     np.testing.assert_allclose(plan, peer.plan, rtol=0.0, atol=1e-7 * size)
 
 
-@pytest.mark.parametrize("steps", [1, 4, 5, 50, 60])
-def test_stages_cover_the_horizon(steps: int) -> None:
-    """Whatever M, and whatever is left for the first stage and the last, the QP is the same."""
-    problem = paper_problem()
-    query = np.zeros(12), problem.objective.desired(paper_reference(51)[1:]), problem.model.u_bar
-    expected = QPSolver("piqp-dense", problem).solve(Query(*query)).plan
-    formulation, backend = PartiallyCondensed(problem, steps_per_stage=steps), PiqpMultistage()
-    backend.setup(formulation.qp)
-    solution = backend.solve(formulation.pose(Query(*query)).qp)
-    np.testing.assert_allclose(formulation.inputs(solution.x)[0], expected[0], atol=1e-3)
-    np.testing.assert_allclose(formulation.inputs(solution.x), expected, atol=0.05)
-
-
 @pytest.mark.parametrize("steps", [1, 3, 5, 7, 50, 80])
 def test_every_stage_length_gives_the_condensed_optimum(steps: int) -> None:
     """Also where the horizon is no multiple of it, and where one stage holds it all."""
@@ -163,24 +149,6 @@ def test_products_of_rounding_are_left_out() -> None:
 
 
 # Models that change from step to step
-
-
-@pytest.mark.parametrize("steps", [1, 2, 5])
-def test_constant_matrices_make_the_papers_plan(constrained_flight: Flight, steps: int) -> None:
-    problem = paper_problem()
-    solver = changing(problem, steps)
-    formulation, backend = PartiallyCondensed(problem), DaqpDense()
-    backend.setup(formulation.qp)
-    pressing = 0
-    for query in flight_queries(constrained_flight, problem, stride=100):
-        solution = solver.solve(ocp_peer.period(problem, *query[:4]))
-        optimum = backend.solve(formulation.pose(Query(*query)).qp)
-        assert solution.status == optimum.status == SOLVED
-        plan, expected = solver.plan(solution), formulation.inputs(optimum.x)
-        np.testing.assert_allclose(plan[:10], expected[:10], atol=1e-3)
-        np.testing.assert_allclose(plan, expected, atol=1e-2)
-        pressing += optimum.active
-    assert pressing > 100
 
 
 @pytest.mark.parametrize("horizon", [1, 3, 7, 10])

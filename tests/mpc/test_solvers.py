@@ -198,12 +198,3 @@ def test_a_solver_that_is_not_installed_names_its_package(monkeypatch: pytest.Mo
         make_backend("daqp")
     assert SOLVERS["daqp"].line == "not installed: pip install 'quadsim[daqp]'"
     assert not SOLVERS["daqp"].installed
-
-
-def test_entries_describe_themselves() -> None:
-    for name in ALWAYS:
-        entry = find_solver(name)
-        assert entry.installed
-        assert entry.line == entry.description
-    absent = replace(SOLVERS["daqp"], package="a_package_that_does_not_exist")
-    assert not absent.installed

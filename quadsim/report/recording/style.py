@@ -8,7 +8,7 @@ import rerun as rr
 
 from quadsim.flight.audit import SIGNALS
 from quadsim.flight.log import FlightLog
-from quadsim.report.curves import line_colour
+from quadsim.report.figure import line_colour
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 
