@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, get_args
 
-from pydantic import Discriminator, Tag, ValidationError
+from pydantic import Discriminator, Tag
 
 from mpc.baselines.geometric import Geometric
 from mpc.baselines.lqr import LQRTable
@@ -16,8 +16,7 @@ from mpc.nonlinear.settings import Nonlinear
 from mpc.robust.settings import Robust
 from mpc.unconstrained import Unconstrained
 from scenarios.plugin import FORM, Plugin, is_plugin
-from scenarios.schema.base import Spec
-from scenarios.schema.problems import ScenarioError, describe_all
+from scenarios.schema.problems import parse_table
 from scenarios.schema.settings import set_field
 from scenarios.schema.writing import plain
 
@@ -55,7 +54,8 @@ AnyController = Annotated[_Table, _OrName()]
 """Any of the laws, distinguished by its type; one whose fields all have defaults may be given by its name alone."""
 
 
-class _Holder(Spec):
+@dataclass(frozen=True, kw_only=True)
+class _Holder:
     """A table that has a controller, for messages to name it."""
 
     controller: AnyController
@@ -70,11 +70,7 @@ def changed(controller: AnyController, fields: Mapping[str, Any]) -> AnyControll
     data: dict[str, Any] = {} if "type" in fields else plain(controller)
     for path, value in _leaves(fields):
         set_field(data, path, value, source="fields")
-    tables = {"controller": data}
-    try:
-        return _Holder.model_validate_json(json.dumps(tables)).controller
-    except ValidationError as error:
-        raise ScenarioError("controller", describe_all(error, tables, _Holder)) from error
+    return parse_table(_Holder, {"controller": data}, "controller").controller
 
 
 def _leaves(fields: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
