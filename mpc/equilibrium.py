@@ -68,10 +68,7 @@ def equilibrium(
 ) -> Trim:
     """What rest takes under a model's disturbance; a rotor that would have to pull stands still.
 
-    Args:
-        model: its effectiveness not yet `twisted`.
-        acceleration: (3,) of the disturbance, world frame [m/s^2]; None for the model's.
-        twist: (3,) see `Trim.twist`; None for none.
+    The model is not yet `twisted`; `acceleration` (3,), world frame [m/s^2], is in place of the model's.
     """
     a_x, a_y, a_z = model.acceleration.tolist() if acceleration is None else acceleration
     twist = np.zeros(3) if twist is None else twist

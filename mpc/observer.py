@@ -71,10 +71,7 @@ class DisturbanceObserver:
     def __init__(self, settings: ObserverSettings, period: float) -> None:
         doubled = math.sqrt(2.0)
         _, force = observer_gain(
-            period,
-            noise=doubled * settings.velocity_noise,
-            walk=settings.velocity_walk,
-            change=settings.force_walk,
+            period, noise=doubled * settings.velocity_noise, walk=settings.velocity_walk, change=settings.force_walk
         )
         _, torque = observer_gain(
             period, noise=doubled * settings.rate_noise, walk=settings.rate_walk, change=settings.torque_walk

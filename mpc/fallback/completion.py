@@ -118,7 +118,7 @@ class StateCompletion:
             measured: (12,) in part perhaps not finite; of another shape, nothing was measured.
             acting: (4,) rotor speeds in force since the last state [rad/s].
             trim: what holds the vehicle at rest.
-            free: whether the vehicle flies, so that the model predicts its motion; otherwise nothing counts as frozen.
+            free: whether the vehicle flies, as the model predicts; otherwise nothing counts as frozen.
         """
         if np.shape(measured) != (N_STATES,):
             measured = np.full(N_STATES, np.nan)

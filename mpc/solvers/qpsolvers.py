@@ -30,11 +30,7 @@ SETTINGS: Final[dict[str, dict[str, Any]]] = {
 
 
 class AnyOfQpsolvers:
-    """A back end; see `mpc.qp.Backend`.
-
-    Args:
-        name: in `qpsolvers.available_solvers`.
-    """
+    """A back end, by its name in `qpsolvers.available_solvers`; see `mpc.qp.Backend`."""
 
     def __init__(self, name: str) -> None:
         self._name = name

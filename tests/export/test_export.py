@@ -154,8 +154,7 @@ def test_a_problem_with_too_many_numbers_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
-    [(1.5, "1.5"), (-0.1, "-0.1"), (1e-39, "0.0"), (-5e-324, "0.0"), (1.2e-38, "1.2e-38")],
+    ("value", "text"), [(1.5, "1.5"), (-0.1, "-0.1"), (1e-39, "0.0"), (-5e-324, "0.0"), (1.2e-38, "1.2e-38")]
 )
 def test_numbers_are_exact_and_none_is_denormal(value: float, text: str) -> None:
     assert CText("double").number(value) == text

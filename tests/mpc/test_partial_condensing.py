@@ -31,7 +31,7 @@ from mpc.ocp import Equilibrium, Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Solution, kkt_residuals
 from mpc.solvers import Formulation, QPSolver
-from mpc.solvers.piqp import PiqpDense, PiqpMultistage
+from mpc.solvers.piqp import Piqp
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -45,7 +45,7 @@ class Changing:
     """A problem whose model changes, staged and solved again each time, in any number of steps per stage."""
 
     form: PartiallyCondensed
-    backend: PiqpMultistage
+    backend: Piqp
 
     def qp(self, now: Period) -> QP:
         return self.form.pose(now.query).qp
@@ -64,7 +64,7 @@ class Changing:
 
 
 def changing(problem: Problem, steps: int) -> Changing:
-    form, backend = PartiallyCondensed(problem, steps_per_stage=steps, changing=True), PiqpMultistage(changing=True)
+    form, backend = PartiallyCondensed(problem, steps_per_stage=steps, changing=True), Piqp(changing=True)
     backend.setup(form.qp)
     return Changing(form, backend)
 
@@ -77,7 +77,7 @@ def softened(problem: Problem, l1: list[float], l2: list[float], *, largest: boo
 
 def exact(form: Formulation, query: tuple[Array, Array, Array, Equilibrium]) -> tuple[Array, Array, float]:
     """Plan and slacks at a form's optimum, with its KKT residual over the size of its multipliers."""
-    backend = PiqpMultistage() if isinstance(form, PartiallyCondensed) else PiqpDense()
+    backend = Piqp() if isinstance(form, PartiallyCondensed) else Piqp(dense=True)
     backend.setup(form.qp)
     qp = form.pose(Query(*query)).qp
     solution = backend.solve(qp)
@@ -112,7 +112,7 @@ def test_it_has_the_condensed_optimum(
     before = model.u_bar + 0.05 * rng.normal(size=nu)
     query = 0.1 * rng.normal(size=n), rng.normal(size=(horizon, len(problem.objective.C_r))), before, rest
     staged = PartiallyCondensed(problem, steps_per_stage=steps)
-    solver = PiqpMultistage()
+    solver = Piqp()
     solver.setup(staged.qp)
     peer = ocp_peer.optimum(problem, ocp_peer.period(problem, *query[:4]))
     if peer.solution.status != SOLVED:

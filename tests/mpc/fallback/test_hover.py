@@ -7,20 +7,9 @@ import math
 import numpy as np
 import pytest
 import scipy.linalg
-from scripted_controller import (
-    PERIOD,
-    advance,
-    bounds,
-    level,
-    model,
-    random_state,
-)
+from scripted_controller import PERIOD, advance, bounds, level, model, random_state
 
-from mpc.fallback.hover import (
-    ACCEPTABLE,
-    ACCEPTABLE_ACCELERATION,
-    HoverLaw,
-)
+from mpc.fallback.hover import ACCEPTABLE, ACCEPTABLE_ACCELERATION, HoverLaw
 from mpc.heading import predict_in_heading_frame, turn
 from mpc.model import hover_model
 from quadsim.assets import vehicle_path

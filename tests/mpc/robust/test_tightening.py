@@ -179,8 +179,7 @@ def test_margins_grow_over_the_horizon_and_saturate(vehicle: Vehicle, rotor_lag:
 
 
 @pytest.mark.parametrize(
-    ("rotor_lag", "delay", "first", "last"),
-    [(0.0, 0.0, 0.13, 0.27), (0.05, 0.0, 0.13, 0.51), (0.05, 0.05, 0.34, 0.96)],
+    ("rotor_lag", "delay", "first", "last"), [(0.0, 0.0, 0.13, 0.27), (0.05, 0.0, 0.13, 0.51), (0.05, 0.05, 0.34, 0.96)]
 )
 def test_defaults_draw_the_tilt_in_as_documented(
     vehicle: Vehicle, rotor_lag: float, delay: float, first: float, last: float
