@@ -283,9 +283,9 @@ class ClosedLoop:
             return None
         return positions
 
-    def _fly(self, observed: Observation, given: Command | None) -> FlownPeriod:
+    def _fly(self, observed: Observation, command: Command | None) -> FlownPeriod:
         plant, computation, steps, now = self._plant, self.computation, self._steps, observed.moment
-        step_s, command = 0.0, given
+        step_s = 0.0
         if command is None:
             started = clock.perf_counter()
             with _ending_flight(now.time):
