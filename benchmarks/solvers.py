@@ -83,18 +83,20 @@ def measure(name: str, quick: bool) -> list[Record]:
         raise InputError(f"{name} is flown by no MPC of fixed matrices; choose a constrained or a robust one")
     if quick:
         scenario = scenario.replace({"duration": 2.0, "controller.horizon": 10, "constraints": []})
-    log = Rollout(scenario).fly().log.control
+    flight = Rollout(scenario).fly()
+    log = flight.log.control
     candidates: dict[str, Replayed] = {}
     setup: dict[str, float] = {}
-    for solver, each in entries(scenario).items():
+    for solver, entry in entries(scenario).items():
+        assembly = flight.assembly.of(entry)
         started = clock.perf_counter()
-        controller = Assembly(each).controller()  # a second time: what can be shared within a process is there
+        controller = assembly.controller()  # a second time: what can be shared within a process is there
         setup[solver] = 1e3 * (clock.perf_counter() - started)
-        reference = Assembly(each).reference(log.t.size + controller.horizon)
+        reference = assembly.reference(log.t.size + controller.horizon)
         candidates[solver] = Replayed(controller, log, reference)
     segments = [range(start, min(start + SEGMENT, log.t.size)) for start in range(0, log.t.size, SEGMENT)]
     hover = make_state(position=(0.0, 0.0, 10.0))
-    with Assembly(scenario).plant() as plant:
+    with flight.assembly.plant() as plant:
 
         def fly_a_period() -> None:
             plant.reset(hover)

@@ -37,6 +37,8 @@ def assemble(
     Raises:
         InputError: the file is missing or malformed, a field is not allowed, or what it names cannot be flown so.
     """
+    if not isinstance(source, str | Path) and not changes:
+        changes = {}
     if seed is not None:
         changes = {**changes, "seed": seed} if isinstance(changes, Mapping) else [*changes, f"seed={seed}"]
     if not isinstance(source, str | Path) and changes and not isinstance(changes, Mapping):

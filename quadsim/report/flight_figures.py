@@ -27,10 +27,13 @@ from quadsim.report.figure import (
     break_at_wraps,
     commanded_speeds,
     effect_curves,
+    has_space,
     line_colour,
+    obstacles_in,
+    outlines,
     reference_curve,
+    region_edges,
 )
-from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.report.to_matplotlib import write_pngs
 from quadsim.state import POSITION, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS

@@ -106,16 +106,7 @@ def fly_campaign(
     report: bool = True,
     watch: Watch = lambda standing: None,
 ) -> CampaignResult:
-    """Fly a campaign, or what is missing of it; the arguments are those of `quadsim.campaign`.
-
-    Each flight's row is the same with any worker and order; so is the table of all.  Whatever ends this
-    early, what was flown stays, and `resume` continues it.
-
-    Raises:
-        InputError: another campaign is there, or `until_width` would leave out flights that are there.
-        OutputError: the directory cannot be written, or another process flies there.
-        KeyboardInterrupt: a person stopped it; what was flown is there.
-    """
+    """Fly a campaign, or what is missing of it, to the same rows by any workers; see `quadsim.campaign`."""
     if until_width is not None and not 0.0 < until_width < 1.0:
         raise ParameterError("", "--until-width", until_width, "between 0 and 1")
     engine = "local" if cluster is None else "dask"
@@ -265,11 +256,7 @@ class Sweep:
 def fly_sweep(
     scenario: Scenario, values: Mapping[str, Sequence[Any]], workers: int | None = None, progress: Progress = silent
 ) -> Sweep:
-    """Fly every combination of values, by dotted path, the last field varying fastest.
-
-    Raises:
-        InputError: a field does not exist, or a value is not allowed.
-    """
+    """Fly every combination of values, by dotted path, the last field varying fastest; see `quadsim.sweep`."""
     for path, tried in values.items():
         if isinstance(tried, str) or not len(tried):
             raise ParameterError("sweep", path, tried, "a list of values to try")
@@ -306,12 +293,7 @@ class Recorded:
 
 
 def recorded_flight(directory: Path, number: int | None) -> Recorded:
-    """A flight of a campaign's directory; the worst one where no number is given.
-
-    Raises:
-        InputError: there is no such flight, or its parameters cannot be flown together.
-        FileError: the directory is no campaign, or not a finished one.
-    """
+    """A flight of a campaign's directory; the worst one where no number is given; see `quadsim.replay`."""
     plan = stored_plan(directory)
     table = read_flights(directory / FLIGHTS_FILE, plan.schema)
     number = worst_flight(table) if number is None else number

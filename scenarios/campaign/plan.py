@@ -180,11 +180,7 @@ def read_campaign(name: str, find: Callable[[str], Path] = campaign_path) -> dic
 
 
 def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = None, seed: int | None = None) -> Plan:
-    """Read and check a campaign that ships, or a file, with the scenario it names; the other arguments change it.
-
-    Raises:
-        InputError: the file is missing or malformed, a field is not allowed, or what it varies cannot be flown.
-    """
+    """Read and check a campaign that ships, or a file, with the scenario it names; the other arguments change it."""
     path, data = campaign_path(name), read_campaign(name)
     data |= {key: value for key, value in (("flights", flights), ("seed", seed)) if value is not None}
     spec = parse_campaign(data, source=path.name)
@@ -194,11 +190,7 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
 
 
 def make_plan(scenario: Scenario, data: Mapping[str, Any]) -> Plan:
-    """A campaign of a scenario that is there already, its other fields given as in a file.
-
-    Raises:
-        InputError: a field is not allowed, or what varies cannot be flown.
-    """
+    """A campaign of a scenario that is there already, its other fields given as in a file."""
     spec = parse_campaign({"name": scenario.name, **data, "scenario": scenario.name}, source="campaign")
     plan = Plan(spec, Assembly(scenario).with_vehicle)
     plan.check()
@@ -206,20 +198,12 @@ def make_plan(scenario: Scenario, data: Mapping[str, Any]) -> Plan:
 
 
 def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignFile:
-    """Check a campaign given as nested tables.
-
-    Raises:
-        ScenarioError: naming every field that is wrong.
-    """
+    """A campaign's file, given as nested tables."""
     return parse_table(CampaignFile, data, source, file="campaign")
 
 
 def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ()) -> Scenario:
-    """The scenario of a campaign's file, with its changes and then those of the command line.
-
-    Raises:
-        InputError: it cannot be read or flown.
-    """
+    """The scenario of a campaign's file, with its changes and then those of the command line."""
     file = scenario_path(spec.scenario)
     data = merge(read_scenario(file, scenario_path), spec.set)
     note_changes(data, spec.set)

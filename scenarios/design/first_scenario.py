@@ -93,16 +93,9 @@ class FirstScenario:
 
 
 def first_scenario(vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust") -> FirstScenario:
-    """A scenario that the vehicle flies well, with its controller's numbers made from the vehicle's.
+    """A scenario that the vehicle flies well, with numbers made from the vehicle's; see `quadsim.scenario`.
 
-    Args:
-        vehicle: the numbers.
-        file: where they are, as the scenario is to name it: a shipped vehicle or a path ending in `.toml`.
-        course: one of `COURSES`.
-        law: one of `LAWS`.
-
-    Raises:
-        UnknownNameError: there is no such course or law.
+    `file` is where these are, as the scenario is to name it; `course` is one of `COURSES`, `law` of `LAWS`.
     """
     for kind, name, known in (("course", course, COURSES), ("controller", law, LAWS)):
         if name not in known:

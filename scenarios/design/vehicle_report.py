@@ -157,21 +157,17 @@ def _designed(vehicle: Vehicle) -> Designed | None:
 
 def vehicle_tables(report: VehicleReport) -> list[Grid]:
     """All of it as tables: figures, torques, what a controller can do, linear model, parameters, shortfalls."""
-    vehicle, sheet, sources = report.vehicle, report.figures, report.sources
+    vehicle, sheet = report.vehicle, report.figures
+    spans = [
+        (torque.axis, *(f"{format_number(low)} .. {format_number(high)}" for low, high in _ranges(torque)))
+        for torque in sheet.torques
+    ]
     tables = [
         _grid(f"{vehicle.name} at hover", ("", "value", "unit"), _figures(vehicle, sheet), note=vehicle.description),
         _grid(
             "torque authority at hover",
             ("axis", "torque [N m]", "acceleration [rad/s^2]", "pure torque [N m]"),
-            [
-                (
-                    torque.axis,
-                    _span(torque.lowest, torque.highest),
-                    _span(torque.lowest_acceleration, torque.highest_acceleration),
-                    _span(torque.lowest_pure, torque.highest_pure),
-                )
-                for torque in sheet.torques
-            ],
+            spans,
             note="thrust held at the weight, every rotor within its range; pure: no torque about the other axes",
         ),
         _grid(
@@ -184,16 +180,23 @@ def vehicle_tables(report: VehicleReport) -> list[Grid]:
         _grid(
             "parameters",
             ("parameter", "value", "unit", "source"),
-            [(name, _value(value), unit, sources[name]) for name, value, unit in report.parameters],
+            [
+                (name, ", ".join(f"{number:g}" for number in np.atleast_1d(value)), unit, report.sources[name])
+                for name, value, unit in report.parameters
+            ],
             note="short names of sources are spelt out at the head of the vehicle's file",
         ),
     ]
-    return tables if report.shortfalls is None else [*tables, _shortfalls(report.scenario or "", report.shortfalls)]
+    if report.shortfalls is not None:
+        lines = [(str(i), text) for i, text in enumerate(report.shortfalls, start=1)]
+        none = [("-", "none: the vehicle meets all of them")]
+        tables.append(_grid(f"bounds of {report.scenario} that it cannot meet", ("", "what and why"), lines or none))
+    return tables
 
 
-def _shortfalls(scenario: str, missed: Sequence[str]) -> Grid:
-    lines = [(str(i + 1), text) for i, text in enumerate(missed)] or [("-", "none: the vehicle meets all of them")]
-    return _grid(f"bounds of {scenario} that it cannot meet", ("", "what and why"), lines)
+def _ranges(torque: TorqueRange) -> tuple[tuple[float, float], ...]:
+    kinds = ("", "_acceleration", "_pure")
+    return tuple((getattr(torque, f"lowest{kind}"), getattr(torque, f"highest{kind}")) for kind in kinds)
 
 
 def _figures(vehicle: Vehicle, sheet: VehicleSheet) -> list[tuple[str, ...]]:
@@ -222,13 +225,13 @@ def _abilities(sheet: VehicleSheet) -> list[tuple[str, ...]]:
     if made is None:
         return [sinks, ("none can be made: hover leaves nothing to control it with", "-", "")]
     why = {"lag": "the rotors' lag", "torque": "torque in reserve", "period": "the shortest control period"}
-    speed = "none" if made.level_speed is None else format_number(made.level_speed)
+    speed = ("none", "") if made.level_speed is None else (format_number(made.level_speed), "m/s")
     labels = {"x, y": f"x, y, limited by {why[made.limited_by]}"}
     return [
         sinks,
         ("tilt bound", format_number(made.tilt_bound), "deg"),
         ("largest level acceleration within it", format_number(made.level_acceleration), "m/s^2"),
-        ("level speed at which the air turns it over", speed, "m/s" if made.level_speed is not None else ""),
+        ("level speed at which the air turns it over", *speed),
         *(
             (f"time constant of {labels.get(axis, axis)}", format_number(time), "s")
             for axis, time in made.time_constants.items()
@@ -239,23 +242,16 @@ def _abilities(sheet: VehicleSheet) -> list[tuple[str, ...]]:
 
 
 def _poles(sheet: VehicleSheet) -> list[tuple[str, ...]]:
-    chains = ", ".join(str(length) for length in sheet.integrator_chains)
+    chains = ", ".join(map(str, sheet.integrator_chains))
     body = f"rigid body: {len(sheet.continuous_poles)} poles, chains of {chains} integrators"
-    lines: list[tuple[str, ...]] = [(body, "0", "1")]
-    for name, pole in sheet.lag_poles.items():
-        label = f"rotors that {'rise' if name == 'rotor_rise' else 'fall'}: {N_ROTORS} poles, not in this model"
-        lines.append((label, format_number(pole), format_number(sheet.discrete_lag_poles[name])))
-    return lines
+    lags = [
+        (f"rotors that {name.removeprefix('rotor_')}: {N_ROTORS} poles, not in this model", format_number(pole))
+        for name, pole in sheet.lag_poles.items()
+    ]
+    discrete = map(format_number, sheet.discrete_lag_poles.values())
+    return [(body, "0", "1"), *((*lag, pole) for lag, pole in zip(lags, discrete, strict=True))]
 
 
 def _grid(title: str, head: tuple[str, ...], lines: Sequence[tuple[str, ...]], note: str = "") -> Grid:
     cells = tuple(tuple(Cell(text=text) for text in line) for line in lines)
     return Grid(key=head[0], title=title, head=head, lines=cells, note=note)
-
-
-def _span(low: float, high: float) -> str:
-    return f"{format_number(low)} .. {format_number(high)}"
-
-
-def _value(value: object) -> str:
-    return ", ".join(f"{item:g}" for item in value) if isinstance(value, tuple) else f"{value:g}"

@@ -184,10 +184,6 @@ def fly_live(
     """Fly a session and save it, whatever ended it; `onward`: from where the scenario, a finished run's, ended.
 
     The other arguments are those of `scenarios.app.live`; `place` is the port, the host and the browser.
-
-    Raises:
-        InputError: something cannot be flown so, or there is nothing that serves a page.
-        OutputError: the directory cannot be written.
     """
     inputs = None if script is None else read_script(script)
     if inputs is None:

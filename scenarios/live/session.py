@@ -275,12 +275,7 @@ class Session:
 
 
 def read_script(path: str | Path) -> Script:
-    """Read a script.
-
-    Raises:
-        FileError: it cannot be read.
-        InputError: it is not a script.
-    """
+    """Read a script."""
     return parse_table(Script, read_toml(Path(path)), str(path), file="script")
 
 

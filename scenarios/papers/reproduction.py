@@ -97,11 +97,7 @@ class Paper(PaperFile):
         return self.path.stem
 
     def scenario_of(self, number: PublishedNumber) -> Scenario:
-        """What is flown for a number.
-
-        Raises:
-            InputError: there is no such scenario, or it cannot be flown so.
-        """
+        """What is flown for a number."""
         beside = self.path.parent / number.scenario
         own_file = number.scenario.endswith(".toml") and beside.is_file()
         path = scenario_path(str(beside) if own_file else number.scenario)
@@ -112,11 +108,7 @@ class Paper(PaperFile):
 
 
 def load_paper(name: str) -> Paper:
-    """Read and check a paper that ships, or a path ending in `.toml`.
-
-    Raises:
-        InputError: the file is missing or malformed, or a field is not allowed.
-    """
+    """Read and check a paper that ships, or a path ending in `.toml`."""
     path = paper_path(name)
     return Paper(path=path, **vars(parse_table(PaperFile, read_toml(path), path.name, file="paper")))
 
@@ -237,11 +229,7 @@ class Reproductions(tuple[Reproduction, ...], Result):
 
 
 def reproduce_paper(paper: Paper, progress: Progress = silent) -> Reproduction:
-    """Fly a paper's numbers, each flight once whatever is measured of it.
-
-    Raises:
-        InputError: a number cannot be flown, or the flight's summary has no such number.
-    """
+    """Fly a paper's numbers, each flight once whatever is measured of it; see `quadsim.reproduce`."""
     scenarios = [paper.scenario_of(number) for number in paper.numbers]
     summaries: dict[str, dict[str, Any]] = {}
     reproduced, what, count = [], f"{paper.name}: numbers", len(scenarios)

@@ -26,11 +26,7 @@ JOURNAL_FILE: Final = "journal.log"
 
 
 def require_optuna() -> Any:
-    """Optuna.
-
-    Raises:
-        MissingPackageError: it is not installed.
-    """
+    """Optuna, or MissingPackageError."""
     try:
         import optuna
     except ModuleNotFoundError as error:

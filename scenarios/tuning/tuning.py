@@ -103,12 +103,6 @@ def fly_tuning(
     The same file gives the same answer with any workers and order: a batch is proposed before it flies, and its scores
     are told in the order of its candidates.  A search that is resumed proposes again what it proposed, and flies what
     is missing.
-
-    Raises:
-        InputError: another tuning is there, or other code began it.
-        MissingPackageError: Optuna is not installed.
-        OutputError: the directory cannot be written, or another process writes there.
-        KeyboardInterrupt: a person stopped it; what was flown is there.
     """
     manifest = _manifest(plan)
     count_workers(workers, cluster)

@@ -288,11 +288,7 @@ def _field(name: str) -> Iterator[None]:
 
 
 def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None) -> TuningPlan:
-    """Read and check a tuning that ships, or a file: its campaign, its scenario, and `trials` and `seed` where given.
-
-    Raises:
-        InputError: the file is missing or malformed, a field is not allowed, or what it searches cannot be flown.
-    """
+    """Read and check a tuning that ships, or a file, with its campaign and scenario; see `quadsim.tune`."""
     path, data = tuning_path(name), read_campaign(name, tuning_path)
     data |= {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     spec = parse_table(TuningFile, data, path.name, file="tuning")

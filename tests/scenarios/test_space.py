@@ -15,10 +15,9 @@ from quadsim.controller import Phase
 from quadsim.errors import FileError
 from quadsim.flight.audit import Finding, SpaceLimit
 from quadsim.flight.rundir import load_run
-from quadsim.report.figure import Scene
+from quadsim.report.figure import Scene, has_space, obstacles_in, outlines, region_edges
 from quadsim.report.flight_figures import page_figures, write_figures
 from quadsim.report.recording import write_recording
-from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.space import Cylinder
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario

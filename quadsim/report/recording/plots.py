@@ -24,7 +24,7 @@ from quadsim.report.figure import (
     line_colour,
     reference_curve,
 )
-from quadsim.report.recording.style import (
+from quadsim.report.recording.world import (
     BOUND,
     FRONT_PANELS,
     REFERENCE,

@@ -45,6 +45,10 @@ def test_counts_follow_from_the_times() -> None:
     assert (scenario.periods, scenario.steps_per_period, scenario.plant_stride) == (3, 300, 10)
 
 
+def test_a_scenario_that_is_given_takes_another_seed() -> None:
+    assert load_scenario(load_scenario("hover"), seed=7).seed == 7
+
+
 def test_absent_bounds_are_infinite() -> None:
     limit, *_ = Assembly(
         parse_scenario(scenario_table() | {"constraints": [{"name": "a", "signal": "z", "lower": 1}]})
