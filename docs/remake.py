@@ -2,7 +2,7 @@
 
 A table stands between `<!-- NAME: filled by docs/remake.py from FILE -->` and `<!-- NAME end -->`.  Golden numbers are
 in the repository, under tests/golden; all other files are made by a command, under runs/.  A table whose file is not
-there stays as it is.
+there stays as it is.  The records of two benchmarks are kept as CSV, docs/data.
 
     python docs/remake.py                    # fill all tables from the files that are there
     python docs/remake.py speed mismatch     # run the commands that make these files first
@@ -11,6 +11,7 @@ there stays as it is.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import re
 import subprocess
@@ -236,37 +237,19 @@ def _cell(value: object) -> str:
     return "-" if value is None else str(value)
 
 
-def mismatch(data: Any) -> str:
-    """What each controller did in each condition."""
-    parts = []
-    for key, form, title in (
-        ("end_error", ".3f", 'Distance from the reference at the end [m]; "lost" with the time:'),
-        ("peak_tilt", "#.4g", "Peak roll or pitch at the physics rate [deg]:"),
-    ):
-        cells: dict[tuple[str, ...], str] = {
-            (row["condition"], row["controller"]): row["fate"] or format(row[key], form) for row in _records(data)
-        }
-        parts.append(f"{title}\n\n{by_controller([''], cells)}")
-    return "\n".join(parts)
-
-
-def speed(data: Any) -> str:
-    """Mean position errors of each controller at each speed, of several seeds with half the 95 % interval."""
-    cells: dict[tuple[str, ...], str] = {}
-    for row in _records(data):
-        half = f" ± {row['half']:.3f}" if row["half"] else ""
-        text = "lost" if row["error"] is None else f"{row['error']:.3f}{half}"
-        cells[row["course"], f"{row['speed']:g}", row["controller"]] = text
-    return by_controller(["course", "m/s"], cells)
-
-
-def by_controller(head: list[str], cells: dict[tuple[str, ...], str]) -> str:
-    """A table with a column for each controller, which is the last of a cell's names."""
-    controllers, rows = dict.fromkeys(names[-1] for names in cells), dict.fromkeys(names[:-1] for names in cells)
-    return markdown(
-        [*head, *controllers],
-        [[*row, *(cells.get((*row, controller), "-") for controller in controllers)] for row in rows],
-    )
+def write_csv(name: str) -> None:
+    """A benchmark's records as docs/data/NAME.csv, numbers to four digits."""
+    source = MADE / f"{name}.json"
+    if not source.is_file():
+        return
+    rows = [
+        {key: f"{value:.4g}" if isinstance(value, float) else value for key, value in row.items()}
+        for row in _records(json.loads(source.read_text(encoding="utf-8")))
+    ]
+    with (ROOT / "docs" / "data" / f"{name}.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, [*dict.fromkeys(key for row in rows for key in row)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 TABLES: Final[dict[str, Callable[[Any], str]]] = {
@@ -278,8 +261,6 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "first-flights": first_flights,
     "campaigns": campaigns,
     "tunings": tunings,
-    "mismatch": mismatch,
-    "speed": speed,
     **dict.fromkeys(("solvers", "flight", "film", "campaign"), records),
 }
 
@@ -324,6 +305,8 @@ def main() -> None:
         page.write_text(text, encoding="utf-8")
         for source in missing:
             print(f"{page.relative_to(ROOT)}: stays as it is without {source}")
+    for name in ("mismatch", "speed"):
+        write_csv(name)
     for name, drawn in FIGURES.items():
         if (ROOT / drawn).is_file():
             figure = Image.open(ROOT / drawn).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)

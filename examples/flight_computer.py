@@ -18,7 +18,7 @@ from pathlib import Path
 
 import quadsim
 from quadsim.state import Array
-from scenarios.export.serial_line import SerialMPC
+from scenarios.export.in_the_loop import SerialMPC
 
 
 class Terminal:

@@ -8,17 +8,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 import scipy.linalg
+from scipy.linalg import lapack
 
 from mpc.ocp import Problem, Query, predicted
 from mpc.paper import Prediction, cost, prediction, slew_matrix
 from mpc.qp import QP, Posed, QPRows, Solution
-from quadsim.state import Array, Indices
+from quadsim.controller import UNCONSTRAINED
+from quadsim.state import Array
 
 Flags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+LARGEST: Final = 2**20
+"""Entries of the QP's matrices beyond which its unconstrained optimum costs more than it saves."""
+ILL_CONDITIONED: Final = 1e-4
+"""Error of an input held throughout, found again from its gradient, above which a Hessian is too ill-conditioned."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,20 +99,14 @@ def _with_inputs(values: Array, rows: QPRows) -> Array:
 class Condensed:
     """min 1/2 x' P x + c' x over x = [u(k); ...; u(k+N-1); e], e (N, m_s) the slacks of soft rows.
 
-    Attributes:
-        maps: how states follow from the inputs.
-        cost: of the inputs alone.
-        qp: H, the rows time by time, and the box, for xi(k) and y_d zero and u(k-1) = u_bar.
-
-    Raises:
-        ValueError: the problem has no constraints; it needs no QP.
+    `qp` is that for xi(k) and y_d zero and u(k-1) = u_bar, rows time by time; `cost` that of the inputs alone.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._problem, self._rows = problem, QPRows(problem)
         model, N, nu = problem.model, problem.horizon, problem.model.nu
-        self.maps = prediction(model, N)
-        self.cost, self._values = condensed_cost(problem, self.maps), row_maps(self._rows, self.maps)
+        maps = prediction(model, N)
+        self.cost, self._values = condensed_cost(problem, maps), row_maps(self._rows, maps)
         rows = self._rows
         self._inputs, m_s = N * nu, rows.slack.shape[1]
         soft = problem.rows.slacks
@@ -118,10 +119,6 @@ class Condensed:
         self._of_rest = self._values.of_inputs.reshape(N, len(rows.C), N, nu).sum(axis=2)  # of u_s throughout
         self._pull = self.cost.H.reshape(N * nu, N, nu).sum(axis=1)  # by u_s throughout
         size = self._inputs + N * m_s
-        later: list[Indices] = []
-        for entries in (nu, m_s, len(rows.C)):
-            own = sum(map(len, later)) + np.arange(N * entries)
-            later.append(np.concatenate([own[entries:], own[(N - 1) * entries :]]))
         self._blank = QP(
             P=np.asfortranarray(scipy.linalg.block_diag(self.cost.H, 2.0 * np.diag(l2)) if m_s else self.cost.H),
             c=np.zeros(size),
@@ -132,7 +129,6 @@ class Condensed:
             h_u=np.zeros(rows.lower.size),
             x_l=np.concatenate([rows.u_min.ravel(), np.zeros(N * m_s)]),
             x_u=np.concatenate([rows.u_max.ravel(), np.full(N * m_s, np.inf)]),
-            later=np.concatenate(later),
         )
         nothing = np.zeros((N, problem.objective.C_r.shape[0]))
         self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp
@@ -239,6 +235,38 @@ class Condensed:
             z_slacks = np.minimum(np.abs(multipliers[:, soft]) - l1 - 2.0 * l2 * slacks, 0.0)
             x, z_box = np.concatenate((x, slacks.ravel())), np.concatenate((z_box, z_slacks.ravel()))
         return Solution(x, self._blank.b, z, z_box)
+
+
+class FreeOptimum:
+    """The unconstrained optimum of QPs of one form, where it satisfies every constraint: then it is the optimum.
+
+    Eq. (22).  Unless the matrices are `changing` from one QP to the next, the Hessian is factorised once.
+    """
+
+    def __init__(self, form: Condensed, *, changing: bool) -> None:
+        self.form, H = form, form.cost.H
+        self._inputs, self._usable, self._factor = len(H), True, None
+        if not changing:
+            self._factor, failed = lapack.dpotrf(H)
+            hold = np.ones(len(H))
+            self._usable = form.qp.P.size + form.qp.G.size <= LARGEST and not failed
+            self._usable &= np.abs(lapack.dpotrs(self._factor, H @ hold)[0] - hold).max() < ILL_CONDITIONED
+
+    def __call__(self, qp: QP) -> Solution | None:
+        """The optimum of a QP; None where a constraint is in its way."""
+        if not self._usable:
+            return None
+        m, x = self._inputs, np.zeros(qp.c.size)
+        if self._factor is None:
+            _, x[:m], failed = lapack.dposv(qp.P[:m, :m], -qp.c[:m])
+        else:
+            x[:m], failed = lapack.dpotrs(self._factor, -qp.c[:m])
+        values = np.concatenate([x, qp.G @ x])
+        lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
+        if failed or not ((lower <= values) & (values <= upper)).all():
+            return None
+        z_box = np.concatenate([np.zeros(m), -qp.c[m:]])
+        return Solution(x, np.zeros(0), np.zeros(qp.h_l.size), z_box, status=UNCONSTRAINED)
 
 
 def _root(weight: Array) -> Array | None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -69,23 +68,13 @@ def discretise(A_c: Array, B_c: Array, period: float) -> tuple[Array, Array]:
 
 
 def lqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
-    """K (nu, n) of u = -K x, which minimises the infinite sum of x' Q x + u' R u, x(k+1) = A x(k) + B u(k).
-
-    Raises:
-        numpy.linalg.LinAlgError: there is no such gain.
-    """
+    """K (nu, n) of u = -K x, which minimises the infinite sum of x' Q x + u' R u, x(k+1) = A x(k) + B u(k)."""
     P = scipy.linalg.solve_discrete_are(A, B, Q, R)
     return np.asarray(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A))
 
 
 def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
-    """The vehicle's discrete model at hover, for a control period tau_s [s].
-
-    Raises:
-        ParameterError: the period is not positive.
-    """
-    if not 0.0 < period < np.inf:
-        raise ParameterError("controller", "period", period, "positive and finite")
+    """The vehicle's discrete model at hover, for a control period tau_s [s]."""
     A, B = discretise(*continuous_model(vehicle), period)
     u_bar = np.full(N_ROTORS, vehicle.hover_speed)
     return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(u_bar), period=period)

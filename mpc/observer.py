@@ -16,14 +16,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated, Final
 
 import numpy as np
 import scipy.linalg
 from annotated_types import doc
 
-from quadsim.errors import ParameterError
 from quadsim.fields import Positive
 from quadsim.rotation import body_rates_of
 from quadsim.state import ANGLES, VELOCITIES, Array
@@ -50,12 +49,6 @@ class ObserverSettings:
     largest_force: Annotated[Positive, doc("[m/s^2] larger estimates are clipped")] = 5.0
     largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 30.0
 
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if not 0.0 < value < math.inf:
-                raise ParameterError("controller.offset_free", item.name, value, "positive and finite")
-
 
 def observer_gain(period: float, *, noise: float, walk: float, change: float) -> tuple[float, float]:
     """Gains (of v, of d) of the steady-state Kalman filter of one pair, on the surprise in v.
@@ -78,10 +71,7 @@ class DisturbanceObserver:
     def __init__(self, settings: ObserverSettings, period: float) -> None:
         doubled = math.sqrt(2.0)
         _, force = observer_gain(
-            period,
-            noise=doubled * settings.velocity_noise,
-            walk=settings.velocity_walk,
-            change=settings.force_walk,
+            period, noise=doubled * settings.velocity_noise, walk=settings.velocity_walk, change=settings.force_walk
         )
         _, torque = observer_gain(
             period, noise=doubled * settings.rate_noise, walk=settings.rate_walk, change=settings.torque_walk
@@ -104,10 +94,10 @@ class DisturbanceObserver:
         """Take note of a measured state (12,) and of what was predicted for it (12,), disturbances included."""
         now, then = measured.tolist(), predicted.tolist()
         axis, rates, expected_rates = thrust_axis(now), body_rates_of(now), body_rates_of(then)
-        x, y, z = (found - wanted for found, wanted in zip(now[VELOCITIES], then[VELOCITIES], strict=True))
+        x, y, z = (a - b for a, b in zip(now[VELOCITIES], then[VELOCITIES], strict=True))
         along = z / max(axis[2], UPRIGHT)
         velocity = x - along * axis[0], y - along * axis[1], along
-        self.learn([*velocity, *(found - wanted for found, wanted in zip(rates, expected_rates, strict=True))])
+        self.learn([*velocity, *(a - b for a, b in zip(rates, expected_rates, strict=True))])
 
     def learn(self, surprise: Sequence[float] | Array) -> None:
         """Take note of by how much three velocities and three body rates (6,) are other than predicted."""

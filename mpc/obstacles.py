@@ -29,7 +29,7 @@ from mpc.constraints import Constraint, Penalty
 from mpc.ocp import Problem, Query, predicted
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.solvers import Answer, Solver
-from mpc.solvers.piqp import PiqpMultistage
+from mpc.solvers.piqp import Piqp
 from quadsim.controller import ACCEPTED
 from quadsim.fields import NonNegative
 from quadsim.space import AnyObstacle, Corridor, Fence, Obstacle, Solids
@@ -70,11 +70,11 @@ class Space:
         radius: of the vehicle's bounding ball [m].
         period: from one predicted instant to the next [s].
         horizon: N.
-        settings: see `AvoidanceSettings`.
+        settings: how closely.
         margins: (N, 3) further ones along x, y, z at each predicted instant [m], as of a disturbance; None for none.
         penalty: l1 [1/m] and l2 [1/m^2] of violating a half-space; None for hard ones.
-        largest: whether it is of the largest violation at each instant, instead of all.
         positions: which of the states are x, y, z.
+        largest: whether the penalty is of the largest violation at each instant, instead of all.
     """
 
     def __init__(
@@ -131,16 +131,12 @@ class Space:
 
     def constraints(self, normals: Array, bounds: Array, states: int) -> tuple[Constraint, ...]:
         """All half-spaces, one constraint per obstacle or region, by its name."""
-        found = []
+        constraints = []
         for shape in self._shapes:
-            at = self._names == shape.name
-            found.append(self.constraint(normals[at], bounds[at], states, name=_titled(shape)))
-        return tuple(found)
-
-
-def _titled(shape: Shape) -> str:
-    kind = "obstacle" if isinstance(shape, Obstacle) else "corridor" if isinstance(shape, Corridor) else ""
-    return f"{kind} {shape.name}".strip()
+            kind = "obstacle" if isinstance(shape, Obstacle) else "corridor" if isinstance(shape, Corridor) else ""
+            at, name = self._names == shape.name, f"{kind} {shape.name}".strip()
+            constraints.append(self.constraint(normals[at], bounds[at], states, name=name))
+        return tuple(constraints)
 
 
 class ObstacleQP:
@@ -160,7 +156,7 @@ class ObstacleQP:
 
     def reset(self) -> None:
         """Forget the last plan."""
-        self._forms: dict[int, tuple[PartiallyCondensed, PiqpMultistage]] = {}
+        self._forms: dict[int, tuple[PartiallyCondensed, Piqp]] = {}
         self._last: Array | None = None
 
     def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> tuple[Answer, Problem]:
@@ -237,12 +233,12 @@ class ObstacleQP:
             room[at] = -LOOSE  # what was there stays
             count *= 2
 
-    def _form(self, count: int) -> tuple[PartiallyCondensed, PiqpMultistage]:
+    def _form(self, count: int) -> tuple[PartiallyCondensed, Piqp]:
         """The QP with so many half-spaces at each instant, and what solves it."""
         if count not in self._forms:
             normals = np.full((count, self.problem.horizon, 3), 3.0**-0.5)  # in general position
             form = PartiallyCondensed(self._posed(normals, np.zeros(normals.shape[:2])), changing=self._changing)
-            backend = PiqpMultistage(changing=True)
+            backend = Piqp(changing=True)
             backend.setup(form.qp)
             self._forms[count] = form, backend
         return self._forms[count]

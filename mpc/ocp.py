@@ -132,11 +132,7 @@ class Problem:
 
     @cached_property
     def rows(self) -> Rows:
-        """The rows of all constraints.
-
-        Raises:
-            ValueError: there are none.
-        """
+        """The rows of all constraints."""
         constraints = self.every_constraint
         if not constraints:
             raise ValueError("a constrained MPC needs a problem with bounds")

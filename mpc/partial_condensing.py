@@ -29,7 +29,6 @@ from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem, Query
 from mpc.qp import QP, Posed, QPRows, Solution
-from quadsim.errors import ParameterError
 from quadsim.state import Array, Indices
 
 ROUNDING: Final = 1e-14
@@ -145,7 +144,7 @@ def condense(at: Layout, start: Array, free: Array, *steps: Array) -> tuple[Arra
 
 
 class PartiallyCondensed:
-    """The partially condensed QP of a problem.
+    """The partially condensed QP of a problem; `qp` is that for xi(k) and y_d zero and u(k-1) = u_bar.
 
     Args:
         problem: with constraints.
@@ -153,22 +152,11 @@ class PartiallyCondensed:
             takes what is left of the horizon, and where M > 1 as many more steps as there is room for in blocks of the
             others' size.
         changing: whether the model's matrices will be others; then no entry is left out that might be needed.
-
-    Attributes:
-        fixed: the matrices of the problem's model.
-        qp: of these, for xi(k) and y_d zero and u(k-1) = u_bar.
-
-    Raises:
-        ValueError: the problem has no constraints; it needs no QP.
-        ParameterError: the number of steps is not possible.
     """
 
     def __init__(self, problem: Problem, *, steps_per_stage: int | None = None, changing: bool = False) -> None:
         model, N = problem.model, problem.horizon
-        usual = max(round(STEPS_OF_ONE_INPUT / math.sqrt(model.nu)), 1)
-        steps = usual if steps_per_stage is None else steps_per_stage
-        if not isinstance(steps, int) or steps < 1:
-            raise ParameterError("controller", "steps_per_stage", steps, "a whole number >= 1")
+        steps = steps_per_stage or max(round(STEPS_OF_ONE_INPUT / math.sqrt(model.nu)), 1)
         self._problem, self._rows, soft = problem, QPRows(problem), problem.rows.slacks
         self._at = at = Layout(N, model.n, model.nu, soft.size, steps)
         rows, objective = self._rows, problem.objective

@@ -12,7 +12,7 @@ from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem
 from quadsim.controller import SOLVED
-from quadsim.state import Array, Indices
+from quadsim.state import Array
 
 Matrix: TypeAlias = Array | csc_matrix
 
@@ -25,10 +25,6 @@ class QP:
     """min 1/2 x' P x + c' x  subject to  A x = b,  h_l <= G x <= h_u,  x_l <= x <= x_u.
 
     Matrices are dense or sparse (csc); bounds may be infinite.  Eq. (27), with rows bounded from both sides.
-
-    Attributes:
-        later: which of the bounds of [x; G x] is the same one step later in the plan, its own at the last step; None
-            where that is not known.  What is active moves one step earlier from one period to the next.
     """
 
     P: Matrix
@@ -40,7 +36,6 @@ class QP:
     h_u: Array
     x_l: Array
     x_u: Array
-    later: Indices | None = None
 
 
 class QPRows:
@@ -52,9 +47,6 @@ class QPRows:
         lower, upper: (N, K).
         of_states: (K,) see `mpc.constraints.Rows`.
         u_min, u_max: (N, nu) the box.
-
-    Raises:
-        ValueError: the problem has none.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -66,12 +58,8 @@ class QPRows:
         self._origin = origin = np.concatenate([hard, above, below])
         of_rows = (rows.slack[:, None] == np.arange(rows.slacks.size)).astype(float)
         self.slack = np.concatenate([np.zeros((hard.size, rows.slacks.size)), 0.0 - of_rows[above], of_rows[below]])
-        self.C, self.D, self.E, self.of_states = (
-            rows.C[..., origin, :],
-            rows.D[origin],
-            rows.E[origin],
-            rows.of_states[origin],
-        )
+        self.C, self.D, self.E = rows.C[..., origin, :], rows.D[origin], rows.E[origin]
+        self.of_states = rows.of_states[origin]
         self.lower, self.upper = rows.lower[:, origin].copy(), rows.upper[:, origin].copy()
         self.lower[:, hard.size : hard.size + above.size] = -np.inf
         self.upper[:, hard.size + above.size :] = np.inf
@@ -88,17 +76,17 @@ class QPRows:
     def multipliers(self, z: Array, z_inputs: Array) -> Array:
         """(N, m) multipliers of the problem's rows, from those of the QP's rows (N K,) and of inputs (N nu,)."""
         N = len(self.lower)
-        found = np.zeros((N, len(self._whole.D)))
+        multipliers = np.zeros((N, len(self._whole.D)))
         for column, row in zip(z.reshape(N, -1).T, self._origin, strict=True):
-            found[:, row] += column
+            multipliers[:, row] += column
         left = z_inputs.reshape(N, -1).copy()
         for row in self._boxed:  # of several at the same bound, the first has it all
             j = self._whole.input[row]
             upper, lower = self._whole.upper[:, row] == self.u_max[:, j], self._whole.lower[:, row] == self.u_min[:, j]
             held = np.where(left[:, j] > 0.0, upper, lower)
-            found[held, row] = left[held, j]
+            multipliers[held, row] = left[held, j]
             left[held, j] = 0.0
-        return found
+        return multipliers
 
     def split(self, multipliers: Array) -> tuple[Array, Array]:
         """The inverse: multipliers of the QP's rows (N K,) and of inputs (N nu,)."""

@@ -24,7 +24,8 @@ def printable(text: str, *, keep: str = "") -> str:
     if text.isprintable():
         return text
     return "".join(
-        each if each in keep or unicodedata.category(each) not in _HIDDEN else ascii(each)[1:-1] for each in text
+        character if character in keep or unicodedata.category(character) not in _HIDDEN else ascii(character)[1:-1]
+        for character in text
     )
 
 
@@ -160,7 +161,7 @@ class DivergenceError(FlightError):
 
 
 class LostError(FlightError):
-    """The vehicle is beyond one of the flight's loss criteria; see `quadsim.sim.phase.CRITERIA`."""
+    """The vehicle is beyond one of the flight's loss criteria; see `quadsim.flight.phase.CRITERIA`."""
 
     def __init__(self, criterion: str, quantity: str, unit: str, *, value: float, limit: float, time: float) -> None:
         message = f"lost: {quantity} {value:.5g} {unit}, beyond lost.{criterion} = {limit:g} {unit}"

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, Final
 from xml.etree import ElementTree
 
 from quadsim.errors import printable
-from quadsim.flight.summary import constraint_verdict
+from quadsim.flight.rundir import constraint_verdict
 from quadsim.outputs import absolute, require_file, writing_file
 from quadsim.report.comparison import failure_sentences
 from quadsim.report.table import format_number
 
 if TYPE_CHECKING:
-    from scenarios.campaign.run import CampaignResult
-    from scenarios.campaign.statistics.requirement import Judgement
+    from scenarios.campaign.campaign import CampaignResult
+    from scenarios.campaign.statistics import Judgement
     from scenarios.papers.reproduction import Reproduction
     from scenarios.reaudit import Reaudit
 

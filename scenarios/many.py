@@ -34,7 +34,7 @@ Fly = Callable[[Any], Row]
 ERROR, TIMEOUT, MEMORY, DIED = "error", "timeout", "memory", "died"
 """Verdicts of flights that gave no row: it raised, took too long or too much memory, or its process died."""
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_PRELOAD: Final = ("scenarios.campaign.pilot", "mpc.constrained", "mpc.robust.controller", "mpc.unconstrained")
+_PRELOAD: Final = ("scenarios.campaign.plan", "mpc.constrained", "mpc.robust.controller", "mpc.unconstrained")
 """Loaded once, by the server that workers are forked from."""
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
@@ -320,6 +320,6 @@ def _threads(client: Any) -> int:
 @functools.cache
 def _code() -> dict[str, str]:
     """Versions of the packages that decide a flight's numbers, our own by the digest of its code."""
-    from scenarios.campaign.manifest import code_digest
+    from scenarios.campaign.store import code_digest
 
     return {name: versions()[name] for name in ("mujoco", "numpy", "scipy", "piqp")} | {"quadsim": code_digest()[:19]}

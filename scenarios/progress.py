@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from scenarios.campaign.run import Standing, Watch
+    from scenarios.campaign.campaign import Standing, Watch
 
 Progress = Callable[[str, int, int], None]  # called with (what, done, total) during long work
 
@@ -80,12 +80,11 @@ def watching(progress: bool) -> Iterator[Watch]:
 
 def _describe(standing: Standing) -> str:
     """How far it is, how fast, until when, and how it looks."""
-    from scenarios.campaign.statistics.inference import proportion
-    from scenarios.campaign.statistics.wording import interval
+    from scenarios.campaign.statistics import interval, proportion
 
     share = proportion(standing.failed, standing.flown)
     left = datetime.timedelta(seconds=round((standing.flights - standing.flown) / standing.rate))
     return (
         f"{standing.flown}/{standing.flights}, {standing.rate:.2f}/s, {left} left; "
-        f"{standing.failed} failed ({interval(share.lower, share.upper)})"
+        f"{standing.failed} failed ({interval(share['lower'], share['upper'])})"
     )

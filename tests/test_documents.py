@@ -20,7 +20,7 @@ from scenarios.rollout import Rollout
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-BLOCKS = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
+BLOCKS = re.compile(r"^```python(?: exec)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PYTHON = {page: blocks for page in PAGES if (blocks := BLOCKS.findall(page.read_text(encoding="utf-8")))}
 """Pages with examples in Python."""
 MADE = {"gallery.md"}

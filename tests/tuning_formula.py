@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 import tomlkit
 
-from scenarios.campaign.results.table import Row
+from scenarios.campaign.plan import Plan
+from scenarios.campaign.rows import Row
 from scenarios.schema.scenario import Scenario
-from scenarios.tuning.plan import TuningPlan
-from scenarios.tuning.run import TuningResult, tune
+from scenarios.tuning.tuning import TuningResult, fly_tuning
+from scenarios.tuning.tuning_plan import TuningPlan
 
 BEST_SPEED, BEST_Z = 0.05, 300.0  # where the formula is smallest
 TUNING: dict[str, Any] = {
@@ -66,23 +67,22 @@ class Formula:
     stopped_by: Callable[[], BaseException] = KeyboardInterrupt
     flown: list[int] = field(default_factory=list)
 
-    def fly(self, pilot: Any, flights: Sequence[int], **_: object) -> Generator[Row, None, None]:
+    def fly(self, plan: Plan, flights: Sequence[int]) -> Generator[Row, None, None]:
         for flight in reversed(flights) if self.backwards else flights:
             if len(self.flown) == self.stops_after:
                 raise self.stopped_by()
             self.flown.append(flight)
-            scenario = pilot.plan.of(flight)
+            scenario = plan.of(flight)
             violated = self.violated(scenario)
-            row = pilot.failed(flight, "", "violated" if violated else "satisfied")
+            row = plan.failed(flight, "", "violated" if violated else "satisfied")
             yield {**row, "status": "completed", "violated": violated, "failed": violated, "rmse.x": error_of(scenario)}
 
 
 def tune_by(formula: Formula, plan: TuningPlan, directory: Path, **options: Any) -> TuningResult:
     """A tuning whose rows come from a formula."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("scenarios.tuning.run", "scenarios.campaign.run"):
-            patch.setattr(f"{module}.fly_flights", formula.fly)
-        return tune(plan, directory, **options)
+        patch.setattr(Plan, "fly_all", lambda plan, flights, **_: formula.fly(plan, flights))
+        return fly_tuning(plan, directory, **options)
 
 
 def write_tuning(directory: Path, **changes: Any) -> Path:

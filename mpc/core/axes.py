@@ -47,9 +47,6 @@ def axes(problem: Problem) -> list[Axis]:
 
     Pieces that nothing moves or regulates are left out: they want u_s.  Where such a piece has a row, or a row of
     constraints or of C_r is on nothing, or the problem is all of one piece, the one axis is the whole problem.
-
-    Raises:
-        ValueError: the problem has no constraints.
     """
     rows, model, objective = problem.rows, problem.model, problem.objective
     bounded: NDArray[np.bool_] = np.asarray(rows.C.any(axis=1))

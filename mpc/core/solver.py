@@ -79,11 +79,7 @@ class Work(ctypes.Structure):
 
 @cache
 def core_library() -> ctypes.CDLL:
-    """The library, its functions declared.
-
-    Raises:
-        MissingCoreError: there is none here.
-    """
+    """The library, its functions declared."""
     library = load()
     check_mirrors(quadsim_axis=_Axis, quadsim_row=_Row, quadsim_term=_Term, quadsim_problem=_Problem, quadsim_work=Work)
     library.quadsim_work_reals.restype, library.quadsim_work_reals.argtypes = ctypes.c_long, [_AT]
@@ -94,14 +90,9 @@ def core_library() -> ctypes.CDLL:
 
 
 class CoreProblem:
-    """A problem's tables where the core reads them; any number of controllers may share them.
+    """A problem's `tables` where the core reads them; any number of controllers may share them.
 
-    Raises:
-        ParameterError: the problem is not one for the core.
-
-    Attributes:
-        tables: the numbers.
-        struct: the `quadsim_problem`, which points to memory that this object holds.
+    `struct` is the `quadsim_problem`, which points to memory that this object holds.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -149,16 +140,12 @@ def _content(value: object) -> object:
     if isinstance(value, np.ndarray):
         return value.shape, value.tobytes()
     if is_dataclass(value):
-        return tuple(_content(getattr(value, each.name)) for each in fields(value))
+        return tuple(_content(getattr(value, item.name)) for item in fields(value))
     return tuple(map(_content, value)) if isinstance(value, tuple) else value
 
 
 def core_problem(problem: Problem) -> CoreProblem:
-    """A problem's tables, which equal problems of this process share.
-
-    Raises:
-        ParameterError: the problem is not one for the core.
-    """
+    """A problem's tables, which equal problems of this process share."""
     return _core_problem(Key.to(problem))
 
 
@@ -175,7 +162,6 @@ class Core:
 
     Raises:
         MissingCoreError: there is no library.
-        ParameterError: the problem is not one for the core.
     """
 
     name: Final = CORE
@@ -202,8 +188,8 @@ class Core:
         )
         self._side = self._view(self._work.last, ctypes.c_int8, p.step_rows)
         sizes = p.states, p.horizon * p.regulated, p.states, N_ROTORS, N_ROTORS
-        self._given = np.zeros(sum(sizes))
-        parts = np.split(self._given, np.cumsum(sizes[:-1]))
+        self._query = np.zeros(sum(sizes))
+        parts = np.split(self._query, np.cumsum(sizes[:-1]))
         self._state, wanted, self._x_s, self._u_s, self._before = parts
         self._wanted = wanted.reshape(p.horizon, -1)
         self._arguments = self._at, *(part.ctypes.data for part in parts)
@@ -231,7 +217,7 @@ class Core:
         if self._modes is not None:
             for speeds in (self._state[N_STATES:], self._x_s[N_STATES:]):
                 speeds[:] = self._modes @ speeds
-        way = self._library.quadsim_optimise(*self._arguments) if math.isfinite(self._given.sum()) else len(WAYS)
+        way = self._library.quadsim_optimise(*self._arguments) if math.isfinite(self._query.sum()) else len(WAYS)
         if way >= len(WAYS):
             return self._by_piqp(query, started)
         plan, slacks, multipliers, active = self._plan.copy(), self._no_slacks, self._no_multipliers, 0

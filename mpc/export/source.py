@@ -41,11 +41,7 @@ class CController:
 
     @cached_property
     def tables(self) -> Tables:
-        """The numbers of its problem.
-
-        Raises:
-            ParameterError: the problem is not one for the core.
-        """
+        """The numbers of its problem."""
         return core_problem(self.law.problem).tables
 
     @property

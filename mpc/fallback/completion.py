@@ -23,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.equilibrium import Trim
-from mpc.fallback.hover import require_quadrotor
 from mpc.fallback.settings import by_group
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
@@ -79,26 +78,21 @@ def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) ->
     Its attitude and body rates are left out where the state's are predicted.  Next to a pitch of 90 deg the rates of
     Euler angles are implausibly large; those of the body are not.
     """
-    found = {**vars(now), "acting": acting, "unseen": unseen}
+    values = {**vars(now), "acting": acting, "unseen": unseen}
     if unseen[ANGLES].any():
-        found["attitude"] = None
+        values["attitude"] = None
     if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
-        found["body_rates"] = None
-    return CompletedMoment(**found)
+        values["body_rates"] = None
+    return CompletedMoment(**values)
 
 
 class StateCompletion:
     """Completes one state after the other, one per control period.
 
-    Attributes:
-        unseen: (12,) periods since each channel was last measured; infinite before it ever was.
-
-    Raises:
-        ParameterError: the model is not a quadrotor's.
+    `unseen` (12,) is the number of periods since each channel was last measured; infinite before it ever was.
     """
 
     def __init__(self, model: LinearModel) -> None:
-        require_quadrotor(model)
         self._model = model
         self._measured_covariance = read_only(np.diag(NOISE**2))
         self._process = read_only(_process_noise(model.period))
@@ -124,7 +118,7 @@ class StateCompletion:
             measured: (12,) in part perhaps not finite; of another shape, nothing was measured.
             acting: (4,) rotor speeds in force since the last state [rad/s].
             trim: what holds the vehicle at rest.
-            free: whether the vehicle flies, so that the model predicts its motion; otherwise nothing counts as frozen.
+            free: whether the vehicle flies, as the model predicts; otherwise nothing counts as frozen.
         """
         if np.shape(measured) != (N_STATES,):
             measured = np.full(N_STATES, np.nan)

@@ -25,8 +25,7 @@ from mpc.equilibrium import Trim
 from mpc.fallback.settings import by_group
 from mpc.heading import anchored, slope, turn_horizontally
 from mpc.model import LinearModel, lqr
-from quadsim.errors import ParameterError
-from quadsim.state import INDEX, N_STATES, POSITION, VELOCITY, Array, read_only
+from quadsim.state import INDEX, POSITION, VELOCITY, Array, read_only
 from quadsim.vehicle import N_ROTORS
 
 ACCEPTABLE_ACCELERATION: Final = (2.0, 8.0, 8.0, 2.0)  # along z [m/s^2], about x, y and z [rad/s^2]
@@ -43,32 +42,13 @@ _ROLL_PITCH: Final = [1, 2]  # rows of an acceleration (4,)
 ACCEPTABLE: Final = by_group(0.5, 1.0, 0.2, 1.0)  # [m], [m/s], [rad], yaw as well, [rad/s]
 
 
-def require_quadrotor(model: LinearModel) -> None:
-    """Refuse a model of anything but the twelve states and four rotors.
-
-    Raises:
-        ParameterError: it has other states or inputs.
-    """
-    if (model.n, model.nu) != (N_STATES, N_ROTORS):
-        rule = f"one of {N_STATES} states and {N_ROTORS} inputs"
-        raise ParameterError("controller", "model", f"{model.n} states and {model.nu} inputs", rule)
-
-
 class HoverLaw:
-    """The LQR of hover, set up once; `tilt` is the largest roll and pitch demanded together [rad].
+    """The LQR of hover, set up once: `gain` (4, 12) is K, from errors in the heading frame, and `slope` (4, 4) is S.
 
-    Attributes:
-        gain: (4, 12) K, from errors in the heading frame to accelerations.
-        slope: (4, 4) S; see `mpc.heading.slope`.
-
-    Raises:
-        ParameterError: the model is not a quadrotor's, or the tilt is not between 0 and 90 deg.
+    `tilt` is the largest roll and pitch demanded together [rad].
     """
 
     def __init__(self, model: LinearModel, *, tilt: float) -> None:
-        require_quadrotor(model)
-        if not 0.0 < tilt < 0.5 * math.pi:
-            raise ParameterError("controller", "tilt", tilt, "between 0 and pi/2 rad")
         self.model, self.tilt = model, tilt
         self.slope = read_only(slope(model))
         self._inverse = np.linalg.inv(self.slope)

@@ -26,8 +26,7 @@ to, and not its tilt.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Annotated, Final
 
 import numpy as np
@@ -67,15 +66,8 @@ class TighteningSettings:
     ] = 0.5
     angular_acceleration: Annotated[NonNegative, doc("[rad/s^2] the same of angular ones, body frame")] = 0.5
     turning: Annotated[
-        NonNegative,
-        doc("[unit of the state/s^2, rad for angles] largest second derivative of an output at its bound"),
+        NonNegative, doc("[unit of the state/s^2, rad for angles] largest second derivative of an output at its bound")
     ] = 3.0
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if not 0.0 <= value < math.inf:
-                raise ParameterError("controller.tightening", item.name, value, "at least 0 and finite")
 
 
 def margins(
@@ -102,13 +94,10 @@ def margins(
         estimated: whether the prediction holds an estimate of the disturbance, which may be wrong by twice its bounds.
 
     Raises:
-        ParameterError: an output is bounded on one side only, or too narrowly for these disturbances, of which the one
-            that takes most is named; the lag is too short, or the delay longer than a period.
+        ParameterError: an output is bounded on one side only, or too narrowly; the lag is too short.
     """
     if 0.0 < rotor_lag < SHORTEST_LAG:
         raise ParameterError("controller", "rotor_lag", rotor_lag, f"0, or at least {SHORTEST_LAG:g} s")
-    if delay > period:
-        raise ParameterError("controller", "delay", delay, f"at most the control period of {period} s")
     room = 0.5 * (bounds.y_max - bounds.y_min)
     for i in np.flatnonzero(~np.isfinite(room)):
         name, scale, _ = bounds.output(int(i))

@@ -12,11 +12,10 @@ from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from mpc.condensing import Condensed
+from mpc.condensing import Condensed, FreeOptimum
 from mpc.ocp import Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Backend, KKTResiduals, Solution
-from mpc.solvers.free import FreeOptimum
 from quadsim.controller import ACCEPTED, CORE, GAIN
 from quadsim.errors import InputError, MissingCoreError, MissingPackageError, ParameterError, UnknownNameError
 from quadsim.state import Array
@@ -27,7 +26,7 @@ Formulation: TypeAlias = Condensed | PartiallyCondensed
 
 @dataclass(frozen=True, kw_only=True)
 class SolverEntry:
-    """What a named solver takes, and one line about it."""
+    """What a named solver takes."""
 
     description: str  # one line
     package: str  # what it is imported as
@@ -36,7 +35,7 @@ class SolverEntry:
     extra: str = ""  # the extra of this project that installs the package; empty for one that is always there
 
     def formulate(self, problem: Problem, *, changing: bool = False) -> Formulation:
-        """The form of the problem that it takes, for a model that is `changing` from period to period or not."""
+        """The form of the problem that it takes, of a model that may be `changing` from period to period."""
         if self.dense:
             return Condensed(problem)
         return PartiallyCondensed(problem, steps_per_stage=self.steps_per_stage, changing=changing)
@@ -58,8 +57,8 @@ class SolverEntry:
 
             reason = why_missing()
             return "" if reason is None else f"no core: {reason}"
-        found = importlib.util.find_spec(self.package)
-        return f"not installed: pip install 'quadsim[{self.extra}]'" if found is None else ""
+        installed = importlib.util.find_spec(self.package) is not None
+        return "" if installed else f"not installed: pip install 'quadsim[{self.extra}]'"
 
 
 SOLVERS: Final = {
@@ -93,11 +92,7 @@ LARGEST: Final = 1e6
 
 
 def find_solver(name: str) -> SolverEntry:
-    """The solver of a name: the core, one of `SOLVERS` or, where it is installed, of qpsolvers.
-
-    Raises:
-        UnknownNameError: there is no such solver.
-    """
+    """The solver of a name: the core, one of `SOLVERS` or of qpsolvers; `UnknownNameError` where there is none."""
     name = ALIASES.get(name, name)
     if name in (CORE, CORE_OR_PIQP, *SOLVERS):
         return SOLVERS.get(name, COMPILED)
@@ -127,21 +122,16 @@ def solver_entries() -> dict[str, SolverEntry]:
 
 
 def make_backend(name: str, *, changing: bool = False) -> Backend:
-    """A fresh back end of a named QP solver, for matrices that are `changing` or not.
-
-    Raises:
-        UnknownNameError: there is no such QP solver.
-        MissingPackageError: it needs a package that is not installed.
-    """
+    """A fresh back end of a named QP solver; raises `UnknownNameError`, or `MissingPackageError`."""
     if name in (CORE, CORE_OR_PIQP):
         raise UnknownNameError("QP solver", name, SOLVERS, "make_solver has it")
     entry = find_solver(name)
     if not entry.installed:
         raise MissingPackageError(f"the solver {name!r}", entry.package, extra=entry.extra)
     if entry.package == "piqp":
-        from mpc.solvers.piqp import PiqpDense, PiqpMultistage
+        from mpc.solvers.piqp import Piqp
 
-        return (PiqpDense if entry.dense else PiqpMultistage)(changing=changing)
+        return Piqp(dense=entry.dense, changing=changing)
     if entry.package == "daqp":
         from mpc.solvers.daqp import DaqpDense
 
@@ -216,9 +206,7 @@ def make_solver(name: str, problem: Problem) -> Solver:
     """A problem's solver by name: the core, or a QP solver that has the unconstrained optimum tried before it.
 
     Raises:
-        UnknownNameError: there is no such solver.
-        MissingPackageError: it needs a package that is not installed.
-        MissingCoreError: the core was not compiled.
+        UnknownNameError, MissingPackageError, MissingCoreError: there is no such solver, or not here.
         ParameterError: the core cannot take the problem.
     """
     if name not in (CORE, CORE_OR_PIQP):
@@ -247,10 +235,10 @@ class QPSolver:
     def __init__(self, name: str, problem: Problem, *, changing: bool = False, free_first: bool = False) -> None:
         self.name, self._changing = ALIASES.get(name, name), changing
         self.formulation = find_solver(name).formulate(problem, changing=changing)
-        self._free: tuple[Condensed, FreeOptimum] | None = None
+        self._free: FreeOptimum | None = None
         if free_first and not (changing and isinstance(self.formulation, PartiallyCondensed)):
             form = self.formulation if isinstance(self.formulation, Condensed) else Condensed(problem)
-            self._free = form, FreeOptimum(form, changing=changing)
+            self._free = FreeOptimum(form, changing=changing)
         self.reset()
 
     def reset(self) -> None:
@@ -264,30 +252,25 @@ class QPSolver:
         Data that is not finite, or beyond `LARGEST` in a model that changes, is answered with the status
         `invalid_data`: no back end can be trusted to notice.
         """
+        form, by, method, spent_s = self.formulation, self.name, Method.WHOLE, 0.0
         if not _usable(query):
-            form = self.formulation
             nowhere = np.full_like(form.qp.c, math.nan)
             return Answer(form.inputs(nowhere), form.slacks(nowhere), INVALID_DATA, self.name)
-        answer, states_of = self._solve(query)
-        if self._changing and answer.status in ACCEPTED and np.isfinite(answer.plan).all():
-            assert answer.certificate is not None
-            return answer._replace(states=states_of(answer.certificate()[1].x))
-        return answer
-
-    def _solve(self, query: Query) -> tuple[Answer, Callable[[Array], Array]]:
-        """The answer, and what takes its primal point to the predicted states."""
-        form, posed, spent_s = None, None, 0.0
+        posed, solution = None, None
         if self._free is not None:
-            started, (form, free) = clock.perf_counter(), self._free
-            posed = form.pose(query)
-            solution, spent_s = free(posed.qp), clock.perf_counter() - started
+            started, posed = clock.perf_counter(), self._free.form.pose(query)
+            solution, spent_s = self._free(posed.qp), clock.perf_counter() - started
             if solution is not None:
-                answer = Answer.of(form, posed.qp, solution, GAIN)
-                return answer._replace(method=Method.FREE, solve_s=spent_s), posed.states
-        if posed is None or form is not self.formulation:
-            posed = self.formulation.pose(query)
-        answer = Answer.of(self.formulation, posed.qp, self._backend.solve(posed.qp), self.name)
-        return answer._replace(solve_s=spent_s + answer.solve_s), posed.states
+                form, by, method = self._free.form, GAIN, Method.FREE
+            elif self._free.form is not form:
+                posed = None
+        posed = form.pose(query) if posed is None else posed
+        solution = self._backend.solve(posed.qp) if solution is None else solution
+        answer = Answer.of(form, posed.qp, solution, by)
+        answer = answer._replace(method=method, solve_s=spent_s + solution.solve_s)
+        if self._changing and answer.status in ACCEPTED and np.isfinite(answer.plan).all():
+            return answer._replace(states=posed.states(solution.x))
+        return answer
 
 
 def _usable(query: Query) -> bool:

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.controller import ACCEPTED, MISSED, NO_SOLVER, Phase
-from quadsim.flight.ground import AIRBORNE, Outline, clearance, takeoff_time, touchdown
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, TimingLog
+from quadsim.flight.phase import AIRBORNE, Outline, clearance, takeoff_time, touchdown
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
 
 SETTLING_BAND: Final = 0.05  # half width of the band an output has to stay in to be settled, as a share of the step

@@ -1,21 +1,157 @@
-"""A run's directory: tables, scenario and summary first, then what is made from them; each file with its SHA-256."""
+"""A run's directory: tables, scenario and `summary.json`, each file with its SHA-256, read back."""
 
 from __future__ import annotations
 
+import json
+import math
+import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from types import NoneType
 from typing import Any, Final
 
-from quadsim.errors import FileError
-from quadsim.flight.audit import Limit
+from quadsim.errors import FileError, printable
+from quadsim.flight.audit import Finding, Held, Limit, SpaceLimit, SumLimit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_log
-from quadsim.flight.summary import SUMMARY_FILE as SUMMARY_FILE
-from quadsim.flight.summary import limit_from_json
-from quadsim.flight.summary import read_summary as read_summary
+from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.outputs import file_hashes
+from quadsim.space import shape_from_json, shape_to_json
 from quadsim.vehicle import Vehicle
+
+NUMBER: Final = (int, float)
+MAYBE_NUMBER: Final = (int, float, NoneType)
+LARGEST_FILE: Final = 64_000_000  # size [bytes] of the largest file that is read
+_FORM: Final = {
+    **dict.fromkeys(("scenario", "status"), str),
+    "reason": (str, NoneType),
+    "satisfied": bool,
+    "duration": NUMBER,
+    "constraints": list,
+    **dict.fromkeys(("tracking", "control", "controller", "vehicle", "wall_s", "files"), dict),
+}
+_CONSTRAINT: Final = {
+    **dict.fromkeys(("name", "signal", "unit"), str),
+    **dict.fromkeys(("tolerance", "tolerance_sampled", "start", "time_violated"), NUMBER),
+    **dict.fromkeys(("required", "satisfied"), bool),
+    **dict.fromkeys(
+        ("lower", "upper", "stop", "peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time"),
+        MAYBE_NUMBER,
+    ),
+}
+"""What verdicts and pages rest on; the rest is trusted."""
+
+
+def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
+    """A JSON object from a file of quadsim's, `what` for messages; `form` has the type of each entry that it must have.
+
+    Raises:
+        FileError: it cannot be read, is no JSON, or an entry is missing or of another type.
+    """
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise FileError(path, f"is not {what}: it must be of {LARGEST_FILE} or fewer bytes")
+        table = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+    except (OSError, RecursionError, ValueError) as error:
+        if isinstance(error, FileError):
+            raise
+        raise FileError(path, f"is not {what} ({printable(str(error))[:200]})") from error
+    if wrong := _misfits(table, form):
+        raise FileError(path, f"is not {what}: it lacks or misstates {', '.join(wrong)}")
+    return dict(table)
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number of JSON")
+
+
+def _misfits(table: object, form: Mapping[str, Any]) -> list[str]:
+    """Entries of a table that are missing or of another type; true and false are no numbers."""
+    held = table if isinstance(table, dict) else {}
+    return [
+        name
+        for name, kind in form.items()
+        if name not in held or not isinstance(held[name], kind) or (isinstance(held[name], bool) and kind is not bool)
+    ]
+
+
+def read_summary(directory: Path) -> dict[str, Any]:
+    """`summary.json` of a run directory.
+
+    Raises:
+        FileError: there is none, quadsim did not write it, or a link leads out of the directory.
+    """
+    require_inside(directory)
+    path = directory / SUMMARY_FILE
+    if not path.is_file():
+        raise FileError(directory, f"is not a run directory: it has no {SUMMARY_FILE}")
+    summary = read_json(path, _FORM, "a run's summary")
+    for i, entry in enumerate(summary["constraints"]):
+        if wrong := _misfits(entry, _CONSTRAINT):
+            raise FileError(path, f"is not a run's summary: constraints.{i} lacks or misstates {', '.join(wrong)}")
+    return summary
+
+
+def require_inside(directory: Path) -> None:
+    """Refuse to read a directory that holds a link out of it; links within it are no harm.
+
+    Raises:
+        FileError: naming the first such link.
+    """
+    home = directory.resolve()
+    for folder, folders, files in os.walk(directory):  # which follows no link to a folder
+        for path in (Path(folder, name) for name in sorted((*folders, *files))):
+            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(home):
+                raise FileError(path, f"is a link that leads out of {directory}; nothing is read through it")
+
+
+def limit_to_json(finding: Finding) -> dict[str, Any]:
+    """One entry of `constraints` in `summary.json`; an absent bound, or a window the flight never reached, is null."""
+    limit = finding.limit
+    stated = {name: value for name, value in vars(limit).items() if name not in ("name", "signal", "terms", "shape")}
+    audited = {name: value for name, value in vars(finding).items() if name != "limit"}
+    return {
+        "name": limit.name,
+        "signal": limit.signal,
+        **({"terms": dict(limit.terms)} if isinstance(limit, SumLimit) else {}),
+        **({"shape": shape_to_json(limit.shape)} if isinstance(limit, SpaceLimit) else {}),
+        "unit": limit.unit,
+        **{name: value if math.isfinite(value) else None for name, value in (stated | audited).items()},
+        "satisfied": finding.satisfied,
+        "verdict": finding.verdict,
+    }
+
+
+def limit_from_json(entry: Mapping[str, Any]) -> Limit:
+    """The limit that `limit_to_json` wrote."""
+    absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
+    values = {field.name: entry[field.name] for field in fields(Limit)}
+    values |= {name: bound for name, bound in absent.items() if values[name] is None}
+    if entry.get("shape"):
+        return SpaceLimit(shape=shape_from_json(entry["shape"]), radius=float(entry["radius"]), **values)
+    if not entry.get("terms"):
+        return Limit(**values)
+    return SumLimit(terms=tuple((name, float(factor)) for name, factor in entry["terms"].items()), **values)
+
+
+def finding_from_json(entry: Mapping[str, Any]) -> Finding:
+    """The finding that `limit_to_json` wrote."""
+    names = ("peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time", "time_violated")
+    values = {name: math.nan if entry[name] is None else float(entry[name]) for name in names}
+    return Finding(limit=limit_from_json(entry), **values)
+
+
+def constraint_verdict(entry: Mapping[str, Any]) -> Held:
+    """The verdict on a constraint of a summary that follows from its margins."""
+    return finding_from_json(entry).verdict
+
+
+def deciding_margin(entry: Mapping[str, Any]) -> tuple[float | None, float]:
+    """The margin that this verdict rests on, None where there is none, and its tolerance."""
+    margin, tolerance = finding_from_json(entry).deciding
+    return None if math.isnan(margin) else margin, tolerance
+
 
 SCENARIO_FILE: Final = "scenario.toml"
 RECORDING_FILE: Final = "flight.rrd"
@@ -64,5 +200,5 @@ def load_run(directory: Path) -> Run:
 
 def damaged_files(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     """Files named in the summary that are missing or whose SHA-256 is not the recorded one."""
-    found = file_hashes(directory)
-    return [name for name, digest in summary["files"].items() if found.get(name) != digest]
+    digests = file_hashes(directory)
+    return [name for name, digest in summary["files"].items() if digests.get(name) != digest]

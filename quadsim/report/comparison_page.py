@@ -13,8 +13,15 @@ from urllib.parse import quote
 
 from quadsim.errors import OutputError, ParameterError
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
-from quadsim.flight.rundir import FIGURES_DIR, RECORDING_FILE, SCENARIO_FILE, SUMMARY_FILE, VIDEO_FILE, Run
-from quadsim.flight.summary import require_inside
+from quadsim.flight.rundir import (
+    FIGURES_DIR,
+    RECORDING_FILE,
+    SCENARIO_FILE,
+    SUMMARY_FILE,
+    VIDEO_FILE,
+    Run,
+    require_inside,
+)
 from quadsim.outputs import writing
 from quadsim.report.comparison import (
     comparison_rows,
@@ -25,8 +32,7 @@ from quadsim.report.comparison import (
     run_names,
     verdict_cell,
 )
-from quadsim.report.curves import line_colour
-from quadsim.report.figure import Scene
+from quadsim.report.figure import Scene, line_colour
 from quadsim.report.flight_figures import overview, page_figures
 from quadsim.report.page import PAGE_FILE, RunView, Section, render_page
 from quadsim.report.table import to_markdown

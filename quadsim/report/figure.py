@@ -1,17 +1,117 @@
-"""A figure as plain data: panels of curves, bounds, bands and areas.
+"""A figure as plain data: panels of curves, bounds, bands and areas, and their colours.
 
-`quadsim.report.to_matplotlib` draws it for files and notebooks, `quadsim.report.to_plotly` for pages.
+`quadsim.report.to_matplotlib` draws it for files and notebooks, `quadsim.report.to_plotly` for pages.  Colours are
+distinct for colour-blind readers as well: runs and rotors take theirs from Okabe and Ito's palette (2008), its blue
+made lighter for dark pages, and less its vermilion, which is too near the red of the bounds.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
-from quadsim.report.curves import least_range
-from quadsim.state import Array
+from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
+from quadsim.flight.log import ControlLog, FlightLog
+from quadsim.flight.rundir import Run
+from quadsim.space import AnyObstacle, Obstacle, Region, footprint
+from quadsim.state import POSITION, REFERENCE_NAMES, Array
+
+LINES: Final = ("#1b7fc4", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#8c6d31")
+REFERENCE: Final = "#7a7f87"
+BOUND: Final = "#dc2f38"
+OBSTACLE: Final = "#b85c48"
+LEAST_SPANS: Final = {"m": 0.01, "deg": 0.1, "m/s": 0.01, "deg/s": 0.1, "rad/s": 1.0}
+"""Span of an axis, by its unit, below which there is nothing to see but rounding."""
+_HALF_TURN: Final = 180.0
+
+
+def line_colour(i: int) -> str:
+    """Colour of the i-th run, or rotor, counted from 0; they repeat after six."""
+    return LINES[i % len(LINES)]
+
+
+def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | None:
+    """Ends of an axis for curves that stand still; None where it may fit itself to them, or has no least span.
+
+    Numbers that are not finite do not count.
+    """
+    values = np.concatenate([np.ravel(curve) for curve in curves]) if curves else np.empty(0)
+    values = values[np.isfinite(values)]
+    span = LEAST_SPANS.get(unit, 0.0)
+    if not values.size or values.max() - values.min() >= span:
+        return None
+    middle = 0.5 * float(values.min() + values.max())
+    if abs(middle) < 1e-3 * span:
+        middle = 0.0  # an axis about zero has round ticks
+    return middle - 0.5 * span, middle + 0.5 * span
+
+
+def reference_curve(log: ControlLog, name: str) -> Array:
+    """(K,) filtered reference of x, y, z or yaw, in the unit of its signal."""
+    values = log.reference[:, REFERENCE_NAMES.index(name)]
+    return np.degrees(values) if SIGNALS[name].unit == "deg" else values
+
+
+def bounds_of(limits: Iterable[Limit], signal: str, end: float) -> list[tuple[float, float, float]]:
+    """Each distinct bound on a signal, once, and from when to when it holds in a flight that ends at `end` [s]."""
+    bounds = {
+        (bound, limit.start, min(limit.stop, end)): None
+        for limit in limits
+        for bound in (limit.lower, limit.upper)
+        if limit.signal == signal and limit.start < end and np.isfinite(bound)
+    }
+    return list(bounds)
+
+
+def break_at_wraps(t: Array, values: Array, unit: str) -> tuple[Array, Array]:
+    """A curve with a gap wherever an angle in degrees jumps by more than half a turn, as roll does beyond 180 deg.
+
+    Times [s] and values (K,) become (K + wraps,), with a NaN in each gap; values of another unit than `deg` never wrap.
+    """
+    after = np.flatnonzero(np.abs(np.diff(values)) > _HALF_TURN) + 1 if unit == "deg" else np.empty(0, int)
+    return np.insert(t, after, 0.5 * (t[after - 1] + t[after])), np.insert(values, after, np.nan)
+
+
+_VISIBLE_SPEED: Final = 1e-3
+"""Difference between commanded and acting rotor speeds from which on they are two curves [rad/s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectCurves:
+    """One quantity along x, y and z at the plant's instants, `values` (M, 3); `key` is a short name, e.g. `wind`."""
+
+    key: str
+    title: str
+    unit: str
+    values: Array
+
+
+def effect_curves(log: FlightLog) -> list[EffectCurves]:
+    """External force and torque, and the wind, each where it is not zero throughout."""
+    wrench = np.zeros((1, 6)) if log.plant.wrench is None else log.plant.wrench
+    wind = np.zeros((1, 3)) if log.plant.wind is None else log.plant.wind
+    curves = (
+        EffectCurves(key="force", title="external force, world", unit="N", values=wrench[:, :3]),
+        EffectCurves(key="torque", title="external torque, body", unit="N m", values=wrench[:, 3:]),
+        EffectCurves(key="wind", title="wind, world", unit="m/s", values=wind),
+    )
+    return [entry for entry in curves if np.any(entry.values)]
+
+
+def commanded_speeds(log: FlightLog) -> Array | None:
+    """(M, 4) the commands in force at the plant's instants [rad/s]; None where the rotors turn just as commanded.
+
+    They differ where rotors lag or saturate, and where commands take time to compute.
+    """
+    plant, control = log.plant, log.control
+    if not control.t.size:
+        return None
+    period = np.searchsorted(control.t, plant.t, side="right") - 1
+    commanded: Array = control.speeds[period]
+    return commanded if np.abs(commanded - plant.speeds).max() > _VISIBLE_SPEED else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,3 +230,38 @@ class Scene:
     title: str
     paths: tuple[tuple[Array, str, str, str, bool], ...]  # (K, 3) [m], label, colour, group, dashed; NaN is a gap
     solids: tuple[tuple[Array, str], ...] = ()  # points (K, 3) [m] whose convex hull is a solid, and its name
+
+
+_ROUND: float = 1.5  # how far beyond course and path regions without an end are drawn [m]
+_LONG: float = 40.0  # how far a path is followed from the middle of the course [m]: a lost vehicle leaves the picture
+
+
+def obstacles_in(limits: Iterable[Limit]) -> list[AnyObstacle]:
+    """The obstacles among limits."""
+    return [limit.shape for limit in limits if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Obstacle)]
+
+
+def has_space(limits: Iterable[Limit]) -> bool:
+    """Whether there are obstacles or regions among limits."""
+    return any(isinstance(limit, SpaceLimit) for limit in limits)
+
+
+def region_edges(run: Run) -> Iterator[tuple[SpaceLimit, Array]]:
+    """Each region with its edges (E, 2, 3) [m], cut off around course and path."""
+    regions = [limit for limit in run.limits if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Region)]
+    if not regions:
+        return
+    course = run.log.control.reference[:, :3]
+    path = run.log.plant.state[:, POSITION]
+    points = np.concatenate([course, path[np.isfinite(path).all(axis=1)]])
+    middle = points[0]
+    points = np.clip(points, middle - _LONG, middle + _LONG)
+    for limit in regions:
+        assert isinstance(limit.shape, Region)
+        yield limit, limit.shape.edges(points.min(axis=0) - _ROUND, points.max(axis=0) + _ROUND)
+
+
+def outlines(obstacle: Obstacle, t: float) -> list[Array]:
+    """From above, each solid's outline (n, 2) [m] at a time."""
+    place = obstacle.positions(np.array([t]))[0]
+    return [place[:2] + footprint(solid) for solid in obstacle.solids]

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from quadsim.errors import OutputError
-from quadsim.report.curves import BOUND
-from quadsim.report.figure import Bound, Figure, Panel, Series
+from quadsim.report.figure import BOUND, Bound, Figure, Panel, Series
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from quadsim.report.curves import BOUND, OBSTACLE
-from quadsim.report.figure import Figure, Panel, Scene, Series
+from quadsim.report.figure import BOUND, OBSTACLE, Figure, Panel, Scene, Series
 from quadsim.state import Array
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from quadsim.assets import models_dir
-from quadsim.flight.ground import Outline
+from quadsim.flight.phase import Outline
 from quadsim.rotation import euler_to_quaternion
 from quadsim.space import Obstacle
 from quadsim.state import Array

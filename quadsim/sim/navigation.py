@@ -10,10 +10,9 @@ import numpy as np
 
 from quadsim.errors import ParameterError
 from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
-from quadsim.sim.estimation.estimate import MEAN_QUATERNION, MEAN_RATES, EstimatorSettings
-from quadsim.sim.estimation.filter import ErrorStateFilter, Tally
-from quadsim.sim.sensing.sampler import Sample, Sampler, truth
-from quadsim.sim.sensing.sensor import Sensor, SensorFault, SensorName
+from quadsim.sim.error_state import MEAN_QUATERNION, MEAN_RATES, EstimatorSettings
+from quadsim.sim.estimator import ErrorStateFilter, Tally
+from quadsim.sim.sensing import Sample, Sampler, Sensor, SensorFault, SensorName, truth
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
 from quadsim.vehicle import Vehicle
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from quadsim.rotation import body_to_euler_rates, quaternion_to_euler
-from quadsim.sim.sensing.sensor import whole
+from quadsim.sim.sensing import whole
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array
 
 Integrator = Literal["mujoco", "rk4"]  # who takes the physics steps: MuJoCo, or `quadsim.sim.rigid_body`

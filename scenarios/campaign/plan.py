@@ -1,34 +1,37 @@
-"""A campaign ready to be flown: its file, its scenario, and from these the scenario of each flight."""
+"""A campaign ready to be flown: its file, its scenario, and from these the scenario and the row of each flight."""
 
 from __future__ import annotations
 
+import time as clock
 import tomllib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
-from pydantic import ValidationError
 
-from quadsim.errors import FileError, InputError, ParameterError
-from scenarios.campaign.draws import Draws
-from scenarios.campaign.results.events import Event, parse_event
-from scenarios.campaign.results.table import DRAW, TIMES, Row, make_schema
-from scenarios.campaign.spec import CampaignSpec, Value, VaryBase
-from scenarios.limits import build_limits
-from scenarios.loading import check_parts, parse_scenario
-from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
+from quadsim.errors import FileError, InputError, ParameterError, QuadsimError
+from scenarios.assembly import Assembly
+from scenarios.campaign.campaign_file import CampaignFile, Draws, Value, Varied
+from scenarios.campaign.events import Event, parse_event
+from scenarios.campaign.rows import DRAW, TIMES, Row, flown_row, make_schema
+from scenarios.catalogue import campaign_path, scenario_path
+from scenarios.flight import Flight
+from scenarios.loading import parse_scenario
+from scenarios.machine import processor_name
+from scenarios.many import ERROR, MEMORY, fly_many
+from scenarios.rollout import Rollout
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.plugin import PluginSpec
-from scenarios.schema.problems import ScenarioError, describe_all
+from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import NOT_DESCRIBED, apply_setting, differences, get_field, note_changes, set_field
-from scenarios.shipped import campaign_path, scenario_path
 
 FIRST: Final = 5  # flights of which one at least has to be possible
-Change = tuple[VaryBase, Value]
+Change = tuple[Varied, Value]
 Parse = Callable[[dict[str, Any]], Scenario]
 
 
@@ -36,7 +39,7 @@ Parse = Callable[[dict[str, Any]], Scenario]
 class Plan:
     """A campaign's file and the scenario that its flights differ from."""
 
-    spec: CampaignSpec  # the file
+    spec: CampaignFile  # the file
     scenario: Scenario  # with the file's changes, and every number of its vehicle, in it
     one_seed: bool = False  # whether all flights have the scenario's own
 
@@ -49,7 +52,7 @@ class Plan:
     def schema(self) -> pa.Schema:
         """The columns of its results."""
         kinds = {entry.name: (column_type(entry), entry.unit) for entry in self.spec.vary}
-        return make_schema(kinds, build_limits(self.scenario))
+        return make_schema(kinds, Assembly(self.scenario).limits)
 
     @property
     def flies_user_code(self) -> bool:
@@ -103,16 +106,56 @@ class Plan:
         _ = self.failure
         check_ends(
             self.spec.vary,
-            lambda entry, value: check_parts(self._varied([(entry, value)], name=self.scenario.name, seed=0)),
+            lambda entry, value: Assembly(self._varied([(entry, value)], name=self.scenario.name, seed=0)).check(),
             table="vary",
         )
         refusals = []
         for flight in range(min(FIRST, self.spec.flights)):
             try:
-                return check_parts(self.of(flight))
+                Assembly(self.of(flight)).check()
+                return
             except InputError as error:
                 refusals.append(error)
         raise InputError(f"none of the first {len(refusals)} flights can be flown, the first since {refusals[0]}")
+
+    def fly(self, flight: int) -> Row:
+        """The row of a flight; one that cannot be flown has one too, with its reason."""
+        started = clock.perf_counter()
+        try:
+            flown = Rollout(self.of(flight)).fly()
+        except QuadsimError as error:
+            return self.failed(flight, str(error))
+        if raised := flown.log.traceback:  # no more of such a flight is kept than that it raised
+            reason, limit = str(flown.log.reason), f"(it may take {self.spec.limits.memory:g} MB)"
+            short = raised[-1].startswith(MemoryError.__name__)
+            return self.failed(flight, f"{reason} {limit}", MEMORY) if short else self.failed(flight, reason)
+        return self.row_of(flight, flown, clock.perf_counter() - started)
+
+    def fly_all(
+        self, flights: Sequence[int], *, workers: int | None = None, cluster: str | None = None
+    ) -> Generator[Row]:
+        """The rows of flights, each once, in whatever order they come; see `scenarios.many.fly_many`."""
+        limits = {"timeout": self.spec.limits.flight, "memory": self.spec.limits.memory}
+        many = fly_many(flights, self.fly, workers=workers, cluster=cluster, isolate=self.flies_user_code, **limits)
+        with closing(many) as rows:
+            for place, row in rows:
+                yield row if "flight" in row else self.failed(flights[place], row["reason"], row["verdict"])
+
+    def row_of(self, flight: int, flown: Flight, wall_s: float = 0.0) -> Row:
+        """The row of a flight that was flown, in that time [s]."""
+        machine = processor_name()
+        return self._row(
+            flight, flown_row(flown.log, flown.findings, verdict=flown.outcome, wall_s=wall_s, machine=machine)
+        )
+
+    def failed(self, flight: int, reason: str, verdict: str = ERROR) -> Row:
+        """The row of a flight that raised, met a limit of time or memory, or whose process died."""
+        nothing = {"status": verdict, "verdict": verdict, "reason": reason, "violated": True, "crashed": False}
+        return self._row(flight, nothing)
+
+    def _row(self, flight: int, outcome: Row) -> Row:
+        row = dict.fromkeys(self.schema.names) | self.identity(flight) | outcome
+        return row | {"failed": any(event.holds(row) for event in self.failure)}
 
     def _varied(self, changes: Sequence[Change], *, name: str, seed: int) -> Scenario:
         def parse(data: dict[str, Any]) -> Scenario:
@@ -137,11 +180,7 @@ def read_campaign(name: str, find: Callable[[str], Path] = campaign_path) -> dic
 
 
 def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = None, seed: int | None = None) -> Plan:
-    """Read and check a campaign that ships, or a file, with the scenario it names; the other arguments change it.
-
-    Raises:
-        InputError: the file is missing or malformed, a field is not allowed, or what it varies cannot be flown.
-    """
+    """Read and check a campaign that ships, or a file, with the scenario it names; the other arguments change it."""
     path, data = campaign_path(name), read_campaign(name)
     data |= {key: value for key, value in (("flights", flights), ("seed", seed)) if value is not None}
     spec = parse_campaign(data, source=path.name)
@@ -151,36 +190,20 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
 
 
 def make_plan(scenario: Scenario, data: Mapping[str, Any]) -> Plan:
-    """A campaign of a scenario that is there already, its other fields given as in a file.
-
-    Raises:
-        InputError: a field is not allowed, or what varies cannot be flown.
-    """
+    """A campaign of a scenario that is there already, its other fields given as in a file."""
     spec = parse_campaign({"name": scenario.name, **data, "scenario": scenario.name}, source="campaign")
-    plan = Plan(spec, resolve_vehicle(scenario, build_vehicle(scenario)))
+    plan = Plan(spec, Assembly(scenario).with_vehicle)
     plan.check()
     return plan
 
 
-def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignSpec:
-    """Check a campaign given as nested tables.
-
-    Raises:
-        ScenarioError: naming every field that is wrong.
-    """
-    try:
-        return CampaignSpec.model_validate(dict(data))
-    except ValidationError as error:
-        problems = describe_all(error, data, CampaignSpec, file="campaign")
-        raise ScenarioError(source, problems) from error
+def parse_campaign(data: Mapping[str, Any], *, source: str) -> CampaignFile:
+    """A campaign's file, given as nested tables."""
+    return parse_table(CampaignFile, data, source, file="campaign")
 
 
-def flown_scenario(spec: CampaignSpec, path: Path, settings: Sequence[str] = ()) -> Scenario:
-    """The scenario of a campaign's file, with its changes and then those of the command line.
-
-    Raises:
-        InputError: it cannot be read or flown.
-    """
+def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ()) -> Scenario:
+    """The scenario of a campaign's file, with its changes and then those of the command line."""
     file = scenario_path(spec.scenario)
     data = merge(read_scenario(file, scenario_path), spec.set)
     note_changes(data, spec.set)
@@ -197,8 +220,8 @@ def flown_scenario(spec: CampaignSpec, path: Path, settings: Sequence[str] = ())
         scenario = parse_scenario(data, source=f"{path.name}, {file.name}", directory=file.parent)
     except OSError as error:
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
-    check_parts(scenario)
-    return resolve_vehicle(scenario, build_vehicle(scenario))
+    Assembly(scenario).check()
+    return Assembly(scenario).with_vehicle
 
 
 def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], ...]:
@@ -211,8 +234,8 @@ def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], .
         scenario = {
             key: value for key, value in tomllib.loads(plan.scenario.to_toml()).items() if key not in NOT_DESCRIBED
         }
-        own = plan.spec.model_dump(include={"sampling", "seed", "limits"})
-        tables.append({**scenario, **own, "vary": [entry.model_dump() for entry in plan.spec.vary]})
+        campaign = asdict(plan.spec)
+        tables.append({**scenario, **{name: campaign[name] for name in ("seed", "sampling", "limits", "vary")}})
         drawn.append({field for entry in plan.spec.vary if not entry.relative for field in entry.fields})
     return tuple(entry for entry in differences(*tables) if entry[0] not in drawn[0] & drawn[1])
 
@@ -229,7 +252,7 @@ def locate(data: dict[str, Any], directory: Path) -> None:
         locate_files(changes, directory)
 
 
-def column_type(entry: VaryBase) -> pa.DataType:
+def column_type(entry: Varied) -> pa.DataType:
     """The type of the column that holds an entry's values."""
     first = entry.extremes()[0]
     if isinstance(first, bool):
@@ -250,11 +273,11 @@ def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *,
     Raises:
         InputError: what comes of it is no scenario.
     """
-    given, data = data, merge(data, {})
+    before, data = data, merge(data, {})
     for entry, _ in changes:  # a field of `[actual]` is as modelled until it is drawn
         for above, name, *_rest in (field.split(".") for field in entry.fields if "." in field):
-            if above == "actual" and name in given["vehicle"]:
-                data.setdefault("actual", {}).setdefault(name, given["vehicle"][name])
+            if above == "actual" and name in before["vehicle"]:
+                data.setdefault("actual", {}).setdefault(name, before["vehicle"][name])
     after = merge(data, {})
     for entry, value in changes:
         for field in entry.fields:
@@ -263,17 +286,17 @@ def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *,
     return parse(after)
 
 
-def _scaled(data: dict[str, Any], entry: VaryBase, field: str, value: Value, parse: Parse, table: str) -> Value:
-    given = get_field(data, field)
-    if given is None:  # refused with its own message where there is no such field
-        changed(data, [(entry.model_copy(update={"relative": False}), value)], parse, table=table)
-    for what, number in ((f"the scenario has no number at {field}", given), ("what is drawn is no number", value)):
+def _scaled(data: dict[str, Any], entry: Varied, field: str, value: Value, parse: Parse, table: str) -> Value:
+    modelled = get_field(data, field)
+    if modelled is None:  # refused with its own message where there is no such field
+        changed(data, [(replace(entry, relative=False), value)], parse, table=table)
+    for what, number in ((f"the scenario has no number at {field}", modelled), ("what is drawn is no number", value)):
         if isinstance(number, bool) or not isinstance(number, int | float):
             raise ParameterError(f"{table}.{entry.name}", "relative", True, f"false where {what}")
-    return value * given
+    return value * modelled
 
 
-def check_ends(entries: Iterable[VaryBase], check: Callable[[VaryBase, Value], object], *, table: str) -> None:
+def check_ends(entries: Iterable[Varied], check: Callable[[Varied, Value], object], *, table: str) -> None:
     """Refuse entries that cannot be flown at an end of their range; `check` raises where one cannot have a value.
 
     Raises:

@@ -53,9 +53,9 @@ def _smoothest(values: Array, resolution: float) -> Array:
     one = np.zeros_like(roughness)
     one[-1] = 1.0
     for weight in _WEIGHTS:
-        found: Array = solveh_banded(one + weight * roughness, values)
-        if np.abs(found - values).max() <= resolution:
-            return found
+        smooth: Array = solveh_banded(one + weight * roughness, values)
+        if np.abs(smooth - values).max() <= resolution:
+            return smooth
     return values
 
 

@@ -82,5 +82,5 @@ def switches(windows: Sequence[Window], elsewhere: float, *, initial: float) -> 
     instants = sorted({max(0.0, instant) for window in windows for instant in (window.start, window.stop)} | {0.0})
     held = [[window.value for window in windows if window.start <= t < window.stop] for t in instants]
     values = [initial, *(values[-1] if values else elsewhere for values in held)]
-    found = zip(instants, itertools.pairwise(values), strict=True)
-    return [(time, before, after) for time, (before, after) in found if before != after]
+    steps = zip(instants, itertools.pairwise(values), strict=True)
+    return [(time, before, after) for time, (before, after) in steps if before != after]

@@ -18,8 +18,8 @@ DEFAULT: Final = "steps"  # the type of a table that states none
 
 def _kind(value: object) -> str:
     """The tag of a table or of what was made of one."""
-    given = value.get("type", DEFAULT) if isinstance(value, dict) else getattr(value, "type", DEFAULT)
-    return given if isinstance(given, str) else repr(given)
+    kind = value.get("type", DEFAULT) if isinstance(value, dict) else getattr(value, "type", DEFAULT)
+    return kind if isinstance(kind, str) else repr(kind)
 
 
 ReferenceTable = Annotated[

@@ -111,7 +111,7 @@ def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
     fixed = [0, *(other for other in (1, 2, 3) if pure and other != row)]
     equal = np.zeros(len(fixed))
     equal[0] = vehicle.mass * vehicle.gravity / units[0]
-    found = []
+    extremes = []
     for sign in (1.0, -1.0):
         solution = linprog(
             sign * matrix[row] / units[row],
@@ -121,5 +121,5 @@ def _extremes(vehicle: Vehicle, row: int, *, pure: bool) -> tuple[float, float]:
             method="highs",
         )
         assert solution.success, "hover itself is feasible"
-        found.append(float(sign * solution.fun * units[row]))
-    return found[0], found[1]
+        extremes.append(float(sign * solution.fun * units[row]))
+    return extremes[0], extremes[1]

@@ -15,7 +15,7 @@ from mpc.baselines.bandwidths import lag_to_allow_for
 from mpc.robust.tightening import SHORTEST_LAG
 from quadsim.errors import UnknownNameError, printable
 from quadsim.vehicle import Vehicle
-from scenarios.design.tuning import (
+from scenarios.design.rules import (
     HEADING_RATIO,
     HEADING_STEP,
     HEIGHT_RATIO,
@@ -25,9 +25,9 @@ from scenarios.design.tuning import (
     MOVE_RATIO,
     PERIOD_SHARE,
     THRUST_SHARE,
-    Tuning,
+    Design,
     delay_margin,
-    tune,
+    design_for,
 )
 
 if TYPE_CHECKING:
@@ -93,21 +93,14 @@ class FirstScenario:
 
 
 def first_scenario(vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust") -> FirstScenario:
-    """A scenario that the vehicle flies well, with its controller's numbers made from the vehicle's.
+    """A scenario that the vehicle flies well, with numbers made from the vehicle's; see `quadsim.scenario`.
 
-    Args:
-        vehicle: the numbers.
-        file: where they are, as the scenario is to name it: a shipped vehicle or a path ending in `.toml`.
-        course: one of `COURSES`.
-        law: one of `LAWS`.
-
-    Raises:
-        UnknownNameError: there is no such course or law.
+    `file` is where these are, as the scenario is to name it; `course` is one of `COURSES`, `law` of `LAWS`.
     """
     for kind, name, known in (("course", course, COURSES), ("controller", law, LAWS)):
         if name not in known:
             raise UnknownNameError(kind, name, known)
-    tuning = tune(vehicle)
+    tuning = design_for(vehicle)
     reference, duration, size = _course(course, vehicle, tuning)
     name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course}".lower())[:80]
     for_duration = "" if duration is None else f"duration = {duration}  # s\n"
@@ -144,7 +137,7 @@ def _rotors(vehicle: Vehicle) -> str:
     return "[effects.rotors]  # lag and inertia of the vehicle file\n"
 
 
-def _notes(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> str:
+def _notes(vehicle: Vehicle, tuning: Design, course: str, law: str) -> str:
     """The comments above the file: what it was made from."""
     can = tuning.authority
     limits = {
@@ -155,7 +148,7 @@ def _notes(vehicle: Vehicle, tuning: Tuning, course: str, law: str) -> str:
     option, what = "", "The loop's bandwidth for x and y"
     then = (
         f"Without bounds it tolerates {1e3 * delay_margin(vehicle, tuning):.3g} ms more delay than it knows of.\n"
-        "# Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: scenarios/design/tuning.py."
+        "# Weights by Bryson's rule, 1 / (largest accepted deviation)^2; rules and sources: scenarios/design/rules.py."
     )
     if law != "robust":
         option, what = f" --controller {law}", "The course is made for a robust MPC, whose bandwidth for x and y"
@@ -172,7 +165,7 @@ angular acceleration in reserve at hover
 """
 
 
-def _description(course: str, vehicle: Vehicle, tuning: Tuning) -> str:
+def _description(course: str, vehicle: Vehicle, tuning: Design) -> str:
     what = {
         "hover": f"hover at {_height(vehicle, STEP):g} m",
         "step": f"steps of {STEP:g} m in x, y and z",
@@ -181,7 +174,7 @@ def _description(course: str, vehicle: Vehicle, tuning: Tuning) -> str:
     return f"{vehicle.name}: {what[course]}"
 
 
-def largest_eight(vehicle: Vehicle, tuning: Tuning) -> tuple[float, Literal["tilt", "speed"]]:
+def largest_eight(vehicle: Vehicle, tuning: Design) -> tuple[float, Literal["tilt", "speed"]]:
     """The largest level acceleration [m/s^2] of a figure eight that the vehicle can fly, and what is reached there."""
     tilting = vehicle.gravity * tuning.acceleration
     # Of (a sin wt, a/2 sin 2wt) the largest speed is sqrt(2) a w.
@@ -189,13 +182,13 @@ def largest_eight(vehicle: Vehicle, tuning: Tuning) -> tuple[float, Literal["til
     return (moving, "speed") if moving < tilting else (tilting, "tilt")
 
 
-def _eight_limit(vehicle: Vehicle, tuning: Tuning) -> str:
+def _eight_limit(vehicle: Vehicle, tuning: Design) -> str:
     if largest_eight(vehicle, tuning)[1] == "speed":
         return f"the fastest level speed, {tuning.fastest:.3g} m/s"
     return "the largest acceleration within the tilt bound"
 
 
-def _course(course: str, vehicle: Vehicle, tuning: Tuning) -> tuple[str, float | None, float]:
+def _course(course: str, vehicle: Vehicle, tuning: Design) -> tuple[str, float | None, float]:
     """The table `[reference]`, the flight's duration [s], None to the end of the course, and its size [m]."""
     if course == "hover":
         return "[reference]  # no windows: every axis stays at its initial position, yaw at 0\n", 4.0, STEP
@@ -227,7 +220,7 @@ ramp = {round(0.5 * turn, 3)}  # s, half a turn to gain its speed, and to lose i
     return text, None, length
 
 
-def _robust(vehicle: Vehicle, tuning: Tuning) -> str:
+def _robust(vehicle: Vehicle, tuning: Design) -> str:
     place, height, heading = (_rounded(weight) for weight in tuning.weights)
     speed, w, tilt = _rounded(tuning.speed_weight), tuning.bandwidth, _tilt(tuning)
     lag, known = "0.0", "the vehicle gives no lag"
@@ -266,7 +259,7 @@ pitch = {[-tilt, tilt]}  # as roll
 """
 
 
-def _baseline(law: str, vehicle: Vehicle, tuning: Tuning) -> str:
+def _baseline(law: str, vehicle: Vehicle, tuning: Design) -> str:
     rules = "  # weights by Bryson's rule, its defaults; it tracks pose and velocity, not acceleration"
     steepest, w = BASELINE_SHARE * _tilt(tuning), tuning.bandwidth
     tilt = round(min(LQR_TILT, steepest) if law == "lqr" else steepest, 3)
@@ -285,7 +278,7 @@ horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for t
     return text
 
 
-def _constraints(vehicle: Vehicle, tuning: Tuning, size: float) -> str:
+def _constraints(vehicle: Vehicle, tuning: Design, size: float) -> str:
     """What the flight is audited against, whatever its controller; `size` of the course [m]."""
     tilt, off = _tilt(tuning), _rounded(ROOM * size)
     rounding = _rounded(1e-9 * vehicle.speed_max)
@@ -321,13 +314,13 @@ def _height(vehicle: Vehicle, size: float) -> float:
     return max(LOWEST, math.ceil(10.0 * (_floor(vehicle) + CLEARANCE * ROOM * size) - 1e-6) / 10.0)
 
 
-def _tilt(tuning: Tuning) -> float:
+def _tilt(tuning: Design) -> float:
     """The tilt bound [deg], a whole number where it is above 5."""
     degrees = math.degrees(tuning.tilt) + 1e-9
     return float(math.floor(degrees)) if degrees > 5.0 else _rounded(degrees)
 
 
-def _slew(tuning: Tuning) -> tuple[float, float]:
+def _slew(tuning: Design) -> tuple[float, float]:
     return _rounded(tuning.slew[0], 4), _rounded(tuning.slew[1], 4)
 
 

@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
 from scenarios.design.authority import Authority, authority
 from scenarios.feasibility_check import fitting, report
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
@@ -20,49 +21,54 @@ SLOWEST_ANSWER: Final = 1.0
 def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
     """A line for each bound of a scenario, whatever its own vehicle, that the vehicle cannot meet."""
     spec, can = scenario.controller, authority(vehicle)
-    found: list[str] = []
+    missed: list[str] = []
     if isinstance(spec, BoundedSpec | LQRSpec | PIDSpec | GeometricSpec) and spec.input_bounds is not None:
-        found += _inputs(spec.input_bounds, vehicle, scenario.control_period)
+        missed += _inputs(spec.input_bounds, vehicle, scenario.control_period)
     if isinstance(spec, BoundedSpec):
         for name in ("roll", "pitch"):
             if name in spec.output_bounds:
-                found += _tilt(f"controller.output_bounds.{name}", max(map(abs, spec.output_bounds[name])), can)
+                missed += _tilt(f"controller.output_bounds.{name}", max(map(abs, spec.output_bounds[name])), can)
     elif isinstance(spec, LQRSpec | PIDSpec | GeometricSpec):
-        found += _tilt("controller.tilt", spec.tilt, can)
+        missed += _tilt("controller.tilt", spec.tilt, can)
     if isinstance(spec, RobustSpec) and spec.rotor_lag == "vehicle" and vehicle.rotor_rise is None:
-        found.append("controller.rotor_lag is the vehicle's, whose file gives no rotor_rise: give a number of seconds")
+        missed.append("controller.rotor_lag is the vehicle's, whose file gives no rotor_rise: give a number of seconds")
     for limit in scenario.constraints:
         if limit.signal == "speed" and not limit.lower <= vehicle.hover_speed <= limit.upper:
             sides = f"{limit.lower:g} to {limit.upper:g}"
-            found.append(f"constraint {limit.name}: hover is {vehicle.hover_speed:.4g} rad/s, the audit allows {sides}")
-    if any("hover is" in line for line in found):  # the course's rotor speeds would repeat it
-        return tuple(found)
-    problems = report(scenario, vehicle).problems
-    found += [f"the course requires {problem}" for problem in problems]
-    fits = fitting(scenario, vehicle) if problems else ""
-    return (*found, fits) if fits else tuple(found)
+            missed.append(
+                f"constraint {limit.name}: hover is {vehicle.hover_speed:.4g} rad/s, the audit allows {sides}"
+            )
+    if any("hover is" in line for line in missed):  # the course's rotor speeds would repeat it
+        return tuple(missed)
+    assembly = Assembly(scenario)
+    problems = report(assembly).problems
+    missed += [f"the course requires {problem}" for problem in problems]
+    fits = fitting(assembly) if problems else ""
+    return (*missed, fits) if fits else tuple(missed)
 
 
 def _inputs(bounds: InputBoundsSpec, vehicle: Vehicle, period: float) -> list[str]:
     lower, upper = bounds.speed
-    speed, hover, found = "controller.input_bounds.speed", vehicle.hover_speed, []
+    speed, hover, missed = "controller.input_bounds.speed", vehicle.hover_speed, []
     if hover > upper:
-        found.append(f"{speed}: hover is {hover:.4g} rad/s, the scenario allows {upper:g}")
+        missed.append(f"{speed}: hover is {hover:.4g} rad/s, the scenario allows {upper:g}")
     elif hover < lower:
-        found.append(f"{speed}: hover is {hover:.4g} rad/s, the scenario requires at least {lower:g}")
+        missed.append(f"{speed}: hover is {hover:.4g} rad/s, the scenario requires at least {lower:g}")
     if upper > vehicle.speed_max:
-        found.append(f"{speed}: the scenario counts on {upper:g} rad/s, the rotors reach {vehicle.speed_max:g}")
+        missed.append(f"{speed}: the scenario counts on {upper:g} rad/s, the rotors reach {vehicle.speed_max:g}")
     if lower < vehicle.speed_min:
-        found.append(f"{speed}: the scenario counts on {lower:g} rad/s, the rotors hold at least {vehicle.speed_min:g}")
+        missed.append(
+            f"{speed}: the scenario counts on {lower:g} rad/s, the rotors hold at least {vehicle.speed_min:g}"
+        )
     up = bounds.slew[1]
     needed = vehicle.speed_max - hover
     if up * SLOWEST_ANSWER < needed * period:
         time = f"{needed * period / up:.3g} s" if up else "for ever"
-        found.append(
+        missed.append(
             f"controller.input_bounds.slew: {up:g} rad/s per period take {time} from hover to the highest speed, "
             f"{needed:.4g} rad/s more; tilt and height are answered too late"
         )
-    return found
+    return missed
 
 
 def _tilt(name: str, bound: float, can: Authority) -> list[str]:

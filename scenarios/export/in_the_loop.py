@@ -1,32 +1,208 @@
-"""Processor in the loop: a flight whose controller is an exported one, on its target or in the target's emulator."""
+"""Processor in the loop: a flight whose controller is an exported one, on its target or in the target's emulator.
+
+The programs of an export are built with its Makefile and run; questions and answers pass the serial line of
+`mpc/export/c/serial.c`.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
+import select
+import shutil
+import struct
+import subprocess
 import tempfile
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from enum import IntEnum
 from pathlib import Path
+from types import TracebackType
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
 from mpc.answer import ActuatorBounds
 from mpc.core.law import ANSWERERS, LEVELS, STATUSES
 from mpc.export.ctext import Precision
-from mpc.export.targets import TARGETS, Target
+from mpc.export.targets import EMULATOR, TARGETS, Target
 from mpc.ocp import Problem
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Moment, stopped
+from quadsim.errors import FlightError, MissingProgramError, QuadsimError
+from quadsim.flight.audit import Limit
 from quadsim.outputs import reserving
-from quadsim.state import Array
+from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.export.emulation import Program, build, require_programs
+from scenarios.assembly import Assembly
 from scenarios.export.exporter import c_controller, exported_law, programs
-from scenarios.export.serial_line import SerialMPC
 from scenarios.flight import Flight
 from scenarios.limits import with_bounds_stated
-from scenarios.loading import as_scenario
+from scenarios.loading import load_scenario
 from scenarios.progress import Progress, reporting
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
+
+CROSS_PACKAGES: Final = "make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm"
+HOST_PACKAGES: Final = "make gcc libc6-dev"
+PATIENCE: Final = 120.0  # how long an answer of the emulated processor may take [s]; the longest step takes a second
+
+
+def require_programs(target: Target, what: str) -> None:
+    """Refuse what needs a compiler, or an emulator, that is not here.
+
+    Raises:
+        MissingProgramError: one is not installed.
+    """
+    for program in ("make", target.compiler, *([EMULATOR] if target.board else [])):
+        if shutil.which(program) is None:
+            raise MissingProgramError(what, program, packages=CROSS_PACKAGES if target.board else HOST_PACKAGES)
+
+
+def build(directory: Path, program: str, *settings: str) -> Path:
+    """Make a program of an export, a target of its Makefile, with settings of its variables, e.g. `CC=clang`.
+
+    Raises:
+        QuadsimError: it cannot be built; with the compiler's first words.
+    """
+    done = subprocess.run(["make", "-C", str(directory), program, *settings], capture_output=True, text=True)
+    if done.returncode:
+        errors = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
+        raise QuadsimError(f"{directory / program} cannot be built: {errors[0] if errors else 'make fails'}")
+    return directory / program
+
+
+class Program:
+    """A program that runs, and the serial line to it; see `Line`."""
+
+    def __init__(self, target: Target, image: Path) -> None:
+        command = [*target.emulation, "-serial", "stdio", "-kernel", str(image)] if target.board else [str(image)]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0
+        )
+
+    def __enter__(self) -> Program:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._process.kill()
+        self._process.communicate()
+
+    def send(self, data: bytes) -> None:
+        """Send all of it; to a program that has ended nothing."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(data)
+
+    def receive(self, count: int) -> bytes:
+        """`count` bytes; fewer where the program has ended, or sends nothing for `PATIENCE`."""
+        assert self._process.stdout is not None
+        line, data = self._process.stdout.fileno(), b""
+        while len(data) < count and select.select([line], [], [], PATIENCE)[0]:
+            more = os.read(line, count - len(data))
+            if not more:
+                break
+            data += more
+        return data
+
+
+MARK: Final = 0x4D504351
+_LETTER: Final = {"double": "d", "float": "f"}
+
+
+class Kind(IntEnum):
+    """The kind of a query."""
+
+    START = 0  # begin anew after u(-1), the reference its one row throughout
+    ROW = 1  # take one more row of the reference
+    STEP = 2  # take one more row and solve
+
+
+class Reply(NamedTuple):
+    """An answer: the number of its question, u(k) (4,) [rad/s], and a status of `quadsim_mpc.h`."""
+
+    number: int
+    command: Array
+    status: int
+
+
+class Line(Protocol):
+    """A serial line."""
+
+    def send(self, data: bytes) -> None:
+        """Send all of it."""
+        ...
+
+    def receive(self, count: int) -> bytes:
+        """`count` bytes; fewer where the other end has closed, or no longer answers."""
+        ...
+
+
+class Frames:
+    """Questions and answers as bytes, in a precision."""
+
+    def __init__(self, precision: str) -> None:
+        letter = _LETTER[precision]
+        self._question = struct.Struct(f"<2I{N_STATES + 2 * N_ROTORS}{letter}2I")
+        self._answer = struct.Struct(f"<2I{N_ROTORS}{letter}2I")
+
+    @property
+    def answer_size(self) -> int:
+        """Bytes of an answer."""
+        return self._answer.size
+
+    def question(self, kind: Kind, number: int, state: Array, row: Array, acting: Array) -> bytes:
+        """A question with its checksum; what its kind does not take may be anything."""
+        data = self._question.pack(MARK, number % 2**32, *state, *row, *acting, kind, 0)[:-4]
+        return data + zlib.crc32(data).to_bytes(4, "little")
+
+    def reply(self, data: bytes) -> Reply | None:
+        """The answer that these bytes are; None where they are none."""
+        if len(data) != self._answer.size:
+            return None
+        mark, number, *command, status, checksum = self._answer.unpack(data)
+        if mark != MARK or checksum != zlib.crc32(data[:-4]):
+            return None
+        return Reply(number, np.array(command, np.float64), status)
+
+
+class SerialMPC:
+    """An exported controller of `double` or `float` numbers at the other end of a serial line."""
+
+    def __init__(self, line: Line, precision: str, horizon: int) -> None:
+        self._line, self._frames, self._horizon = line, Frames(precision), horizon
+        self._number, self._window, self._speeds = 0, np.zeros((0, 4)), np.zeros(N_ROTORS)
+
+    def reset(self, speeds: Array) -> None:
+        """Begin anew after u(-1) (4,) [rad/s]."""
+        self._speeds, self._window = np.array(speeds, float), np.zeros((0, 4))
+
+    def step(self, time: float, state: Array, reference: Array, acting: Array) -> Reply:
+        """The answer at t_k [s] to x(k) (12,), the reference (N, 4) and u(k-1) (4,) [rad/s].
+
+        Where the reference is the last one moved on, its last row alone is sent.
+
+        Raises:
+            FlightError: no answer came, or none that is whole.
+        """
+        if not len(self._window):
+            self._query(time, Kind.START, state, reference[0], self._speeds)
+        if not np.array_equal(self._window[1:], reference[:-1]):
+            for row in reference[:-1]:
+                self._query(time, Kind.ROW, state, row, acting)
+        self._window = np.array(reference)
+        return self._query(time, Kind.STEP, state, reference[-1], acting)
+
+    def _query(self, time: float, kind: Kind, state: Array, row: Array, acting: Array) -> Reply:
+        self._number += 1
+        self._line.send(self._frames.question(kind, self._number, state, row, acting))
+        while True:
+            reply = self._frames.reply(self._line.receive(self._frames.answer_size))
+            if reply is None:
+                problem = f"the controller at the serial line gave no answer to question {self._number}"
+                raise FlightError(problem, time=time)
+            if reply.number == self._number:  # else what its watchdog had sent meanwhile
+                return reply
 
 
 class MPCInTheLoop:
@@ -103,7 +279,7 @@ def fly_exported(
         >>> import quadsim
         >>> flight = quadsim.fly_exported("hover", target="cortex-m4f", precision="float")  # doctest: +SKIP
     """
-    scenario = as_scenario(scenario)
+    scenario = load_scenario(scenario)
     machine = TARGETS[target]
     files = c_controller(scenario, precision).files | programs(machine, precision)
     require_programs(machine, "to fly an exported controller")
@@ -128,14 +304,12 @@ def fly_exported(
 
 def _allowing(scenario: Scenario, spacing: float) -> Scenario:
     """The scenario with tolerances of at least `spacing` [rad/s] on speeds and their steps."""
-    limits = [
-        replace(
-            limit,
-            tolerance=max(spacing, limit.tolerance),
-            tolerance_sampled=max(spacing, limit.tolerance_sampled),
-        )
-        if limit.signal in ("speed", "slew")
-        else limit
-        for limit in with_bounds_stated(scenario).constraints
-    ]
+
+    def widened(limit: Limit) -> Limit:
+        if limit.signal not in ("speed", "slew"):
+            return limit
+        tolerances = {name: max(spacing, getattr(limit, name)) for name in ("tolerance", "tolerance_sampled")}
+        return replace(limit, **tolerances)
+
+    limits = [*map(widened, with_bounds_stated(Assembly(scenario)).constraints)]
     return scenario.model_copy(update={"constraints": limits})

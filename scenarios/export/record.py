@@ -21,8 +21,7 @@ from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import ACCEPTED, CORE, GAIN, Command, Moment, Phase
 from quadsim.errors import ExportError, PlanExhaustedError
 from quadsim.state import Array
-from scenarios.build import build_controller
-from scenarios.parts.vehicle import build_vehicle
+from scenarios.assembly import Assembly
 from scenarios.rollout import Rollout
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.scenario import Scenario
@@ -79,7 +78,7 @@ def record(scenario: Scenario) -> Recording:
     scenario = scenario.replace({"controller.compiled": False})
     if isinstance(scenario.controller, BoundedSpec):
         scenario = scenario.replace({"controller.solver": CORE})
-    law = build_controller(scenario, build_vehicle(scenario))
+    law = Assembly(scenario).controller()
     inner = law.inner if isinstance(law, Guarded) else law
     assert isinstance(inner, MPC)
     recorder = Recorder(inner)
@@ -112,7 +111,7 @@ def _answers(
     if isinstance(law, UnconstrainedMPC):
         return np.zeros(len(queries), np.int64), _free_commands(law, queries)
     law.reset(speeds)
-    found: list[tuple[int, Array]] = []
+    answers: list[tuple[int, Array]] = []
     for k, (state, acting, reference) in enumerate(queries):
         answer = REFUSED, acting
         with contextlib.suppress(PlanExhaustedError):
@@ -122,8 +121,8 @@ def _answers(
                 answer = WAYS[law.answer.method], command.speeds
                 if command.answered_by not in (GAIN, CORE):
                     break
-        found.append(answer)
-    status, commands = zip(*found, strict=True)
+        answers.append(answer)
+    status, commands = zip(*answers, strict=True)
     return np.array(status), np.array(commands)
 
 

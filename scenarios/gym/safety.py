@@ -68,7 +68,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See `gymnasium.Env.reset`."""
-        found = self.env.reset(seed=seed, options=options)
+        observed = self.env.reset(seed=seed, options=options)
         started = self._base.started
         if started.vehicle != self._vehicle:
             self._filter, self._law = make_filter(self._spec, started.vehicle, started.scenario.control_period)
@@ -77,7 +77,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         assert acting is not None
         self._law.reset(acting)
         self.steps = self.interventions = 0
-        return found
+        return observed
 
     def step(self, action: Action) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """See `gymnasium.Env.step`.

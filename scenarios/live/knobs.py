@@ -1,13 +1,14 @@
-"""The fields of a controller that a person may turn in flight, from the schema of scenario files."""
+"""The fields of a controller that a person may turn in flight, from their declarations."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from scenarios.schema.base import fields_of, is_table
 from scenarios.schema.controller import ControllerSpec
-from scenarios.schema.json_schema import scenario_schema
+from scenarios.schema.problems import Kind, kinds_of
 
 Value = float | int | bool | str | tuple[float, ...]
 
@@ -26,46 +27,31 @@ class Knob:
 
 def knobs(spec: ControllerSpec) -> tuple[Knob, ...]:
     """Every field of a controller that has a value, but its type, longer lists and what a user's controller reads."""
-    root = scenario_schema()
-    values = spec.model_dump(mode="json", exclude_none=True, exclude={"type"})
-    return tuple(_walk("", values, root["$defs"][type(spec).__name__], "", root))
+    return tuple(knob for knob in _walk("", spec, (Kind(type=type(spec)),), "") if knob.path != "type")
 
 
-def _walk(path: str, value: Any, schema: Mapping[str, Any], about: str, root: Mapping[str, Any]) -> Iterator[Knob]:
-    schema, found = _plain(schema, root, value)
-    about = found or about
-    if isinstance(value, Mapping):
-        properties, others = schema.get("properties", {}), schema.get("additionalProperties", {})
+def _walk(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterator[Knob]:
+    below = f"{path}." if path else ""
+    if is_table(type(value)):
+        for name, field in fields_of(type(value)).items():
+            inner = kinds_of(field.annotation, tuple(field.metadata))
+            yield from _walk(f"{below}{name}", getattr(value, name), inner, field.description or about)
+    elif isinstance(value, Mapping):
         for name, entry in value.items():
-            inner = properties.get(name, others)
-            if isinstance(inner, Mapping):
-                yield from _walk(f"{path}.{name}" if path else name, entry, inner, about, root)
-        return
-    entry = _plain(schema.get("items", {}), root, None)[0] if isinstance(value, list) else schema
-    if isinstance(value, list):
-        if len(value) != 2 or not all(isinstance(number, int | float) for number in value):
-            return
-        value = tuple(map(float, value))
-    yield Knob(
-        path=path,
-        value=value,
-        about=about,
-        minimum=entry.get("minimum", entry.get("exclusiveMinimum")),
-        maximum=entry.get("maximum", entry.get("exclusiveMaximum")),
-        choices=tuple(entry.get("enum", (value,))) if isinstance(value, str) else (),
-    )
+            yield from _walk(f"{below}{name}", entry, [kind for table in kinds for kind in table.entries], about)
+    elif isinstance(value, list | tuple):
+        if len(value) == 2 and all(isinstance(number, int | float) for number in value):
+            entries = [entry for kind in kinds for entry in kind.entries]
+            yield from _walk_numbers(path, tuple(map(float, value)), entries, about)
+    elif isinstance(value, str):
+        choices = tuple(str(choice) for kind in kinds for choice in kind.choices)
+        yield Knob(path=path, value=value, about=about, choices=choices or (value,))
+    elif value is not None:
+        yield from _walk_numbers(path, value, kinds, about)
 
 
-def _plain(schema: Mapping[str, Any], root: Mapping[str, Any], value: Any) -> tuple[Mapping[str, Any], str]:
-    """A schema without references and alternatives, as far as they describe a value, and what it is about."""
-    about = schema.get("description", "")
-    while True:
-        if "$ref" in schema:
-            schema = root["$defs"][schema["$ref"].rpartition("/")[2]]
-        elif "anyOf" in schema or "oneOf" in schema:
-            options = [each for each in schema.get("anyOf", schema.get("oneOf", ())) if each.get("type") != "null"]
-            fitting = [each for each in options if isinstance(value, str) == (each.get("type") == "string")]
-            schema = (fitting or options)[0]
-        else:
-            return schema, about
-        about = about or schema.get("description", "")
+def _walk_numbers(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterator[Knob]:
+    limits = next((kind.limits for kind in kinds if kind.type in (float, int, bool)), None)
+    if limits is not None:  # else it is what a user's controller reads
+        low, high = (limits.get(inside, limits.get(beyond)) for inside, beyond in (("ge", "gt"), ("le", "lt")))
+        yield Knob(path=path, value=value, about=about, minimum=low, maximum=high)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-import errno
 import inspect
 import io
 import math
@@ -19,20 +18,18 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from html import escape
-from importlib.util import find_spec
 from typing import Any, Final
 
 import numpy as np
 
 from quadsim.controller import OPTIMAL
-from quadsim.errors import InputError, MissingPackageError, OutputError, ParameterError
+from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.flight.audit import Limit
-from quadsim.report.curves import BOUND, LINES
+from quadsim.report.figure import BOUND, LINES
 from quadsim.rotation import quaternion_to_euler
 from quadsim.vehicle import N_ROTORS
-from scenarios.live.guard import Guard
 from scenarios.live.knobs import Knob, Value, knobs
-from scenarios.live.pacing import Pace
+from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
 from scenarios.live.stage import Stage
 from scenarios.schema.controller import ControllerSpec
@@ -63,26 +60,6 @@ STYLE: Final = """<style>
 </style>"""
 
 
-def require_server(host: str, port: int) -> None:
-    """Refuse, before anything is flown, where no page could be served.
-
-    Raises:
-        MissingPackageError: viser is not installed.
-        ParameterError: the host is no address of this machine, or the port is none, or in use.
-    """
-    if find_spec("viser") is None:
-        raise MissingPackageError("quadsim live", "viser", extra="live")
-    if not 0 <= port <= 65535:
-        raise ParameterError("", "--port", port, "from 1 to 65535, or 0 for any that is free")
-    try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        socket.create_server((host or "?", port), family=family).close()
-    except (OSError, UnicodeError) as error:
-        if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES):
-            raise ParameterError("", "--port", port, "a port that is free") from error
-        raise ParameterError("", "--host", host, "an address of this machine") from error
-
-
 def _reachable(host: str) -> str:
     """How others call this machine: where it listens on all its addresses, one of them."""
     if host not in ("0.0.0.0", "::"):
@@ -94,7 +71,7 @@ def _reachable(host: str) -> str:
 
 
 class Page:
-    """A session's page, which `pace` drives; see `require_server`.
+    """A session's page, which `pace` drives.
 
     Args:
         save: writes the run directory of what has been flown and reports where; in the simulation thread.
@@ -122,13 +99,13 @@ class Page:
         silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
         with silent, guard.installed():
             self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
-        found = self._server.get_port()
-        if port not in (0, found):
+        listening = self._server.get_port()
+        if port not in (0, listening):
             self.close()
             raise ParameterError("", "--port", port, "a port that is free")
         for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):  # a tunnel that any client may open
             self._server._websock_server.unregister_handler(message)
-        self.address = f"http://{_reachable(host)}:{found}/?token={guard.token}"
+        self.address = f"http://{_reachable(host)}:{listening}/?token={guard.token}"
         self._driver: int | None = None
         self._takes: dict[int, Any] = {}  # the button of each client that takes the controls
         self._aims: dict[int, Any] = {}  # where each client looks, from the vehicle [m]
@@ -202,11 +179,12 @@ class Page:
         self._status = gui.add_html(_says("starting"))
         self._margins = gui.add_html("")
         with gui.add_folder("Run"):
-            self._group("Flight", {"Pause": self._toggle, "Step": self._step, "Reset": self._reset})
+            self._group("Flight", {"Pause": self._toggle, "Step": self._step, "Reset": self._between(self._reset)})
             speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1", hint="simulated over real time")
             self._on(speed.on_update, lambda event: setattr(self._pace, "speed", float(event.target.value)))
             self._follow = gui.add_checkbox("Camera follows", True)
-            self._group("Keep", {"Save": self._save_now, "Scenario": self._download, "Scene": self._scene})
+            keep = {"Save": self._between(self._keep), "Scenario": self._between(self._download), "Scene": self._scene}
+            self._group("Keep", keep)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Push"):
             self._pushes()
@@ -235,7 +213,7 @@ class Page:
         gui.add_markdown("Drag the vehicle with the mouse to pull it.")
 
         def pulled(event: Any) -> None:
-            to = None if event.phase == "end" else [float(each) for each in event.end_position]
+            to = None if event.phase == "end" else [float(number) for number in event.end_position]
             self._session.submit({"type": "pull", "to": to}, subject="pull")
 
         self._on(self.stage.grab.on_drag("left"), pulled)
@@ -296,7 +274,7 @@ class Page:
 
     def _set_point(self, at: Any) -> None:
         self._fly(np.zeros(3))
-        x, y, z = (round(float(each), 2) for each in at)
+        x, y, z = (round(float(number), 2) for number in at)
         self._handle.position, self._place.value = np.array([x, y, z]), (x, y, z)
         self._session.submit({"type": "setpoint", "x": x, "y": y, "z": z}, subject="setpoint")
 
@@ -309,7 +287,7 @@ class Page:
 
     def _show_velocity(self, velocity: Any) -> None:
         self._steer = velocity
-        self._steered.value = ", ".join(f"{each:g}" for each in velocity)
+        self._steered.value = ", ".join(f"{speed:g}" for speed in velocity)
 
     def _show_knobs(self, spec: ControllerSpec) -> None:
         for _, handles in self._fields.values():
@@ -333,21 +311,21 @@ class Page:
         look = {"min": knob.minimum, "max": knob.maximum, "hint": knob.about}
         if isinstance(value, tuple):
             names = (f"{knob.path} lower", f"{knob.path} upper")
-            return [gui.add_number(name, each, **look) for name, each in zip(names, value, strict=True)]
+            return [gui.add_number(name, bound, **look) for name, bound in zip(names, value, strict=True)]
         return [gui.add_number(knob.path, value, step=1 if isinstance(value, int) else None, **look)]
 
     async def _turn(self, path: str, event: Any) -> None:
         if path not in self._fields:  # of a controller that was replaced meanwhile
             return
         knob, handles = self._fields[path]
-        values = tuple(each.value for each in handles)
+        values = tuple(number.value for number in handles)
         value: Value = values[0] if len(handles) == 1 else values
         if await self._replace({path: value}, f"{path} = {value}"):
             self._fields[path] = dataclasses.replace(knob, value=value), handles
             return
         before = knob.value if isinstance(knob.value, tuple) else (knob.value,)
-        for handle, each in zip(handles, before, strict=True):
-            handle.value = each
+        for handle, number in zip(handles, before, strict=True):
+            handle.value = number
 
     async def _take(self, name: str) -> None:
         spec = self._session.scenario.controller if name == "as started" else self._others[name]
@@ -374,33 +352,28 @@ class Page:
         self._pace.paused = True
         self._pace.single()
 
-    def _reset(self, event: Any) -> None:
-        def anew(session: Session) -> None:
-            session.reset()
-            self.ended(None)
-
-        self._pace.order(anew)
-
-    def _save_now(self, event: Any) -> None:
-        def keep(session: Session) -> None:
-            try:
-                result = f"saved: {self._save(session)}"
-            except (InputError, OutputError) as error:
-                result = f"not saved: {error}"
-            with _unless_gone():
-                event.client.add_notification("Save", result)
-
-        self._pace.order(keep)
-
-    def _download(self, event: Any) -> None:
-        def send(session: Session) -> None:
-            if session.k:
-                _send(event.client, f"{session.scenario.name}.toml", session.flight().scenario.to_toml())
-
-        self._pace.order(send)
-
     def _scene(self, event: Any) -> None:
         _send(event.client, f"{self._session.scenario.name}.html", self._server.scene.as_html())
+
+    def _between(self, act: Callable[[Session, Any], None]) -> Callable[[Any], None]:
+        """What has something done between two periods, in the thread that flies; `act` takes session and client."""
+        return lambda event: self._pace.order(lambda session: act(session, event.client))
+
+    def _reset(self, session: Session, client: Any) -> None:
+        session.reset()
+        self.ended(None)
+
+    def _keep(self, session: Session, client: Any) -> None:
+        try:
+            result = f"saved: {self._save(session)}"
+        except (InputError, OutputError) as error:
+            result = f"not saved: {error}"
+        with _unless_gone():
+            client.add_notification("Save", result)
+
+    def _download(self, session: Session, client: Any) -> None:
+        if session.k:
+            _send(client, f"{session.scenario.name}.toml", session.flight().scenario.to_toml())
 
     # Who drives
 
@@ -442,8 +415,8 @@ class Page:
             if event.client.client_id != self._driver:
                 text = "Another page has the controls: Take the controls changes that."
                 event.client.add_notification("You watch", text)
-            elif inspect.isawaitable(found := act(event)):
-                await found
+            elif inspect.isawaitable(result := act(event)):
+                await result
 
         register(called)
 

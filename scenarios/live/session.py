@@ -13,21 +13,22 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Le, doc
 from pydantic import Field
 
 from quadsim.assets import read_toml
-from quadsim.errors import FlightError, InputError
-from quadsim.fields import Fraction
+from quadsim.errors import FlightError, InputError, ParameterError
+from quadsim.fields import Fraction, Vector
 from quadsim.flight.audit import Limit
 from quadsim.sim.loop import Sample
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
-from scenarios.build import preferring_core
+from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
+from scenarios.flight_events import Successor
 from scenarios.limits import with_bounds_stated
-from scenarios.parts.live import Successor, validated
 from scenarios.rollout import Rollout
-from scenarios.schema.base import Spec, Triple
 from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.problems import parse_table
 from scenarios.schema.scenario import Scenario
 
 STIFFNESS: Final = 0.4  # of the spring that a person pulls by, in weights of the vehicle per metre
@@ -35,41 +36,48 @@ STRONGEST: Final = 0.3  # largest pull in weights of the vehicle
 FORCE_STEP: Final = 1e-3  # to which pulls are rounded [N]
 
 
-class Pull(Spec):
+@dataclass(frozen=True, kw_only=True)
+class Pull:
     """A spring from the vehicle to a point of the world, held until it is let go."""
 
     type: Literal["pull"]
-    to: Triple | None = None  # [m] world; absent to let go
+    to: Annotated[Vector | None, doc("[m] world; absent to let go")] = None
 
 
-class Wear(Spec):
+@dataclass(frozen=True, kw_only=True)
+class Wear:
     """A rotor's loss of thrust, held."""
 
     type: Literal["wear"]
-    rotor: Annotated[int, Field(ge=1, le=4)]
+    rotor: Annotated[int, Ge(1), Le(4)]
     loss: Fraction
 
 
-class Steer(Spec):
-    """The set-point's velocity [m/s], held."""
+@dataclass(frozen=True, kw_only=True)
+class Steer:
+    """The set-point's velocity, held."""
 
     type: Literal["steer"]
-    velocity: Triple
+    velocity: Annotated[Vector, doc("[m/s]")]
 
 
-class _Held(Spec):
+@dataclass(frozen=True, kw_only=True)
+class _Held:
     input: Annotated[Pull | Wear | Steer, Field(discriminator="type")]
 
 
-class _ScriptInput(Spec, extra="allow"):
-    at: Annotated[float, Field(ge=0.0)]
-
-
-class Script(Spec):
+@dataclass(frozen=True, kw_only=True)
+class Script:
     """A session without a browser: inputs as `Session.submit` takes them, and the times [s] at which they are given."""
 
-    duration: Annotated[float, Field(gt=0.0, le=36_000.0)]  # of the session [s]
-    inputs: list[_ScriptInput] = Field(default_factory=list)
+    duration: Annotated[float, Gt(0.0), Le(36_000.0), doc("[s] of the session")]
+    inputs: list[dict[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        for i, entry in enumerate(self.inputs):
+            at = entry.get("at")
+            if not isinstance(at, int | float) or isinstance(at, bool) or not 0.0 <= at < self.duration:
+                raise ParameterError("", f"inputs.{i}.at", at, f"below duration = {self.duration} s, and 0 or more")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,8 +123,10 @@ class Session:
         self._queue.clear()
         scenarios = [self.scenario]
         if self._against is not None:
-            scenarios.append(with_bounds_stated(self.scenario).model_copy(update={"controller": self._against}))
-        self.flights = tuple(Rollout(each, live=True) for each in scenarios)
+            scenarios.append(
+                with_bounds_stated(Assembly(self.scenario)).model_copy(update={"controller": self._against})
+            )
+        self.flights = tuple(Rollout(flown, live=True) for flown in scenarios)
         self._held = _Hand()
         self.reason: str | None = None
 
@@ -193,10 +203,10 @@ class Session:
         An input is given when the first period begins that is not before its time.
         """
         refused: list[str] = []
-        waiting = deque(sorted(script.inputs, key=lambda each: each.at))
+        waiting = deque(sorted(script.inputs, key=lambda entry: float(entry["at"])))
         while self.reason is None and self.k * self.period < script.duration - 1e-9:
-            while waiting and waiting[0].at <= self.k * self.period + 1e-9:
-                self.submit(waiting.popleft().model_extra or {})
+            while waiting and waiting[0]["at"] <= self.k * self.period + 1e-9:
+                self.submit({name: value for name, value in waiting.popleft().items() if name != "at"})
             refused += self.advance().refused
         return refused
 
@@ -220,7 +230,7 @@ class Session:
             else:
                 self._happen(table)
             return
-        match validated(_Held, {"input": table}, "input").input:
+        match parse_table(_Held, {"input": table}, "input").input:
             case Pull(to=to):
                 self._held.pull = None if to is None else np.array(to)
             case Wear(rotor=rotor, loss=loss):
@@ -265,17 +275,8 @@ class Session:
 
 
 def read_script(path: str | Path) -> Script:
-    """Read a script.
-
-    Raises:
-        FileError: it cannot be read.
-        InputError: it is not a script.
-    """
-    script = validated(Script, read_toml(Path(path)), str(path))
-    for i, each in enumerate(script.inputs):
-        if each.at >= script.duration:
-            raise InputError(f"{path}: inputs.{i}.at must be below duration = {script.duration} s; got {each.at}")
-    return script
+    """Read a script."""
+    return parse_table(Script, read_toml(Path(path)), str(path), file="script")
 
 
 def _horizon(flight: Rollout, sample: Sample) -> Array | None:

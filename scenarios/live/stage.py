@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from quadsim.flight.audit import SpaceLimit
-from quadsim.report.curves import BOUND, LINES, OBSTACLE, REFERENCE
+from quadsim.report.figure import BOUND, LINES, OBSTACLE, REFERENCE
 from quadsim.sim.airframe import BODY, compile_model
 from quadsim.space import Obstacle, Region
 from quadsim.state import Array
@@ -169,10 +169,10 @@ def _add_solid(scene: Any, name: str, kind: str, size: Any, **look: Any) -> None
 
 def _segments(points: Array, count: int) -> Array:
     """(count, 2, 3) of a line through points, its last one repeated: the number must not change."""
-    found = np.repeat(points[-1][None, None], count, axis=0).repeat(2, axis=1)
+    segments = np.repeat(points[-1][None, None], count, axis=0).repeat(2, axis=1)
     pairs = np.stack([points[:-1], points[1:]], axis=1)[-count:]
-    found[: len(pairs)] = pairs
-    return found.astype(np.float32)
+    segments[: len(pairs)] = pairs
+    return segments.astype(np.float32)
 
 
 def _course(session: Session) -> Array:

@@ -1,29 +1,123 @@
-"""A paper's numbers flown: published, ours, difference."""
+"""Numbers that papers publish, one TOML file per paper, and these flown: published, ours, difference."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
 
+from annotated_types import MaxLen, MinLen, doc
+
+from quadsim.assets import read_toml
 from quadsim.errors import InputError
+from quadsim.fields import NonNegative, Number, Positive
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
-from scenarios.papers.paper import NumberSpec, Paper, scenario_of
+from scenarios.assembly import Assembly
+from scenarios.catalogue import paper_path, scenario_path
+from scenarios.loading import parse_scenario
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.rollout import Rollout
+from scenarios.schema.base import MOST_ENTRIES, Pair
+from scenarios.schema.bases import merge, read_scenario
+from scenarios.schema.problems import parse_table
+from scenarios.schema.scenario import Scenario
 
 HEAD: Final = ("number", "unit", "published", "ours", "difference", "tolerance", "reproduced")
 _RULE: Final = "measure must lead to a number of the flight's summary"
+Text = Annotated[str, MinLen(1), MaxLen(300)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedNumber:
+    """One published number, and the flight that gives ours."""
+
+    name: Annotated[Text, doc("what it is, for tables")]
+    scenario: Annotated[str, doc("a library name, or a path ending in .toml, relative to the paper's file")]
+    set: Annotated[dict[str, Any], doc("tables that are merged over the scenario, as over a base")] = field(
+        default_factory=dict
+    )
+    measure: Annotated[str, doc("dotted path into the flight's summary.json; an entry of a list by its name")] = (
+        "tracking.position_error.mean"
+    )
+    unit: Annotated[str, MaxLen(20), doc("of the number, for tables")] = "m"
+    published: Annotated[Number | Pair, doc("[unit] the number, or the lowest and the highest of several")]
+    relation: Annotated[Literal["equal", "at most", "at least"], doc("what ours is to be to the published one")] = (
+        "equal"
+    )
+    absolute: Annotated[NonNegative | None, doc("[unit] tolerance; either absolute or relative")] = None
+    relative: Annotated[Positive | None, doc("[-] tolerance as a share of the published number")] = None
+    source: Annotated[Text, doc("where the published number is from")]
+
+    def __post_init__(self) -> None:
+        if (self.absolute is None) == (self.relative is None):
+            raise ValueError("absolute must be given, or relative, but not both")
+        if self.relative is not None and not any(self.span):
+            raise ValueError("absolute must be given where the published number is 0")
+        if isinstance(self.published, list):
+            low, high = self.published
+            if self.relation != "equal" or not low < high:
+                raise ValueError(f"published must be a lower and a higher number of relation equal; got {[low, high]}")
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The lowest and the highest published number."""
+        low, high = self.published if isinstance(self.published, list) else (self.published, self.published)
+        return low, high
+
+    @property
+    def tolerance(self) -> float:
+        """How far off ours may be [unit]."""
+        return self.absolute if self.absolute is not None else (self.relative or 0.0) * max(map(abs, self.span))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperFile:
+    """A paper, with the numbers of it that are reproduced."""
+
+    title: Annotated[Text, doc("of the paper")]
+    authors: Annotated[Text | None, doc("of the paper; absent where it names none")] = None
+    publication: Annotated[Text | None, doc("where and when it was published")] = None
+    about: Annotated[Text, doc("what is reproduced, and what it is written from")]
+    numbers: Annotated[list[PublishedNumber], MinLen(1), MaxLen(MOST_ENTRIES), doc("its numbers, in order")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Paper(PaperFile):
+    """A paper with the file that it was read from."""
+
+    path: Path
+
+    @property
+    def name(self) -> str:
+        """Short name of the paper."""
+        return self.path.stem
+
+    def scenario_of(self, number: PublishedNumber) -> Scenario:
+        """What is flown for a number."""
+        beside = self.path.parent / number.scenario
+        own_file = number.scenario.endswith(".toml") and beside.is_file()
+        path = scenario_path(str(beside) if own_file else number.scenario)
+        data = merge(read_scenario(path, scenario_path), number.set)
+        scenario = parse_scenario(data, source=f"{number.name}: {path.name}", directory=path.parent)
+        Assembly(scenario).check()
+        return scenario
+
+
+def load_paper(name: str) -> Paper:
+    """Read and check a paper that ships, or a path ending in `.toml`."""
+    path = paper_path(name)
+    return Paper(path=path, **vars(parse_table(PaperFile, read_toml(path), path.name, file="paper")))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduced:
     """One number."""
 
-    spec: NumberSpec  # the published one
+    spec: PublishedNumber  # the published one
     ours: float | None  # of our flight [unit]; None where it ended early
     reason: str | None = None  # why it did
 
@@ -134,34 +228,22 @@ class Reproductions(tuple[Reproduction, ...], Result):
         return {"reproduced": not self.exit_status, "papers": [paper.to_json() for paper in self]}
 
 
-def reproduce_paper(
-    paper: Paper, progress: Progress = silent, *, chosen: Callable[[NumberSpec], bool] = lambda _: True
-) -> Reproduction:
-    """Fly a paper's numbers, each flight once whatever is measured of it.
-
-    Args:
-        paper: see `scenarios.papers.paper.load_paper`.
-        progress: called with (what, done, total).
-        chosen: which numbers.
-
-    Raises:
-        InputError: a number cannot be flown, or the flight's summary has no such number.
-    """
-    specs = [spec for spec in paper.numbers if chosen(spec)]
-    scenarios = [scenario_of(paper, spec) for spec in specs]
-    flown: dict[str, dict[str, Any]] = {}
-    found = []
-    for done, (spec, scenario) in enumerate(zip(specs, scenarios, strict=True)):
-        progress(f"{paper.name}: numbers", done, len(specs))
-        key = json.dumps([spec.scenario, spec.set], sort_keys=True, default=str)
-        if key not in flown:
-            flown[key] = dict(Rollout(scenario).fly().summary)
-        found.append(_measured(spec, flown[key]))
-    progress(f"{paper.name}: numbers", len(specs), len(specs))
-    return Reproduction(paper=paper, numbers=tuple(found))
+def reproduce_paper(paper: Paper, progress: Progress = silent) -> Reproduction:
+    """Fly a paper's numbers, each flight once whatever is measured of it; see `quadsim.reproduce`."""
+    scenarios = [paper.scenario_of(number) for number in paper.numbers]
+    summaries: dict[str, dict[str, Any]] = {}
+    reproduced, what, count = [], f"{paper.name}: numbers", len(scenarios)
+    for done, (number, scenario) in enumerate(zip(paper.numbers, scenarios, strict=True)):
+        progress(what, done, count)
+        key = json.dumps([number.scenario, number.set], sort_keys=True, default=str)
+        if key not in summaries:
+            summaries[key] = dict(Rollout(scenario).fly().summary)
+        reproduced.append(_measured(number, summaries[key]))
+    progress(what, count, count)
+    return Reproduction(paper=paper, numbers=tuple(reproduced))
 
 
-def _measured(spec: NumberSpec, summary: dict[str, Any]) -> Reproduced:
+def _measured(spec: PublishedNumber, summary: dict[str, Any]) -> Reproduced:
     if summary["status"] != "completed":
         return Reproduced(spec=spec, ours=None, reason=summary["reason"])
     value: Any = summary

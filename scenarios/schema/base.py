@@ -25,6 +25,8 @@ LARGEST_SEED: Final = 2**63 - 1  # the largest whole number that every reader of
 Seconds = Annotated[float, Field(ge=0.0, le=10.0)]
 Lag = Seconds | Literal["vehicle"]  # A time constant, or that of the vehicle file
 
+STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
 _FIRST: Final = {"at": 0, "type": 1}
 """Fields that stand first in a table, which may have been added to those of a dataclass."""
 
@@ -35,7 +37,7 @@ class Spec(BaseModel):
     What a validator raises starts with the name of the field, for `scenarios.schema.problems.describe` to complete.
     """
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, **STRICT)
 
 
 def is_table(kind: object) -> TypeGuard[type[Any]]:

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import datetime
 import difflib
+import functools
+import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import islice
 from types import NoneType, UnionType
-from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from annotated_types import GroupedMetadata
-from pydantic import BaseModel, Tag, ValidationError
+from pydantic import BaseModel, Tag, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, core_schema
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.vehicle import MEANT
-from scenarios.schema.base import fields_of, is_table
+from scenarios.schema.base import STRICT, fields_of, is_table
+
+Table = TypeVar("Table")
 
 _LISTS: Final = (list, tuple, Sequence)  # types that are lists in a file
 _TAGS: Final = ("type", "distribution")  # fields that distinguish tables
@@ -67,17 +71,21 @@ class Kind:
         return tags or {getattr(self.type, "__name__", "")}
 
     @property
+    def limits(self) -> dict[str, Any]:
+        """Its limits, by the names that annotated_types has for them."""
+        return dict(_limits(self.metadata))
+
+    @property
     def lengths(self) -> tuple[int, float]:
         """The least and the largest number of entries of a list, or characters of a text."""
-        limits = dict(_limits(self.metadata))
-        return limits.get("min_length") or 0, limits.get("max_length") or math.inf
+        return self.limits.get("min_length") or 0, self.limits.get("max_length") or math.inf
 
     def __str__(self) -> str:
         """What is allowed, as the end of "must be ..."."""
         if self.choices:
             *rest, last = ("false" if choice is False else repr(choice) for choice in self.choices)
             return f"one of {', '.join(rest)} or {last}" if rest else last
-        limits, count = dict(_limits(self.metadata)), _count(*self.lengths)
+        limits, count = self.limits, _count(*self.lengths)
         if self.is_list:
             held = {entry.type for entry in self.entries}
             return f"a list of {count}{'numbers' if held <= {float, int} else 'texts' if held == {str} else 'entries'}"
@@ -187,8 +195,28 @@ class ScenarioError(InputError):
         self.source, self.problems = source, tuple(problems)
 
 
+def parse_table(kind: type[Table], data: Mapping[str, Any], source: str, *, file: str = "scenario") -> Table:
+    """Nested tables as the table that a class declares.
+
+    Raises:
+        ScenarioError: naming every field that is wrong; the message starts with `source`.
+    """
+    try:
+        table: Table = _adapter(cast(Any, kind)).validate_json(json.dumps(data, default=lambda _: math.inf))
+    except ValidationError as error:
+        raise ScenarioError(source, describe_all(error, data, kind, file=file)) from error
+    return table
+
+
+@functools.cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    if not issubclass(kind, BaseModel):
+        kind.__pydantic_config__ = STRICT  # of tables within, too
+    return TypeAdapter(kind)
+
+
 def describe_all(
-    error: ValidationError, data: Mapping[str, Any], root: type[BaseModel], *, file: str = "scenario"
+    error: ValidationError, data: Mapping[str, Any], root: type[Any], *, file: str = "scenario"
 ) -> list[str]:
     """A line about each wrong field; of a list, that it is too long, or else which of its entries are wrong.
 
@@ -209,7 +237,7 @@ def describe_all(
     ]
 
 
-def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[BaseModel], *, file: str = "scenario") -> str:
+def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *, file: str = "scenario") -> str:
     """One line about one field of a file that is to be a `root`: its name, what is allowed, what was given."""
     place = find(details["loc"], data, root)
     field, kind, given = ".".join(place.names), details["type"], place.given

@@ -21,8 +21,8 @@ from annotated_types import Len, doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Number, Vector
-from quadsim.sim.estimation.estimate import EstimatorSettings
-from quadsim.sim.sensing.sensor import Sampling, Sensor, SensorName
+from quadsim.sim.error_state import EstimatorSettings
+from quadsim.sim.sensing import Sampling, Sensor, SensorName
 
 Deviations = NonNegative | Annotated[tuple[NonNegative, ...], Len(3, 3)]
 """One standard deviation for all three axes, or one each."""
@@ -85,7 +85,7 @@ class SensorsSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorSpec(EstimatorSettings):
-    """An error-state Kalman filter from the sensors and the modelled vehicle; see `quadsim.sim.estimation`."""
+    """An error-state Kalman filter from the sensors and the modelled vehicle; see `quadsim.sim.estimator`."""
 
     type: Annotated[Literal["error_state"], doc("kind of estimator")]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -14,12 +14,10 @@ import pyarrow as pa
 from quadsim.errors import InputError, MissingPackageError
 from quadsim.outputs import Growing
 from quadsim.state import Array
-from scenarios.campaign.pilot import CampaignPilot
-from scenarios.campaign.results.store import Store
-from scenarios.campaign.results.table import Row
-from scenarios.campaign.spec import ChoiceSpec, IntegerSpec, LogUniformSpec, Value
-from scenarios.tuning.plan import START, SearchPlan, TuningPlan, Values
-from scenarios.tuning.spec import SearchSpec
+from scenarios.campaign.campaign_file import Choice, Integer, LogUniform, Value
+from scenarios.campaign.rows import Row
+from scenarios.campaign.store import Store
+from scenarios.tuning.tuning_plan import START, Searched, SearchPlan, TuningPlan, Values
 
 if TYPE_CHECKING:
     from optuna.trial import Trial
@@ -28,11 +26,7 @@ JOURNAL_FILE: Final = "journal.log"
 
 
 def require_optuna() -> Any:
-    """Optuna.
-
-    Raises:
-        MissingPackageError: it is not installed.
-    """
+    """Optuna, or MissingPackageError."""
     try:
         import optuna
     except ModuleNotFoundError as error:
@@ -59,11 +53,9 @@ class Score:
 class Search:
     """The study and the flights of its candidates: trial n is candidate n, and trial 0 the start."""
 
-    def __init__(
-        self, plan: TuningPlan, files: Growing, fly: Callable[..., Generator[Row]], watch: Callable[..., None]
-    ) -> None:
+    def __init__(self, plan: TuningPlan, files: Growing, watch: Callable[..., None], **where: Any) -> None:
         optuna = require_optuna()
-        self._plan, self._fly, self._watch, self._started = plan, fly, watch, clock.perf_counter()
+        self._plan, self._watch, self._where, self._started = plan, watch, where, clock.perf_counter()
         self.candidates: dict[int, Values] = {START: {}}
         self.scores: dict[int, Score] = {}
         self._flights = SearchPlan(plan.start.spec, plan.start.scenario, tuning=plan, candidates=self.candidates)
@@ -109,19 +101,19 @@ class Search:
             going = [trial for trial in going if self._goes_on(trial, flights)]
         states = require_optuna().trial.TrialState
         for trial in trials:
-            found = self.scores[trial.number]
-            self._spared += self._plan.most - found.flights
-            trial.set_constraint("failures", found.excess)
-            state = states.FAIL if not trial.params else None if found.values else states.PRUNED
-            self.study.tell(trial, found.values if state is None else None, state=state)
+            score = self.scores[trial.number]
+            self._spared += self._plan.most - score.flights
+            trial.set_constraint("failures", score.excess)
+            state = states.FAIL if not trial.params else None if score.values else states.PRUNED
+            self.study.tell(trial, score.values if state is None else None, state=state)
 
     def _goes_on(self, trial: Trial, flights: int) -> bool:
         """Whether a trial flies on: it can still hold the requirement, and the pruner agrees."""
         rows = self._first(trial.number, flights)
-        found = self.scores[trial.number] = self._score(trial.number, rows)
-        if found.count > self._plan.requirement.share * self._plan.most:
+        score = self.scores[trial.number] = self._score(trial.number, rows)
+        if score.count > self._plan.requirement.share * self._plan.most:
             return False
-        if len(found.values) > 1:  # of several objectives Optuna prunes none
+        if len(score.values) > 1:  # of several objectives Optuna prunes none
             return True
         for draw, (value,) in enumerate(self._plan.objectives(rows)):
             if np.isfinite(value):
@@ -134,7 +126,7 @@ class Search:
         So few flights do not count for or against a candidate that happened to fly easy or hard draws.
         """
         values, start = self._plan.objectives(rows), self._plan.objectives(self._first(START, self._plan.most))
-        whole, met = (np.asarray(np.isfinite(each).all(axis=1)) for each in (values, start))
+        whole, met = (np.asarray(np.isfinite(objectives).all(axis=1)) for objectives in (values, start))
         both = whole & met[: len(rows)]
         means: Array = values[whole].mean(axis=0) if whole.any() else np.empty(0)
         if both.any():
@@ -159,13 +151,13 @@ class Search:
         """
         plan, most = self._flights, self._plan.most
         numbers = [candidate * most + draw for candidate in candidates for draw in range(flights)]
-        if any(plan.identity(each).items() - self._rows[each].items() for each in numbers if each in self._rows):
+        if any(plan.identity(n).items() - self._rows[n].items() for n in numbers if n in self._rows):
             raise InputError("--resume needs the candidates that flew there, and other ones were proposed")
         missing = [number for number in numbers if number not in self._rows]
         if not missing:
             return
         try:
-            with closing(self._fly(CampaignPilot(plan), missing)) as rows:
+            with closing(plan.fly_all(missing, **self._where)) as rows:
                 for row in rows:
                     self._store.add(row)
                     self._rows[row["flight"]] = row
@@ -184,12 +176,14 @@ class Search:
         that are no worse than the start in any.  Where no candidate is feasible, it is the one that fails least.
         """
         scores, start = self.scores, self.scores[START]
-        whole = [each for each in scores.values() if each.feasible and each.flights == self._plan.most]
-        points = {each.values for each in whole}
+        whole = [score for score in scores.values() if score.feasible and score.flights == self._plan.most]
+        points = {score.values for score in whole}
         best = [p for p in points if not any(other != p and np.less_equal(other, p).all() for other in points)]
-        front = [each.candidate for each in sorted(whole, key=lambda each: each.values) if each.values in best]
+        front = [score.candidate for score in sorted(whole, key=lambda score: score.values) if score.values in best]
         if not front:
-            least = min(scores.values(), key=lambda each: (each.excess, -each.flights, each.values, each.candidate))
+            least = min(
+                scores.values(), key=lambda score: (score.excess, -score.flights, score.values, score.candidate)
+            )
             return least.candidate, []
         values = np.array([scores[candidate].values for candidate in front])
         distances = np.linalg.norm((values - values.min(axis=0)) / np.maximum(np.ptp(values, axis=0), 1e-300), axis=1)
@@ -199,16 +193,16 @@ class Search:
         return next((c for c in near if np.less_equal(scores[c].values, start.values).all()), START), front
 
 
-def _distribution(kinds: Any, entry: SearchSpec) -> Any:
+def _distribution(kinds: Any, entry: Searched) -> Any:
     match entry:
-        case ChoiceSpec():
+        case Choice():
             return kinds.CategoricalDistribution(entry.values)
-        case IntegerSpec():
+        case Integer():
             return kinds.IntDistribution(entry.low, entry.high)
-    return kinds.FloatDistribution(entry.low, entry.high, log=isinstance(entry, LogUniformSpec))
+    return kinds.FloatDistribution(entry.low, entry.high, log=isinstance(entry, LogUniform))
 
 
-def _contains(entry: SearchSpec, value: Value | None) -> bool:
-    if isinstance(entry, ChoiceSpec):
+def _contains(entry: Searched, value: Value | None) -> bool:
+    if isinstance(entry, Choice):
         return value in entry.values
     return isinstance(value, int | float) and entry.low <= value <= entry.high

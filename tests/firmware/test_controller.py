@@ -9,20 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import quadprog
 from exported_c import HOST, Host, Reply, replay
 
-from mpc.condensing import Condensed
 from mpc.export.ctext import Precision
-from mpc.ocp import Query
-from mpc.solvers import QPSolver
-from quadsim.controller import SOLVED
 from quadsim.state import Array
-from scenarios.build import build_problem
 from scenarios.export.exporter import c_controller
 from scenarios.export.record import REFUSED, Recording, record
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
@@ -117,47 +110,6 @@ def drawn(name: str = "paper-constrained") -> list[tuple[Array, Array, Array]]:
     return found
 
 
-@functools.cache
-def peers() -> list[tuple[Array | None, Array | None]]:
-    """First commands of DAQP and of quadprog; None where they find none."""
-    scenario = load_scenario("paper-constrained")
-    problem = build_problem(scenario, build_vehicle(scenario))
-    daqp, form = QPSolver("daqp", problem), Condensed(problem)
-    found: list[tuple[Array | None, Array | None]] = []
-    for state, reference, acting in drawn():
-        query = Query(state, problem.objective.desired(reference), acting)
-        answer = daqp.solve(Query(query.state, query.desired, query.u_before))
-        first = answer.plan[0] if answer.status == SOLVED else None
-        qp = form.pose(Query(query.state, query.desired, query.u_before)).qp
-        rows = np.vstack([np.eye(qp.c.size), qp.G])
-        lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
-        try:
-            x = quadprog.solve_qp(np.array(qp.P), -qp.c, np.vstack([rows, -rows]).T, np.concatenate([lower, -upper]))[0]
-            second = form.inputs(x)[0]
-        except ValueError:
-            second = None
-        found.append((first, second))
-    return found
-
-
-@pytest.mark.parametrize("warm", [False, True], ids=["cold", "warm"])
-@pytest.mark.parametrize("precision", TOLERANCE)
-def test_drawn_states_have_the_verdict_and_the_optimum_of_two_solvers(precision: Precision, warm: bool) -> None:
-    host, hover = Host(load_scenario("paper-constrained"), precision, rows=160), np.full(4, 188.0)
-    host.reset(hover)
-    infeasible = 0
-    for (state, reference, acting), (first, second) in zip(drawn(), peers(), strict=True):
-        if not warm:
-            host.reset(hover)
-        reply = host.step(state, reference, acting)
-        assert (reply.status >= REFUSED) == (first is None) == (second is None)
-        infeasible += first is None
-        if first is not None and second is not None:
-            nearest = min(np.abs(reply.command - first).max(), np.abs(reply.command - second).max())
-            assert nearest <= (1e-7 if precision == "double" else 5e-2)
-    assert 20 <= infeasible <= 500
-
-
 PRECISIONS: tuple[Precision, ...] = ("double", "float")
 FLOATS = {
     "paper-constrained": (0.1, 0.0),
@@ -201,66 +153,3 @@ def test_more_active_rows_than_there_is_room_for_end_as_defined() -> None:
     reply = small.step(*arguments)
     assert reply.status == 3
     assert ((reply.command - flight.acting[0] <= 5.0) & (reply.command - flight.acting[0] >= -10.0)).all()
-
-
-BROKEN = (np.nan, np.inf, -np.inf, 1e300)
-
-
-@pytest.mark.parametrize("name", ["paper-constrained", "robust"])
-@pytest.mark.parametrize("value", BROKEN)
-@pytest.mark.parametrize("what", ["state", "reference", "acting"])
-def test_input_that_is_none_leads_to_the_command_before(name: str, what: str, value: float) -> None:
-    flight, host = recording(name), Host(load_scenario(name))
-    arguments = {
-        "state": flight.state[0].copy(),
-        "reference": flight.path[: host.horizon].copy(),
-        "acting": flight.acting[0].copy(),
-    }
-    host.reset(flight.speeds)
-    first = host.step(**arguments)
-    broken = {**arguments, what: arguments[what].copy()}
-    broken[what].flat[1] = value
-    reply = host.step(**broken)
-    assert reply.status == 5 if not np.isfinite(value) or name == "robust" else reply.status >= REFUSED
-    assert np.isfinite(reply.command).all()
-    assert (reply.command >= 0.0).all()
-    assert (reply.command <= 250.0).all()
-    if what == "acting" and not np.isfinite(value):
-        np.testing.assert_array_equal(reply.command, first.command)
-    assert host.step(**arguments).status == first.status  # and the next one is answered again
-
-
-def test_a_plan_is_held_shifted_where_there_is_no_optimum() -> None:
-    flight, host = recording("paper-constrained-lag20"), Host(load_scenario("paper-constrained-lag20"))
-    found = replay(host, flight)
-    refused = [reply.status for reply in found if reply.status >= REFUSED]
-    assert refused
-    assert set(refused) <= {3, 4}
-    for before, reply in zip(flight.acting, found, strict=True):
-        step = reply.command - before
-        assert (step >= -10.0 - 1e-9).all()
-        assert (step <= 5.0 + 1e-9).all()
-
-
-def test_two_controllers_do_not_know_of_one_another() -> None:
-    flight, scenario = recording("paper-constrained"), load_scenario("paper-constrained")
-    alone, other = Host(scenario), Host(scenario)
-    other.reset(np.full(4, 100.0))
-    alone.reset(flight.speeds)
-    for k in range(40):
-        window = flight.path[k : k + alone.horizon]
-        other.step(flight.state[-1 - k], window, flight.acting[k])
-        reply = alone.step(flight.state[k], window, flight.acting[k])
-        np.testing.assert_array_equal(reply.command, replies("paper-constrained", "double")[k].command)
-
-
-def test_a_reset_in_flight_forgets_the_active_set() -> None:
-    flight, host = recording("paper-constrained"), Host(load_scenario("paper-constrained"))
-    host.reset(flight.speeds)
-    first = host.step(flight.state[0], flight.path[: host.horizon], flight.acting[0])
-    for k in range(1, 30):
-        host.step(flight.state[k], flight.path[k : k + host.horizon], flight.acting[k])
-    host.reset(flight.speeds)
-    again = host.step(flight.state[0], flight.path[: host.horizon], flight.acting[0])
-    assert again.changes == first.changes > 10  # from the ground, without an active set
-    np.testing.assert_array_equal(again.plan, first.plan)

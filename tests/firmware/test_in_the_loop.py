@@ -11,9 +11,7 @@ import pytest
 from mpc.export.targets import TARGETS
 from quadsim.errors import FlightError, MissingProgramError
 from scenarios.cli import main
-from scenarios.export.emulation import Program, require_programs
-from scenarios.export.in_the_loop import fly_exported
-from scenarios.export.serial_line import SerialMPC
+from scenarios.export.in_the_loop import Program, SerialMPC, fly_exported, require_programs
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 

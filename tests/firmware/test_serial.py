@@ -14,9 +14,8 @@ import pytest
 from firmware.conftest import Answers, Export, Run
 
 from quadsim.state import Array
-from scenarios.export.emulation import build
+from scenarios.export.in_the_loop import Frames, Kind, Reply, SerialMPC, build
 from scenarios.export.record import Recording, record
-from scenarios.export.serial_line import Frames, Kind, Reply, SerialMPC
 from scenarios.loading import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,7 +10,7 @@ import pytest
 from firmware.conftest import Answer, Answers, Export, Measured, Run
 
 from mpc.export.targets import TARGETS, TICK
-from scenarios.export.emulation import build
+from scenarios.export.in_the_loop import build
 
 HERE = Path(__file__).parent
 BOARDS = [name for name, target in TARGETS.items() if target.board]

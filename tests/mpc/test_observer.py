@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from mpc.observer import DisturbanceObserver, ObserverSettings, observer_gain, thrust_axis
-from quadsim.errors import ParameterError
 from quadsim.rotation import body_to_euler_rates, body_to_world
 from quadsim.state import EULER, EULER_RATE, VELOCITY, Array, make_state
 
@@ -158,10 +157,3 @@ def test_reset_forgets() -> None:
     assert observer.estimate.any()
     observer.reset()
     assert not observer.estimate.any()
-
-
-@pytest.mark.parametrize("name", ["velocity_noise", "rate_walk", "force_walk", "torque_walk", "largest_torque"])
-@pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
-def test_settings_name_the_number_that_is_impossible(name: str, value: float) -> None:
-    with pytest.raises(ParameterError, match=rf"controller\.offset_free\.{name} must be positive and finite"):
-        ObserverSettings(**{name: value})

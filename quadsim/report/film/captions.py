@@ -17,14 +17,12 @@ from quadsim.report.comparison import failure_sentences
 from quadsim.report.film import painter as ink
 from quadsim.report.film.frames import Footage, MarginTrack
 from quadsim.report.film.painter import Colour, Painter, Picture, shade, text_width
-from quadsim.report.film.topview import TopView
 from quadsim.report.table import ABSENT
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
 
 _STRIP: Final = 150  # height of the bottom strip, in design pixels of a 1280 x 720 frame
-_COMPACT_SCALE: Final = 1.6
-_MAP: Final = (236, 190)  # width and height of the map, in design pixels
-_COMPACT_MAP: Final = (180, 150)
+_LEGEND: Final = (230, "reference", ink.AMBER), (150, "flown", ink.BLUE), (100, "predicted", ink.GREEN)
+"""How far left of the right edge [design pixels] the colours of the paths are named."""
 _MOST_MARGINS: Final = 6
 
 
@@ -33,7 +31,7 @@ _LAST: Final = 1.0
 _SHOWN: Final = 2.0  # time [s] for which it shows what has happened
 _MOST_EVENTS: Final = 3
 _MOST_LINES: Final = 10  # of that: more would reach the strip at the bottom
-_WIDEST: Final = 140  # letters of a line of that, between the frame's edge and the map
+_WIDEST: Final = 140  # letters of a line of that, between the frame's edge and the legend
 
 
 class Overlay:
@@ -42,44 +40,40 @@ class Overlay:
     Lengths below are design pixels of a 1280 x 720 frame, scaled to the frame's real size.
     """
 
-    def __init__(self, run: Run, footage: Footage, *, width: int, height: int, compact: bool = False) -> None:
-        self._run, self._footage, self._compact = run, footage, compact
-        self._scale = min(width / 1280.0, height / 720.0) * (_COMPACT_SCALE if compact else 1.0)
+    def __init__(self, run: Run, footage: Footage, *, width: int, height: int) -> None:
+        self._run, self._footage = run, footage
+        self._scale = min(width / 1280.0, height / 720.0)
         self._width, self._height = width / self._scale, height / self._scale
         controller = run.summary.get("controller", {})
         self._subtitle = law_name(controller.get("name", ""))
         self._grounded = any(phase != Phase.FLYING for phase in run.log.control.phase)
         self._ranked = sorted(footage.margins, key=lambda track: track.rank)  # of the whole flight: rows stay in place
-        self._top_view = TopView(run, footage, *(_COMPACT_MAP if compact else _MAP), acting=not compact)
 
     def draw(self, frame: Picture, i: int) -> Picture:
         """Frame `i` (height, width, 3) with its captions; `frame` itself is changed."""
         lines = self._headlines(i)
         columns: list[tuple[float, Callable[[Painter, float, float, int], None]]]
-        columns = [(262, self._attitude), (188, self._speeds)]
-        if not self._compact:
-            columns = [(262, self._position), *columns, (188, self._slews), (226, self._margins)]
+        columns = [
+            *((262, self._position), (262, self._attitude), (188, self._speeds), (188, self._slews)),
+            (226, self._margins),
+        ]
         gap = max(0.0, (self._width - 48.0 - sum(width for width, _ in columns)) / (len(columns) - 1))
         lefts = [24.0 + gap * j + sum(width for width, _ in columns[:j]) for j in range(len(columns))]
         strip = self._height - _STRIP
 
-        map_left, map_size = self._width - self._top_view.width - 16, (self._top_view.width, self._top_view.height)
         longest = max(text_width(text, size, scale=self._scale) for text, size, _ in lines)
         shade(frame, 16, 16, 24 + longest, 14 + 27 * len(lines), scale=self._scale)
-        shade(frame, map_left, 16, *map_size, scale=self._scale)
-        if self._compact:
-            for left, (width, _) in zip(lefts, columns, strict=True):
-                shade(frame, left - 8, strip - 16, width + 16, _STRIP, scale=self._scale)
-        else:
-            shade(frame, 0, strip, self._width, _STRIP, scale=self._scale)
+        shade(frame, self._width - 246, 16, 230, 30, scale=self._scale)
+        shade(frame, 0, strip, self._width, _STRIP, scale=self._scale)
 
         image = Image.fromarray(frame)
         painter = Painter(image, self._scale)
         for j, (text, size, colour) in enumerate(lines):
             painter.text(28, 38 + 27 * j, text, size=size, colour=colour, anchor="lm")
-        self._top_view.draw(painter, map_left, 16, i)
+        for right, text, colour in _LEGEND:
+            painter.text(self._width - right, 24, text, size=13, colour=colour)
         for left, (_, panel) in zip(lefts, columns, strict=True):
-            panel(painter, left, strip + (-8.0 if self._compact else 10.0), i)
+            panel(painter, left, strip + 10.0, i)
         return np.asarray(image)
 
     def _limit(self, signal: str, i: int) -> Limit | None:
@@ -92,8 +86,6 @@ class Overlay:
         control, k = self._run.log.control, self._footage.period[i]
         time = self._footage.times[i]
         lines: list[tuple[str, float, Colour]] = [(self._run.name, 21, ink.WHITE)]
-        if self._compact:
-            return [*lines, (f"t = {time:.1f} s", 17, ink.GREY)]
         lines += [(self._subtitle, 14, ink.GREY), (f"t = {time:.2f} s", 20, ink.WHITE), self._answer(k)]
         for vectors, what, unit, colour in (
             (self._footage.wind, "wind", "m/s", ink.CYAN),

@@ -30,7 +30,7 @@ class Shot:
     speed: float = 1.0  # simulated seconds per second of film
     first: int = 0  # first frame to film
     count: int  # how many
-    compact: bool = False  # whether to leave out all but the largest captions, for small pictures
+    captions: bool = True  # which small pictures have no room for
 
     @property
     def times(self) -> Array:

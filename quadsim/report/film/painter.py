@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import functools
-import math
 from typing import Any, Final
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-
-from quadsim.state import Array
 
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
 Colour = tuple[int, int, int]
@@ -23,7 +20,6 @@ AMBER: Final = (255, 184, 77)
 GREEN: Final = (120, 222, 150)
 CYAN: Final = (126, 232, 232)
 VIOLET: Final = (225, 120, 205)
-BRICK: Final = (206, 104, 82)
 
 _TEXTS: Final = 2048
 """Texts that are cached as pictures, of each size of font: a film shows most of its words in every frame."""
@@ -51,31 +47,6 @@ class Painter:
             (round(left), round(top), max(round(right) - 1, round(left)), max(round(bottom) - 1, round(top))),
             fill=colour,
         )
-
-    def line(self, points: Array, colour: Colour, *, width: float = 1.5) -> None:
-        """Draw through points (n, 2)."""
-        if len(points) > 1:
-            self._canvas.line(
-                (points * self._scale).ravel().tolist(), fill=colour, width=max(1, round(width * self._scale))
-            )
-
-    def polygon(self, points: Array, colour: Colour) -> None:
-        """Fill an outline (n, 2)."""
-        self._canvas.polygon((points * self._scale).ravel().tolist(), fill=colour)
-
-    def dot(self, place: Array, radius: float, colour: Colour) -> None:
-        """Fill a circle."""
-        self._canvas.circle((place * self._scale).tolist(), radius * self._scale, fill=colour)
-
-    def arrow(self, start: Array, reach: Array, colour: Colour) -> None:
-        """Draw from a place (2,) by `reach` (2,); nothing where that is shorter than its head."""
-        head, length = 6.0, math.hypot(*reach)
-        if length < head:
-            return
-        along = head / length * reach
-        across, tip = 0.6 * np.array([-along[1], along[0]]), start + reach
-        self.line(np.stack([start, tip]), colour, width=2.0)
-        self.line(np.stack([tip - along + across, tip, tip - along - across]), colour, width=2.0)
 
 
 def shade(frame: Picture, x: float, y: float, width: float, height: float, *, scale: float) -> None:

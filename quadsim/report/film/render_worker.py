@@ -10,7 +10,7 @@ import itertools
 import json
 import pickle
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -20,12 +20,13 @@ import numpy as np
 
 from quadsim.controller import Phase
 from quadsim.flight.rundir import Run, load_run
+from quadsim.report.figure import obstacles_in, region_edges
 from quadsim.report.film.camera import REQUEST
 from quadsim.report.film.captions import Overlay
 from quadsim.report.film.frames import Footage, Shot, make_footage, thin
 from quadsim.report.film.painter import Picture
-from quadsim.report.scene import obstacles_in, region_edges
 from quadsim.sim.airframe import FLOOR, PROPELLER_NAMES, compile_model, obstacle_body
+from quadsim.space import Obstacle
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -51,6 +52,46 @@ _REGION_COLOUR: Final = (0.95, 0.95, 0.55, 0.5)
 _SHADOW_COLOUR: Final = (0.05, 0.07, 0.10, 0.45)
 
 
+def _camera(arm: float) -> mujoco.MjvCamera:
+    """The camera that follows a vehicle of an arm length [m]."""
+    camera = mujoco.MjvCamera()
+    camera.distance = CAMERA_DISTANCE * arm
+    camera.azimuth, camera.elevation = CAMERA_AZIMUTH, CAMERA_ELEVATION
+    return camera
+
+
+def _renderer(model: mujoco.MjModel, width: int, height: int) -> mujoco.Renderer:
+    """A quick renderer: without multisampling, shadows and reflections."""
+    model.vis.quality.offsamples = 0
+    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+    renderer = mujoco.Renderer(model, height, width, max_geom=_MOST_GEOMS)
+    for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        renderer.scene.flags[flag] = 0
+    return renderer
+
+
+def _place(
+    data: mujoco.MjData,
+    vehicle: Vehicle,
+    obstacles: Sequence[Obstacle],
+    pose: Sequence[float],
+    turned: Sequence[float] | Array,
+    time: float,
+) -> None:
+    """Put the vehicle at a pose (7,), its rotors turned by angles (4,) [rad], and obstacles where they are then."""
+    model = data.model
+    data.qpos[:7] = pose
+    for name, angle, spin in zip(PROPELLER_NAMES, turned, vehicle.rotor_spins, strict=True):
+        half = -0.5 * spin * angle / BLADE_SLOWDOWN  # a propeller turns against its reaction torque
+        model.body(name).quat[:] = np.cos(half), 0.0, 0.0, np.sin(half)
+    for obstacle in obstacles:
+        if obstacle.moves:
+            body = model.body(obstacle_body(obstacle)).id
+            data.mocap_pos[model.body_mocapid[body]] = obstacle.positions(np.array([time]))[0]
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_camlight(model, data)
+
+
 class Stage:
     """A vehicle in its scene, rendered off screen; use as a context manager, it owns an OpenGL context.
 
@@ -65,19 +106,13 @@ class Stage:
         self._obstacles = obstacles_in(run.limits)
         self._model = compile_model(run.vehicle, visuals=True, obstacles=self._obstacles)
         self._regions = list(region_edges(run))
-        self._model.vis.quality.offsamples = 0
-        self._model.vis.global_.offwidth, self._model.vis.global_.offheight = width, height
         lowest = max(float(footage.path[:, 2].min()), -_DEEPEST_FLOOR)
         self._floor = min(lowest, 0.0) + float(self._model.geom(FLOOR).pos[2])
         self._model.geom(FLOOR).pos[2] = self._floor
         self._data = mujoco.MjData(self._model)
-        self._camera = mujoco.MjvCamera()
-        self._camera.distance = CAMERA_DISTANCE * self._arm
-        self._camera.azimuth, self._camera.elevation = CAMERA_AZIMUTH, CAMERA_ELEVATION
+        self._camera = _camera(self._arm)
         self._speed_bound = min((limit.upper for limit in run.limits if limit.signal == "speed"), default=np.inf)
-        self._renderer = mujoco.Renderer(self._model, height, width, max_geom=_MOST_GEOMS)
-        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
-            self._renderer.scene.flags[flag] = 0
+        self._renderer = _renderer(self._model, width, height)
 
     def __enter__(self) -> Stage:
         return self
@@ -88,17 +123,8 @@ class Stage:
     def render(self, i: int) -> Picture:
         """Frame `i` of the footage, (height, width, 3), without captions."""
         shown = self._footage
-        self._data.qpos[:3], self._data.qpos[3:7] = shown.position[i], shown.quaternion[i]
-        for name, turned, spin in zip(PROPELLER_NAMES, shown.turned[i], self._run.vehicle.rotor_spins, strict=True):
-            half = -0.5 * spin * turned / BLADE_SLOWDOWN  # a propeller turns against its reaction torque
-            self._model.body(name).quat[:] = np.cos(half), 0.0, 0.0, np.sin(half)
-        for obstacle in self._obstacles:
-            if obstacle.moves:
-                body = self._model.body(obstacle_body(obstacle)).id
-                place = obstacle.positions(shown.times[i : i + 1])[0]
-                self._data.mocap_pos[self._model.body_mocapid[body]] = place
-        mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mj_camlight(self._model, self._data)
+        pose = [*shown.position[i], *shown.quaternion[i]]
+        _place(self._data, self._run.vehicle, self._obstacles, pose, shown.turned[i], shown.times[i])
         # Aimed a little low, so that the vehicle stands above the captions.
         self._camera.lookat = shown.aim[i] - (0.0, 0.0, 0.55 * self._arm)
         self._renderer.update_scene(self._data, self._camera)
@@ -166,12 +192,13 @@ class Stage:
 
 
 def frames(run: Run, shot: Shot) -> Iterator[Picture]:
-    """The frames of a shot, captions and all, each (height, width, 3)."""
+    """The frames of a shot, each (height, width, 3)."""
     footage = make_footage(run, shot.times)
-    overlay = Overlay(run, footage, width=shot.width, height=shot.height, compact=shot.compact)
+    overlay = Overlay(run, footage, width=shot.width, height=shot.height) if shot.captions else None
     with Stage(run, footage, width=shot.width, height=shot.height) as stage:
         for i in range(shot.count):
-            yield overlay.draw(stage.render(i), i)
+            picture = stage.render(i)
+            yield picture if overlay is None else overlay.draw(picture, i)
 
 
 def film(shot: Shot, path: Path) -> None:
@@ -214,36 +241,21 @@ def serve(requests: BinaryIO, pictures: BinaryIO) -> None:
     """Draw one state after the other, as `quadsim.report.film.camera.Camera` requests them, until there are no more."""
     vehicle, obstacles, width, height = pickle.load(requests)
     model = compile_model(vehicle, visuals=True, obstacles=obstacles)
-    model.vis.quality.offsamples = 0
-    model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    data, camera = mujoco.MjData(model), mujoco.MjvCamera()
-    camera.distance = CAMERA_DISTANCE * vehicle.arm_length
-    camera.azimuth, camera.elevation = CAMERA_AZIMUTH, CAMERA_ELEVATION
-    floor = float(model.geom(FLOOR).pos[2])
-    lowest = 0.0
-    with mujoco.Renderer(model, height, width, max_geom=_MOST_GEOMS) as renderer:
-        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
-            renderer.scene.flags[flag] = 0
+    data, camera = mujoco.MjData(model), _camera(vehicle.arm_length)
+    floor, lowest = float(model.geom(FLOOR).pos[2]), 0.0
+    with _renderer(model, width, height) as renderer:
         while len(request := requests.read(REQUEST.size)) == REQUEST.size:
             time, *numbers = REQUEST.unpack(request)
-            data.qpos[:7], goal, turned = numbers[:7], numbers[7:10], numbers[10:]
-            for name, angle, spin in zip(PROPELLER_NAMES, turned, vehicle.rotor_spins, strict=True):
-                half = -0.5 * spin * angle / BLADE_SLOWDOWN  # a propeller turns against its reaction torque
-                model.body(name).quat[:] = np.cos(half), 0.0, 0.0, np.sin(half)
-            for obstacle in obstacles:
-                if obstacle.moves:
-                    body = model.body(obstacle_body(obstacle)).id
-                    data.mocap_pos[model.body_mocapid[body]] = obstacle.positions(np.array([time]))[0]
             lowest = max(min(lowest, numbers[2]), -_DEEPEST_FLOOR)
             model.geom(FLOOR).pos[2] = lowest + floor
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_camlight(model, data)
+            _place(data, vehicle, obstacles, numbers[:7], numbers[10:], time)
             camera.lookat = numbers[:3]
             renderer.update_scene(data, camera)
             scene = renderer.scene
             sphere, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, 0.15 * vehicle.arm_length)
             colour = np.array(_COURSE_COLOUR, np.float32)
-            mujoco.mjv_initGeom(scene.geoms[scene.ngeom], sphere, size, np.array(goal), np.eye(3).ravel(), colour)
+            goal = np.array(numbers[7:10])
+            mujoco.mjv_initGeom(scene.geoms[scene.ngeom], sphere, size, goal, np.eye(3).ravel(), colour)
             scene.ngeom += 1
             pictures.write(renderer.render().tobytes())
             pictures.flush()

@@ -29,7 +29,17 @@ from quadsim.vehicle import Vehicle
 
 BACKENDS: Final = ("egl", "osmesa")  # what can render without a screen, in the order tried
 _WORKER: Final = (sys.executable, "-P", "-m", "quadsim.report.film.render_worker")
-_PROBE: Final = (sys.executable, "-P", "-m", "quadsim.report.film.probe")
+_PROBE: Final = (
+    "import mujoco\n"
+    "model = mujoco.MjModel.from_xml_string("
+    "\"<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></mujoco>\")\n"
+    "data = mujoco.MjData(model)\n"
+    "mujoco.mj_forward(model, data)\n"
+    "with mujoco.Renderer(model, 32, 32) as renderer:\n"
+    "    renderer.update_scene(data)\n"
+    "    assert renderer.render().any(), 'the picture is black'\n"
+)
+"""Renders one tiny picture, and fails unless there is something in it."""
 _PROBE_SECONDS: Final = 60.0
 _LEAST_FREE_BYTES: Final = 1024 * 1024
 _FEWEST_FRAMES: Final = 30  # A further worker is not worth its start for fewer frames than these
@@ -61,7 +71,8 @@ def rendering_backend() -> str:
 
 @functools.cache  # a working one is not tried again by this process; one that raises is
 def _probe(backend: str) -> None:
-    subprocess.run(_PROBE, env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS)
+    command = (sys.executable, "-P", "-c", _PROBE)
+    subprocess.run(command, env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS)
 
 
 def worker_count(frames: int, most: int | None = None) -> int:
@@ -106,13 +117,13 @@ def render_video(
 
 
 def render_gif(run_directory: Path, path: Path, *, workers: int | None = None, overwrite: bool = False) -> None:
-    """Film a run as a small looping GIF in 16:9, six times as fast as it was; arguments and errors as `render_video`.
+    """Film a run as a small looping GIF without captions, six times as fast; arguments and errors as `render_video`.
 
-    It is rendered at twice its size, with large captions, and scaled down, which smooths its edges.
+    It is rendered at twice its size and scaled down, which smooths its edges.
     """
     fps, speed = 8, 6.0
     count = max(1, round(film_end(load_run(run_directory)) * fps / speed))
-    shot = Shot(run=str(run_directory), width=960, height=540, fps=fps, speed=speed, count=count, compact=True)
+    shot = Shot(run=str(run_directory), width=960, height=540, fps=fps, speed=speed, count=count, captions=False)
     with _making(path, overwrite) as new:
         film = new.with_suffix(".mp4")
         backend = _film(shot, film, workers, None)

@@ -7,12 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scripted_controller import (
-    PERIOD,
-    bounds,
-    model,
-    problem,
-)
+from scripted_controller import PERIOD, bounds, model, problem
 from support import paper_reference
 
 from mpc.constrained import ConstrainedMPC
@@ -22,16 +17,15 @@ from mpc.ocp import Query
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers.piqp import STATUS
 from quadsim.controller import ACCEPTED
-from quadsim.flight.ground import clearance
 from quadsim.flight.log import FlightLog
+from quadsim.flight.phase import PhaseMonitor, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.computation import Computation, Stall
 from quadsim.sim.effects import Effects, Ground
 from quadsim.sim.loop import fly
 from quadsim.sim.navigation import Navigation
-from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
-from quadsim.sim.sensing.sensor import FaultKind, SensorFault, SensorName
+from quadsim.sim.sensing import FaultKind, SensorFault, SensorName
 from quadsim.state import INDEX, POSITION, VELOCITY, Array, make_state
 from quadsim.vehicle import Vehicle
 

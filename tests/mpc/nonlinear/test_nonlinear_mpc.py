@@ -235,38 +235,6 @@ def test_a_flip_is_flown_through() -> None:
     assert np.linalg.norm(states[:, P], axis=1).max() < 4.0
 
 
-def test_a_vertical_loop_is_flown() -> None:
-    """Radius 2 m at 6 m/s, thrust towards its centre: the attitude goes once around about body y."""
-    radius, speed, lead, tail = 2.0, 6.0, 30, 120
-    omega = speed / radius
-    theta = omega * PERIOD * np.arange(round(math.tau / omega / PERIOD) + 1)
-    straight = PERIOD * speed * np.arange(-lead, 0)
-    x = np.concatenate([straight, radius * np.sin(theta), PERIOD * speed * np.arange(1, tail + 1)])
-    z = np.concatenate([0 * straight, radius * (1.0 - np.cos(theta)), np.zeros(tail)])
-    position = np.stack([x, 0 * x, z], axis=1)
-    velocity = np.gradient(position, PERIOD, axis=0)
-    acceleration = np.zeros_like(velocity)
-    acceleration[lead : lead + theta.size, 0] = -(speed**2) / radius * np.sin(theta)
-    acceleration[lead : lead + theta.size, 2] = speed**2 / radius * np.cos(theta)
-    force = acceleration + np.array([0.0, 0.0, VEHICLE.gravity])
-    pitch = np.unwrap(np.arctan2(force[:, 0], force[:, 2]))
-    attitude = np.stack([np.cos(pitch / 2), 0 * pitch, np.sin(pitch / 2), 0 * pitch], axis=1)
-    rates = np.zeros_like(velocity)
-    rates[:, 1] = np.gradient(pitch, PERIOD)
-    thrusts = np.tile(VEHICLE.mass * np.linalg.norm(force, axis=1)[:, None] / 4.0, (1, 4))
-    motion = Motion(
-        position=position, velocity=velocity, acceleration=acceleration, attitude=attitude, body_rates=rates,
-        thrusts=thrusts,
-    )  # fmt: skip
-    start = at_rest()
-    start[P], start[V] = position[0], velocity[0]
-    states = fly(law(horizon=15), start, PERIOD * (len(x) - 1), motion)
-    assert thrust_axis(states[:, Q])[:, 2].min() < -0.7
-    far = np.linalg.norm(states[:-50, P] - position[:-50], axis=1)  # at the end it comes to rest
-    assert far.max() < 0.5
-    assert far[-1] < 0.05
-
-
 # --- references ----------------------------------------------------------------------------------------------------
 
 

@@ -13,8 +13,7 @@ import pytest
 from quadsim.errors import FileError
 from quadsim.flight import rundir
 from quadsim.flight.audit import audit
-from quadsim.flight.rundir import Run
-from quadsim.flight.summary import limit_from_json, limit_to_json
+from quadsim.flight.rundir import Run, limit_from_json, limit_to_json
 from quadsim.outputs import to_json
 
 

@@ -11,8 +11,8 @@ import pytest
 from quadsim.controller import Command, Controller, Moment, Phase
 from quadsim.errors import PlanExhaustedError
 from quadsim.flight.log import FlightLog
+from quadsim.flight.phase import PhaseMonitor
 from quadsim.sim.loop import fly
-from quadsim.sim.phase import PhaseMonitor
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle

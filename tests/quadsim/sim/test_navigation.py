@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from quadsim.errors import ParameterError
-from quadsim.sim.estimation.estimate import EstimatorSettings
+from quadsim.sim.error_state import EstimatorSettings
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.physics import physics_to_state
 from quadsim.sim.plant import Plant
-from quadsim.sim.sensing.sensor import FaultKind, Sensor, SensorFault, SensorName
+from quadsim.sim.sensing import FaultKind, Sensor, SensorFault, SensorName
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
 
@@ -168,7 +168,6 @@ def test_the_estimator_alone_minds_that_the_feet_stand(standing: bool, vehicle: 
             },
             r"fault.sensor must be on a sensor that the estimator has \(position, attitude, rates\); got 'velocity'",
         ),
-        ((Sensor(name=SensorName.POSITION, rate=300.0),), {}, "sensors.position.rate must be a divisor of"),
     ],
 )
 def test_what_cannot_work_is_refused(

@@ -1,4 +1,4 @@
-"""Campaigns without a flight: tables in the columns of `scenarios.campaign.results.table`, filled from a known law."""
+"""Campaigns without a flight: tables in the columns of `scenarios.campaign.rows`, filled from a known law."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 
 from quadsim.flight.audit import Limit
-from scenarios.campaign.results.table import Row, make_schema, make_table, split_times
+from scenarios.campaign.rows import Row, make_schema, make_table, split_times
 
 LIMITS = (
     Limit(name="roll", signal="roll", lower=-5.0, upper=5.0, tolerance=0.05),

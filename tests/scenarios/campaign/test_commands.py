@@ -27,7 +27,7 @@ CAMPAIGN = {
     "vary": [MASS],
 }
 HASTY = (
-    "from scenarios import entry; from scenarios.campaign.results import store; "
+    "from scenarios import entry; from scenarios.campaign import store; "
     "store.FLUSH_S = 0.3; raise SystemExit(entry.main())"
 )
 """A command line whose campaigns write what is flown as soon as it is there."""

@@ -19,7 +19,7 @@ from quadsim.state import INDEX, N_STATES, make_state
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import authority
 from scenarios.design.first_scenario import SHARE, first_scenario, largest_eight
-from scenarios.design.tuning import FASTEST, PERIOD_SHARE, delay_margin, gain, is_stable, tune
+from scenarios.design.rules import FASTEST, PERIOD_SHARE, delay_margin, design_for, gain, is_stable
 from scenarios.loading import parse_scenario
 from scenarios.parts.controllers import make_controller
 
@@ -30,7 +30,7 @@ EVERY = pytest.mark.parametrize("vehicle", ALL, ids=lambda vehicle: vehicle.name
 @EVERY
 def test_the_loop_stands_a_third_of_its_time_constant_of_more_delay(vehicle: Vehicle) -> None:
     """The bound by lag then leaves 0.8 (T + tau / 2), whatever the vehicle."""
-    tuning = tune(vehicle)
+    tuning = design_for(vehicle)
     margin = delay_margin(vehicle, tuning)
     assert margin * tuning.bandwidth == pytest.approx(1.0 / 3.0, rel=0.05)
     assert margin > 0.75 * (tuning.authority.lag + 0.5 * tuning.period)
@@ -42,7 +42,7 @@ def test_a_baselines_loop_tolerates_a_quarter_to_three_quarters_of_that_delay(ve
     """Its gain K (4, n + 4) by differences at hover, of the law that a first scenario has."""
     numbers = {name: value for name in VEHICLE_UNITS if (value := getattr(vehicle, name)) is not None}
     data = first_scenario(vehicle, vehicle.name, law=law).to_data() | {"vehicle": {"file": vehicle.name, **numbers}}
-    scenario, tuning, step = parse_scenario(data), tune(vehicle), 1e-5
+    scenario, tuning, step = parse_scenario(data), design_for(vehicle), 1e-5
     K = np.zeros_like(gain(vehicle, tuning))
     for i in range(N_STATES):
         state, answers = np.zeros(N_STATES), []
@@ -57,7 +57,7 @@ def test_a_baselines_loop_tolerates_a_quarter_to_three_quarters_of_that_delay(ve
 
 @EVERY
 def test_period_horizon_and_bandwidth_go_together(vehicle: Vehicle) -> None:
-    tuning = tune(vehicle)
+    tuning = design_for(vehicle)
     assert tuning.bandwidth <= FASTEST
     assert tuning.bandwidth * tuning.period <= PERIOD_SHARE
     assert 30 <= tuning.horizon <= 60
@@ -67,7 +67,7 @@ def test_period_horizon_and_bandwidth_go_together(vehicle: Vehicle) -> None:
 def test_weights_make_a_butterworth_pattern_of_the_stated_bandwidth() -> None:
     """Without lag and the cost of moves, at a short period: four poles of x at radius w, two of z, two of yaw."""
     vehicle = next(each for each in ALL if each.name == "lopes2011")
-    tuning = replace(tune(vehicle), period=0.001, move_weight=1e-12)
+    tuning = replace(design_for(vehicle), period=0.001, move_weight=1e-12)
     K = gain(vehicle, tuning)[:, :12]
     A, B = discretise(*continuous_model(vehicle), tuning.period)
     closed = A - B @ K
@@ -100,7 +100,7 @@ def test_a_tilt_grows_in_the_air_by_munks_moment() -> None:
 def test_a_figure_eight_keeps_below_the_speed_at_which_the_air_turns_the_vehicle() -> None:
     """Its speed, by the course that is flown, is 60 % of that at which p = w; else its acceleration is that of tilt."""
     for vehicle in [each for each in ALL if each.name == "random-16"] + ALL[::3]:
-        tuning = tune(vehicle)
+        tuning = design_for(vehicle)
         reference = first_scenario(vehicle, vehicle.name, course="figure-eight").to_data()["reference"]
         speed = math.sqrt(0.5) * reference["length"] * math.tau / reference["period"]
         assert speed <= 1.01 * SHARE * tuning.fastest
@@ -113,7 +113,7 @@ def test_a_figure_eight_keeps_below_the_speed_at_which_the_air_turns_the_vehicle
 
 def test_a_delay_margin_is_where_a_simulated_loop_begins_to_grow() -> None:
     vehicle = next(each for each in ALL if each.name == "hummingbird")
-    tuning = tune(vehicle)
+    tuning = design_for(vehicle)
     K, margin, step = gain(vehicle, tuning), delay_margin(vehicle, tuning), 1e-3
     A, B = discretise(*continuous_model(vehicle, vehicle.rotor_rise or 0.0), step)
 
@@ -139,7 +139,7 @@ def test_a_delay_margin_is_where_a_simulated_loop_begins_to_grow() -> None:
 def test_a_vehicle_with_nothing_in_reserve_is_refused_and_one_with_little_is_not() -> None:
     vehicle = next(each for each in ALL if each.name == "hummingbird")
     with pytest.raises(ParameterError, match=r"vehicle.speed_max must be further from its hover speed, 453.2 rad/s"):
-        tune(replace(vehicle, speed_max=vehicle.hover_speed))
-    little = tune(replace(vehicle, speed_max=1.02 * vehicle.hover_speed))
+        design_for(replace(vehicle, speed_max=vehicle.hover_speed))
+    little = design_for(replace(vehicle, speed_max=1.02 * vehicle.hover_speed))
     assert little.tilt == pytest.approx(little.authority.steady_tilt / 3.0)
     assert delay_margin(vehicle, little) > 0.0

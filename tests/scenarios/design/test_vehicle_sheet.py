@@ -20,7 +20,7 @@ from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.cli import main
 from scenarios.design.authority import torque_ranges
-from scenarios.design.vehicle_figures import make_sheet
+from scenarios.design.vehicle_report import make_sheet
 from scenarios.results import EXIT_DONE
 
 VEHICLES = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]

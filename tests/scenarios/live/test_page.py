@@ -24,9 +24,8 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from scenarios.cli import main
-from scenarios.live.guard import Guard
-from scenarios.live.pacing import Pace
 from scenarios.live.page import Page
+from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -15,15 +16,20 @@ import pytest
 import quadsim
 from quadsim.errors import FileError, UnknownNameError
 from quadsim.report.table import grid_to_markdown
+from scenarios.catalogue import paper_names, scenario_names
 from scenarios.cli import main
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.papers.paper import NumberSpec, load_paper, scenario_of
-from scenarios.papers.reproduction import Reproduced, Reproduction, reproduce_paper
+from scenarios.papers.reproduction import (
+    PublishedNumber,
+    Reproduced,
+    Reproduction,
+    load_paper,
+    reproduce_paper,
+)
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.rollout import Rollout
 from scenarios.schema.problems import ScenarioError
-from scenarios.shipped import paper_names, scenario_names
 
 HEAD = 'title = "A paper"\nauthors = "N. N."\nabout = "A hover"\n'
 NUMBER = """
@@ -50,9 +56,9 @@ def loop4(fly_once: Callable[..., Flight]) -> Reproduction:
     """The short flights of Torrente et al., as CI flies them; `test_library` has them, too."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Rollout, "fly", lambda rollout: fly_once(rollout.scenario.name))
-        return reproduce_paper(
-            load_paper("torrente2021"), chosen=lambda spec: spec.scenario.startswith("torrente-loop4") and not spec.set
-        )
+        paper = load_paper("torrente2021")
+        short = [n for n in paper.numbers if n.scenario.startswith("torrente-loop4") and not n.set]
+        return reproduce_paper(replace(paper, numbers=short))
 
 
 def test_the_circle_at_4_m_s_is_reproduced(loop4: Reproduction) -> None:
@@ -81,7 +87,7 @@ def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
     for name in paper_names():
         paper = load_paper(name)
         for number in paper.numbers:
-            scenario_of(paper, number)
+            paper.scenario_of(number)
         names = [number.name for number in paper.numbers]
         assert len(set(names)) == len(names)
     flown = {number.scenario for number in load_paper("torrente2021").numbers}
@@ -100,7 +106,7 @@ def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
     ],
 )
 def test_a_number_is_judged_by_its_relation_and_tolerance(relation: Any, ours: float, within: bool) -> None:
-    spec = NumberSpec(name="n", scenario="hover", published=1.0, relation=relation, absolute=0.01, source="s")
+    spec = PublishedNumber(name="n", scenario="hover", published=1.0, relation=relation, absolute=0.01, source="s")
     assert Reproduced(spec=spec, ours=ours).within is within
 
 
@@ -145,7 +151,7 @@ def test_a_scenario_beside_the_papers_file_is_found(tmp_path: Path) -> None:
     path = Path(written(tmp_path, ("0.5", "absolute = 0.0")))
     path.write_text(path.read_text().replace('scenario = "hover"', 'scenario = "mine.toml"'))
     paper = load_paper(str(path))
-    assert scenario_of(paper, paper.numbers[0]).name == "mine"
+    assert paper.scenario_of(paper.numbers[0]).name == "mine"
 
 
 @pytest.mark.parametrize(

@@ -14,10 +14,8 @@ from hypothesis import strategies as st
 from tuning_formula import TUNING, write_tuning
 
 from quadsim.errors import InputError
-from scenarios.cli import main
-from scenarios.shipped import tuning_names
-from scenarios.tuning.objective import value_of
-from scenarios.tuning.plan import load_tuning
+from scenarios.catalogue import tuning_names
+from scenarios.tuning.tuning_plan import load_tuning, value_of
 
 
 def entry(**changes: Any) -> list[dict[str, Any]]:
@@ -64,13 +62,6 @@ def campaign(**changes: Any) -> dict[str, Any]:
 def test_a_wrong_field_is_refused_by_its_name(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         load_tuning(str(write_tuning(tmp_path, **changes)))
-
-
-def test_the_command_reports_it_in_one_line_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_tuning(tmp_path, trials=7)
-    assert main(["tune", str(path), "--out", str(tmp_path / "t")]) == 2
-    assert capsys.readouterr().err == "quadsim: little.toml: trials must be a multiple of batch, 6; got 7\n"
-    assert not (tmp_path / "t").exists()
 
 
 @pytest.mark.parametrize("name", tuning_names())

@@ -18,21 +18,20 @@ from tuning_formula import BEST_SPEED, BEST_Z, Formula, error_of, tune_by, write
 
 from quadsim.errors import InputError, MissingPackageError, OutputError
 from quadsim.outputs import SUMMARY_FILE
-from scenarios.campaign.results.table import read_table
+from scenarios.campaign.rows import read_table
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
-from scenarios.tuning import run as module
-from scenarios.tuning.page import sentences, verdict
-from scenarios.tuning.plan import START, TuningPlan, load_tuning
-from scenarios.tuning.run import TuningResult
+from scenarios.tuning import tuning as module
 from scenarios.tuning.search import JOURNAL_FILE
+from scenarios.tuning.tuning import TuningResult, sentences, verdict
+from scenarios.tuning.tuning_plan import START, TuningPlan, load_tuning
 
 
 def tune(plan: TuningPlan, directory: Path, by: Formula | int, **options: Any) -> TuningResult:
     """Without a report; flown by a formula, or by so many workers."""
     if isinstance(by, Formula):
         return tune_by(by, plan, directory, report=False, **options)
-    return module.tune(plan, directory, workers=by, report=False, **options)
+    return module.fly_tuning(plan, directory, workers=by, report=False, **options)
 
 
 @pytest.fixture
@@ -144,7 +143,7 @@ def test_an_interrupted_search_ends_as_it_would_have(plan: TuningPlan, whole: Tu
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from scenarios.tuning.plan import load_tuning
+from scenarios.tuning.tuning_plan import load_tuning
 from tuning_formula import Formula, tune_by
 
 killed = Formula(stops_after=21, stopped_by=lambda: os.kill(os.getpid(), signal.SIGKILL))

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quadsim.sim.estimation.estimate import EstimatorSettings, difference
-from quadsim.sim.estimation.filter import ErrorStateFilter
-from quadsim.sim.sensing.sampler import Sampler
-from quadsim.sim.sensing.sensor import Sensor, SensorName
+from quadsim.sim.error_state import EstimatorSettings, difference
+from quadsim.sim.estimator import ErrorStateFilter
+from quadsim.sim.sensing import Sampler, Sensor, SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

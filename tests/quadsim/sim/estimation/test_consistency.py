@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from quadsim.sim.estimation.estimate import EstimatorSettings
-from quadsim.sim.sensing.sensor import Sensor, SensorName
+from quadsim.sim.error_state import EstimatorSettings
+from quadsim.sim.sensing import Sensor, SensorName
 from quadsim.vehicle import Vehicle
 
 SEEDS = 60

@@ -9,8 +9,16 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from quadsim.sim.estimation.estimate import Estimate, EstimatorSettings, difference, retract
-from quadsim.sim.estimation.prediction import MotionModel, drive, motion_model, predict
+from quadsim.sim.error_state import (
+    Estimate,
+    EstimatorSettings,
+    MotionModel,
+    difference,
+    drive,
+    motion_model,
+    predict,
+    retract,
+)
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle

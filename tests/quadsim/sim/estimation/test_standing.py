@@ -10,18 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadsim.sim.estimation.estimate import Estimate, EstimatorSettings
-from quadsim.sim.estimation.prediction import (
+from quadsim.sim.error_state import (
     STILL_RATE,
     STILL_TIME,
     STILL_VELOCITY,
+    Estimate,
+    EstimatorSettings,
     MotionModel,
     drive,
     lifts,
     motion_model,
     stand,
 )
-from quadsim.sim.sensing.sensor import Sensor, SensorName
+from quadsim.sim.sensing import Sensor, SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

@@ -1,0 +1,336 @@
+"""The error-state Kalman filter's equations: an estimate, its prediction in time, and its update by a sample.
+
+An estimate is a mean on the manifold of poses and rates, and the covariance of its small error e = [dp dv dtheta domega
+db], 15 numbers: position and velocity in the world frame, attitude as a rotation vector in the body frame (q_true = q *
+exp(dtheta)), body rates and gyro bias.  Solà 2017, Secs. 5.1.1 and 5.3.1; multiplicative in the sense of Markley,
+"Attitude error representations for Kalman filtering", JGCD 26 (2003).
+
+Prediction, the modelled vehicle as a rigid body driven by its rotor speeds, and the growth of the error with time:
+
+    dp/dt = v            dv/dt = R(q) [0, 0, U/m] - [0, 0, g] + w_a      dq/dt = q * [0, omega] / 2
+    domega/dt = I^-1 (tau - omega x I omega) + w_alpha                   db/dt = w_b
+
+with white w_a, w_alpha, w_b, and to first order in the error, F(t) of de/dt = F e + w (Solà 2017, Eqs. (238)-(240), the
+vehicle's model in place of an accelerometer):
+
+    dv: -R [a]x dtheta      dtheta: -[omega]x dtheta + domega      domega: I^-1 ([I omega]x - [omega]x I) domega
+
+On the ground a vehicle whose feet stand would fall by its rotor speeds alone.  The ground carries what the rotors do
+not, so nothing moves: p, q and the gyro's bias stay, v = 0 and omega = 0, which is a zero-velocity update (Groves,
+"Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems", 2nd ed. 2013, Sec. 15.3) at every step.
+Legs that give and slide a little leave v and omega white: sigma at any instant, forgotten after tau, so that position
+and attitude walk randomly with densities sigma sqrt(tau).
+
+Update, what a sample changes in an estimate, and whether it is an outlier:
+
+    r = z - h(x)    S = H P H' + R    K = P H' S^-1    e = K r    P <- P - K H P
+
+The innovation of an attitude is the rotation vector from the estimate to the sample, so it is as good upside down as
+level (Trawny and Roumeliotis, "Indirect Kalman filter for 3D attitude estimation", 2005, Sec. 3).  The normalised
+innovation squared, r' S^-1 r, is chi-square with three degrees of freedom where model and noise are as stated.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Final
+
+import numpy as np
+from annotated_types import Gt, Lt, doc
+
+from quadsim.fields import NonNegative, Vector
+from quadsim.rotation import conjugate, exponential, logarithm, multiply, normalise, of_euler
+from quadsim.sim.sensing import SensorName
+from quadsim.state import Array, read_only
+from quadsim.vehicle import Vehicle
+
+POSITION: Final = slice(0, 3)
+VELOCITY: Final = slice(3, 6)
+ATTITUDE: Final = slice(6, 9)
+RATES: Final = slice(9, 12)
+GYRO_BIAS: Final = slice(12, 15)
+N_ERRORS: Final = 15
+
+MEAN_QUATERNION: Final = slice(6, 10)
+MEAN_RATES: Final = slice(10, 13)
+MEAN_GYRO_BIAS: Final = slice(13, 16)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimatorSettings:
+    """Tuning of the error-state filter.
+
+    Densities are those of white noise on all three axes alike: integrated for a time t they give the standard deviation
+    density sqrt(t).  The gate is that of the chi-square test of a sample's innovation.
+    """
+
+    acceleration_noise: Annotated[NonNegative, doc("[m/s^2/sqrt(Hz)] unmodelled white acceleration")] = 0.3
+    angular_acceleration_noise: Annotated[
+        NonNegative, doc("[rad/s^2/sqrt(Hz)] white angular acceleration that it does not explain")
+    ] = 1.0
+    gyro_bias_walk: Annotated[NonNegative, doc("[deg/s/sqrt(s)] random walk of the gyro's bias")] = 0.002
+    initial_position: Annotated[NonNegative, doc("[m] standard deviation of the first estimate's error, per axis")] = (
+        0.05
+    )
+    initial_velocity: Annotated[NonNegative, doc("[m/s] the same")] = 0.05
+    initial_attitude: Annotated[NonNegative, doc("[deg] the same, about each body axis")] = 1.0
+    initial_rates: Annotated[NonNegative, doc("[deg/s] the same")] = 1.0
+    initial_gyro_bias: Annotated[NonNegative, doc("[deg/s] the same, of a bias first taken as zero")] = 0.5
+    gate: Annotated[
+        float, Gt(0.0), Lt(1.0), doc("[-] probability with which a right sample passes the test of its innovation")
+    ] = 0.9999
+    patience: Annotated[
+        NonNegative, doc("[s] after which a sensor that was rejected all along is accepted again; 0 for never")
+    ] = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """The estimated state of the vehicle."""
+
+    mean: Array  # (16,) position [m], velocity [m/s] (world), quaternion wxyz, rates [rad/s] (body), gyro bias [rad/s]
+    covariance: Array  # (15, 15) of the error
+
+
+def retract(mean: Array, error: Array) -> Array:
+    """The mean (16,) moved by an error (15,); Solà 2017, Eq. (283)."""
+    moved = np.empty_like(mean)
+    moved[:6] = mean[:6] + error[:6]
+    w, x, y, z = mean[MEAN_QUATERNION].tolist()
+    a, b, c = error[ATTITUDE].tolist()
+    moved[MEAN_QUATERNION] = normalise(multiply((w, x, y, z), exponential((a, b, c))))
+    moved[10:] = mean[10:] + error[9:]
+    return moved
+
+
+def difference(mean: Array, other: Array) -> Array:
+    """The error (15,) of `other` against `mean`, such that moving `other` by it gives `mean`; inverts `retract`."""
+    error = np.empty(N_ERRORS)
+    error[:6] = mean[:6] - other[:6]
+    error[9:] = mean[10:] - other[10:]
+    w, x, y, z = mean[MEAN_QUATERNION].tolist()
+    a, b, c, d = other[MEAN_QUATERNION].tolist()
+    error[ATTITUDE] = logarithm(multiply(conjugate((a, b, c, d)), (w, x, y, z)))
+    return error
+
+
+_EYE = read_only(np.eye(N_ERRORS))
+STILL_VELOCITY: Final = 0.1
+"""Standard deviation of the velocity of a vehicle that stands, per axis [m/s]; also of one that its ground cushion has
+lifted before the modelled thrust could."""
+STILL_RATE: Final = math.radians(0.5)
+"""The same of its body rates [rad/s]: as much as a MEMS gyro's noise, so that standing is worth a sample of it."""
+STILL_TIME: Final = 0.01  # time tau after which these velocities and rates are forgotten [s]
+
+
+_CHAIN = np.zeros((N_ERRORS, N_ERRORS))  # the two double integrators, dp/dt = v and dtheta/dt = omega
+_CHAIN[POSITION, VELOCITY] = _CHAIN[ATTITUDE, RATES] = np.eye(3)
+read_only(_CHAIN)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """What the rotors do: U / m [m/s^2] along body z, and (tau_x, tau_y, tau_z) [N m], body."""
+
+    acceleration: float
+    torque: tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionModel:
+    """The modelled vehicle."""
+
+    mass: float  # m [kg]
+    gravity: float  # g [m/s^2]
+    inertia: Vector  # (Ixx, Iyy, Izz) [kg m^2]
+    allocation: Array  # (4, 4) from squared rotor speeds to thrust and torque
+    noise: tuple[Array, Array, Array]
+    """Three (15, 15) coefficients of h, h^2, h^3 in the noise that gathers in a time h; see `_gathered`."""
+
+
+def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:
+    """The model of a vehicle disturbed as the settings say."""
+    density = np.zeros(N_ERRORS)
+    density[VELOCITY] = settings.acceleration_noise**2
+    density[RATES] = settings.angular_acceleration_noise**2
+    density[GYRO_BIAS] = math.radians(settings.gyro_bias_walk) ** 2
+    return MotionModel(
+        mass=vehicle.mass,
+        gravity=vehicle.gravity,
+        inertia=vehicle.inertia,
+        allocation=read_only(vehicle.allocation),
+        noise=_gathered(np.diag(density)),
+    )
+
+
+def drive(model: MotionModel, speeds: Array) -> Drive:
+    """What rotor speeds (4,) [rad/s] do; rotors do not turn backwards."""
+    thrust, x, y, z = (model.allocation @ np.square(np.maximum(speeds, 0.0))).tolist()
+    return Drive(acceleration=thrust / model.mass, torque=(x, y, z))
+
+
+def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: float) -> Estimate:
+    """The estimate a time h [s] later, short against the time in which the vehicle turns.
+
+    The mean by the midpoint rule, the attitude on the sphere; the covariance as F P F' + Q(h), F to third order in h.
+    """
+    h, a = duration, driven.acceleration
+    px, py, pz, vx, vy, vz, qw, qx, qy, qz, p, q, r, *bias = estimate.mean.tolist()
+    attitude = (qw, qx, qy, qz)
+    ixx, iyy, izz = model.inertia
+    kx, ky, kz = (izz - iyy) / ixx, (ixx - izz) / iyy, (iyy - ixx) / izz
+    tx, ty, tz = driven.torque[0] / ixx, driven.torque[1] / iyy, driven.torque[2] / izz
+
+    half = 0.5 * h
+    p1, q1, r1 = p + half * (tx - kx * q * r), q + half * (ty - ky * p * r), r + half * (tz - kz * p * q)
+    quarter = 0.25 * h  # the mean rate of the first half, times its length
+    w, x, y, z = multiply(attitude, exponential((quarter * (p + p1), quarter * (q + q1), quarter * (r + r1))))
+    ax, ay, az = 2.0 * a * (x * z + w * y), 2.0 * a * (y * z - w * x), a * (1.0 - 2.0 * (x * x + y * y)) - model.gravity
+    mean = np.array(
+        [
+            px + h * (vx + half * ax),
+            py + h * (vy + half * ay),
+            pz + h * (vz + half * az),
+            vx + h * ax,
+            vy + h * ay,
+            vz + h * az,
+            *normalise(multiply(attitude, exponential((h * p1, h * q1, h * r1)))),
+            p + h * (tx - kx * q1 * r1),
+            q + h * (ty - ky * p1 * r1),
+            r + h * (tz - kz * p1 * q1),
+            *bias,
+        ]
+    )
+
+    # -R [a]x = a [-r2, r1, 0] with r1, r2 the columns of R, at the middle of the step as all else.
+    # Blocks are filled one above the other in the six columns of attitude and rates: one assignment costs as much as 9.
+    A = _CHAIN.copy()
+    A[VELOCITY.start : RATES.stop, ATTITUDE.start : RATES.stop] = [
+        [-2.0 * a * (x * y - w * z), a * (1.0 - 2.0 * (y * y + z * z)), 0.0, 0.0, 0.0, 0.0],
+        [-a * (1.0 - 2.0 * (x * x + z * z)), 2.0 * a * (x * y + w * z), 0.0, 0.0, 0.0, 0.0],
+        [-2.0 * a * (y * z + w * x), 2.0 * a * (x * z - w * y), 0.0, 0.0, 0.0, 0.0],
+        [0.0, r1, -q1, 1.0, 0.0, 0.0],
+        [-r1, 0.0, p1, 0.0, 1.0, 0.0],
+        [q1, -p1, 0.0, 0.0, 0.0, 1.0],
+        [0.0, 0.0, 0.0, 0.0, -kx * r1, -kx * q1],
+        [0.0, 0.0, 0.0, -ky * r1, 0.0, -ky * p1],
+        [0.0, 0.0, 0.0, -kz * q1, -kz * p1, 0.0],
+    ]
+    A *= h
+    F = _EYE + A @ (_EYE + 0.5 * A @ (_EYE + A / 3.0))
+    once, twice, thrice = model.noise
+    noise = h * (once + h * (twice + h * thrice))
+    return Estimate(mean=mean, covariance=F @ estimate.covariance @ F.T + noise)
+
+
+def _gathered(density: Array) -> tuple[Array, Array, Array]:
+    """Coefficients of the noise's covariance after a time h, int e^(N s) Q e^(N' s) ds = Q h + ... h^2 + ... h^3.
+
+    N holds the two double integrators, dp/dt = v and dtheta/dt = omega; N^2 = 0, so the series ends.  That the axes
+    turn meanwhile changes nothing, as the noise is alike on all of them.
+    """
+    N = _CHAIN
+    return read_only(density), read_only(0.5 * (N @ density + density @ N.T)), read_only(N @ density @ N.T / 3.0)
+
+
+_RETAINED, _VARIANCE, _WALK = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
+"""1 where neither velocity nor rates have a part and else 0; their variance; the growth of the rest."""
+_RETAINED[VELOCITY] = _RETAINED[RATES] = 0.0
+_VARIANCE[VELOCITY], _VARIANCE[RATES] = STILL_VELOCITY**2, STILL_RATE**2
+_WALK[POSITION], _WALK[ATTITUDE] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
+
+
+def lifts(model: MotionModel, driven: Drive) -> bool:
+    """Whether rotors lift a vehicle off the ground: their thrust exceeds its weight, U > m g."""
+    return driven.acceleration > model.gravity
+
+
+def stand(model: MotionModel, estimate: Estimate, duration: float) -> Estimate:
+    """The estimate a time h [s] later of a vehicle that stands; its velocity and rates are not used."""
+    mean = estimate.mean.copy()
+    mean[VELOCITY] = mean[MEAN_RATES] = 0.0
+    covariance = np.outer(_RETAINED, _RETAINED) * estimate.covariance + np.diag(_VARIANCE + duration * _WALK)
+    covariance[GYRO_BIAS, GYRO_BIAS] += duration * model.noise[0][GYRO_BIAS, GYRO_BIAS]
+    return Estimate(mean=mean, covariance=covariance)
+
+
+_BLOCKS: Final = {
+    SensorName.POSITION: (POSITION,),
+    SensorName.VELOCITY: (VELOCITY,),
+    SensorName.ATTITUDE: (ATTITUDE,),
+    SensorName.RATES: (RATES, GYRO_BIAS),
+}
+"""The parts of the error whose sum a sensor sees."""
+_LEADS: Final = {
+    SensorName.POSITION: (VELOCITY,),
+    SensorName.VELOCITY: (),
+    SensorName.ATTITUDE: (RATES, GYRO_BIAS),
+    SensorName.RATES: (),
+}
+"""The parts whose errors add up in it over time; the gyro's bias does by way of the rates, which follow the gyro."""
+
+
+def _observation(name: SensorName) -> Array:
+    H = np.zeros((3, N_ERRORS))
+    for block in _BLOCKS[name]:
+        H[:, block] = np.eye(3)
+    return read_only(H)
+
+
+OBSERVATION: Final = {name: _observation(name) for name in SensorName}  # (3, 15) H of each sensor
+
+
+def innovation(name: SensorName, mean: Array, value: Array) -> Array:
+    """(3,) a sample (3,) less that predicted by the mean (16,), in the sensor's unit."""
+    if name is SensorName.ATTITUDE:
+        w, x, y, z = mean[MEAN_QUATERNION].tolist()
+        roll, pitch, yaw = value.tolist()
+        return np.array(logarithm(multiply(conjugate((w, x, y, z)), of_euler(roll, pitch, yaw))))
+    if name is SensorName.RATES:
+        return value - mean[MEAN_RATES] - mean[MEAN_GYRO_BIAS]
+    return value - mean[_BLOCKS[name][0]]
+
+
+def update(estimate: Estimate, name: SensorName, value: Array, variance: Array, gate: float) -> tuple[Estimate, float]:
+    """The estimate after a sample (3,), and the sample's normalised innovation squared.
+
+    A sample whose normalised innovation squared is not within the gate, or not a number, changes nothing.  The error is
+    reset to zero without G = I - [dtheta / 2]x of Solà 2017, Eq. (287), which would turn the covariance by half the
+    correction and is there neglected, too.  `variance` (3, 3) is R, of the sensor's noise.
+    """
+    H, P = OBSERVATION[name], estimate.covariance
+    residual = innovation(name, estimate.mean, value)
+    rows = H @ P
+    weight = _inverse(rows @ H.T + variance)
+    distance = float(residual @ weight @ residual)
+    if not distance <= gate:
+        return estimate, distance
+    gain = rows.T @ weight
+    P = P - gain @ rows
+    return Estimate(mean=retract(estimate.mean, gain @ residual), covariance=0.5 * (P + P.T)), distance
+
+
+def doubt(estimate: Estimate, name: SensorName, value: Array, refused: float) -> Estimate:
+    """The estimate with its variance widened by as much as a sample (3,) disagrees with it, so that the sample passes.
+
+    For the way back after divergence: the innovation squared is added to the variance of all that the sensor sees, and
+    (innovation / time)^2 to that of the rates of change which may have caused its error in the meantime, in which all
+    its samples were refused [s].
+    """
+    covariance = estimate.covariance.copy()
+    squares = np.diag(np.square(innovation(name, estimate.mean, value)))
+    for block in _BLOCKS[name]:
+        covariance[block, block] += squares
+    for block in _LEADS[name]:
+        covariance[block, block] += squares / refused**2
+    return Estimate(mean=estimate.mean, covariance=covariance)
+
+
+def _inverse(S: Array) -> Array:
+    """The inverse of a symmetric positive definite (3, 3) matrix by its cofactors: faster than a call of LAPACK."""
+    (a, b, c), (_, d, e), (_, _, f) = S.tolist()
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    scale = 1.0 / (a * A + b * B + c * C)
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    return scale * np.array([[A, B, C], [B, D, E], [C, E, F]])

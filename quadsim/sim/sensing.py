@@ -1,0 +1,265 @@
+"""Sensors: from the true motion to samples that arrive late, wrong or never, and what can befall a sensor."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated, Final, NamedTuple
+
+import numpy as np
+from annotated_types import Ge, Le, doc
+from numpy.typing import NDArray
+
+from quadsim.errors import ParameterError
+from quadsim.fields import Fraction
+from quadsim.rotation import Vector, exponential, multiply, quaternion_to_euler
+from quadsim.state import Array
+
+AXES: Final = (0, 1, 2)
+
+
+class SensorName(StrEnum):
+    """What can be measured, three numbers each."""
+
+    POSITION = "position"  # x, y, z [m], world
+    VELOCITY = "velocity"  # vx, vy, vz [m/s], world
+    ATTITUDE = "attitude"
+    """Roll, pitch, yaw [rad]; errors are rotation vectors in the body frame, q_measured = q * exp(error)."""
+    RATES = "rates"  # p, q, r [rad/s], body: a rate gyro
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outliers:
+    """Gross errors: samples whose noise is drawn from a wider distribution.
+
+    The contaminated normal distribution (1 - probability) N(0, noise^2) + probability N(0, (size noise)^2), all axes
+    together.  Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35 (1964), Sec. 1.
+    """
+
+    probability: Annotated[Fraction, doc("[-] of a sample being one")]
+    size: Annotated[float, Ge(1.0), Le(1e6), doc("[-] how many times the noise it has")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """When a sensor's samples are taken, when they arrive, and which do not."""
+
+    rate: Annotated[
+        float, Ge(0.01), Le(1e4), doc("[Hz] samples per second, the first at t = 0; a divisor of the physics rate")
+    ]
+    delay: Annotated[
+        float, Ge(0.0), Le(10.0), doc("[s] from taking a sample to its arrival, a whole number of physics steps")
+    ] = 0.0
+    dropout: Annotated[Fraction, doc("[-] probability of a sample being lost")] = 0.0
+    outliers: Annotated[Outliers | None, doc("absent: none")] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor(Sampling):
+    """One sensor, in the unit of its name (see `SensorName`).
+
+    A sample taken at t = j / rate is value + bias + walk(t) + noise.  It arrives `delay` later, or never.
+    """
+
+    name: SensorName  # what is measured
+    noise: Vector = (0.0, 0.0, 0.0)  # standard deviation per axis, white from sample to sample
+    bias: Vector = (0.0, 0.0, 0.0)  # constant offset per axis
+    bias_walk: Vector = (0.0, 0.0, 0.0)
+    """The bias's random walk per axis [unit/sqrt(s)]: its variance grows by bias_walk^2 t."""
+
+    def stride(self, timestep: float) -> int:
+        """Physics steps from one sample to the next.
+
+        Raises:
+            ParameterError: the rate does not divide the physics rate.
+        """
+        rule = f"a divisor of the physics rate of {1.0 / timestep:g} Hz"
+        return whole(f"sensors.{self.name}", "rate", self.rate, 1.0 / (self.rate * timestep), rule)
+
+    def latency(self, timestep: float) -> int:
+        """Physics steps from taking a sample to its arrival.
+
+        Raises:
+            ParameterError: the delay is not a whole number of physics steps.
+        """
+        rule = f"a whole multiple of the physics step of {timestep} s"
+        return whole(f"sensors.{self.name}", "delay", self.delay, self.delay / timestep, rule, smallest=0)
+
+
+class FaultKind(StrEnum):
+    """What can befall a sensor for a while."""
+
+    DROPOUT = "dropout"  # no samples
+    FREEZE = "freeze"  # every sample repeats the last one that got through before
+    NAN = "nan"  # samples are not numbers
+    BIAS = "bias"  # an offset is added
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorFault:
+    """A sensor's fault, for all samples taken at start <= t < stop."""
+
+    sensor: SensorName  # which one
+    kind: FaultKind  # what happens
+    start: float  # [s]
+    stop: float = math.inf  # [s]; infinite where it is permanent
+    axes: tuple[int, ...] = AXES  # which of the three numbers become NaN
+    offset: Vector = (0.0, 0.0, 0.0)
+    """What is added, in the sensor's unit; a rotation vector in the body frame for attitude."""
+
+    def window(self, timestep: float) -> tuple[int, int | None]:
+        """First physics step that it holds at, and the first that it does not; None where it never ends."""
+        first = math.ceil(self.start / timestep - 1e-6)  # an instant meant to be a step is one, whatever the rounding
+        return first, math.ceil(self.stop / timestep - 1e-6) if math.isfinite(self.stop) else None
+
+
+def whole(owner: str, name: str, value: float, count: float, rule: str, *, smallest: int = 1) -> int:
+    """The whole number that a count of physics steps is, which follows from a parameter.
+
+    Raises:
+        ParameterError: it is none, or too small.
+    """
+    steps = round(count)
+    if steps < smallest or not math.isclose(steps, count, rel_tol=1e-9, abs_tol=1e-9):
+        raise ParameterError(owner, name, value, rule)
+    return steps
+
+
+_COLUMNS = {
+    SensorName.POSITION: slice(1, 4),
+    SensorName.VELOCITY: slice(8, 11),
+    SensorName.ATTITUDE: slice(4, 8),
+    SensorName.RATES: slice(11, 14),
+}
+"""Where a sensor's quantity is in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
+
+Flags = NDArray[np.bool_]
+Steps = NDArray[np.int64]
+
+
+class Sample(NamedTuple):
+    """One sample."""
+
+    sensor: SensorName  # whose
+    taken: int  # physics step at which it was taken, its time stamp
+    arrival: int  # physics step from which it is known
+    value: Array  # (3,) in the unit of the sensor's name
+
+
+def truth(name: SensorName, physics: Array) -> Array:
+    """A perfect sensor's samples (M, 3) of MuJoCo's states (M, 14)."""
+    values = physics[:, _COLUMNS[name]]
+    return quaternion_to_euler(values) if name is SensorName.ATTITUDE else values.copy()
+
+
+class Sampler:
+    """Takes a sensor's samples; the same ones again after a reset, however the time is cut into calls.
+
+    Noise, bias, dropouts and outliers each draw from a generator of their own, so none changes another's draws.
+    """
+
+    def __init__(
+        self, sensor: Sensor, *, timestep: float, faults: tuple[SensorFault, ...], rng: np.random.Generator
+    ) -> None:
+        self.sensor = sensor
+        self._stride = sensor.stride(timestep)
+        self._latency = sensor.latency(timestep)
+        self._noise, self._bias = np.array(sensor.noise), np.array(sensor.bias)
+        self._step = np.array(sensor.bias_walk) * math.sqrt(self._stride * timestep)
+        self._timestep = timestep
+        self.reschedule(faults)
+        self._initial = tuple(rng.spawn(4))
+        self.reset()
+
+    @property
+    def watched(self) -> bool:
+        """Whether it knows of any fault, and so what a frozen sensor would repeat."""
+        return bool(self._faults)
+
+    def reschedule(self, faults: Sequence[SensorFault]) -> None:
+        """Let these faults, of this sensor and others, take the place of those before."""
+        of_this = (fault for fault in faults if fault.sensor is self.sensor.name)
+        self._faults = tuple((fault, fault.window(self._timestep)) for fault in of_this)
+
+    def reset(self) -> None:
+        """Start again, with the same draws."""
+        self._of_noise, self._of_bias, self._of_dropout, self._of_outliers = copy.deepcopy(self._initial)
+        self._walked: Array | None = None
+        self._through: Array | None = None
+
+    def sample(self, physics: Array, first: int) -> list[Sample]:
+        """The samples taken during a segment of motion, those lost left out.
+
+        Of MuJoCo's states (M, 14) at successive physics steps, the first of number `first`; segments follow one another
+        from step 0.
+        """
+        begin = -first % self._stride
+        rows = physics[begin :: self._stride]
+        count = len(rows)
+        if not count:
+            return []
+        taken = np.arange(first + begin, first + len(physics), self._stride)
+        errors = self._walk(count) + self._draw_noise(count) + 0.0  # which leaves no -0
+        lost = self._of_dropout.random(count) < self.sensor.dropout
+        befallen = [(fault, _within(taken, window)) for fault, window in self._faults]
+        offset, frozen = np.zeros((count, 3)), np.zeros(count, dtype=bool)
+        for fault, held in befallen:
+            match fault.kind:
+                case FaultKind.BIAS:
+                    offset[held] += fault.offset
+                case FaultKind.DROPOUT:
+                    lost |= held
+                case FaultKind.FREEZE:
+                    frozen |= held
+        values = self._measure(rows, errors + offset)
+        if befallen:
+            for value, gone, stuck in zip(values, lost, frozen, strict=True):
+                if stuck and self._through is not None:
+                    value[:] = self._through
+                elif not gone:
+                    self._through = value.copy()
+        for fault, held in befallen:
+            if fault.kind is FaultKind.NAN:
+                values[np.ix_(np.flatnonzero(held), np.array(fault.axes))] = np.nan
+        name, latency = self.sensor.name, self._latency
+        return [
+            Sample(name, step, step + latency, value)
+            for step, value, gone in zip(taken.tolist(), values, lost.tolist(), strict=True)
+            if not gone
+        ]
+
+    def _walk(self, count: int) -> Array:
+        """(count, 3) bias at each sample: its constant at the first of all, then a random walk."""
+        steps = self._step * self._of_bias.standard_normal((count, 3))
+        if self._walked is None:
+            steps[0] = self._bias
+        else:
+            steps[0] += self._walked
+        biases: Array = np.cumsum(steps, axis=0)
+        self._walked = biases[-1]
+        return biases
+
+    def _draw_noise(self, count: int) -> Array:
+        noise = self._noise * self._of_noise.standard_normal((count, 3))
+        draws, outliers = self._of_outliers.random(count), self.sensor.outliers
+        if outliers is not None:
+            noise[draws < outliers.probability] *= outliers.size
+        return noise
+
+    def _measure(self, rows: Array, errors: Array) -> Array:
+        name = self.sensor.name
+        if name is not SensorName.ATTITUDE:
+            return rows[:, _COLUMNS[name]] + errors
+        turned = [
+            multiply((w, x, y, z), exponential((a, b, c)))
+            for (w, x, y, z), (a, b, c) in zip(rows[:, _COLUMNS[name]].tolist(), errors.tolist(), strict=True)
+        ]
+        return quaternion_to_euler(np.array(turned))
+
+
+def _within(taken: Steps, window: tuple[int, int | None]) -> Flags:
+    start, stop = window
+    return (taken >= start) & ((taken < stop) if stop is not None else True)

@@ -1,1 +1,0 @@
-"""What the vehicle's sensors say of its motion: noise, bias, delay, dropouts, outliers and faults."""

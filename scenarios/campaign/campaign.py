@@ -1,0 +1,346 @@
+"""Campaigns flown: what is missing is flown, rows are saved as they come, the whole is summed up.
+
+Beside it what else maps over `Plan.fly_all`: a sweep of every combination of values; and one flight flown again.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+import time as clock
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from quadsim.errors import InputError, OutputError, ParameterError, UnknownNameError
+from quadsim.outputs import Growing, growing
+from scenarios.assembly import Assembly
+from scenarios.campaign import store as records
+from scenarios.campaign.campaign_report import write_report
+from scenarios.campaign.plan import Plan, parse_campaign
+from scenarios.campaign.rows import DRAW, make_table, read_table
+from scenarios.campaign.statistics import Judgement, estimate, proportion, worst_flight
+from scenarios.campaign.store import (
+    FLIGHTS_FILE,
+    TIMES_FILE,
+    Store,
+    other_than_flew,
+    read_flights,
+    read_manifest,
+    stored_plan,
+)
+from scenarios.flight import Flight, to_pandas
+from scenarios.many import MEMORY, TIMEOUT, count_workers
+from scenarios.progress import Progress, silent
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
+from scenarios.schema.scenario import Scenario
+
+REPORT_FILES: Final = ("index.html", "campaign.png")
+CHECK_EVERY: Final = 10
+"""Flights after which the interval is looked at again, where it decides when to stop; of grids, whole turns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Standing:
+    """How far a campaign is."""
+
+    flown: int  # flights that are there
+    flights: int  # that there are to be
+    failed: int  # of those flown
+    rate: float  # flights per second of this session
+
+
+Watch = Callable[[Standing], None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CampaignResult(Result):
+    """What came of a campaign."""
+
+    directory: Path  # where everything is
+    manifest: dict[str, Any]  # what was flown, with what
+    table: pa.Table  # `flights.parquet`
+    summary: dict[str, Any]  # `summary.json`
+    judgements: tuple[Judgement, ...] = ()  # of the requirements that were stated
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`; 1 where the flights do not support a requirement."""
+        return EXIT_DONE if all(judgement.holds for judgement in self.judgements) else EXIT_FAILED
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios.campaign.campaign_report import campaign_lines
+
+        return campaign_lines(self.summary, self.judgements, self.directory)
+
+    def to_json(self) -> dict[str, Any]:
+        """`summary.json`, and the verdict on each requirement."""
+        return {**self.summary, "requirements": [judgement.to_json() for judgement in self.judgements]}
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas DataFrame.
+
+        Raises:
+            MissingPackageError: pandas is not installed.
+        """
+        return to_pandas(self.table)
+
+
+def fly_campaign(
+    plan: Plan,
+    directory: Path,
+    *,
+    workers: int | None = None,
+    cluster: str | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    until_width: float | None = None,
+    report: bool = True,
+    watch: Watch = lambda standing: None,
+) -> CampaignResult:
+    """Fly a campaign, or what is missing of it, to the same rows by any workers; see `quadsim.campaign`."""
+    if until_width is not None and not 0.0 < until_width < 1.0:
+        raise ParameterError("", "--until-width", until_width, "between 0 and 1")
+    engine = "local" if cluster is None else "dask"
+    session = {"engine": engine, "workers": count_workers(workers, cluster), "flights": 0, "wall_s": None}
+    if records.is_campaign(directory) and not (resume or overwrite):
+        raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
+    records.code_digest()  # kept: a process that dies before its manifest is there could not be resumed
+    with growing(directory, records.MANIFEST_FILE, overwrite=overwrite) as files:
+        if records.is_campaign(directory):
+            records.require_same(plan, directory)
+        progress = _Progress(plan, files, until_width=until_width, watch=watch)
+        manifest = records.start(plan, files, session, flying=bool(progress.missing))
+        try:
+            progress.fly(workers, cluster)
+        except BaseException:
+            manifest["status"] = "interrupted"
+            raise
+        finally:
+            session |= {"flights": progress.flown, "wall_s": clock.perf_counter() - progress.started}
+            manifest["flown"] = int(np.count_nonzero(progress.outcomes[: progress.wanted] >= 0))
+            records.write(manifest, files)
+
+        table = progress.store.close(progress.wanted)
+        spec, directory = plan.spec, files.path
+        summary = {"campaign": spec.name, "scenario": plan.scenario.name, **estimate(table)}
+
+        def write(place: Path) -> None:
+            write_report(place, table, summary, spec, campaign=directory)
+
+        put_report(files, REPORT_FILES, write if report else None)
+        # flights by the processor that flew them; those that raised, or that no process came back from, have none
+        processors = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
+        manifest["machines"] = dict(sorted(Counter(processors).items()))
+        manifest["status"] = "complete" if progress.wanted == spec.flights else "stopped"
+        records.write(manifest, files)
+        files.finish(summary)
+    return CampaignResult(directory=directory, manifest=manifest, table=table, summary=summary)
+
+
+class _Progress:
+    """A session: what is there, what is still to be flown, and what is waiting to be written."""
+
+    def __init__(self, plan: Plan, files: Growing, *, until_width: float | None, watch: Watch) -> None:
+        self._plan, self._width, self._watch = plan, until_width, watch
+        self.store = Store(files, plan.schema)
+        self.wanted, self.flown, self._checked = plan.spec.flights, 0, 0
+        self.started = clock.perf_counter()
+        self.outcomes = np.full(plan.spec.flights, -1, np.int8)  # not flown, passed, failed
+        there = self.store.table()
+        there = there.filter(pc.less(there["flight"], plan.spec.flights))
+        self.outcomes[there["flight"].to_numpy()] = there["failed"].to_numpy(zero_copy_only=False)
+
+    @property
+    def missing(self) -> list[int]:
+        """The flights to be flown."""
+        return [] if self._is_sure() else list(np.flatnonzero(self.outcomes < 0).tolist())
+
+    def fly(self, workers: int | None, cluster: str | None) -> None:
+        """Fly what is missing, until nothing is, or the interval is narrow enough.
+
+        Raises:
+            InputError: it is so before flights that a finished campaign has.
+        """
+        missing, counted = self.missing, self.store.counted()
+        if self._is_sure() and self.wanted < counted:
+            narrow = f"the interval is as narrow after {self.wanted} of the {counted} flights that are there"
+            raise InputError(f"--until-width would leave out flights: {narrow}; go on without it")
+        try:
+            with closing(self._plan.fly_all(missing, workers=workers, cluster=cluster)) as rows:
+                for row in rows:
+                    self.store.add(row)
+                    self.flown += 1
+                    self.outcomes[row["flight"]] = row["failed"]
+                    there, failed = (int(np.count_nonzero(self.outcomes >= least)) for least in (0, 1))
+                    rate = self.flown / (clock.perf_counter() - self.started)
+                    self._watch(Standing(flown=there, flights=self.wanted, failed=failed, rate=rate))
+                    if self._is_sure():
+                        return
+        finally:
+            self.store.flush()
+
+    def _is_sure(self) -> bool:
+        """Whether the interval is narrow enough after the first n flights, for the smallest such n.
+
+        Only flights without a gap before them count, so that the answer does not depend on which came back first.
+        """
+        if self._width is None or self.wanted < self.outcomes.size:
+            return self._width is not None
+        whole = int(np.argmax(np.append(self.outcomes, -1) < 0))
+        every = math.lcm(CHECK_EVERY, self._plan.spec.cells)  # whole turns of the grids
+        for count in range(self._checked + every, whole + 1, every):
+            self._checked = count
+            share = proportion(int(np.count_nonzero(self.outcomes[:count] == 1)), count)
+            if share["upper"] - share["lower"] <= self._width:
+                self.wanted = count
+                return True
+        return False
+
+
+def put_report(files: Growing, names: Sequence[str], write: Callable[[Path], object] | None) -> None:
+    """Put what a function writes into a directory there, file by file; without one, remove an earlier report.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        if write is not None:
+            write(Path(scratch))
+        made = {path.name: path.read_bytes() for path in Path(scratch).iterdir()}
+    files.remove([name for name in names if name not in made])
+    files.write(made)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The flights of a sweep, a row each, with the units in the columns' metadata."""
+
+    table: pa.Table  # what was swept, by dotted path; verdict; tracking errors; commands; margins; step times
+
+    def __getitem__(self, column: str) -> np.ndarray[Any, Any]:
+        """(flights,) of a column by its name.
+
+        Raises:
+            UnknownNameError: there is none.
+        """
+        if column not in self.table.column_names:
+            raise UnknownNameError("column", column, self.table.column_names)
+        return np.asarray(self.table[column].to_numpy())
+
+    def __len__(self) -> int:
+        """Flights."""
+        return int(self.table.num_rows)
+
+    def to_arrow(self) -> pa.Table:
+        """The table."""
+        return self.table
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas DataFrame.
+
+        Raises:
+            MissingPackageError: pandas is not installed.
+        """
+        return to_pandas(self.table)
+
+
+def fly_sweep(
+    scenario: Scenario, values: Mapping[str, Sequence[Any]], workers: int | None = None, progress: Progress = silent
+) -> Sweep:
+    """Fly every combination of values, by dotted path, the last field varying fastest; see `quadsim.sweep`."""
+    for path, tried in values.items():
+        if isinstance(tried, str) or not len(tried):
+            raise ParameterError("sweep", path, tried, "a list of values to try")
+    lists = [getattr(tried, "tolist", lambda tried=tried: list(tried))() for tried in values.values()]
+    entries = [
+        {"name": f"field-{i}", "fields": [path], "distribution": "grid", "values": lists[i]}
+        for i, path in enumerate(values)
+    ]
+    count = math.prod(map(len, lists))
+    data = {"name": scenario.name, "scenario": scenario.name, "flights": count, "vary": entries}
+    spec = parse_campaign(data, source="sweep")
+    plan = Plan(spec, Assembly(scenario).with_vehicle, one_seed=True)
+    plan.check()
+    progress("sweep", 0, count)
+    rows = []
+    with closing(plan.fly_all(range(count), workers=workers)) as flown:
+        for row in flown:
+            rows.append(row)
+            progress("sweep", len(rows), count)
+    table = make_table(rows, plan.schema).drop_columns(["flight", "seed", "failed"])
+    table = table.rename_columns({f"{DRAW}field-{i}": path for i, path in enumerate(values)})
+    return Sweep(table.select([*values, *(name for name in table.column_names if name not in values)]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """A flight of a finished campaign."""
+
+    number: int
+    row: Mapping[str, Any]  # of `flights.parquet`
+    plan: Plan
+    scenario: Scenario
+    notes: Sequence[str]  # what a person should know before it is flown again
+
+
+def recorded_flight(directory: Path, number: int | None) -> Recorded:
+    """A flight of a campaign's directory; the worst one where no number is given; see `quadsim.replay`."""
+    plan = stored_plan(directory)
+    table = read_flights(directory / FLIGHTS_FILE, plan.schema)
+    number = worst_flight(table) if number is None else number
+    flights = table["flight"].to_pylist()
+    if number not in flights:
+        raise ParameterError("", "--flight", number, f"one of the flights 0 to {flights[-1]} of {directory}")
+    row, notes = table.slice(flights.index(number), 1).to_pylist()[0], []
+    if differing := other_than_flew(read_manifest(directory), plan):
+        notes.append(f"other {', '.join(differing)} flew that campaign, so numbers may differ")
+    if row["verdict"] in (TIMEOUT, MEMORY):
+        ended = f"flight {number} was ended in the campaign ({row['reason']})"
+        notes.append(f"{ended}; here nothing ends it but Ctrl-C")
+    return Recorded(number=number, row=row, plan=plan, scenario=plan.of(number), notes=notes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay(Result):
+    """A flight of a campaign, flown again."""
+
+    recorded: Recorded  # as the campaign has it
+    flight: Flight  # as it was flown now
+    differing: Sequence[str]  # columns of the campaign's table that are not the same bit for bit
+
+    @property
+    def exit_status(self) -> int:
+        """See `Result.exit_status`; 1 where its numbers are not the campaign's."""
+        return EXIT_FAILED if self.differing else EXIT_DONE
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+
+        yield from self.flight.shown()
+        number, count = self.recorded.number, len(self.recorded.row)
+        if self.differing:
+            yield console.styled((f"flight {number} differs from the campaign's in {', '.join(self.differing)}", "red"))
+        else:
+            yield f"flight {number}: {count} columns, each the same as in the campaign"
+
+    def to_json(self) -> dict[str, Any]:
+        """`summary.json` of the flight as it was flown now."""
+        return self.flight.to_json()
+
+
+def held_against(flight: Flight, recorded: Recorded) -> Replay:
+    """A campaign's flight that was flown again, beside what the campaign has of it."""
+    row = recorded.plan.row_of(recorded.number, flight)
+    (again,) = make_table([row], recorded.plan.schema).to_pylist()
+    differing = [name for name, value in recorded.row.items() if name not in again or again[name] != value]
+    return Replay(recorded=recorded, flight=flight, differing=differing)

@@ -1,0 +1,337 @@
+"""The campaign file: what is flown, how often, what varies and is a failure; and what is drawn for each flight.
+
+Each flight's own generator is seeded by `SeedSequence([campaign seed, flight])`, so that neither the number of flights
+nor the worker matters; spread samplings take the points of `scipy.stats.qmc` in order instead.  Points in the unit
+cube become values through the inverse of each distribution function.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+import scipy  # whose `stats` takes half a second to load, where it is first used
+from annotated_types import Ge, Le, MaxLen, MinLen, doc
+from pydantic import Field
+
+from quadsim.errors import InputError
+from quadsim.fields import Number, Positive
+from quadsim.state import Array
+from scenarios.campaign.events import parse_event
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES
+from scenarios.schema.writing import to_toml
+
+Whole = Annotated[int, Ge(-LARGEST_SEED), Le(LARGEST_SEED)]
+Seed = Annotated[int, Ge(0), Le(LARGEST_SEED)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$"), MaxLen(60)]
+Unit = Annotated[str, MaxLen(20), doc("of the values, for tables and plots")]
+Value = bool | Whole | Number | str | list[Number]
+"""What can be drawn from a list: whatever a field of a scenario may be, but for tables."""
+MOST_FLIGHTS: Final = 1_000_000
+_TAIL: Final = 1e-3  # share of a distribution beyond the values taken as its ends
+
+
+@dataclass(frozen=True, kw_only=True)
+class Varied:
+    """What every entry of `[[vary]]` has, and of `[[search]]`."""
+
+    name: Annotated[Name, doc("letters, digits, _ and -; the column `draw.NAME` of the results")]
+    fields: Annotated[
+        list[str],
+        MinLen(1),
+        MaxLen(MOST_ENTRIES),
+        doc(
+            "dotted paths into the scenario that all get the drawn value, as for --set; an entry of a list by its "
+            "name or index"
+        ),
+    ]
+    unit: Unit = "-"
+    relative: Annotated[bool, doc("whether the sampled value multiplies the scenario's own")] = False
+    distribution: str
+
+    def quantile(self, share: float) -> Value:
+        """The value below which a share, from 0 to less than 1, of the distribution lies; of a list, in its order."""
+        raise NotImplementedError
+
+    def extremes(self) -> list[Value]:
+        """The values at the ends, or all of a list: if these can be flown, the others can."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Ranged(Varied):
+    low: Number
+    high: Number
+
+    def __post_init__(self) -> None:
+        _require_range(self.low, self.high)
+
+    def extremes(self) -> list[Value]:
+        return [self.low, self.high]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Uniform(_Ranged):
+    """Every value between two bounds is equally likely."""
+
+    distribution: Literal["uniform"]
+
+    def quantile(self, share: float) -> Value:
+        """See `Varied`."""
+        return self.low + (self.high - self.low) * share
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogUniform(_Ranged):
+    """The logarithm is uniform: every factor is equally likely."""
+
+    distribution: Literal["log_uniform"]
+    low: Positive
+    high: Positive
+
+    def quantile(self, share: float) -> Value:
+        """See `Varied`."""
+        return float(self.low * (self.high / self.low) ** share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Integer(_Ranged):
+    """Every whole number between two bounds, both included, is equally likely."""
+
+    distribution: Literal["integer"]
+    low: Whole
+    high: Whole
+
+    def quantile(self, share: float) -> Value:
+        """See `Varied`."""
+        return self.low + int((self.high - self.low + 1) * share)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Normal(Varied):
+    """A normal distribution, truncated at `low` and `high`."""
+
+    distribution: Literal["normal"]
+    mean: Number
+    deviation: Annotated[Positive, doc("standard deviation, before it is cut off")]
+    low: Annotated[Number | None, doc("absent: no lower end")] = None
+    high: Annotated[Number | None, doc("absent: no upper end")] = None
+
+    def __post_init__(self) -> None:
+        low, high = self._ends
+        _require_range(low, high)
+        if low > self.mean + 8.0 * self.deviation or high < self.mean - 8.0 * self.deviation:
+            raise ValueError(
+                f"mean must be within 8 standard deviations of the range {low:g} to {high:g}, or nothing is ever drawn "
+                f"from there; got {self.mean:g} with deviation {self.deviation:g}"
+            )
+
+    @property
+    def _ends(self) -> tuple[float, float]:
+        return -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
+
+    def quantile(self, share: float) -> Value:
+        """See `Varied`."""
+        low, high = ((end - self.mean) / self.deviation for end in self._ends)
+        return float(scipy.stats.truncnorm.ppf(share, low, high, loc=self.mean, scale=self.deviation))
+
+    def extremes(self) -> list[Value]:
+        """See `Varied`."""
+        tails = zip(self._ends, (_TAIL, 1.0 - _TAIL), strict=True)
+        return [end if math.isfinite(end) else self.quantile(share) for end, share in tails]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Listed(Varied):
+    values: Annotated[list[Value], MinLen(1), MaxLen(MOST_ENTRIES)]
+
+    def __post_init__(self) -> None:
+        kinds = {type(value) if isinstance(value, bool | str | list) else float for value in self.values}
+        if len(kinds) > 1:
+            raise ValueError(f"values must all be of one kind; got {self.values}")
+        if len(set(map(str, self.values))) < len(self.values):
+            raise ValueError(f"values must be distinct; got {self.values}")
+
+    def extremes(self) -> list[Value]:
+        return list(self.values)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice(_Listed):
+    """One of several values, each with its own weight."""
+
+    distribution: Literal["choice"]
+    weights: Annotated[
+        Annotated[list[Annotated[float, Ge(0.0), Le(1e6)]], MaxLen(MOST_ENTRIES)] | None,
+        doc("one per value, of any sum; absent: all the same"),
+    ] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.weights is not None and len(self.weights) != len(self.values):
+            raise ValueError(f"weights must be as many as values, {len(self.values)}; got {len(self.weights)}")
+        if self.weights is not None and not sum(self.weights) > 0.0:
+            raise ValueError(f"weights must not all be 0; got {self.weights}")
+
+    def quantile(self, share: float) -> Value:
+        """See `Varied`."""
+        edges = np.cumsum(self.weights or [1.0] * len(self.values))
+        return self.values[int(np.searchsorted(edges, share * edges[-1], side="right"))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid(_Listed):
+    """Every value in turn; several grids make every combination, the last one changing fastest."""
+
+    distribution: Literal["grid"]
+
+
+Vary = Annotated[Uniform | LogUniform | Normal | Integer | Choice | Grid, Field(discriminator="distribution")]
+
+
+def _require_range(low: float, high: float) -> None:
+    if not low < high:
+        raise ValueError(f"low must be below high; got {low:g} and {high:g}")
+
+
+def check_fields(entries: Sequence[Varied], table: str, owners: dict[str, str]) -> None:
+    """Refuse fields that two entries replace, and those that are not to be replaced.
+
+    `table` names the entries; `owners` has who replaces a field, and gets the entries' own.
+    """
+    for entry in entries:
+        for path in entry.fields:
+            why = {"seed": "seed: every flight has one of its own"}.get(path)
+            if path.split(".")[-1] == "name":
+                why = f"{path}: results are identified by names"
+            elif path in owners:
+                why = f"{path}, which {owners[path]} draws"
+            if why is not None:
+                raise ValueError(f"{table}.{entry.name}.fields must not have {why}")
+            owners[path] = entry.name
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightLimits:
+    """What one flight may take before it is ended, as a result with the verdict `timeout` or `memory`."""
+
+    flight: Annotated[Positive, doc("[s] wall clock of a flight")] = 600.0
+    memory: Annotated[float, Ge(100.0), Le(1e9), doc("[MB] of the flight's process, beyond what it starts with")] = (
+        2000.0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class CampaignFile:
+    """Many flights of one scenario."""
+
+    name: Annotated[
+        str,
+        Field(pattern=r"^[a-z0-9][a-z0-9._-]*$"),
+        MaxLen(80),
+        doc("letters a-z, digits and . _ -; names the campaign's directory"),
+    ]
+    description: Annotated[str, doc("one line")] = ""
+    scenario: Annotated[str, doc("a library name, or a path ending in .toml")]
+    set: Annotated[dict[str, Any], doc("a part of a scenario file, merged over the scenario field by field")] = field(
+        default_factory=dict
+    )
+    flights: Annotated[int, Ge(1), Le(MOST_FLIGHTS), doc("how many")]
+    seed: Annotated[Seed, doc("of all draws, and of the seed of each flight")] = 0
+    sampling: Annotated[
+        Literal["random", "latin_hypercube", "sobol", "halton"],
+        doc(
+            "how numbers are drawn: random (each flight by itself), or spread evenly over all that varies: "
+            "latin_hypercube, sobol, halton"
+        ),
+    ] = "random"
+    failure: Annotated[
+        list[str],
+        MinLen(1),
+        MaxLen(MOST_ENTRIES),
+        doc(
+            "a flight fails when any of these events happens: lost, violated, crashed, error, died, timeout, memory, "
+            "or a column of the results compared with a number, e.g. rmse.z > 0.5"
+        ),
+    ] = field(default_factory=lambda: ["violated"])
+    limits: FlightLimits = FlightLimits()
+    vary: Annotated[list[Vary], MaxLen(MOST_ENTRIES), doc("what varies")] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        names = [entry.name for entry in self.vary]
+        if len(set(names)) < len(names):
+            raise ValueError(f"vary must have distinct names; got {names}")
+        check_fields(self.vary, "vary", {})
+        grids = ", ".join(entry.name for entry in self.vary if isinstance(entry, Grid))
+        if grids and self.sampling in ("sobol", "halton"):
+            rule = f"random or latin_hypercube where there are grids ({grids}), whose turns go with its points"
+            raise ValueError(f"sampling must be {rule}; got {self.sampling!r}")
+        if self.flights % self.cells:
+            rule = f"a multiple of the {self.cells} combinations of its grids"
+            raise ValueError(f"flights must be {rule}; got {self.flights}")
+        for text in self.failure:
+            try:
+                if parse_event(text).text == "failure":
+                    raise InputError("failure is what this list defines")
+            except InputError as error:
+                raise ValueError(f"failure has an entry {text!r} that is no event: {error}") from error
+
+    @property
+    def cells(self) -> int:
+        """Combinations that the grids make; 1 without any."""
+        return math.prod(len(entry.values) for entry in self.vary if isinstance(entry, Grid))
+
+    def to_toml(self) -> str:
+        """The file with every field, defaults included; reading it gives this campaign again."""
+        return to_toml(self)
+
+
+class Draws:
+    """The drawn values of a campaign's flights; the same for the same file, in any process and order."""
+
+    def __init__(self, spec: CampaignFile) -> None:
+        self._spec = spec
+        self._spread = None if spec.sampling == "random" else _spread_points(spec)
+        self._repeats: dict[str, int] = {}  # for how many flights in a row each grid keeps its value
+        repeat = 1
+        for entry in reversed(spec.vary):
+            if isinstance(entry, Grid):
+                self._repeats[entry.name] = repeat
+                repeat *= len(entry.values)
+
+    def seed(self, flight: int) -> int:
+        """The seed of a flight's scenario, a whole number of 63 bits."""
+        return int(self._sequence(flight).generate_state(1, np.uint64)[0] >> np.uint64(1))
+
+    def values(self, flight: int) -> dict[str, Value]:
+        """What is drawn for a flight, by the names of the entries of `[[vary]]`."""
+        if self._spread is None:
+            point = np.random.default_rng(self._sequence(flight).spawn(1)[0]).random(len(self._spec.vary))
+        else:
+            point = self._spread[flight]
+        return {
+            entry.name: entry.values[flight // self._repeats[entry.name] % len(entry.values)]
+            if isinstance(entry, Grid)
+            else entry.quantile(share)
+            for entry, share in zip(self._spec.vary, point.tolist(), strict=True)
+        }
+
+    def _sequence(self, flight: int) -> np.random.SeedSequence:
+        return np.random.SeedSequence([self._spec.seed, flight])
+
+
+def _spread_points(spec: CampaignFile) -> Array:
+    """(K, d) points that fill the unit cube evenly."""
+    if not spec.vary:
+        return np.empty((spec.flights, 0))
+    qmc = scipy.stats.qmc
+    kinds = {"latin_hypercube": qmc.LatinHypercube, "sobol": qmc.Sobol, "halton": qmc.Halton}
+    sampler = kinds[spec.sampling](len(spec.vary), rng=np.random.default_rng(np.random.SeedSequence(spec.seed)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # Sobol's points are balanced best in powers of two
+        points: Array = sampler.random(spec.flights)
+    return np.minimum(points, np.nextafter(1.0, 0.0))

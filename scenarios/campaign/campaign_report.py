@@ -1,0 +1,413 @@
+"""What came of a campaign: its outcome in a sentence, its tables, its figure, and a page that works offline."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from quadsim.report.figure import Bound, Figure, Panel, Series
+from quadsim.report.page import PAGE_FILE, Section, render_page
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
+from quadsim.report.to_matplotlib import write_pngs
+from quadsim.report.to_plotly import Plot, to_plot
+from quadsim.state import Array
+from scenarios.campaign.campaign_file import CampaignFile
+from scenarios.campaign.events import HARMLESS, INCOMPLETE, VERDICTS
+from scenarios.campaign.rows import (
+    DRAW,
+    Summary,
+    draw_names,
+    is_number,
+    numbers,
+    texts,
+    unit_of,
+    verdicts,
+)
+from scenarios.campaign.statistics import ALPHA, Judgement, count_of, drivers, interval, label, p_value, percent
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+_MOST_LINES: Final = 8  # of a table on the console; the report has them all
+_MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN}
+_ENDS: Final = ("lower", "upper")
+_ALWAYS: Final = ("failure", "violation", "lost")  # events that are listed even where they never happened
+
+
+def campaign_lines(summary: Summary, judgements: Sequence[Judgement], directory: Path) -> Iterator[RenderableType]:
+    """What came of a campaign, as a console shows it."""
+    from scenarios import console
+
+    where = console.short_path(directory)
+    yield console.styled((summary["campaign"], "bold"), f": {verdict_sentence(summary)}")
+    if summary["parameters"]:
+        yield driver_sentence(summary)
+    tables = [event_table(summary), constraint_table(summary), worst_table(summary, where)]
+    yield from console.grids([_brief(grid) for grid in tables if grid.lines], left=("constraint", "reason"))
+    if summary["worst"]:
+        command = replay_command(where, summary["worst"][0]["flight"])
+        yield console.styled("to fly one of them again: ", (command, "bold"))
+    for judgement in judgements:
+        yield console.styled((judgement.sentence, "green" if judgement.holds else "red"))
+    yield console.written_to(directory)
+
+
+def _brief(grid: Grid) -> Grid:
+    """The first lines of a table, with a short last column."""
+    ends = [(line, " ".join(line[-1].text.split())) for line in grid.lines[:_MOST_LINES]]
+    lines = [(*line[:-1], replace(line[-1], text=end if len(end) <= 60 else f"{end[:57]}...")) for line, end in ends]
+    return replace(grid, note="", lines=tuple(lines))
+
+
+def verdict_sentence(summary: Summary) -> str:
+    """How many flights failed, and how sure that is: `37 of 1000 flights failed: 3.7 % (95 %: 2.6 to 5.1 %)`."""
+    failure = summary["events"]["failure"]
+    text = f"{failure['count']} of {count_of(failure['flights'], 'flight')} failed"
+    if failure["flights"]:
+        share, ends = _shares(failure)
+        text += f": {share} ({100.0 * summary['confidence']:g} %: {ends})"
+    left_out = summary["flights"] - failure["flights"]
+    return text + (f"; {count_of(left_out, 'incomplete flight')} not counted" if left_out else "")
+
+
+def driver_sentence(summary: Summary) -> str:
+    """The varied parameters on which the worst margin, or else failure, depends beyond chance, the strongest first."""
+    outcome = "worst_margin" if any(related["worst_margin"] for related in drivers(summary).values()) else "failed"
+    sure = {
+        name: related[outcome]
+        for name, related in drivers(summary).items()
+        if related[outcome] and min(related[outcome]["p_holm"], related[outcome]["p_xi_holm"]) < ALPHA
+    }
+    noun = "The worst margin" if outcome == "worst_margin" else "Failure"
+    listed = ", ".join(f"{name} (rho {related['rho']:+.2f}, xi {related['xi']:.2f})" for name, related in sure.items())
+    return f"{noun} depends on {listed or 'no varied parameter beyond chance'}."
+
+
+def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
+    """How often each event that happened did; `failure` names the events that count as failure."""
+    sure = f"{100.0 * summary['confidence']:g} %"
+    counted = f" ({', '.join(failure)})" if failure else ""
+    return Grid(
+        key="events",
+        title="How often",
+        head=("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}"),
+        lines=tuple(
+            line(name, str(share["count"]), *_shares(share), *(percent(share[f"{end}_one_sided"]) for end in _ENDS))
+            for name, share in summary["events"].items()
+            if share["count"] or name in _ALWAYS
+        ),
+        note=f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold, or "
+        "the flight was lost, raised an error or met a limit. Shares of both leave out incomplete flights, which ended "
+        "before a required constraint was reached. Intervals are Clopper-Pearson's, of independent draws; the last two "
+        "columns are one-sided. Spread draws are more precise than that.",
+    )
+
+
+def constraint_table(summary: Summary) -> Grid:
+    """How often each constraint did not hold, and by how much at worst."""
+    lines = []
+    for name, constraint in summary["constraints"].items():
+        failed, worst = constraint["not_satisfied"], (ABSENT, ABSENT)
+        if constraint["worst_margin"] is not None:
+            worst = f"{format_number(constraint['worst_margin'])} {constraint['unit']}", str(constraint["worst_flight"])
+        count = Cell(text=str(failed["count"]), mark=Mark.BAD if failed["count"] else Mark.NONE)
+        lines.append(line(name, count, *_shares(failed), *worst))
+    return Grid(
+        key="constraints",
+        title="Constraints",
+        head=(
+            *("constraint", "flights that did not hold it", "share"),
+            *(f"{100.0 * summary['confidence']:g} % interval", "worst margin", "in flight"),
+        ),
+        lines=tuple(lines),
+        note="Margins are at the physics rate, without the tolerance; negative is beyond the bound. Shares are of the "
+        "flights that reached the constraint or were lost before it.",
+    )
+
+
+def metric_table(summary: Summary) -> Grid:
+    """How every metric is distributed."""
+    measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
+    lines = tuple(
+        line(
+            label(name, metric["unit"]),
+            *(format_number(metric[measure]) for measure in measures),
+            str(metric["flights"]),
+        )
+        for name, metric in summary["metrics"].items()
+    )
+    return Grid(
+        key="metrics",
+        title="All metrics",
+        head=("metric", *measures, "flights"),
+        lines=lines,
+        note="Over the flights that have the number, lost ones, up to where they were aborted, included.",
+    )
+
+
+def worst_table(summary: Summary, directory: str) -> Grid:
+    """The worst flights, and how to fly one again."""
+    worst = summary["worst"]
+    lines = tuple(
+        line(
+            str(flight["flight"]),
+            Cell(text=flight["verdict"], mark=_MARKS.get(flight["verdict"], Mark.BAD)),
+            *(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
+            format_number(flight["duration"]),
+            Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
+        )
+        for flight in worst
+    )
+    again = f" To fly one of them again: {replay_command(directory, worst[0]['flight'])}" if worst else ""
+    return Grid(
+        key="worst",
+        title="Worst flights",
+        head=("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason"),
+        lines=lines,
+        note="Lost flights first, then errors, limits, violations and the rest; among these, failed ones first, then "
+        "the smaller worst margin." + again,
+    )
+
+
+def worst_draws_table(summary: Summary) -> Grid:
+    """Parameters of the worst flights, a column for each."""
+    worst = summary["worst"]
+    lines = tuple(
+        line(label(name, parameter["unit"]), *(_drawn(flight["draws"][name]) for flight in worst))
+        for name, parameter in summary["parameters"].items()
+    )
+    return Grid(
+        key="worst-draws",
+        title="Their parameters",
+        head=("flight", *(str(flight["flight"]) for flight in worst)),
+        lines=lines if worst else (),
+    )
+
+
+def replay_command(directory: str, flight: int) -> str:
+    """The command that flies one flight of a campaign again."""
+    return f"quadsim replay {shlex.quote(directory)} --flight {flight}"
+
+
+def _drawn(value: Any) -> str:
+    return format_number(value) if isinstance(value, float) else str(value)
+
+
+def _shares(share: Mapping[str, Any]) -> tuple[str, str]:
+    return percent(share["share"]), interval(share["lower"], share["upper"])
+
+
+def driver_table(summary: Summary) -> Grid:
+    """How the worst margin and failure depend on each varied parameter."""
+    lines = (
+        line(label(name, related["unit"]), *_association(related["worst_margin"]), *_association(related["failed"]))
+        for name, related in drivers(summary).items()
+    )
+    measures = ("rho", "after Holm", "xi", "after Holm")
+    return Grid(
+        key="drivers-table",
+        title="Which parameters matter",
+        head=("varied parameter", *(f"{of}: {measure}" for of in ("worst margin", "failure") for measure in measures)),
+        lines=tuple(lines),
+        note="rho: Spearman's rank correlation. xi: Chatterjee's (2021), of any dependence, also of harm at both ends "
+        "of a range. p-values are corrected by Holm's method for all of this table; bold: beyond chance at "
+        f"{100.0 * ALPHA:g} %.",
+    )
+
+
+def group_table(summary: Summary) -> Grid:
+    """How often flights failed over each varied parameter, lowest values first; of none or all failed, no lines."""
+    failure = summary["events"]["failure"]
+    listed = {}
+    for name, parameter in summary["parameters"].items() if 0 < failure["count"] < failure["flights"] else ():
+        levels = [f"{level}: {percent(share['share'])}" for level, share in parameter.get("levels", {}).items()]
+        if cells := levels + [_group(group) for group in parameter.get("groups", ())]:
+            listed[label(name, parameter["unit"])] = cells
+    size = max(map(len, listed.values()), default=0)
+    return Grid(
+        key="groups",
+        title="Failures over each varied parameter",
+        head=("varied parameter", *(f"{k + 1}." for k in range(size))),
+        lines=tuple(line(name, *cells, *[ABSENT] * (size - len(cells))) for name, cells in listed.items()),
+        note="Share of failed flights among those with such values; groups are of about equal size, or by value where "
+        f"there are few. Over all flights it is {percent(failure['share'])}.",
+    )
+
+
+def _association(related: Mapping[str, Any] | None) -> tuple[Cell, ...]:
+    if related is None:
+        return line(*[ABSENT] * 4)
+    sure = [Mark.BEST if related[p] < ALPHA else Mark.NONE for p in ("p_holm", "p_xi_holm")]
+    rho, xi = Cell(text=f"{related['rho']:+.2f}", mark=sure[0]), Cell(text=f"{related['xi']:.2f}", mark=sure[1])
+    return line(rho, p_value(related["p_holm"]), xi, p_value(related["p_xi_holm"]))
+
+
+def _group(group: Mapping[str, Any]) -> str:
+    low, high = format_number(group["low"]), format_number(group["high"])
+    return f"{low if low == high else f'{low} to {high}'}: {percent(group['share'])}"
+
+
+_FILES: Final = (
+    *("campaign.toml", "scenario.toml", "flights.parquet", "timing.parquet", "summary.json", "manifest.json"),
+    "campaign.png",
+)
+"""What the page links to, where it is there."""
+_MARGINS: Final = (
+    "The worst margin is that of a flight's required constraints, tolerance included, as a share of half the "
+    "constraint's band: 1 in the middle, 0 (dashed) at the end of what is allowed, negative beyond. What is measured "
+    "of a lost flight ends where it was aborted."
+)
+_POINTS: Final = "Triangles at the edges are flights beyond the axes; at the foot also those without a margin."
+
+
+MAIN_METRICS: Final = (
+    "worst_margin",
+    *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
+    *("peak_tilt", "total_variation", "fallback_periods"),
+)
+"""What a reader of a campaign looks for first."""
+_BINS: Final = 40
+_MOST_SCATTERS: Final = 3  # in the overview
+_MOST_POINTS: Final = 9000  # of one verdict in all scatters of a page, which has a few MB then
+_GAP: Final = 0.06  # from the axis' end to what is drawn at the edge, as a share of the axis
+_FENCE: Final = 5.0  # quartile ranges beyond the quartiles up to which values are drawn where they are
+
+
+def write_report(
+    directory: Path, table: pa.Table, summary: Summary, spec: CampaignFile, *, campaign: Path | None = None
+) -> Path:
+    """Write `index.html` and `campaign.png` into a directory that is being made; the page.
+
+    The page links to the files of `campaign`, the campaign's own directory where that is another, as its commands do.
+
+    Raises:
+        OutputError: the directory cannot be written.
+    """
+    campaign = campaign or directory
+    sentence = verdict_sentence(summary)
+    figure = overview(table, summary, f"{spec.name}: {sentence}")
+    write_pngs([figure] if figure.panels else [], directory)
+    often = (event_table(summary, spec.failure), constraint_table(summary))
+    shapes = _plots("metrics", "Flights by verdict", histograms(table), _MARGINS)
+    clouds = _plots("scatter", "Worst margin over each parameter", scatters(table), _POINTS)
+    worst = (worst_table(summary, str(campaign)), worst_draws_table(summary))
+    sections = [
+        Section(title="How often", tables=often),
+        Section(title="Distributions", plots=shapes, folded=(metric_table(summary),)),
+        Section(title="What drives failure", plots=clouds, tables=(driver_table(summary), group_table(summary))),
+        Section(title="Worst flights", tables=worst),
+    ]
+    files = {name: name for name in _FILES if (directory / name).is_file() or (campaign / name).is_file()}
+    mark = Mark.NONE if not summary["flights"] else Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
+    verdict = Cell(text=sentence, mark=mark)
+    page = render_page("campaign", spec.name, sections, description=spec.description, verdict=verdict, files=files)
+    (directory / PAGE_FILE).write_text(page, encoding="utf-8")
+    return directory / PAGE_FILE
+
+
+def _plots(key: str, title: str, panels: Sequence[Panel], note: str) -> tuple[Plot, ...]:
+    return (to_plot(Figure(key=key, title=title, panels=tuple(panels)), note=note),) if panels else ()
+
+
+def overview(table: pa.Table, summary: Summary, title: str) -> Figure:
+    """Worst margins, or else the first metric that differs between flights, and the parameters that matter."""
+    strongest = list(drivers(summary))
+    clouds = {panel.x_label.partition(" [")[0]: panel for panel in scatters(table)}
+    ranked = sorted(clouds, key=lambda name: strongest.index(name) if name in strongest else len(strongest))
+    panels = [
+        *histograms(table)[:1],
+        *(clouds[name] for name in ranked[:_MOST_SCATTERS]),
+    ]
+    return Figure(key="campaign", title=title, panels=tuple(replace(panel, height=1.4) for panel in panels))
+
+
+def histograms(table: pa.Table) -> list[Panel]:
+    """How the main metrics that differ between flights are distributed, by verdict."""
+    panels = []
+    for name in MAIN_METRICS:
+        values = numbers(table, name)
+        finite = values[np.isfinite(values)]
+        if finite.size < 2 or np.ptp(finite) == 0.0:
+            continue
+        low, high = _ends(finite)
+        width = (high - low or 1.0) / min(_BINS, max(8, int(2.0 * np.sqrt(finite.size))))
+        edges = width * np.arange(np.floor(low / width), np.ceil(high / width) + 1.0)  # 0 is one, where it is inside
+        inside, below, bars = np.clip(values, edges[0], edges[-1]), np.zeros(edges.size - 1), []
+        for verdict, rows in verdicts(table).items():
+            counts = np.histogram(inside[rows & np.isfinite(values)], edges)[0].astype(float)
+            if counts.any():
+                middles, colour = 0.5 * (edges[:-1] + edges[1:]), VERDICTS[verdict].colour
+                bars.append(Series(x=middles, y=counts, base=below, colour=colour, label=verdict, style="bars"))
+            below = below + counts
+        beyond = int(np.count_nonzero((finite < edges[0]) | (finite > edges[-1])))
+        zero = (Bound(value=0.0, vertical=True),) if name == "worst_margin" and edges[0] <= 0.0 <= edges[-1] else ()
+        x_label = label(name, unit_of(table, name)) + (f"; {beyond} beyond, in the end bars" if beyond else "")
+        panels.append(Panel(title="", x_label=x_label, y_label="flights", series=tuple(bars), bounds=zero, whole=True))
+    return panels
+
+
+def scatters(table: pa.Table) -> list[Panel]:
+    """The worst margin of each flight over each varied parameter; triangles are beyond the axes, or have no margin."""
+    margins, names = numbers(table, "worst_margin"), draw_names(table)
+    if not np.isfinite(margins).any():
+        return []
+    low, high = _ends(margins[np.isfinite(margins)])
+    low, high = min(0.0, low), max(0.0, high)  # 0, the end of what is allowed, is among them
+    y, beyond_y = _clip(np.where(np.isfinite(margins), margins, -np.inf), low, high, "down", "up")
+    room, panels = 0.6 * _GAP * ((high - low) or 1.0), []
+    for name in names:
+        kinds: tuple[str, ...] = ()
+        if is_number(table, DRAW + name):
+            values = numbers(table, DRAW + name)
+        else:
+            listed = texts(table, DRAW + name)
+            kinds = tuple(sorted(set(listed)))
+            spread = np.random.default_rng(0).uniform(-0.3, 0.3, listed.size)  # the same every time
+            values = np.array([kinds.index(value) for value in listed], float) + spread
+        x, beyond_x = _clip(values, *_ends(values[np.isfinite(values)]), "left", "right")
+        beyond, points = np.where(beyond_y == "", beyond_x, beyond_y), list[Series]()
+        for verdict, flown in verdicts(table).items():
+            rows, (_, colour, symbol) = np.flatnonzero(flown), VERDICTS[verdict]
+            even = np.linspace(0.0, rows.size - 1.0, min(rows.size, _MOST_POINTS // len(names)))
+            rows = rows[np.unique(even.astype(int))]
+            for edge in ("", "down", "up", "left", "right"):
+                there, marker = rows[beyond[rows] == edge], f"triangle-{edge}" if edge else symbol
+                if there.size:
+                    points.append(
+                        Series(x=x[there], y=y[there], flights=numbers(table, "flight")[there], colour=colour,
+                               label=verdict, style="points", marker=marker, width=5.0 if edge else 3.5, opacity=0.7)
+                    )  # fmt: skip
+        panels.append(
+            Panel(
+                title="",
+                x_label=label(name, unit_of(table, DRAW + name)),
+                y_label="worst margin",
+                series=tuple(points),
+                bounds=(Bound(value=0.0),),
+                x_names=kinds,
+                y_range=(float(y.min()) - room, float(y.max()) + room),
+            )
+        )
+    return panels
+
+
+def _ends(finite: Array) -> tuple[float, float]:
+    """The smallest and the largest of some values, without those far out."""
+    q1, q3 = np.percentile(finite, [25, 75])
+    reach = _FENCE * (q3 - q1) or np.inf
+    inside = finite[(finite >= q1 - reach) & (finite <= q3 + reach)]
+    return float(inside.min()), float(inside.max())
+
+
+def _clip(values: Array, low: float, high: float, below: str, above: str) -> tuple[Array, np.ndarray]:
+    """Values (K,) with those beyond the ends a little outside, and on which side each is; empty inside."""
+    side = np.where(values < low, below, np.where(values > high, above, ""))
+    gap = _GAP * ((high - low) or 1.0)
+    return np.select([side == below, side == above], [low - gap, high + gap], values), side

@@ -1,0 +1,371 @@
+"""Two campaigns flown on the same draws: is the second better, and how sure is that?
+
+Flights of one number have the same drawn values and random numbers, so they are compared in pairs: this detects
+far smaller differences than two campaigns side by side would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from quadsim.errors import InputError
+from quadsim.outputs import to_json, writing
+from quadsim.report.page import PAGE_FILE, Section, render_page
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
+from scenarios.campaign.events import EVENT_NAMES, Flags, parse_event
+from scenarios.campaign.rows import (
+    DRAW,
+    SATISFIED,
+    constraint_names,
+    draw_names,
+    flags,
+    is_counted,
+    numbers,
+    texts,
+    unit_of,
+)
+from scenarios.campaign.statistics import (
+    ALPHA,
+    CONFIDENCE,
+    FAILURE,
+    PairedDifference,
+    holm,
+    label,
+    mcnemar,
+    p_value,
+    paired_difference,
+    percent,
+)
+from scenarios.results import Result, Shown
+from scenarios.schema.settings import shown
+
+COMPARISON_FILE: Final = "comparison.json"
+TABLE_FILE: Final = "comparison.md"
+COMPARED: Final = (
+    *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
+    *(f"max_error.{name}" for name in ("x", "y", "z")),
+    *("peak_tilt", "worst_margin", "total_variation", "fallback_periods"),
+)
+"""Metrics that are compared, where both campaigns have them."""
+Differences = tuple[tuple[str, Any, Any], ...]
+"""Fields, with the value of the first and of the second; None where it is absent."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventComparison:
+    """In how many pairs an event happened to both flights, to one alone, and to none."""
+
+    event: str
+    both: int
+    only_a: int
+    only_b: int
+    neither: int
+    p: float  # two-sided, of McNemar's exact test
+    p_holm: float  # corrected for all compared events that happened to one flight of a pair alone
+    difference: float  # share of b - share of a
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Flights of the first and of the second campaign in which it happened."""
+        return self.both + self.only_a, self.both + self.only_b
+
+    @property
+    def pairs(self) -> int:
+        """All pairs."""
+        return self.both + self.only_a + self.only_b + self.neither
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricComparison:
+    """A metric over the pairs in which both flights were completed and have it."""
+
+    name: str
+    unit: str
+    mean_a: float | None  # None of no pairs
+    mean_b: float | None
+    difference: PairedDifference  # of the second less the first
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairedComparison(Result):
+    """What two campaigns on the same draws show of each other."""
+
+    names: tuple[str, str]  # of the first and the second campaign
+    flights: int  # pairs
+    left_out: int  # flights that only one of them has, or of whose pair one is incomplete
+    completed: int  # pairs in which both flights were completed
+    shared_draws: tuple[str, ...]  # parameters that both drew, alike in every pair
+    own_draws: tuple[str, ...]  # parameters that only one of them drew
+    differences: Differences | None  # fields in which their scenarios and draws differ; None where not known
+    events: tuple[EventComparison, ...]  # failure, then every other event with a name, then each constraint not held
+    metrics: tuple[MetricComparison, ...]
+    page: Path | None = None  # of the report, where it was written
+
+    @property
+    def verdict(self) -> str:
+        """`better`, `worse` or `not distinguishable`: of the second campaign, by its failures at a level of 5 %."""
+        failure = self.events[0]
+        if failure.p >= ALPHA:
+            return "not distinguishable"
+        return "better" if failure.only_b < failure.only_a else "worse"
+
+    @property
+    def sentence(self) -> str:
+        """The verdict with its numbers."""
+        (a, b), failure = self.names, self.events[0]
+        phrase = f"{b} is {self.verdict} than {a}"
+        if self.verdict == "not distinguishable":
+            phrase = f"{b} and {a} are not distinguishable by their failures"
+        return (
+            f"{phrase}: of {self.flights} paired flights, {failure.counts[1]} failed with {b} and {failure.counts[0]} "
+            f"with {a} (McNemar's exact test, {p_value(failure.p)})."
+        )
+
+    @property
+    def pairing(self) -> str:
+        """What the pairs have in common, and what they have not."""
+        phrase = f"Pairs share {', '.join(('their seed', *self.shared_draws))}"
+        if self.own_draws:
+            phrase += f"; one campaign alone draws {', '.join(self.own_draws)}"
+        if self.left_out:
+            phrase += f"; {self.left_out} flights are left out, as one of their pair is absent or incomplete"
+        if self.differences is not None:
+            phrase += f". Fields in which the campaigns differ: {len(self.differences)}"
+        return f"{phrase}."
+
+    @property
+    def difference_tables(self) -> tuple[Grid, ...]:
+        """The fields in which the campaigns' scenarios and draws differ; no table where none does."""
+        lines = tuple(line(field, shown(a), shown(b)) for field, a, b in self.differences or ())
+        grid = Grid(key="differences", title="What differs", head=("field", *self.names), lines=lines)
+        return (grid,) if lines else ()
+
+    @property
+    def tables(self) -> tuple[Grid, Grid]:
+        """Events, and metrics."""
+        return _event_table(self), _metric_table(self)
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+
+        yield self.pairing
+        yield from console.grids(self.difference_tables)
+        yield self.sentence
+        yield from console.grids(self.tables)
+        if self.page is not None:
+            yield console.written_to(self.page)
+
+    def to_markdown(self) -> str:
+        """What differs, the verdict, and its tables."""
+        head = [f"# {self.names[1]} against {self.names[0]}\n", f"{self.pairing}\n"]
+        verdict = [*map(section, self.difference_tables), f"{self.sentence}\n", *map(section, self.tables)]
+        return "\n".join([*head, *verdict])
+
+    def write_report(self, directory: Path, *, overwrite: bool = False) -> Path:
+        """Write `index.html`, `comparison.json` and `comparison.md`, together or not at all; the page.
+
+        Raises:
+            OutputError: the directory cannot be written, or holds something else.
+        """
+        sections = [
+            Section(title="What is compared", text=(self.pairing,), tables=self.difference_tables),
+            Section(title="Which is better", text=(self.sentence,), tables=self.tables),
+        ]
+        title = f"{self.names[1]} against {self.names[0]}"
+        files = {file: file for file in (COMPARISON_FILE, TABLE_FILE)}
+        texts = {
+            COMPARISON_FILE: to_json(self.to_json()),
+            TABLE_FILE: self.to_markdown(),
+            PAGE_FILE: render_page("campaign comparison", title, sections, files=files),
+        }
+        with writing(directory, overwrite=overwrite) as partial:
+            for name, text in texts.items():
+                (partial / name).write_text(text, encoding="utf-8")
+        return directory / PAGE_FILE
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for a file; differences are of the second campaign less the first."""
+        return {
+            "names": list(self.names),
+            "verdict": self.verdict,
+            "sentence": self.sentence,
+            "confidence": CONFIDENCE,
+            **{name: getattr(self, name) for name in ("flights", "left_out", "completed")},
+            "shared_draws": list(self.shared_draws),
+            "own_draws": list(self.own_draws),
+            "differences": None
+            if self.differences is None
+            else [{"field": name, "values": list(values)} for name, *values in self.differences],
+            "events": {event.event: asdict(event) for event in self.events},
+            "metrics": {metric.name: asdict(metric) for metric in self.metrics},
+        }
+
+
+def compare_pairs(
+    table_a: pa.Table,
+    table_b: pa.Table,
+    names: tuple[str, str],
+    failures: tuple[Sequence[str], Sequence[str]] | None = None,
+    differences: Differences | None = None,
+) -> PairedComparison:
+    """Compare two campaigns, pairing their flights by number.
+
+    Args:
+        table_a: `flights.parquet` of the first.
+        table_b: of the second.
+        names: of the first and the second; where they are the same, the comparison distinguishes them as such.
+        failures: the events that each counts as failure; None where they are known to be the same.
+        differences: see `scenarios.campaign.plan.plan_differences`; None where not known.
+
+    Raises:
+        InputError: they count other events as failure, or have other constraints; they have no flight in common; or a
+            pair differs in its seed or in a value that both drew.
+    """
+    if names[0] == names[1]:
+        names = (f"{names[0]} (first)", f"{names[1]} (second)")
+    _require_same_questions(table_a, table_b, names, failures)
+    shared = np.intersect1d(numbers(table_a, "flight"), numbers(table_b, "flight"))
+    if not shared.size:
+        raise InputError(f"campaigns {names[0]!r} and {names[1]!r} have no flight of one number: nothing can be paired")
+    a, b = (table.filter(np.isin(numbers(table, "flight"), shared)).sort_by("flight") for table in (table_a, table_b))
+    complete = is_counted(a, FAILURE) & is_counted(b, FAILURE)
+    if not complete.any():
+        raise InputError(
+            f"campaigns {names[0]!r} and {names[1]!r} have no pair of flights of which both reached every required "
+            "constraint: fly them for longer"
+        )
+    a, b = a.filter(complete), b.filter(complete)
+    draws_a, draws_b = draw_names(a), draw_names(b)
+    shared_draws = tuple(name for name in draws_a if name in draws_b)
+    for column in ("seed", *(DRAW + name for name in shared_draws)):
+        for flight, *values in zip(
+            *(values.to_pylist() for values in (a["flight"], a[column], b[column])), strict=True
+        ):
+            if values[0] != values[1]:
+                raise InputError(
+                    f"flight {flight} of {names[0]!r} has {column} = {values[0]!r}, and of {names[1]!r} {values[1]!r}: "
+                    "only campaigns of one seed and the same draws can be compared in pairs; fly one of them again "
+                    "with the other's seed, sampling and [[vary]]"
+                )
+    completed = (texts(a, "status") == "completed") & (texts(b, "status") == "completed")
+    return PairedComparison(
+        names=names,
+        flights=a.num_rows,
+        left_out=table_a.num_rows + table_b.num_rows - 2 * a.num_rows,
+        completed=int(completed.sum()),
+        shared_draws=shared_draws,
+        own_draws=tuple(sorted(set(draws_a) ^ set(draws_b))),
+        differences=differences,
+        events=_compare_events(a, b),
+        metrics=tuple(
+            _compare_metric(a, b, name, completed)
+            for name in COMPARED
+            if {name} <= {*a.column_names} & {*b.column_names}
+        ),
+    )
+
+
+def _require_same_questions(
+    a: pa.Table, b: pa.Table, names: Sequence[str], failures: tuple[Sequence[str], Sequence[str]] | None
+) -> None:
+    first, second = (sorted({parse_event(text).text for text in events}) for events in failures or ((), ()))
+    if first != second:
+        raise InputError(
+            f"{names[0]!r} counts {', '.join(first)} as failure, and {names[1]!r} {', '.join(second)}: only "
+            "campaigns with the same failure events can be compared; fly one of them again with the other's"
+        )
+    for name, one, other in ((names[0], a, b), (names[1], b, a)):
+        if alone := sorted(set(constraint_names(one)) - set(constraint_names(other))):
+            raise InputError(
+                f"{name!r} alone has the constraints {', '.join(alone)}: only campaigns that are audited against the "
+                "same constraints can be compared"
+            )
+
+
+def _compare_events(a: pa.Table, b: pa.Table) -> tuple[EventComparison, ...]:
+    """Every event with its test, corrected for all of them but those that no flight of a pair had alone.
+
+    These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).
+    """
+    happened = {name: [parse_event(name).column(table) for table in (a, b)] for name in EVENT_NAMES}
+    for name in constraint_names(a):
+        happened[f"{name} not held"] = [~flags(table, SATISFIED + name, absent=False) for table in (a, b)]
+    alone = {event: (int((in_a & ~in_b).sum()), int((in_b & ~in_a).sum())) for event, (in_a, in_b) in happened.items()}
+    p = {event: mcnemar(*counts) for event, counts in alone.items()}
+    tested = [event for event, counts in alone.items() if any(counts)]
+    corrected = dict(zip(tested, holm([p[event] for event in tested]), strict=True))
+    return tuple(
+        EventComparison(
+            event=event,
+            both=int((in_a & in_b).sum()),
+            only_a=alone[event][0],
+            only_b=alone[event][1],
+            neither=int((~in_a & ~in_b).sum()),
+            p=p[event],
+            p_holm=corrected.get(event, 1.0),
+            difference=(alone[event][1] - alone[event][0]) / a.num_rows,
+        )
+        for event, (in_a, in_b) in happened.items()
+    )
+
+
+def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> MetricComparison:
+    first, second = numbers(a, name), numbers(b, name)
+    valid = completed & np.isfinite(first) & np.isfinite(second)
+    first, second = first[valid], second[valid]
+    return MetricComparison(
+        name=name,
+        unit=unit_of(a, name),
+        mean_a=float(first.mean()) if first.size else None,
+        mean_b=float(second.mean()) if second.size else None,
+        difference=paired_difference(first, second),
+    )
+
+
+def _event_table(comparison: PairedComparison) -> Grid:
+    a, b = comparison.names
+    lines = []
+    for event in comparison.events:
+        counts = [f"{count} ({percent(count / event.pairs)})" for count in event.counts]
+        pairs = map(str, (event.only_a, event.only_b, event.both))
+        sure = Mark.BEST if event.p_holm < ALPHA else Mark.NONE
+        if any(event.counts):
+            corrected = Cell(text=p_value(event.p_holm), mark=sure)
+            lines.append(line(event.event, *counts, *pairs, p_value(event.p), corrected))
+    return Grid(
+        key="events",
+        title="Events",
+        head=("event", a, b, f"{a} alone", f"{b} alone", "both", "p", "after Holm"),
+        lines=tuple(lines),
+        note="p: McNemar's exact test, two-sided, of each event by itself; the verdict is by that of failure. After "
+        "Holm: corrected for all events that one flight of a pair alone had; bold: beyond chance at "
+        f"{100.0 * ALPHA:g} %.",
+    )
+
+
+def _metric_table(comparison: PairedComparison) -> Grid:
+    a, b = comparison.names
+    lines = []
+    for metric in comparison.metrics:
+        difference, ends, mark = metric.difference, ABSENT, Mark.NONE
+        if difference.lower is not None and difference.upper is not None:
+            ends = f"{format_number(difference.lower)} to {format_number(difference.upper)}"
+            mark = Mark.BEST if difference.lower > 0.0 or difference.upper < 0.0 else Mark.NONE
+        means = map(format_number, (metric.mean_a, metric.mean_b))
+        mean = Cell(text=format_number(difference.mean), mark=mark)
+        lines.append(line(label(metric.name, metric.unit), *means, mean, ends, str(difference.pairs)))
+    return Grid(
+        key="metrics",
+        title="Metrics",
+        head=("metric", f"{a}, mean", f"{b}, mean", "mean difference", f"{100.0 * CONFIDENCE:g} % interval", "pairs"),
+        lines=tuple(lines),
+        note=f"Over the {comparison.completed} of {comparison.flights} pairs in which both flights were completed. "
+        f"Differences are {b} less {a}; bold where Student's t interval does not hold 0.",
+    )

@@ -1,1 +1,0 @@
-"""A campaign as tables, text, figure, plots and pages."""

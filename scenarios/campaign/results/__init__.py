@@ -1,1 +1,0 @@
-"""The rows of a campaign, one per flight: their table, events, verdicts and storage."""

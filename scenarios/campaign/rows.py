@@ -1,0 +1,237 @@
+"""The rows of a campaign, one per flight, and their Parquet table.
+
+A column's unit stands in its metadata.  A value that does not exist, such as the tracking error of a flight that raised
+before its first period, is null.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from quadsim.controller import ACCEPTED, NO_SOLVER, Phase
+from quadsim.errors import FileError
+from quadsim.flight import metrics
+from quadsim.flight.audit import Finding, Limit
+from quadsim.flight.log import FlightLog
+from quadsim.flight.parquet import read_parquet
+from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
+from scenarios.campaign.events import HARMLESS, INCOMPLETE, VERDICTS, Event, Flags
+
+Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
+DRAW: Final = "draw."  # how the columns of drawn values begin
+MARGIN, TIME_VIOLATED, SATISFIED = "margin.", "time_violated.", "satisfied."
+"""How the columns of a constraint begin, before its name."""
+_MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
+_COMMANDED: Final = ("speed", "slew")  # signals that the controller sets itself
+_FLOAT, _WHOLE = pa.float64(), pa.int64()
+
+
+def _fields(kind: pa.DataType, unit: str, *names: str) -> list[pa.Field]:
+    return [pa.field(name, kind, metadata={"unit": unit}) for name in names]
+
+
+_HEAD: Final = [
+    *_fields(pa.string(), "-", "status", "verdict", "reason"),
+    *_fields(pa.bool_(), "-", "failed", "violated", "crashed"),
+    *_fields(_FLOAT, "s", "duration"),
+]
+_COMMANDS: Final = [
+    *_fields(_FLOAT, "deg", "peak_tilt"),
+    *_fields(_FLOAT, "rad/s", "speed_min", "speed_max", "slew_min", "slew_max", "total_variation"),
+    *_fields(_WHOLE, "-", "fallback_periods", "fallback_max", "unsolved_periods"),
+    *_fields(_FLOAT, "rad", "slack_max"),
+    *_fields(_WHOLE, "-", "solver_periods"),
+    *_fields(_FLOAT, "-", "iterations.mean"),
+    *_fields(_WHOLE, "-", "iterations.max"),
+]
+_WORST: Final = [*_fields(_FLOAT, "-", "worst_margin"), *_fields(pa.string(), "-", "worst_constraint")]
+_TIMING: Final = [
+    *_fields(pa.string(), "-", "machine"),
+    *_fields(_FLOAT, "s", "wall_s"),
+    *_fields(_FLOAT, "ms", "step_p50_ms", "step_p99_ms"),
+]
+TIMES: Final = tuple(field.name for field in _TIMING)
+"""What a clock measured of a flight, and where; it stands in a table of its own."""
+Summary = Mapping[str, Any]
+Texts = np.ndarray[Any, np.dtype[np.object_]]
+_NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
+Rows = np.ndarray[Any, np.dtype[np.intp]]
+
+
+def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit]) -> pa.Schema:
+    """The columns of a campaign, clock times last; `draws` has type and unit of each varied parameter."""
+    fields = _fields(_WHOLE, "-", "flight", "seed")
+    for name, (kind, unit) in draws.items():
+        fields += _fields(kind, unit, DRAW + name)
+    fields += _HEAD
+    for measure in _MEASURES:
+        for channel, unit in zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True):
+            fields += _fields(_FLOAT, unit, f"{measure}.{channel}")
+    fields += _COMMANDS
+    for limit in limits:
+        fields += _fields(_FLOAT, limit.unit, MARGIN + limit.name)
+        fields += _fields(_FLOAT, "s", TIME_VIOLATED + limit.name)
+        fields += _fields(pa.bool_(), "-", SATISFIED + limit.name)
+    return pa.schema([*fields, *_WORST, *_TIMING])
+
+
+def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall_s: float, machine: str) -> Row:
+    """What a campaign keeps of a flight, whose plant rows are at the physics rate, and of its audit."""
+    row: Row = {
+        "status": log.status,
+        "verdict": verdict,
+        "reason": log.reason,
+        "violated": verdict not in (HARMLESS, INCOMPLETE),
+        "crashed": str(Phase.CRASHED) in log.control.phase,
+        "duration": round(float(log.plant.t[-1]), 9),
+        "wall_s": wall_s,
+        "machine": machine,
+    }
+    for finding in findings:
+        name = finding.limit.name
+        row[MARGIN + name] = finding.worst_margin if math.isfinite(finding.worst_margin) else None
+        row[TIME_VIOLATED + name] = finding.time_violated
+        unknown = finding.verdict == "incomplete" and verdict != "lost"  # a lost flight had to get there
+        row[SATISFIED + name] = None if unknown else finding.satisfied
+    row["worst_margin"], row["worst_constraint"] = worst_margin(findings)
+    return row | (_numbers(log) if log.control.t.size else {})
+
+
+def worst_margin(findings: Iterable[Finding]) -> tuple[float | None, str | None]:
+    """The smallest margin of the required constraints, tolerance included, as a share of half its band, and whose.
+
+    At the physics rate or at the control samples, each with its own tolerance, whichever is smaller: it is negative
+    where a constraint that was reached did not hold.  1 is the middle of a band, 0 the end of what is allowed; of a
+    bound with one side alone, the share is of the bound's own magnitude.  A command at its own bound is no near miss:
+    constraints of `speed` and `slew` count once they are violated.  None where no such constraint was reached.
+    """
+    shares = [
+        (share, finding.limit.name)
+        for finding in findings
+        if finding.limit.required and math.isfinite(share := _share(finding))
+        if share < 0.0 or finding.limit.signal not in _COMMANDED
+    ]
+    return min(shares, default=(None, None))
+
+
+def make_table(rows: Iterable[Row], schema: pa.Schema) -> pa.Table:
+    """Rows as a table, sorted by flight; what a row lacks is null, and text that is no Unicode has backslashes."""
+
+    def storable(value: object) -> object:
+        return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
+
+    ordered = sorted(rows, key=lambda row: row["flight"])
+    columns = [pa.array([storable(row.get(field.name)) for row in ordered], field.type) for field in schema]
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def split_times(table: pa.Table) -> tuple[pa.Table, pa.Table]:
+    """What a seed determines, and what a clock measured, by flight."""
+    return table.drop_columns([*TIMES]), table.select(["flight", *TIMES])
+
+
+def read_table(path: Path) -> pa.Table:
+    """A table of flights.
+
+    Raises:
+        FileError: the file is missing, damaged, or none of ours.
+    """
+    table = read_parquet(path)
+    if "flight" not in table.column_names:
+        raise FileError(path, "is not a campaign's table: it has no column 'flight'")
+    return table
+
+
+def unit_of(table: pa.Table, column: str) -> str:
+    """The unit of a column; `-` for none."""
+    return str((table.schema.field(column).metadata or {}).get(b"unit", b"-").decode())
+
+
+def _numbers(log: FlightLog) -> Row:
+    control = log.control
+    tracked = metrics.tracking(control)
+    accepted = sum(status in ACCEPTED for status in control.status)
+    by_solver = np.array([by not in NO_SOLVER for by in control.answered_by])
+    grounded = sum(status in (Phase.LANDED, Phase.CRASHED) for status in control.status)
+    return {
+        **{f"{measure}.{name}": tracked[measure][name] for measure in _MEASURES for name in REFERENCE_NAMES},
+        **metrics.control(control),
+        "peak_tilt": metrics.peak_tilt(log.plant.state),
+        "fallback_periods": int(np.count_nonzero(control.fallback)),
+        "fallback_max": int(control.fallback.max()),
+        "unsolved_periods": control.t.size - accepted - grounded,
+        "slack_max": float(control.slack.max()),
+        "solver_periods": int(by_solver.sum()),
+        "iterations.mean": float(control.iterations[by_solver].mean()) if by_solver.any() else None,
+        "iterations.max": int(control.iterations[by_solver].max()) if by_solver.any() else None,
+        "step_p50_ms": float(np.percentile(log.timing.step_ms, 50)),
+        "step_p99_ms": float(np.percentile(log.timing.step_ms, 99)),
+    }
+
+
+def _share(finding: Finding) -> float:
+    """A margin, tolerance included, as a share of half its band."""
+    at_physics_rate = finding.worst_margin + finding.limit.tolerance
+    at_samples = finding.worst_margin_sampled + finding.limit.tolerance_sampled
+    nearest = np.fmin(at_physics_rate, at_samples) if math.isfinite(at_physics_rate) else at_physics_rate
+    return float(nearest) / finding.limit.half_band
+
+
+def numbers(table: pa.Table, name: str) -> Array:
+    """(K,) a column of numbers or of truth values; NaN where a flight has none, or where there is no such column."""
+    if name not in table.column_names:
+        return np.full(table.num_rows, np.nan)
+    return np.array(table[name].cast(pa.float64()).to_numpy(), float)
+
+
+def flags(table: pa.Table, name: str, *, absent: bool) -> Flags:
+    """(K,) a column of truth values, with `absent` where a flight has none."""
+    return np.array(table[name].fill_null(absent).to_pylist(), bool)
+
+
+def texts(table: pa.Table, name: str) -> Texts:
+    """(K,) a column as text, `-` where a flight has none; truth values as `true` and `false`."""
+    words = table[name].cast(pa.string()) if pa.types.is_boolean(table[name].type) else table[name]
+    return np.array(["-" if value is None else str(value) for value in words.to_pylist()], object)
+
+
+def verdicts(table: pa.Table) -> dict[str, Flags]:
+    """(K,) which flights have each verdict."""
+    return {verdict: np.asarray(texts(table, "verdict") == verdict, bool) for verdict in VERDICTS}
+
+
+def is_counted(table: pa.Table, event: Event) -> Flags:
+    """(K,) which flights count for an event's share: of failure and violation, those that show whether it happened.
+
+    An incomplete flight without it shows neither: it is left out, as it is no success.
+    """
+    if event.text not in ("failure", "violation") or "verdict" not in table.column_names:
+        return np.ones(table.num_rows, bool)
+    return np.asarray((texts(table, "verdict") != INCOMPLETE) | event.column(table), bool)
+
+
+def draw_names(table: pa.Table) -> list[str]:
+    """The varied parameters, in order."""
+    return [name.removeprefix(DRAW) for name in table.column_names if name.startswith(DRAW)]
+
+
+def constraint_names(table: pa.Table) -> list[str]:
+    """The constraints of the scenario, in order."""
+    return [name.removeprefix(SATISFIED) for name in table.column_names if name.startswith(SATISFIED)]
+
+
+def metric_names(table: pa.Table) -> list[str]:
+    """The columns that measure a flight by a number, `worst_margin` included."""
+    return [name for name in table.column_names if is_number(table, name) and not name.startswith(_NO_METRIC)]
+
+
+def is_number(table: pa.Table, name: str) -> bool:
+    """Whether a column holds numbers, rather than texts or truth values."""
+    kind = table.schema.field(name).type
+    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))

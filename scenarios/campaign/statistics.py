@@ -1,0 +1,534 @@
+"""What a campaign's flights show, and with which confidence; how shares are put into words; requirements on them.
+
+Flights are taken as independent draws.  Draws spread evenly (Latin hypercube, Sobol', Halton) make estimates vary less
+than that, so that the intervals are then wider than they need be.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from decimal import Decimal
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import scipy
+from numpy.typing import ArrayLike
+
+from quadsim.errors import InputError, ParameterError
+from quadsim.report.table import ABSENT
+from quadsim.state import Array
+from scenarios.campaign.events import EVENT_NAMES, INCOMPLETE, OPERATIONS, VERDICTS, Event, Flags, parse_event
+from scenarios.campaign.rows import (
+    DRAW,
+    MARGIN,
+    SATISFIED,
+    Summary,
+    constraint_names,
+    draw_names,
+    flags,
+    is_counted,
+    is_number,
+    metric_names,
+    numbers,
+    texts,
+    unit_of,
+    verdicts,
+)
+
+
+def percent(share: float | None, digits: int = 2) -> str:
+    """A share in percent, e.g. `3.7 %`: enough digits that its distance to 0 or 100 % shows, and at least tenths."""
+    return ABSENT if share is None else f"{_percent(share, digits)} %"
+
+
+def interval(lower: float, upper: float) -> str:
+    """An interval of a share, e.g. `2.6 to 5.1 %`."""
+    return f"{_percent(lower)} to {_percent(upper)} %"
+
+
+def label(name: str, unit: str) -> str:
+    """A name with its unit, where it has one."""
+    return name if unit == "-" else f"{name} [{unit}]"
+
+
+def count_of(count: int, thing: str) -> str:
+    """A count with its noun: `1 flight`, `12 flights`."""
+    return f"{count} {thing}{'' if count == 1 else 's'}"
+
+
+def p_value(p: float) -> str:
+    """A p-value, e.g. `p = 0.012`, or `p < 0.001`."""
+    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+
+
+def _percent(share: float, digits: int = 2) -> str:
+    value = 100.0 * share
+    size = min(abs(value), abs(100.0 - value))
+    decimals = max(1, digits - 1 - math.floor(math.log10(size))) if size > 1e-9 else 0
+    return f"{value:.{decimals}f}"
+
+
+CONFIDENCE: Final = 0.95
+ALPHA: Final = 0.05  # level of the tests
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairedDifference:
+    """The differences b - a of pairs."""
+
+    pairs: int
+    mean: float | None = None  # None of no pairs
+    lower: float | None = None  # ends of the mean's t interval; None of fewer than two pairs
+    upper: float | None = None
+
+
+def upper_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> Array:
+    """One-sided upper bounds on proportions, one or (K,): the largest p that gives so few with chance 1 - confidence.
+
+    In closed form, as scipy's `proportion_ci` searches to 1e-12 alone, which is too coarse for shares near 1e-9.
+    Source: Clopper and Pearson, Biometrika 26 (1934); 1 where all happened, and of no trials.
+    """
+    counts, trials = np.asarray(counts, float), np.asarray(trials, float)
+    some = counts < trials
+    bounds = scipy.special.betaincinv(counts + 1.0, np.where(some, trials - counts, 1.0), confidence)
+    return np.where(some, bounds, 1.0)
+
+
+def lower_bounds(counts: ArrayLike, trials: ArrayLike, confidence: float = CONFIDENCE) -> Array:
+    """One-sided lower bounds on proportions, one or (K,); 0 where none happened."""
+    return 1.0 - upper_bounds(np.asarray(trials, float) - np.asarray(counts, float), trials, confidence)
+
+
+def proportion(count: int, flights: int) -> dict[str, Any]:
+    """A share of flights, None of none, with its Clopper-Pearson interval and one-sided bounds: plain data for JSON."""
+    either = 0.5 * (1.0 + CONFIDENCE)
+    return {
+        "count": count,
+        "flights": flights,
+        "share": count / flights if flights else None,
+        "lower": float(lower_bounds(count, flights, either)),
+        "upper": float(upper_bounds(count, flights, either)),
+        "lower_one_sided": float(lower_bounds(count, flights)),
+        "upper_one_sided": float(upper_bounds(count, flights)),
+    }
+
+
+def share_of(happened: np.ndarray[Any, np.dtype[np.bool_]]) -> dict[str, Any]:
+    """The `proportion` of the flights (K,) to which something happened."""
+    return proportion(int(happened.sum()), happened.size)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """P-values of several tests, corrected so that the chance of any false find stays at the level.
+
+    Source: Holm, Scandinavian Journal of Statistics 6 (1979).
+    """
+    order = np.argsort(p_values, kind="stable")
+    factors = len(p_values) - np.arange(len(p_values))
+    corrected = np.minimum(1.0, np.maximum.accumulate(factors * np.asarray(p_values, float)[order]))
+    return [float(p) for p in corrected[np.argsort(order, kind="stable")]]
+
+
+def mcnemar(only_a: int, only_b: int) -> float:
+    """Two-sided p-value of McNemar's exact test: a discordant pair is as likely to be of the first as of the second."""
+    discordant = only_a + only_b
+    return float(scipy.stats.binomtest(only_a, discordant).pvalue) if discordant else 1.0
+
+
+def paired_difference(a: Array, b: Array) -> PairedDifference:
+    """Mean of b - a, (K,) finite each, with Student's t interval."""
+    differences = np.asarray(b, float) - np.asarray(a, float)
+    n = differences.size
+    mean = float(differences.mean()) if n else None
+    if mean is None or n < 2:
+        return PairedDifference(pairs=n, mean=mean)
+    half = float(scipy.stats.t.ppf(0.5 * (1.0 + CONFIDENCE), n - 1)) * float(differences.std(ddof=1)) / math.sqrt(n)
+    return PairedDifference(pairs=n, mean=mean, lower=mean - half, upper=mean + half)
+
+
+_EXACT_UP_TO: Final = 8  # pairs up to which all permutations are counted for a rank correlation's p-value; 8! = 40 320
+_PERMUTED_UP_TO: Final = (
+    40  # pairs up to which xi's p-value is from permutations; beyond, its asymptotic law is as good
+)
+_PERMUTATIONS: Final = 9999
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dependence:
+    """How an outcome depends on a number."""
+
+    rho: float  # Spearman's rank correlation, from -1 to 1
+    p: float  # its two-sided p-value
+    xi: float  # Chatterjee's xi: about 0 where there is no dependence, 1 where the outcome is a function of the number
+    p_xi: float  # its one-sided p-value
+    flights: int  # pairs
+
+
+def dependence(x: Array, y: Array, rng: np.random.Generator) -> Dependence | None:
+    """How y depends on x, (K,) each, by two measures; ties have their mean rank.
+
+    Pairs with a NaN do not count, infinities have their rank.  rho's p-value counts all permutations of up to 8 pairs,
+    and is from Student's t beyond.  xi puts equal values of x in an order at random, as its author advises; its p-value
+    is from permutations of up to 40 pairs and from its asymptotic law beyond.  Of a y with two values, such as an
+    event, it is exact: that law is wrong for rare ones (300 flights, 2 %: p < 0.005 in 4 of 100 by chance).  None of
+    fewer than three pairs, or where one side is always the same.
+    Source: Chatterjee, Journal of the American Statistical Association 116 (2021).
+    """
+    there = ~(np.isnan(x) | np.isnan(y))
+    x, y = scipy.stats.rankdata(x[there]), scipy.stats.rankdata(y[there])
+    if x.size < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+        return None
+    rho, p = _spearman(x, y)
+    y = y[np.lexsort((rng.random(x.size), x))]
+    permuted = scipy.stats.PermutationMethod(n_resamples=_PERMUTATIONS, rng=rng)
+    event = np.unique(y).size == 2
+    method = permuted if y.size <= _PERMUTED_UP_TO and not event else "asymptotic"
+    xi = scipy.stats.chatterjeexi(np.arange(y.size), y, method=method)
+    p_xi = _p_of_few_runs(y > y.min()) if event else float(xi.pvalue)
+    return Dependence(rho=rho, p=p, xi=float(xi.statistic), p_xi=p_xi, flights=y.size)
+
+
+def _spearman(x: Array, y: Array) -> tuple[float, float]:
+    """Rank correlation of ranks, and its p-value."""
+    if x.size > _EXACT_UP_TO:
+        ranked = scipy.stats.spearmanr(x, y)
+        return float(ranked.statistic), float(ranked.pvalue)
+    y = (y - y.mean()) / (np.linalg.norm(x - x.mean()) * np.linalg.norm(y - y.mean()))
+
+    def correlation(ranks: Array, axis: int = -1) -> Any:
+        return np.sum(ranks * y, axis=axis)
+
+    test = scipy.stats.permutation_test((x,), correlation, permutation_type="pairings", n_resamples=np.inf)
+    return float(test.statistic), float(test.pvalue)
+
+
+def _p_of_few_runs(happened: Flags) -> float:
+    """Probability of as few runs of equal values, when all orders are equally likely (Wald and Wolfowitz, 1940).
+
+    Of an event, xi counts such runs.
+    """
+    ones, zeros = int(happened.sum()), int((~happened).sum())
+    runs = np.arange(2, np.count_nonzero(np.diff(happened)) + 2)
+    fewer, more = runs // 2, (runs + 1) // 2  # runs of the one value and of the other, or the reverse
+
+    def ways(of_ones: Any, of_zeros: Any) -> Array:
+        return _log_binomial(ones - 1, of_ones - 1) + _log_binomial(zeros - 1, of_zeros - 1)
+
+    either = np.logaddexp(ways(fewer, more), ways(more, fewer))
+    return float(np.exp(scipy.special.logsumexp(either) - _log_binomial(happened.size, ones)))
+
+
+def _log_binomial(n: int, k: Any) -> Array:
+    """Logarithm of n over k; minus infinity where k > n."""
+    gammaln = scipy.special.gammaln
+    return np.asarray(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
+
+
+FAILURE: Final = parse_event("failure")
+WORST_FLIGHTS: Final = 10
+_PERCENTILES: Final = {"min": 0, "p5": 5, "p50": 50, "p95": 95, "p99": 99, "max": 100}
+_GROUPS: Final = ((50, 5), (12, 3))
+"""Flights from which a varied parameter's values are looked at in this many groups of about equal size."""
+
+
+def estimate(table: pa.Table) -> dict[str, Any]:
+    """Everything in a campaign's summary about its flights, as plain data for JSON.
+
+    Keys: `flights`; `confidence` of every interval; `verdicts`, flights of each; `events` and `constraints`, by name,
+    as `proportion`, a constraint's being that it did not hold, among the flights that reached it or were lost before;
+    `metrics`, over the flights that have each; `parameters`, how the outcome depends on each varied parameter;
+    `worst`, the ten worst flights.
+
+    Incomplete flights are neither failures nor successes (`rows.is_counted`): the shares of failure and
+    violation, and `parameters`, leave them out.
+    """
+    return {
+        "flights": table.num_rows,
+        "confidence": CONFIDENCE,
+        "verdicts": {verdict: int(flown.sum()) for verdict, flown in verdicts(table).items()},
+        "events": {
+            event.text: share_of(event.column(table)[is_counted(table, event)])
+            for event in map(parse_event, EVENT_NAMES)
+        },
+        "metrics": {name: _metric(table, name) for name in metric_names(table)},
+        "constraints": {name: _constraint(table, name) for name in constraint_names(table)},
+        "parameters": parameters(table.filter(is_counted(table, FAILURE))),
+        "worst": [_flight(table, int(i)) for i in ranking(table)[:WORST_FLIGHTS]],
+    }
+
+
+def worst_flight(table: pa.Table) -> int:
+    """The number of the worst flight; see `ranking`.
+
+    Raises:
+        ParameterError: there is no flight.
+    """
+    if not table.num_rows:
+        raise ParameterError("campaign", "flights", 0, "at least one, to find the worst")
+    return int(table["flight"][int(ranking(table)[0])].as_py())
+
+
+def ranking(table: pa.Table) -> np.ndarray[Any, np.dtype[np.intp]]:
+    """(K,) rows of the table, from the worst flight on.
+
+    By verdict (`Verdict.badness`); of one verdict, failed ones come first, then the smaller worst margin.  Flights
+    without a margin come after those with one, by their RMS error in position, the largest first.  What is still equal
+    is in the order of the flights' numbers.
+    """
+    badness = np.array([VERDICTS[name].badness for name in texts(table, "verdict")], int)
+    margin = numbers(table, "worst_margin")
+    errors = np.stack([np.nan_to_num(numbers(table, f"rmse.{axis}")) for axis in "xyz"])
+    distance = np.where(np.isnan(margin), np.linalg.norm(errors, axis=0), 0.0)
+    keys = (
+        numbers(table, "flight"),
+        -distance,
+        np.where(np.isnan(margin), np.inf, margin),
+        ~flags(table, "failed", absent=True),
+        -badness,
+    )
+    return np.lexsort(keys)
+
+
+def _metric(table: pa.Table, name: str) -> dict[str, Any]:
+    values = numbers(table, name)
+    values = values[np.isfinite(values)]
+    about: dict[str, Any] = {"unit": unit_of(table, name), "flights": int(values.size)}
+    if not values.size:
+        return about | dict.fromkeys(("mean", "sd", *_PERCENTILES))
+    percentiles = np.percentile(values, [*_PERCENTILES.values()]).tolist()
+    return about | {
+        "mean": float(values.mean()),
+        "sd": float(values.std(ddof=1)) if values.size > 1 else None,
+        **dict(zip(_PERCENTILES, percentiles, strict=True)),
+    }
+
+
+def _constraint(table: pa.Table, name: str) -> dict[str, Any]:
+    margin = numbers(table, MARGIN + name)
+    held = flags(table, SATISFIED + name, absent=False)
+    unknown = [value is None for value in table[SATISFIED + name].to_pylist()]
+    reached = ~(np.array(unknown, bool) & np.isin(texts(table, "verdict").astype(str), (INCOMPLETE, "violated")))
+    worst = int(np.nanargmin(margin)) if np.isfinite(margin).any() else None
+    return {
+        "unit": unit_of(table, MARGIN + name),
+        "not_satisfied": share_of(~held[reached]),
+        "worst_margin": None if worst is None else float(margin[worst]),
+        "worst_flight": None if worst is None else table["flight"][worst].as_py(),
+    }
+
+
+def _flight(table: pa.Table, row: int) -> dict[str, Any]:
+    shown = ("flight", "verdict", "failed", "worst_margin", "worst_constraint", "duration", "reason")
+    values = table.slice(row, 1).to_pylist()[0]
+    return {name: values[name] for name in shown} | {"draws": {name: values[DRAW + name] for name in draw_names(table)}}
+
+
+def parameters(table: pa.Table) -> dict[str, Any]:
+    """A campaign's summary of each varied parameter, as plain data for JSON.
+
+    Of a number: its `unit`; under `worst_margin` and `failed` how that depends on it (`Dependence`), None
+    where there is nothing to relate; failures by `groups` of its values from the lowest on.  All p-values of all
+    parameters, outcomes and measures together are corrected by Holm's method: `p_holm`, `p_xi_holm`.
+    Of what is drawn from names or truth values: the failures by level.
+    """
+    failed = flags(table, "failed", absent=True)
+    margin = numbers(table, "worst_margin")
+    if not np.isnan(margin).all():  # one that was lost before it had any ranks below all others
+        margin = np.where(np.isnan(margin) & verdicts(table)["lost"], -np.inf, margin)
+    outcomes: dict[str, Any] = {}
+    tested: list[dict[str, Any]] = []
+    for name in draw_names(table):
+        if not is_number(table, DRAW + name):
+            outcomes[name] = _levels(table, name, failed)
+            continue
+        values = numbers(table, DRAW + name)
+        outcomes[name] = {"kind": "number", "unit": unit_of(table, DRAW + name)}
+        for outcome, reached in (("worst_margin", margin), ("failed", failed.astype(float))):
+            related = dependence(values, reached, np.random.default_rng(0))  # the same every time
+            outcomes[name][outcome] = None if related is None else asdict(related)
+            tested += [] if related is None else [outcomes[name][outcome]]
+        outcomes[name]["groups"] = _groups(values, failed)
+    corrected = iter(holm([entry[key] for entry in tested for key in ("p", "p_xi")]))
+    for entry in tested:
+        entry |= {"p_holm": next(corrected), "p_xi_holm": next(corrected)}
+    return outcomes
+
+
+def drivers(summary: Summary) -> dict[str, Mapping[str, Any]]:
+    """The varied parameters on which an outcome may depend at all, the strongest first.
+
+    They are ordered by how `worst_margin` depends on them, or else `failed`.
+    """
+    related = {
+        name: found for name, found in summary["parameters"].items() if found.get("worst_margin") or found.get("failed")
+    }
+
+    def weakness(parameter: tuple[str, Mapping[str, Any]]) -> tuple[float, float]:
+        related = parameter[1]["worst_margin"] or parameter[1]["failed"]
+        return min(related["p_holm"], related["p_xi_holm"]), -max(abs(related["rho"]), related["xi"])
+
+    return dict(sorted(related.items(), key=weakness))
+
+
+def _levels(table: pa.Table, name: str, failed: Flags) -> dict[str, Any]:
+    levels = texts(table, DRAW + name)
+    shares = {level: share_of(failed[levels == level]) for level in sorted(set(levels))}
+    return {"kind": "name", "unit": unit_of(table, DRAW + name), "levels": shares}
+
+
+def _groups(values: Array, failed: Flags) -> list[dict[str, Any]]:
+    """Failures by thirds or fifths of a varied parameter, or by its values if no more; none of few flights."""
+    there = np.isfinite(values)
+    values, failed = values[there], failed[there]
+    size = next((groups for flights, groups in _GROUPS if values.size >= flights), 0)
+    if not size:
+        return []
+    distinct = np.unique(values)
+    cuts = distinct[1:] if distinct.size <= size else np.quantile(values, np.arange(1, size) / size)
+    group = np.searchsorted(cuts, values, side="right")
+    return [
+        {"low": float(values[of].min()), "high": float(values[of].max()), **share_of(failed[of])}
+        for of in (group == k for k in np.unique(group))
+    ]
+
+
+EXAMPLE: Final = "P(violation) < 0.01 @ 95%"
+_SHARES: Final = (Decimal("1e-9"), 1 - Decimal("1e-9"))
+_CONFIDENCES: Final = (Decimal("0.5"), Decimal("0.999999"))
+_FORM: Final = re.compile(
+    r"P\s*\((?P<event>[^()]*)\)\s*(?P<operation><=|>=|<|>)\s*(?P<share>[^<>=@]+?)\s*@\s*(?P<confidence>[^@%]+?)\s*%",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Requirement:
+    """The probability of an event on one side of a share, with this confidence."""
+
+    text: str
+    event: Event
+    operation: str
+    share: float
+    confidence: float
+
+    @property
+    def at_most(self) -> bool:
+        """Whether the probability is to be small, rather than large."""
+        return self.operation.startswith("<")
+
+    def supported_by(self, bound: float) -> bool:
+        """Whether a one-sided bound on the probability is on the required side."""
+        return bool(OPERATIONS[self.operation](bound, self.share))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """Whether the flights support a requirement."""
+
+    requirement: Requirement
+    count: int  # flights in which the event happened
+    flights: int
+    bound: float  # one-sided, at the requirement's confidence: upper where the probability is to be small, else lower
+    holds: bool
+    least_flights: int  # that can support it, all of them in its favour
+
+    @property
+    def sentence(self) -> str:
+        """The judgement with its numbers."""
+        required = self.requirement
+        share = f" ({percent(self.count / self.flights)})" if self.flights else ""
+        phrase = (
+            f"{required.text} {'holds' if self.holds else 'does not hold'}: {required.event.text} in {self.count} of "
+            f"{count_of(self.flights, 'flight')}{share}, so with {100.0 * required.confidence:g} % confidence at "
+            f"{'most' if required.at_most else 'least'} {percent(self.bound, digits=3)}."
+        )
+        if self.flights >= self.least_flights:
+            return phrase
+        least = count_of(self.least_flights, "flight")
+        return f"{phrase} It takes at least {least}, {'none' if required.at_most else 'all'} of them with that event."
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for `summary.json`."""
+        required = asdict(self.requirement) | {"event": self.requirement.event.text}
+        return asdict(self) | {"requirement": required, "sentence": self.sentence}
+
+
+def parse_requirement(text: str) -> Requirement:
+    """A requirement `P(EVENT) OP SHARE @ CONFIDENCE%`, with an event as `events.parse_event` takes it.
+
+    The share is from 1e-9 to 1 - 1e-9, as such or in percent, the confidence from 50 to 99.9999 percent.
+
+    Raises:
+        InputError: it is not of that form.
+        UnknownNameError: there is no such event.
+        ParameterError: a number is outside what is allowed.
+    """
+    text = " ".join(text.split())
+    owner, form = f"requirement {text!r}", _FORM.fullmatch(text)
+    if form is None:
+        raise InputError(
+            f"{owner} must read P(EVENT) OP SHARE @ CONFIDENCE%, with one of < <= > >=, such as {EXAMPLE!r}"
+        )
+    return Requirement(
+        text=text,
+        event=parse_event(form["event"].strip()),
+        operation=form["operation"],
+        share=_number(owner, "share", form["share"], *_SHARES),
+        confidence=_number(owner, "confidence", form["confidence"] + "%", *_CONFIDENCES),
+    )
+
+
+def judge(table: pa.Table, requirement: Requirement) -> Judgement:
+    """Hold a campaign's flights, `flights.parquet`, against a requirement.
+
+    It holds when the one-sided Clopper-Pearson bound at its confidence is on the required side; so it takes
+    flights enough, and no flights support nothing.  Incomplete flights do not count (`rows.is_counted`).
+
+    Raises:
+        UnknownNameError: the table has no column that the event names.
+        InputError: the event compares text with a number.
+    """
+    happened = requirement.event.column(table)[is_counted(table, requirement.event)]
+    count, flights = int(happened.sum()), happened.size
+    bound = _bound(requirement, count, flights)
+    holds, least = flights > 0 and requirement.supported_by(bound), least_flights(requirement)
+    return Judgement(
+        requirement=requirement, count=count, flights=flights, bound=bound, holds=holds, least_flights=least
+    )
+
+
+def least_flights(requirement: Requirement) -> int:
+    """The smallest number of flights that can support a requirement, all of them in its favour.
+
+    With n such flights the bound is (1 - confidence)^(1/n) from the far end, which requires
+    n = ln(1 - confidence) / ln(1 - share); at a tie, the bound itself as it is computed decides.
+    """
+    per_flight = math.log1p(-requirement.share) if requirement.at_most else math.log(requirement.share)
+    n = max(1, math.ceil(math.log1p(-requirement.confidence) / per_flight))
+    near = range(max(1, n - 1), n + 2)
+    best = ((k, _bound(requirement, 0 if requirement.at_most else k, k)) for k in near)
+    return next((k for k, bound in best if requirement.supported_by(bound)), n)
+
+
+def _bound(requirement: Requirement, count: int, flights: int) -> float:
+    """The one-sided bound on the probability."""
+    bounds = upper_bounds if requirement.at_most else lower_bounds
+    return float(bounds(count, flights, requirement.confidence))
+
+
+def _number(owner: str, name: str, text: str, low: Decimal, high: Decimal) -> float:
+    """A share of one, given as such or in percent."""
+    in_percent = text.endswith("%")
+    with contextlib.suppress(ArithmeticError):
+        value = Decimal(text.removesuffix("%").strip()) / (100 if in_percent else 1)
+        if low <= value <= high:
+            return float(value)
+    rule = f"a number from {low} to {high}".lower()
+    if in_percent:
+        rule = f"from {(100 * low).normalize():f}% to {(100 * high).normalize():f}%"
+    raise ParameterError(owner, name, text, rule)

@@ -1,1 +1,0 @@
-"""What a campaign's flights show, and with which confidence."""

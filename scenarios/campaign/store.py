@@ -1,0 +1,298 @@
+"""A campaign's directory while it grows: nothing that was flown is lost, or there twice, whatever is killed.
+
+Rows are appended as files of their own below `parts/`.  When all is flown the parts become `flights.parquet` and
+`timing.parquet`, and go.  The manifest has what was flown, by which code, and how far it is.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import io
+import sys
+import time as clock
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from mpc.core.library import why_missing
+from quadsim.assets import models_dir
+from quadsim.errors import FileError, InputError
+from quadsim.flight.rundir import read_json, require_inside
+from quadsim.outputs import SUMMARY_FILE, Growing, digest_of, to_json
+from scenarios.campaign.campaign_file import CampaignFile
+from scenarios.campaign.plan import Plan, load_plan
+from scenarios.campaign.rows import TIMES, Row, make_table, read_table, split_times
+from scenarios.machine import machine, versions
+from scenarios.parts.plugin import import_plugin
+from scenarios.schema.plugin import ForceSpec, PluginSpec
+
+MANIFEST_FILE: Final = "manifest.json"
+CAMPAIGN_FILE: Final = "campaign.toml"
+SCENARIO_FILE: Final = "scenario.toml"
+FORMAT: Final = "quadsim campaign"
+_FORM: Final = {"format": str, "name": str, "status": str, "flights": int, "flown": int, "sessions": list}
+_ROOT: Final = Path(__file__).resolve().parents[2]
+FLIGHTS_FILE: Final = "flights.parquet"
+TIMES_FILE: Final = "timing.parquet"
+FLUSH_S: Final = 5.0  # how long an answer may wait in memory before it is on the disk [s]
+PARTS_DIR: Final = "parts"
+
+
+def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
+    """A campaign's table, with or without its clock times.
+
+    Raises:
+        FileError: it cannot be read, it has other columns than the campaign, or flights are there twice, or unsorted.
+    """
+    table = read_table(path)
+    kinds = {field.name: field.type for field in table.schema}
+    if any(kinds.get(field.name) != field.type for field in schema if field.name not in TIMES):
+        raise FileError(path, "has other columns than this campaign")
+    flights = table["flight"].to_numpy()
+    if flights.size and (flights[0] < 0 or (np.diff(flights) <= 0).any()):
+        raise FileError(path, "has flights that are not numbered upwards from 0")
+    return table
+
+
+class Store:
+    """The rows of a campaign on disk, in the columns of `scenarios.campaign.rows.make_schema`."""
+
+    def __init__(self, files: Growing, schema: pa.Schema) -> None:
+        self._files, self._directory, self._schema = files, files.path, schema
+        self._waiting: list[Row] = []
+        self._flushed = clock.perf_counter()
+
+    def table(self) -> pa.Table:
+        """All flights that are there, each once, sorted.
+
+        Raises:
+            FileError: a file is damaged or of another campaign.
+        """
+        tables = [self._schema.empty_table()]
+        if (path := self._directory / FLIGHTS_FILE).is_file():
+            table, times = read_flights(path, self._schema), read_table(self._directory / TIMES_FILE)
+            same = times["flight"].equals(table["flight"])  # else the process died between the two files
+            for name in TIMES:
+                absent = pa.nulls(table.num_rows, self._schema.field(name).type)
+                table = table.append_column(name, times[name] if same else absent)
+            tables.append(table)
+        tables += [read_flights(self._directory / name, self._schema) for name in self._parts()]
+        columns = [[table[name] for name in self._schema.names] for table in tables]
+        whole = pa.concat_tables(pa.Table.from_arrays(arrays, schema=self._schema) for arrays in columns)
+        _, first = np.unique(whole["flight"].to_numpy(), return_index=True)
+        return whole.take(first)
+
+    def counted(self) -> int:
+        """Flights of the final table that is there; 0 where there is none."""
+        path = self._directory / FLIGHTS_FILE
+        return read_table(path).num_rows if path.is_file() else 0
+
+    def add(self, row: Row) -> None:
+        """Add a row, which may wait in memory until `flush`, though not for long."""
+        self._waiting.append(row)
+        if clock.perf_counter() - self._flushed > FLUSH_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Append the rows that wait."""
+        self._flushed = clock.perf_counter()
+        self.append(self._waiting)
+        self._waiting = []  # not before: by Ctrl-C it is appended once more, to the same file
+
+    def append(self, rows: Sequence[Row]) -> None:
+        """Add rows in one step.
+
+        Raises:
+            OutputError: they cannot be written; what was there is still there.
+        """
+        if rows:
+            first = min(row["flight"] for row in rows)
+            self._files.write({f"{PARTS_DIR}/part-{first:09d}.parquet": _encoded(make_table(rows, self._schema))})
+
+    def close(self, flights: int) -> pa.Table:
+        """Put the first `flights` flights into their final two tables, remove the parts, return `flights.parquet`.
+
+        Raises:
+            OutputError: they cannot be written; the parts are still there.
+        """
+        whole = self.table()
+        table, times = split_times(whole.filter(pc.less(whole["flight"], flights)))
+        self._files.write({TIMES_FILE: _encoded(times), FLIGHTS_FILE: _encoded(table)})
+        self._files.remove(self._parts())
+        return table
+
+    def _parts(self) -> list[str]:
+        """The parts that are there, by their names relative to the directory."""
+        return sorted(f"{PARTS_DIR}/{path.name}" for path in (self._directory / PARTS_DIR).glob("part-*.parquet"))
+
+
+def _encoded(table: pa.Table) -> bytes:
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer, compression="zstd")
+    return buffer.getvalue()
+
+
+def start(plan: Plan, files: Growing, session: Mapping[str, Any], *, flying: bool) -> dict[str, Any]:
+    """The manifest of a campaign that begins, or is resumed, with the files that define it, itself the last of them.
+
+    Raises:
+        FileError: it is damaged.
+        InputError: something has to be flown, and other code would fly it.
+        OutputError: they cannot be written.
+    """
+    manifest: dict[str, Any] = {
+        "format": FORMAT,
+        "name": plan.spec.name,
+        "description": plan.spec.description,
+        "scenario": plan.scenario.name,
+        "status": "running",
+        "flights": plan.spec.flights,
+        "flown": 0,
+        **flown_by(plan),
+        "sessions": [],
+    }
+    if is_campaign(files.path):
+        known = read_manifest(files.path)
+        differing = [name for name in other_than_flew(known, plan) if name != "machine"]
+        if flying and differing:
+            raise InputError(
+                f"{files.path}: --resume needs the same code, and this one differs from what flew the first flights "
+                f"({', '.join(differing)}): half of the numbers would be another program's; choose another --out"
+            )
+        manifest = {**known, "status": "running", "flights": plan.spec.flights}
+        files.remove([SUMMARY_FILE])  # which is there, with the hashes of all others, while nothing is being flown
+    manifest["sessions"].append(session)
+    texts = {
+        CAMPAIGN_FILE: _stored(plan).to_toml(),
+        SCENARIO_FILE: plan.scenario.to_toml(),
+    }  # files that need no others
+    files.write({name: text.encode() for name, text in texts.items()})
+    write(manifest, files)
+    return manifest
+
+
+def write(manifest: Mapping[str, Any], files: Growing) -> None:
+    """Write or replace the manifest in one step."""
+    files.write({MANIFEST_FILE: to_json(manifest).encode()})
+
+
+def require_same(plan: Plan, directory: Path) -> None:
+    """Refuse to continue a campaign by another one.
+
+    Raises:
+        FileError: there is none, or it is damaged.
+        InputError: it is another one.
+    """
+    known = stored_plan(directory)
+    differing = [
+        field.name
+        for field in fields(CampaignFile)
+        if getattr(_stored(plan), field.name) != getattr(_stored(known), field.name)
+    ]
+    grows = plan.spec.sampling != "latin_hypercube" and plan.spec.flights >= known.spec.flights
+    if differing == ["flights"] and grows:
+        differing = []
+    if known.scenario != plan.scenario:
+        differing.append("scenario")
+    if differing:
+        rule = "; more flights may follow, except of a latin_hypercube" if differing == ["flights"] else ""
+        raise InputError(
+            f"{directory}: --resume needs the same campaign, and its {', '.join(differing)} differs from "
+            f"the one there{rule}; choose another --out"
+        )
+
+
+def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
+    """Of what `flown_by` states, that which is not as when a campaign was begun."""
+    return [name for name, value in flown_by(plan).items() if manifest.get(name) != value]
+
+
+def flown_by(plan: Plan) -> dict[str, Any]:
+    """What numbers come from besides the campaign's own files; imports code of the user."""
+    controller = plan.scenario.controller
+    return {
+        "code": code_digest(),
+        "controller": _user_code(controller) if isinstance(controller, PluginSpec) else None,
+        "forces": [_user_code(force) for force in plan.scenario.forces] or None,
+        "versions": versions(),
+        "machine": machine(),
+    }
+
+
+@functools.cache
+def code_digest() -> str:
+    """SHA-256 of everything of ours that numbers come from: code, models, scenarios, and whether there is a core."""
+    code = _digest([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
+    return code if why_missing() is None else f"{code}, without the core"
+
+
+def _user_code(spec: PluginSpec | ForceSpec) -> str | None:
+    """SHA-256 of a user's module, or of the whole package that it is in; None without a file."""
+    file = getattr(sys.modules[import_plugin(spec).__module__.partition(".")[0]], "__file__", None)
+    if file is None:
+        return None
+    return _digest([Path(file).parent if Path(file).name == "__init__.py" else Path(file)])
+
+
+def _digest(roots: Iterable[Path]) -> str:
+    """SHA-256 of the code, models and scenarios in files and folders."""
+    digest = hashlib.sha256()
+    for root in roots:
+        for path in [root] if root.is_file() else sorted(root.rglob("*")):
+            if path.suffix in (".py", ".c", ".h", ".toml", ".xml") and path.is_file():
+                digest.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
+                digest.update(path.read_bytes())
+    return f"sha256:{digest.hexdigest()}"
+
+
+def read_manifest(directory: Path) -> dict[str, Any]:
+    """`manifest.json` of a campaign.
+
+    Raises:
+        FileError: there is none, or it is not one of ours.
+    """
+    require_inside(directory)
+    path = directory / MANIFEST_FILE
+    if not path.is_file():
+        raise FileError(directory, f"is not a campaign: it has no {MANIFEST_FILE}")
+    manifest = read_json(path, _FORM, "a campaign's manifest")
+    if manifest["format"] != FORMAT:
+        raise FileError(path, "is not a campaign's manifest: it lacks or misstates format")
+    return manifest
+
+
+def is_campaign(directory: Path) -> bool:
+    """Whether a path is a campaign's directory."""
+    try:
+        read_manifest(directory)
+    except FileError:
+        return False
+    return True
+
+
+def stored_plan(directory: Path) -> Plan:
+    """The campaign that a directory holds, from its own files.
+
+    Raises:
+        FileError: it is none, or a file is missing or not the one that was flown.
+    """
+    read_manifest(directory)
+    path = directory / SUMMARY_FILE  # of a finished campaign
+    listed = read_json(path, {}, "a campaign's summary").get("files", {}) if path.exists() else {}
+    for name in (CAMPAIGN_FILE, SCENARIO_FILE, *(name for name in (FLIGHTS_FILE, TIMES_FILE) if name in listed)):
+        path = directory / name
+        if not path.is_file() or (name in listed and digest_of(path) != listed[name]):
+            raise FileError(path, "is missing or not the file that was written")
+    return load_plan(str(directory / CAMPAIGN_FILE))
+
+
+def _stored(plan: Plan) -> CampaignFile:
+    """The campaign's file as its directory has it, with the scenario beside it."""
+    return replace(plan.spec, scenario=SCENARIO_FILE, set={})

@@ -1,0 +1,313 @@
+"""What happens in a flight besides the course and the controller that it starts with, known in advance or not.
+
+A model is compiled, sensors are sampled and forces are evaluated in one way where something may happen to them, and in
+another where nothing can, with other last bits.  An event that changes nothing decides: it is in the scenario of a
+live flight and in the one that is saved of it, whether or not anything of its kind happened.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import insort
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
+from typing import TYPE_CHECKING, Any, Final, get_args
+
+from mpc.ocp import InfeasiblePeriod
+from quadsim.controller import Controller
+from quadsim.errors import InputError, ParameterError, printable
+from quadsim.sim.computation import Stall
+from quadsim.sim.effects import LOADING, Push
+from quadsim.sim.effects.load import Load, MassChange, PayloadDrop, PayloadPickup
+from quadsim.sim.effects.wind import Air, Gust, WindChange
+from quadsim.sim.loop import ClosedLoop
+from quadsim.sim.navigation import Navigation
+from quadsim.sim.plant import Plant
+from quadsim.sim.sensing import SensorName
+from scenarios.schema.controller import ControllerSpec, changed
+from scenarios.schema.events import (
+    MOST_EVENTS,
+    ControllerEvent,
+    Event,
+    SensorFaultEvent,
+    SensorText,
+    SetpointEvent,
+)
+from scenarios.schema.problems import parse_table
+
+if TYPE_CHECKING:
+    from scenarios.assembly import Assembly
+    from scenarios.courses.followed import FollowedCourse
+    from scenarios.schema.scenario import Scenario
+
+_DEPENDENT: Final = (ControllerEvent, PayloadDrop, PayloadPickup, SensorFaultEvent)
+"""The events that depend on what else the scenario has."""
+_MOST: Final = 3  # events of one kind in a row that are reported one by one; more of them in one entry
+_LONGEST: Final = 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class Successor:
+    """A controller that is ready to take over, and the table of a scenario file that it is made of."""
+
+    spec: ControllerSpec
+    controller: Controller
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Listed:
+    """A table that has events, for messages to name them."""
+
+    events: list[Event]
+
+
+class FlightEvents:
+    """The events of a flight, those of its scenario and those that are applied, each put to what it acts on.
+
+    Attributes:
+        assembly: of what is flown, with the events that were applied.
+        unanswered: the first period whose QP had no answer, of the controllers before the one that flies now.
+    """
+
+    def __init__(
+        self,
+        assembly: Assembly,
+        *,
+        plant: Plant,
+        navigation: Navigation | None,
+        reference: FollowedCourse,
+        loop: ClosedLoop,
+        build: Callable[[ControllerSpec], Controller] | None,
+    ) -> None:
+        """Set up, before the first period; `build` makes a controller, None where the user's own one flies."""
+        self.assembly, scenario = assembly, assembly.scenario
+        self._spec = scenario.controller
+        self._plant, self._navigation, self._reference, self._loop = plant, navigation, reference, loop
+        self._build = build
+        self._recent: list[Event] = scenario.events  # those that the plant may still have to do with, and others
+        self.unanswered: InfeasiblePeriod | None = None
+        self._due: list[tuple[int, float, SetpointEvent | ControllerEvent, Successor | None]] = []
+        for event in scenario.events:
+            self._schedule(event)
+        loop.before = self._begin
+
+    def close(self) -> None:
+        """Let go of what refers back here, so that nothing of the flight stays in a cycle."""
+        self._loop.before = self._build = None
+
+    @property
+    def scenario(self) -> Scenario:
+        """What is flown, with the events that were applied."""
+        return self.assembly.scenario
+
+    def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
+        """See `scenarios.rollout.Rollout.apply`."""
+        event = self._stamped(event)
+        scenario = self._with(event)
+        assembly = self.assembly.of(scenario)
+        if isinstance(event, SetpointEvent):
+            self._schedule(event)
+        elif isinstance(event, ControllerEvent):
+            self._succeed(event, scenario, successor)
+        elif isinstance(event, Stall):
+            self._loop.computation = assembly.computation(self._spec)
+        elif isinstance(event, SensorFaultEvent):
+            if self._navigation is None or not self._navigation.watches(SensorName(event.sensor)):
+                raise _not_started_for(event)
+            self._navigation.reschedule(assembly.faults)
+        elif isinstance(event, Gust | WindChange):
+            _ = assembly.moving_air
+            if self._plant.wind is None:
+                raise _not_started_for(event)
+            self._plant.wind.reschedule(*assembly.winds)
+        else:
+            past = self._loop.time - scenario.control_period
+            recent = [e for e in (*self._recent, event) if e.at + _lasting(e) >= past]
+            changes = assembly.changes(recent)
+            if not self._plant.allows(changes):
+                raise _not_started_for(event)
+            self._plant.reschedule(changes)
+            self._recent = recent
+        self.assembly = assembly
+        return event
+
+    def successor(self, fields: Mapping[str, Any]) -> Successor:
+        """See `scenarios.rollout.Rollout.successor`."""
+        return self._built(changed(self._spec, fields))
+
+    def flown(self) -> Scenario:
+        """The scenario up to now, unless the flight has ended otherwise, or nothing has been flown."""
+        scenario, k = self.scenario, self._loop.k
+        if k in (0, scenario.periods) or self._loop.reason is not None:
+            return scenario
+        duration = round(k * scenario.control_period, 9)
+        events = [event for event in scenario.events if event.at < duration]
+        for event in scenario.events:
+            substitute = None if event.at < duration else neutral(scenario, event)
+            if substitute is not None and substitute not in events:
+                events.insert(0, substitute)
+        return scenario.model_copy(update={"duration": duration, "events": events})
+
+    def _stamped(self, event: Event | Mapping[str, Any]) -> Event:
+        """An event with the time at which it happens, to act from the first period on that is not observed yet."""
+        step, first = self.scenario.plant.timestep, self._loop.k + self._loop.observed
+        at = round(first * self.scenario.control_period, 9)
+        if isinstance(event, Mapping):
+            event = parse_table(_Listed, {"events": [{**event, "at": at}]}, "event").events[0]
+        if isinstance(event, SensorFaultEvent):  # what is sensed at the period's begin has been sensed
+            at = round(at + step, 9)
+        if isinstance(event, Stall) and self._loop.answered >= at:  # a command that has come was not held up
+            at = round(self._loop.answered + step, 9)
+        return replace(event, at=at)
+
+    def _with(self, event: Event) -> Scenario:
+        """The scenario with one event more, and as long as that takes."""
+        before, events = self.scenario, [*self.scenario.events, event]
+        if len(events) > MOST_EVENTS:
+            raise ParameterError("scenario", "events", len(events), f"of {MOST_EVENTS} or fewer entries")
+        changes: dict[str, Any] = {"events": events}
+        if event.at >= before.duration:
+            changes["duration"] = round(
+                (math.floor(event.at / before.control_period + 1e-6) + 1) * before.control_period, 9
+            )
+        scenario = before.model_copy(update=changes)
+        if isinstance(event, _DEPENDENT):
+            try:
+                scenario.require_consistent()
+            except ValueError as error:
+                raise InputError(str(error)) from error
+        return scenario
+
+    def _schedule(self, event: Event, ready: Successor | None = None) -> None:
+        """Note what happens when a period begins, the first one from its time on, and not within the plant."""
+        if isinstance(event, SetpointEvent | ControllerEvent):
+            first = math.ceil(event.at / self.scenario.control_period - 1e-6)
+            insort(self._due, (first, event.at, event, ready), key=itemgetter(0, 1))
+
+    def _begin(self, k: int) -> None:
+        """Let happen what is due when a period begins."""
+        while self._due and self._due[0][0] <= k:
+            _, _, event, ready = self._due.pop(0)
+            if isinstance(event, SetpointEvent):
+                self._reference.set(k, event.values)
+                self._loop.motion = None
+            else:
+                self._switch(changed(self._spec, event.fields), ready)
+
+    def first_unanswered(self) -> InfeasiblePeriod | None:
+        """Of all controllers so far: the first QP without an answer, or else the first SQP that did not converge."""
+        periods = [period for period in (self.unanswered, unanswered_by(self._loop.controller)) if period is not None]
+        return min(periods, key=lambda period: period.converges is not None, default=None)
+
+    def _switch(self, spec: ControllerSpec, ready: Successor | None) -> None:
+        successor = ready if ready is not None and ready.spec == spec else self._built(spec)
+        self.unanswered = self.first_unanswered()
+        self._loop.switch(successor.controller)
+        self._spec = spec
+        self._loop.computation = self.assembly.computation(spec)
+
+    def _succeed(self, event: ControllerEvent, scenario: Scenario, ready: Successor | None) -> None:
+        """Schedule a change of the controller, once it and later ones of the file are known to be possible."""
+        specs = [spec for at, spec in scenario.controller_changes if at >= event.at]
+        before = sum(at == event.at for at, _ in self.scenario.controller_changes)
+        succeeding, *later = specs[before:]
+        if ready is None or ready.spec != succeeding:
+            ready = self._built(succeeding)
+        for spec in later:
+            self._built(spec)
+        self._schedule(event, ready)
+
+    def _built(self, spec: ControllerSpec) -> Successor:
+        if self._build is None:
+            raise ParameterError("event", "type", "controller", "another one where the controller is one's own")
+        return Successor(spec=spec, controller=self._build(spec))
+
+
+def unanswered_by(controller: Controller) -> InfeasiblePeriod | None:
+    """The first period whose QP had no answer; None where all had, or there is none."""
+    period = getattr(controller, "unanswered", None)  # a controller of another kind has none
+    return period if isinstance(period, InfeasiblePeriod) else None
+
+
+def _lasting(event: Event) -> float:
+    """For how long an event counts [s]."""
+    duration: float | None = getattr(event, "duration", 0.0)
+    return math.inf if duration is None else duration
+
+
+def _not_started_for(event: Event) -> InputError:
+    rule = "of a kind that the flight was started for, with live=True or by an event of its scenario"
+    return ParameterError("event", "type", event.type, rule)
+
+
+def prepared(assembly: Assembly) -> Scenario:
+    """A scenario in whose flight anything may happen that can happen to its vehicle.
+
+    Wind needs drag to push; with the integrator rk4 the mass is fixed, and with an estimator there are the sensors that
+    it has.
+    """
+    scenario, air = assembly.scenario, assembly.effects.air
+    sensed = {} if scenario.sensors is None else scenario.sensors.present()
+    names = [*sensed] if scenario.estimator is not None else [*get_args(SensorText)]
+    possible: list[Event] = [
+        _push(scenario),
+        *([_mass(scenario)] if scenario.plant.integrator == "mujoco" else []),
+        *([_wind(scenario)] if air is not None and air.drags else []),
+        *(_fault(scenario, name) for name in get_args(SensorText) if name in names),
+    ]
+    added = [event for event in possible if event not in scenario.events]
+    return scenario.model_copy(update={"events": [*added, *scenario.events]})  # what the file has at 0 comes after
+
+
+def neutral(scenario: Scenario, event: Event) -> Event | None:
+    """An event at the start that changes nothing, and prepares a flight for one; None where it needs no preparing."""
+    if isinstance(event, Push):
+        return _push(scenario)
+    if isinstance(event, LOADING):
+        return _mass(scenario)
+    if isinstance(event, Gust | WindChange):
+        return _wind(scenario)
+    return _fault(scenario, event.sensor) if isinstance(event, SensorFaultEvent) else None
+
+
+def _push(scenario: Scenario) -> Push:
+    return Push(at=0.0, duration=scenario.plant.timestep, force=(0.0, 0.0, 0.0))
+
+
+def _mass(scenario: Scenario) -> MassChange:
+    return MassChange(at=0.0, factor=(scenario.effects.load or Load()).mass_factor)
+
+
+def _wind(scenario: Scenario) -> WindChange:
+    return WindChange(at=0.0, velocity=(scenario.effects.air or Air()).wind)
+
+
+def _fault(scenario: Scenario, sensor: SensorText) -> SensorFaultEvent:
+    step = scenario.plant.timestep
+    return SensorFaultEvent(at=0.0, sensor=sensor, fault="bias", offset=(0.0, 0.0, 0.0), duration=step)
+
+
+def story(scenario: Scenario, duration: float) -> list[dict[str, Any]]:
+    """`events` of a summary: `time` [s] and `text` of what happened in so long [s], in order of time.
+
+    What changes nothing, as at a live flight's beginning, is left out.
+    """
+    events = sorted((event for event in scenario.events if event.at < duration), key=lambda event: event.at)
+    happened = [event for event in events if event != neutral(scenario, event)]
+    entries = []
+    for _, group in groupby(happened, key=lambda event: event.type):
+        alike = list(group)
+        if len(alike) <= _MOST:
+            entries += [{"time": event.at, "text": _text(event)} for event in alike]
+        else:
+            text = f"{len(alike)} times until {alike[-1].at:g} s: {_text(alike[0])} first, {_text(alike[-1])} last"
+            entries.append({"time": alike[0].at, "text": text})
+    return entries
+
+
+def _text(event: Event) -> str:
+    duration = getattr(event, "duration", None)
+    lasting = "" if duration is None else f" for {duration:g} s"
+    return printable(f"{event.text()}{lasting}")[:_LONGEST]

@@ -1,0 +1,255 @@
+"""A live session from its beginning to its saved flight: by a page in a browser, or by a script.
+
+`Pace` has the only clock of a session; `Guard` lets in who has its address.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import ipaddress
+import secrets
+import socket
+import sys
+import threading
+import time as clock
+import webbrowser
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import parse_qs, urlsplit
+
+from quadsim.errors import MissingPackageError, ParameterError, QuadsimError
+from scenarios import console
+from scenarios.app import run_directory
+from scenarios.catalogue import scenario_names
+from scenarios.live.session import Frame, Session, read_script
+from scenarios.loading import load_scenario
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Document
+from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.scenario import Scenario
+
+if TYPE_CHECKING:
+    from scenarios.live.page import Page
+
+LATE: Final = 0.25  # [s] beyond which lost time is given up: no period is dropped, the flight is behind real time
+POSES: Final = 2  # drawn in each period
+_IDLE: Final = 0.02  # [s] between looks for orders while nothing is flown
+LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
+
+
+class Pace:
+    """Pause, single periods, speed; set from any thread, read between periods.
+
+    Attributes:
+        speed: simulated over real time that is aimed at.
+        paused: whether only single periods are flown.
+    """
+
+    def __init__(self, now: Callable[[], float] = clock.monotonic) -> None:
+        self._now, self._stop, self._single = now, threading.Event(), threading.Semaphore(0)
+        self.speed, self.paused = 1.0, False
+        self._orders: deque[Callable[[Session], None]] = deque()
+
+    def single(self) -> None:
+        """Fly one period while paused."""
+        self._single.release()
+
+    def stop(self) -> None:
+        """End the session after this period."""
+        self._stop.set()
+
+    def order(self, what: Callable[[Session], None]) -> None:
+        """Have something done between two periods, in the thread that flies."""
+        self._orders.append(what)
+
+    def drive(self, session: Session, view: Page, until: Callable[[Frame], bool] = lambda frame: False) -> None:
+        """Fly until `stop`, or until a frame is the last one; a flight that has ended waits for a reset."""
+        due, flown = self._now(), deque[float](maxlen=round(2.0 / session.period) + 1)  # two seconds
+        while not self._stop.is_set():
+            while self._orders:
+                self._orders.popleft()(session)
+            if session.reason is not None or (self.paused and not self._single.acquire(blocking=False)):
+                self._stop.wait(_IDLE)
+                due = self._now()
+                flown.clear()
+                continue
+            try:
+                frame = session.advance()
+            except QuadsimError as error:
+                session.reason = str(error)
+                view.ended(session.reason)
+                continue
+            flown.append(self._now())
+            span = flown[-1] - flown[0]
+            view.show(frame, (len(flown) - 1) * session.period / span if span > 0.0 else self.speed)
+            for share in range(1, POSES + 1):
+                view.pose(frame, share / POSES)
+                due += session.period / self.speed / POSES
+                if (late := self._now() - due) > LATE:
+                    due += late
+                self._stop.wait(max(0.0, -late))
+            if session.reason is not None:
+                view.ended(session.reason)
+            if until(frame):
+                return
+
+
+class Guard:
+    """Checks requests to a server that listens on a host; the address has to have its `token`.
+
+    A browser lets any site connect to servers on the loopback interface, so that each request is checked: `Host`
+    against names that a foreign site may have bound to this machine, `Origin` against pages of others, and a token,
+    which stands in the address that is printed and is stored as a cookie.
+    """
+
+    def __init__(self, host: str) -> None:
+        self._host, self.token = host, secrets.token_urlsafe(24)
+
+    def refusal(self, headers: Any, path: str, port: int) -> str | None:
+        """Why a request with these headers, this path and query, to this port, is refused; None where it is let in."""
+        try:
+            host, origin = headers.get("Host", ""), headers.get("Origin")
+        except LookupError:  # of the library's headers, where one is there twice
+            return "a header is there twice"
+        if not self._is_ours(host, port):
+            return "this server goes by another name"
+        if origin is not None and not self._is_ours(origin.partition("://")[2], port):
+            return "a page of another site may not connect"
+        tokens = parse_qs(path.partition("?")[2]).get("token", [])
+        with contextlib.suppress(CookieError, LookupError):
+            tokens.append(SimpleCookie(headers.get("Cookie", ""))[f"quadsim-{port}"].value)
+        if not any(secrets.compare_digest(token.encode(), self.token.encode()) for token in tokens):
+            return "open the address that quadsim live printed: it has a token"
+        return None
+
+    @contextlib.contextmanager
+    def installed(self) -> Iterator[None]:
+        """Have the server that viser starts meanwhile check its requests."""
+        from viser.infra import _infra
+
+        library = _infra.websockets.asyncio.server
+        serve = library.serve
+
+        def guarded(*args: Any, process_request: Any = None, **options: Any) -> Any:
+            def check(connection: Any, request: Any) -> Any:
+                port = connection.local_address[1]
+                refused = self.refusal(request.headers, request.path, port)
+                if refused is not None:
+                    return connection.respond(HTTPStatus.FORBIDDEN, f"quadsim: {refused}\n")
+                response = None if process_request is None else process_request(connection, request)
+                if response is not None and "token" in parse_qs(request.path.partition("?")[2]):
+                    cookie = f"quadsim-{port}={self.token}"  # its name has the port, which cookies ignore
+                    response.headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict; Path=/"
+                return response
+
+            return serve(*args, process_request=check, **options)
+
+        library.serve = guarded
+        try:
+            yield
+        finally:
+            library.serve = serve
+
+    def _is_ours(self, netloc: str, port: int) -> bool:
+        """Whether `HOST:PORT` is this server."""
+        try:
+            parts = urlsplit(f"//{netloc}")
+            host, its_port = parts.hostname or "", parts.port
+        except ValueError:
+            return False
+        if its_port != port or host in LOOPBACK or host == self._host:
+            return its_port == port
+        with contextlib.suppress(ValueError):  # no site can be bound to the name of an address
+            return self._host not in LOOPBACK and bool(ipaddress.ip_address(host))
+        return False
+
+
+def fly_live(
+    scenario: Scenario,
+    against: ControllerSpec | None,
+    script: str | Path | None,
+    *,
+    onward: bool,
+    out: str | Path | None,
+    overwrite: bool,
+    video: bool,
+    **place: Any,
+) -> Document:
+    """Fly a session and save it, whatever ended it; `onward`: from where the scenario, a finished run's, ended.
+
+    The other arguments are those of `scenarios.app.live`; `place` is the port, the host and the browser.
+    """
+    inputs = None if script is None else read_script(script)
+    if inputs is None:
+        _require_server(place["host"], place["port"])
+    with (
+        run_directory(f"{scenario.name}-live", out, overwrite=overwrite) as directory,
+        closing(Session(scenario, against)) as session,
+    ):
+        replaced = overwrite
+
+        def save(session: Session) -> str:
+            nonlocal replaced
+            session.flight().save(directory, overwrite=replaced, video=video)
+            replaced = True  # the next time it is this session's own
+            return console.short_path(directory)
+
+        try:
+            while onward and session.reason is None and session.k < scenario.periods:
+                session.advance()
+            if inputs is None:
+                _serve(session, save, **place)
+            else:
+                for reason in session.play(inputs):
+                    console.say(f"refused: {reason}")
+        except KeyboardInterrupt:  # what was flown is saved
+            print(file=sys.stderr)
+        text, flown = "", session.k * session.period
+        if session.k:
+            text = f"{save(session)}: {flown:.2f} s, {session.flight().outcome}\n"
+        status = EXIT_DONE if session.reason is None else EXIT_FAILED
+        return Document(text, {"directory": str(directory), "duration": flown, "reason": session.reason}, status)
+
+
+def _require_server(host: str, port: int) -> None:
+    """Refuse, before anything is flown, where no page could be served."""
+    if find_spec("viser") is None:
+        raise MissingPackageError("quadsim live", "viser", extra="live")
+    if not 0 <= port <= 65535:
+        raise ParameterError("", "--port", port, "from 1 to 65535, or 0 for any that is free")
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host or "?", port), family=family).close()
+    except (OSError, UnicodeError) as error:
+        if getattr(error, "errno", None) in (errno.EADDRINUSE, errno.EACCES):
+            raise ParameterError("", "--port", port, "a port that is free") from error
+        raise ParameterError("", "--host", host, "an address of this machine") from error
+
+
+def _serve(session: Session, save: Callable[[Session], str], *, host: str, port: int, browser: bool) -> None:
+    """Show the page and fly until Ctrl-C; controllers of the library for the same vehicle and period may take over."""
+    from scenarios.live.page import Page
+
+    if host not in LOOPBACK:
+        console.say(
+            f"listening on {host}: anyone on that network with the address below can fly this session; "
+            "the connection is not encrypted"
+        )
+    scenario, others = session.scenario, dict[str, ControllerSpec]()
+    for name in scenario_names():
+        other = load_scenario(name)
+        same = (other.vehicle, other.control_period) == (scenario.vehicle, scenario.control_period)
+        if same and other.controller not in [*others.values(), scenario.controller]:
+            others[f"{other.controller.type} of {name}"] = other.controller
+    pace = Pace()
+    with closing(Page(session, pace, save=save, host=host, port=port, others=others)) as page:
+        print(f"Open {page.address}  (Ctrl-C ends the session and saves it)", flush=True)
+        if browser:
+            webbrowser.open(page.address)
+        pace.drive(session, page)

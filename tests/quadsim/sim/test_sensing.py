@@ -1,0 +1,178 @@
+"""Samples: their statistics against what the sensor states, their times, and what draws what."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from quadsim.rotation import euler_to_quaternion
+from quadsim.sim.sensing import FaultKind, Outliers, Sample, Sampler, Sensor, SensorFault, SensorName, truth
+from quadsim.state import Array
+
+TIMESTEP = 1e-3
+STEPS = 20_000
+
+
+@pytest.fixture(scope="module")
+def physics() -> Array:
+    """(STEPS + 1, 14) states of a vehicle that moves, and is tilted far."""
+    t = TIMESTEP * np.arange(STEPS + 1)
+    rows = np.empty((STEPS + 1, 14))
+    rows[:, 0], rows[:, 1:4], rows[:, 8:11] = t, np.stack([t, t**2, np.sin(t)], 1), np.stack([t, 2 * t, -t], 1)
+    rows[:, 4:8] = euler_to_quaternion(np.stack([1.2 * np.sin(t), 1.4 * np.cos(t), 0.5 * t], 1))
+    rows[:, 11:14] = np.stack([np.cos(t), np.sin(2 * t), 0.1 * t], 1)
+    return rows
+
+
+def sampler(sensor: Sensor, *faults: SensorFault, seed: int = 0) -> Sampler:
+    return Sampler(sensor, timestep=TIMESTEP, faults=faults, rng=np.random.default_rng(seed))
+
+
+def errors(samples: list[Sample], physics: Array) -> Array:
+    """(n, 3) what samples say beyond the truth; rotation vectors for attitude."""
+    taken = [sample.taken for sample in samples]
+    values = np.array([sample.value for sample in samples])
+    name = samples[0].sensor
+    if name is not SensorName.ATTITUDE:
+        return values - truth(name, physics[taken])
+    measured = Rotation.from_euler("ZYX", values[:, ::-1])
+    return (Rotation.from_quat(physics[taken, 4:8], scalar_first=True).inv() * measured).as_rotvec()
+
+
+@pytest.mark.parametrize("name", list(SensorName))
+def test_a_perfect_sensor_reports_the_truth(name: SensorName, physics: Array) -> None:
+    samples = sampler(Sensor(name=name, rate=100.0)).sample(physics, 0)
+    assert [sample.taken for sample in samples] == list(range(0, STEPS + 1, 10))
+    assert np.abs(errors(samples, physics)).max() < 1e-12
+
+
+@pytest.mark.parametrize("name", list(SensorName))
+def test_noise_and_bias_are_as_stated_on_each_axis(name: SensorName, physics: Array) -> None:
+    noise, bias = np.array([0.01, 0.02, 0.05]), np.array([0.1, -0.2, 0.05])
+    sensor = Sensor(name=name, rate=1000.0, noise=tuple(noise), bias=tuple(bias))
+    found = errors(sampler(sensor).sample(physics, 0), physics)
+    np.testing.assert_allclose(found.mean(0), bias, atol=4 * noise.max() / np.sqrt(STEPS))
+    np.testing.assert_allclose(found.std(0), noise, rtol=4 / np.sqrt(2 * STEPS))  # of a standard deviation, 4 sigma
+    corr = np.corrcoef(found[1:].T, found[:-1].T)
+    assert np.abs(corr - np.eye(6)).max() < 5 / np.sqrt(STEPS)  # white, and the axes independent
+
+
+def test_the_variance_of_a_walking_bias_grows_as_time() -> None:
+    rest = np.zeros((101, 14))
+    sensor = Sensor(name=SensorName.VELOCITY, rate=20.0, bias=(0.3, 0.0, 0.0), bias_walk=(0.1, 0.2, 0.4))
+    walks = np.array([[s.value for s in sampler(sensor, seed=seed).sample(rest, 0)] for seed in range(1000)])
+    assert walks[:, 0].tolist() == [[0.3, 0.0, 0.0]] * 1000
+    t = 0.05 * np.arange(1, walks.shape[1])
+    expected = np.outer(t, np.square(sensor.bias_walk))
+    np.testing.assert_allclose(walks[:, 1:].var(axis=0) / expected, 1.0, atol=5 * np.sqrt(2 / 1000))
+
+
+def test_rates_and_delays_are_exact(physics: Array) -> None:
+    samples = sampler(Sensor(name=SensorName.POSITION, rate=40.0, delay=0.11)).sample(physics[:101], 0)
+    assert [(sample.taken, sample.arrival) for sample in samples] == [(25 * i, 25 * i + 110) for i in range(5)]
+
+
+def test_the_share_lost_is_as_stated(physics: Array) -> None:
+    samples = sampler(Sensor(name=SensorName.RATES, rate=1000.0, dropout=0.3)).sample(physics, 0)
+    assert len(samples) / STEPS == pytest.approx(0.7, abs=4 * np.sqrt(0.3 * 0.7 / STEPS))
+    assert not sampler(Sensor(name=SensorName.RATES, rate=1000.0, dropout=1.0)).sample(physics, 0)
+
+
+def test_outliers_widen_the_noise_of_their_share_of_samples(physics: Array) -> None:
+    sensor = Sensor(
+        name=SensorName.POSITION, rate=1000.0, noise=(0.1, 0.1, 0.1), outliers=Outliers(probability=0.1, size=20.0)
+    )
+    found = errors(sampler(sensor).sample(physics, 0), physics)
+    clean = errors(sampler(replace(sensor, outliers=None)).sample(physics, 0), physics)
+    widened = np.isclose(found, 20.0 * clean, rtol=1e-6, atol=1e-9)
+    assert np.all(widened | np.isclose(found, clean, rtol=1e-6, atol=1e-9))
+    assert np.all(widened.all(axis=1) == widened.any(axis=1))  # all axes of a sample together
+    assert widened[:, 0].mean() == pytest.approx(0.1, abs=4 * np.sqrt(0.1 * 0.9 / STEPS))
+
+
+@pytest.mark.parametrize("name", [SensorName.POSITION, SensorName.ATTITUDE])
+@pytest.mark.parametrize("cuts", [(1,), (7,), (50,), (13, 200, 1)])
+def test_samples_do_not_depend_on_how_time_is_cut(name: SensorName, cuts: tuple[int, ...], physics: Array) -> None:
+    sensor = Sensor(
+        name=name,
+        rate=200.0,
+        noise=(0.1, 0.1, 0.1),
+        bias_walk=(0.1, 0.1, 0.1),
+        dropout=0.2,
+        outliers=Outliers(probability=0.2, size=5.0),
+    )
+    freeze = SensorFault(sensor=name, kind=FaultKind.FREEZE, start=0.1, stop=0.2)
+    whole = sampler(sensor, freeze).sample(physics[:401], 0)
+    pieces, at, first, again = [], 0, 0, sampler(sensor, freeze)
+    again.sample(physics[:100], 0)
+    again.reset()
+    while first < 401:
+        count = cuts[at % len(cuts)]
+        pieces += again.sample(physics[first : min(first + count, 401)], first)
+        first, at = first + count, at + 1
+    assert [(s.taken, s.arrival, s.value.tolist()) for s in pieces] == [
+        (s.taken, s.arrival, s.value.tolist()) for s in whole
+    ]
+    other = sampler(sensor, freeze, seed=1).sample(physics[:401], 0)
+    assert [s.value.tolist() for s in other] != [s.value.tolist() for s in whole]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"noise": (1.0, 1.0, 1.0)}, {"bias_walk": (1.0, 1.0, 1.0)}, {"outliers": Outliers(probability=0.5, size=3.0)}],
+)
+def test_one_imperfection_leaves_the_draws_of_the_others_alone(change: dict[str, Any], physics: Array) -> None:
+    sensor = Sensor(name=SensorName.POSITION, rate=100.0, dropout=0.5)
+    plain = sampler(sensor).sample(physics, 0)
+    assert [s.taken for s in sampler(replace(sensor, **change)).sample(physics, 0)] == [s.taken for s in plain]
+
+
+# --- faults --------------------------------------------------------------------------------------------------------
+
+
+def befallen(physics: Array, kind: FaultKind, **more: Any) -> dict[int, Array]:
+    fault = SensorFault(sensor=SensorName.POSITION, kind=kind, start=0.1, stop=0.2, **more)
+    samples = sampler(Sensor(name=SensorName.POSITION, rate=100.0), fault).sample(physics[:301], 0)
+    return {sample.taken: sample.value for sample in samples}
+
+
+def test_faults_hold_from_their_start_until_before_their_end(physics: Array) -> None:
+    inside = set(range(100, 200, 10))
+    outside = set(range(0, 301, 10)) - inside
+    gone = befallen(physics, FaultKind.DROPOUT)
+    assert set(gone) == outside
+    frozen = befallen(physics, FaultKind.FREEZE)
+    assert all(np.array_equal(frozen[step], physics[90, 1:4]) for step in inside)
+    blank = befallen(physics, FaultKind.NAN, axes=(1,))
+    assert all(np.isnan(blank[step]).tolist() == [False, True, False] for step in inside)
+    moved = befallen(physics, FaultKind.BIAS, offset=(1.0, 0.0, -2.0))
+    assert all(np.allclose(moved[step] - physics[step, 1:4], [1.0, 0.0, -2.0]) for step in inside)
+    for values in (frozen, blank, moved):
+        assert all(np.array_equal(values[step], physics[step, 1:4]) for step in outside)
+
+
+def test_a_sensor_frozen_from_the_start_repeats_its_first_sample(physics: Array) -> None:
+    fault = SensorFault(sensor=SensorName.POSITION, kind=FaultKind.FREEZE, start=0.0)
+    samples = sampler(Sensor(name=SensorName.POSITION, rate=100.0), fault).sample(physics[:301], 0)
+    assert all(np.array_equal(sample.value, physics[0, 1:4]) for sample in samples)
+
+
+def test_the_fault_of_another_sensor_changes_nothing(physics: Array) -> None:
+    fault = SensorFault(sensor=SensorName.VELOCITY, kind=FaultKind.NAN, start=0.0)
+    samples = sampler(Sensor(name=SensorName.POSITION, rate=100.0), fault).sample(physics[:301], 0)
+    assert len(samples) == 31
+    assert np.abs(errors(samples, physics)).max() == 0.0
+
+
+def test_windows_begin_and_end_at_the_steps_meant() -> None:
+    def window(start: float, stop: float) -> tuple[int, int | None]:
+        return SensorFault(sensor=SensorName.RATES, kind=FaultKind.NAN, start=start, stop=stop).window(1e-3)
+
+    assert window(0.3, 0.7) == (300, 700)  # 0.7 / 1e-3 is 700.0000000000001 in binary
+    assert window(0.0001, 0.0009) == (1, 1)  # between two steps: none
+    assert window(0.0, math.inf) == (0, None)

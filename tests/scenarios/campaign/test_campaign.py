@@ -1,0 +1,382 @@
+"""Whole campaigns of short flights: the same results whoever flies them, nothing lost, and wrong uses refused."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time as clock
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tomlkit
+
+from quadsim.errors import InputError, OutputError
+from quadsim.outputs import SUMMARY_FILE, Growing
+from scenarios.campaign import campaign as module
+from scenarios.campaign import store as records
+from scenarios.campaign.campaign import CampaignResult as Result
+from scenarios.campaign.campaign import Standing, held_against, recorded_flight
+from scenarios.campaign.campaign_file import Choice
+from scenarios.campaign.plan import Plan, load_plan
+from scenarios.campaign.rows import Row, read_table
+from scenarios.campaign.store import read_manifest
+from scenarios.machine import processor_name
+from scenarios.rollout import Rollout
+
+CAMPAIGN: dict[str, Any] = {
+    "name": "little",
+    "scenario": "hover",
+    "flights": 12,
+    "seed": 4,
+    "failure": ["lost", "max_error.z > 0.2"],
+    "set": {"duration": 0.5, "constraints": [], "controller": {"horizon": 4}},
+    "vary": [
+        {"name": "mass", "fields": ["effects.load.mass_factor"], "distribution": "uniform", "low": 0.5, "high": 1.5}
+    ],
+}
+
+
+@dataclass
+class Alone:
+    """Flies in this process: backwards or not, and interrupted after so many flights."""
+
+    backwards: bool = False
+    stops_after: int | None = None
+
+    def fly(self, plan: Plan, flights: Sequence[int]) -> Generator[Row, None, None]:
+        ordered = list(reversed(flights)) if self.backwards else list(flights)
+        for i, flight in enumerate(ordered):
+            if i == self.stops_after:
+                raise KeyboardInterrupt
+            yield plan.fly(flight)
+
+
+def fly_campaign(plan: Plan, directory: Path, by: Alone | int, *, report: bool = False, **options: Any) -> Result:
+    """Flown in this process, or by so many workers."""
+    with pytest.MonkeyPatch.context() as patch:
+        if isinstance(by, Alone):
+            patch.setattr(Plan, "fly_all", lambda plan, flights, **_: by.fly(plan, flights))
+        workers = None if isinstance(by, Alone) else by
+        return module.fly_campaign(plan, directory, workers=workers, report=report, **options)
+
+
+def make_plan(directory: Path, **changes: Any) -> Plan:
+    path = directory / "little.toml"
+    path.write_text(tomlkit.dumps({**CAMPAIGN, **changes}), encoding="utf-8")
+    return load_plan(str(path))
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> Plan:
+    return make_plan(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """The campaign of `plan`, flown to its end without a report; nobody changes its directory."""
+    here = tmp_path_factory.mktemp("whole")
+    return fly_campaign(make_plan(here), here / "c", Alone())
+
+
+@pytest.fixture(scope="module")
+def by_two(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """The same, flown by two processes."""
+    here = tmp_path_factory.mktemp("two")
+    return fly_campaign(make_plan(here), here / "c", 2)
+
+
+@pytest.fixture
+def flown(whole: Result, tmp_path: Path) -> Path:
+    """A copy of its directory to continue, or to tamper with."""
+    return Path(shutil.copytree(whole.directory, tmp_path / "c"))
+
+
+def content(result: Result) -> tuple[bytes, str]:
+    """The flights, and the summary but for the digests of its files, of which some hold clock times."""
+    summary = json.loads((result.directory / SUMMARY_FILE).read_text())
+    del summary["files"]
+    return (result.directory / "flights.parquet").read_bytes(), json.dumps(summary)
+
+
+def test_results_are_the_same_bytes_with_any_worker(plan: Plan, whole: Result, by_two: Result, tmp_path: Path) -> None:
+    engines = {"backwards": Alone(backwards=True), "one": 1}
+    results = [whole, by_two, *(fly_campaign(plan, tmp_path / name, engine) for name, engine in engines.items())]
+    assert len({content(result) for result in results}) == 1
+    assert results[0].table.num_rows == 12
+    assert 0 < sum(results[0].table["failed"].to_pylist()) < 12
+
+
+def test_what_was_flown_stays_and_the_rest_follows(plan: Plan, whole: Result, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        fly_campaign(plan, tmp_path / "again", Alone(backwards=True, stops_after=5))
+    manifest = read_manifest(tmp_path / "again")
+    assert (manifest["status"], manifest["flown"]) == ("interrupted", 5)
+    seen: list[Standing] = []
+    resumed = fly_campaign(plan, tmp_path / "again", Alone(), resume=True, watch=seen.append)
+    assert [standing.flown for standing in seen] == list(range(6, 13))
+    assert content(resumed) == content(whole)
+    assert [session["flights"] for session in resumed.manifest["sessions"]] == [5, 7]
+
+
+def test_resuming_a_finished_campaign_flies_nothing(plan: Plan, whole: Result, flown: Path) -> None:
+    assert content(fly_campaign(plan, flown, Alone(stops_after=0), resume=True)) == content(whole)
+
+
+def test_more_flights_may_follow(flown: Path, tmp_path: Path) -> None:
+    more = make_plan(tmp_path, flights=15)
+    grown = fly_campaign(more, flown, Alone(), resume=True)
+    assert content(grown) == content(fly_campaign(more, tmp_path / "d", Alone()))
+    assert grown.manifest["flights"] == grown.manifest["flown"] == 15
+
+
+CONTROLLER = """
+import ctypes, os, signal, sys, time
+
+class Mine:
+    warm = []
+
+    def __init__(self, vehicle, period, horizon, kind="calm"):
+        self.speeds, self.kind = [vehicle.hover_speed] * 4, kind
+
+    def step(self, now, state, reference):
+        if self.kind == "warms":
+            self.warm.append(1)
+            return [speed + 0.1 * len(self.warm) for speed in self.speeds]
+        if self.kind == "sleeps":
+            time.sleep(0.03)
+        if self.kind == "raises":
+            raise ZeroDivisionError("of its\\n\\x1b own")
+        if self.kind == "dies":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.kind == "hangs":
+            ctypes.PyDLL(None).sleep(1000)
+        if self.kind == "takes memory":
+            bytearray(1 << 33)
+        return self.speeds
+"""
+"""A controller of the user's; `kind` is what it does beside hovering."""
+
+
+def plan_of_kinds(directory: Path, *kinds: str, **changes: Any) -> Plan:
+    """A flight for each kind of the controller."""
+    module = f"mine_{abs(hash(directory))}"  # one name is imported from one place, in a process
+    (directory / f"{module}.py").write_text(CONTROLLER, encoding="utf-8")
+    entry = {"name": "kind", "fields": ["controller.settings.kind"], "distribution": "grid", "values": [*kinds]}
+    controller = {"type": f"{module}:Mine", "settings": {"kind": "calm"}, "folder": "."}
+    flown = {"duration": 0.5, "constraints": [], "controller": controller}
+    return make_plan(directory, **{"vary": [entry], "flights": len(kinds), "set": flown, **changes})
+
+
+def test_a_bad_flight_is_a_row_with_its_verdict_and_reason(tmp_path: Path) -> None:
+    kinds = ("calm", "raises", "dies", "hangs", "takes memory")
+    plan = plan_of_kinds(tmp_path, *kinds, limits={"flight": 4.0, "memory": 500.0}, failure=["violated"])
+    result = fly_campaign(plan, tmp_path / "c", 2, report=True)
+    table = result.table
+    assert table["verdict"].to_pylist() == ["satisfied", "error", "died", "timeout", "memory"]
+    assert table["reason"].to_pylist()[1:] == [
+        "at t = 0.000 s: the controller raised ZeroDivisionError: of its",
+        "its process ended by signal 9",
+        "it took longer than 4 s",
+        "at t = 0.000 s: the controller raised MemoryError (it may take 500 MB)",
+    ]
+    assert table["failed"].to_pylist() == [False, True, True, True, True]
+    assert [result.summary["events"][name]["count"] for name in ("failure", "died", "lost")] == [4, 1, 0]
+    page = (result.directory / "index.html").read_text(encoding="utf-8")
+    for reason in ("it took longer than 4 s", "(it may take 500 MB)", "its process ended by signal 9"):
+        assert reason in page
+
+
+def test_flights_of_a_users_controller_do_not_change_each_other(tmp_path: Path) -> None:
+    """A list of the class grows with every step: in one process, the second flight would be another one."""
+    plan = plan_of_kinds(tmp_path, "warms", vary=[CAMPAIGN["vary"][0]], flights=6)
+    results = [fly_campaign(plan, tmp_path / f"by-{workers}", workers) for workers in (1, 2)]
+    assert content(results[0]) == content(results[1])
+    (alone,) = fly_campaign(
+        plan_of_kinds(tmp_path, "warms", vary=[CAMPAIGN["vary"][0]], flights=1), tmp_path / "a", 1
+    ).table["rmse.z"]
+    assert results[0].table["rmse.z"][0] == alone
+
+
+def test_code_of_the_user_is_known_wherever_a_campaign_names_it(tmp_path: Path) -> None:
+    assert not make_plan(tmp_path).flies_user_code
+    assert plan_of_kinds(tmp_path, "calm").flies_user_code
+    drawn = Choice(name="law", fields=["controller"], distribution="choice", values=["mine:Mine"])
+    plan = make_plan(tmp_path)
+    assert replace(plan, spec=replace(plan.spec, vary=[drawn])).flies_user_code
+
+
+def test_a_campaign_that_is_killed_resumes_to_the_same_bytes(tmp_path: Path) -> None:
+    plan = plan_of_kinds(tmp_path, "sleeps", vary=[CAMPAIGN["vary"][0]], flights=16)
+    often = "from scenarios.campaign import store; store.FLUSH_S = 0.2; from scenarios.cli import main; main()"
+    options = ("little.toml", "--out", "c", "--workers", "2", "--no-report", "--resume")
+    command = [sys.executable, "-c", often, "campaign", *options]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    parts = tmp_path / "c" / "parts"
+    for kept in range(3):  # once a part more than the last time is there
+        process = subprocess.Popen(command, cwd=tmp_path, env=environment)
+        while len(list(parts.glob("*"))) <= kept:
+            assert process.poll() is None, "it ended, or no part came"
+            clock.sleep(0.02)
+        process.kill()
+        process.wait()
+    assert not (tmp_path / "c" / SUMMARY_FILE).exists()
+    subprocess.run(command, cwd=tmp_path, env=environment, check=True)
+    again = fly_campaign(plan, tmp_path / "whole", 2)
+    assert (tmp_path / "c" / "flights.parquet").read_bytes() == (again.directory / "flights.parquet").read_bytes()
+    summaries = [json.loads((path / SUMMARY_FILE).read_text()) for path in (tmp_path / "c", again.directory)]
+    assert summaries[0] | {"files": {}} == summaries[1] | {"files": {}}  # the hashes are also of clock times
+
+
+def test_it_stops_when_the_interval_is_narrow_enough_at_the_same_flight(tmp_path: Path) -> None:
+    plan = make_plan(tmp_path, flights=40)
+    results = [
+        fly_campaign(plan, tmp_path / name, engine, until_width=0.5)
+        for name, engine in {"one": Alone(), "two": 2}.items()
+    ]
+    assert content(results[0]) == content(results[1])
+    flown = results[0].table.num_rows
+    assert flown in (10, 20, 30)
+    assert results[0].manifest["status"] == "stopped"
+    share = results[0].summary["events"]["failure"]
+    assert share["upper"] - share["lower"] <= 0.5
+    resumed = fly_campaign(plan, tmp_path / "one", Alone(), resume=True)
+    assert (resumed.table.num_rows, resumed.manifest["status"]) == (40, "complete")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
+    result = fly_campaign(plan, tmp_path / "c", Alone(), report=True)
+    manifest = read_manifest(result.directory)
+    assert manifest == result.manifest
+    assert (manifest["name"], manifest["status"], manifest["flights"]) == ("little", "complete", 12)
+    listed = json.loads((result.directory / SUMMARY_FILE).read_text())["files"]
+    assert {"campaign.toml", "scenario.toml", "flights.parquet", "index.html", "manifest.json"} <= set(listed)
+    assert manifest["versions"]["mujoco"]
+    assert manifest["code"].startswith("sha256:")
+    assert manifest["machines"] == {processor_name(): 12}
+    assert read_table(result.directory / "flights.parquet").equals(result.table)
+
+
+# --- what is refused -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"seed": 5}, "seed"),
+        ({"flights": 11}, "flights"),
+        ({"failure": ["lost"]}, "failure"),
+        ({"set": {"duration": 1.0, "constraints": []}}, "scenario"),
+        ({"vary": []}, "vary"),
+    ],
+)
+def test_another_campaign_does_not_go_on_with_it(
+    flown: Path, tmp_path: Path, changes: dict[str, Any], named: str
+) -> None:
+    with pytest.raises(InputError, match=rf"its {named} differs from the one there"):
+        fly_campaign(make_plan(tmp_path, **changes), flown, Alone(), resume=True)
+    with pytest.raises(OutputError, match="a campaign is already there; continue it with --resume"):
+        fly_campaign(make_plan(tmp_path, **changes), flown, Alone())
+
+
+def test_a_latin_hypercube_does_not_grow(tmp_path: Path) -> None:
+    fly_campaign(make_plan(tmp_path, sampling="latin_hypercube"), tmp_path / "c", Alone())
+    more = make_plan(tmp_path, sampling="latin_hypercube", flights=15)
+    with pytest.raises(InputError, match="more flights may follow, except of a latin_hypercube"):
+        fly_campaign(more, tmp_path / "c", Alone(), resume=True)
+
+
+def test_other_code_does_not_go_on_with_it(
+    plan: Plan, flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records, "code_digest", lambda: "sha256:other")
+    with pytest.raises(InputError, match=r"this one differs from what flew the first flights \(code\)"):
+        fly_campaign(make_plan(tmp_path, flights=13), flown, Alone(), resume=True)
+    saved = fly_campaign(plan, flown, Alone(), resume=True)
+    assert saved.manifest["code"] != "sha256:other", "nothing is missing: what flew it stays there"
+
+
+def test_another_controller_of_the_user_does_not_go_on_with_it(tmp_path: Path) -> None:
+    code = "class Hovers:\n    def __init__(self, vehicle, **numbers):\n        self.speeds = [{speed}] * 4\n"
+    code += "    def step(self, now, state, reference):\n        return self.speeds\n"
+    (tmp_path / "hovers.py").write_text(code.format(speed="vehicle.hover_speed"), encoding="utf-8")
+    changed = {"set": {"duration": 0.5, "constraints": [], "controller": "hovers:Hovers"}, "flights": 2}
+    fly_campaign(make_plan(tmp_path, **changed), tmp_path / "c", Alone())
+    (tmp_path / "hovers.py").write_text(code.format(speed="vehicle.hover_speed + 1.0"), encoding="utf-8")
+    with pytest.raises(InputError, match=r"differs from what flew the first flights \(controller\)"):
+        fly_campaign(make_plan(tmp_path, **{**changed, "flights": 3}), tmp_path / "c", Alone(), resume=True)
+
+
+def test_a_narrow_interval_does_not_take_flights_away(plan: Plan, flown: Path) -> None:
+    with pytest.raises(InputError, match=r"--until-width would leave out flights: .* after 10 of the 12 flights"):
+        fly_campaign(plan, flown, Alone(), resume=True, until_width=0.7)
+    assert read_table(flown / "flights.parquet").num_rows == 12
+
+
+def test_grids_are_gone_through_in_whole_turns(tmp_path: Path) -> None:
+    grid = {"name": "turn", "fields": ["initial.euler.2"], "distribution": "grid", "values": [0.0, 1.0, 2.0]}
+    plan = make_plan(tmp_path, flights=60, vary=[grid], failure=["lost"])
+    result = fly_campaign(plan, tmp_path / "c", Alone(), until_width=0.3)
+    drawn = result.table["draw.turn"].to_pylist()
+    assert {drawn.count(value) for value in (0.0, 1.0, 2.0)} == {10}
+
+
+@pytest.mark.parametrize("dies_after", ["manifest.json", "campaign.toml"])
+def test_dying_while_it_grows_locks_nothing_out(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dies_after: str
+) -> None:
+    more = make_plan(tmp_path, flights=15)
+
+    write = Growing.write
+
+    def then_dies(self: Growing, files: Mapping[str, bytes]) -> None:
+        write(self, files)
+        if dies_after in files:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Growing, "write", then_dies)
+        with pytest.raises(KeyboardInterrupt):
+            fly_campaign(more, flown, Alone(), resume=True)
+    assert fly_campaign(more, flown, Alone(), resume=True).table.num_rows == 15
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_report_of_fewer_flights_goes(plan: Plan, tmp_path: Path) -> None:
+    fly_campaign(plan, tmp_path / "c", Alone(), report=True)
+    fly_campaign(make_plan(tmp_path, flights=14), tmp_path / "c", Alone(), resume=True)
+    assert not (tmp_path / "c" / "index.html").exists()
+
+
+# --- replay --------------------------------------------------------------------------------------------------------
+
+
+def test_a_replayed_flight_gives_the_campaigns_numbers(by_two: Result) -> None:
+    worst = recorded_flight(by_two.directory, None)
+    assert worst.number == by_two.summary["worst"][0]["flight"]
+    for number in (None, 0, 7):
+        recorded = recorded_flight(by_two.directory, number)
+        flight = Rollout(recorded.scenario).fly()
+        assert held_against(flight, recorded).differing == []
+        assert flight.log.control.t.size == 10
+
+
+def test_a_replay_reports_when_numbers_differ(whole: Result, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = recorded_flight(whole.directory, 3)
+    other = replace(recorded, row={**recorded.row, "rmse.z": 0.0, "draw.mass": 0.0, "gone": 1.0})
+    assert sorted(held_against(Rollout(other.scenario).fly(), other).differing) == ["draw.mass", "gone", "rmse.z"]
+    monkeypatch.setattr(records, "code_digest", lambda: "sha256:other")
+    assert recorded_flight(whole.directory, 3).notes == ["other code flew that campaign, so numbers may differ"]
+
+
+def test_a_campaign_whose_files_were_changed_is_not_replayed(flown: Path) -> None:
+    path = flown / "scenario.toml"
+    path.write_text(path.read_text().replace("duration = 0.5", "duration = 0.6"))
+    with pytest.raises(InputError, match=r"scenario\.toml: is missing or not the file that was written"):
+        recorded_flight(flown, 0)

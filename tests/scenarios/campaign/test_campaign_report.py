@@ -1,0 +1,233 @@
+"""The page of a campaign: complete, offline, escaped, small enough, and drawn by a browser without a complaint."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from browser import open_page
+
+from quadsim.report.figure import Panel
+from quadsim.report.to_matplotlib import to_png
+from scenarios.campaign.campaign_file import CampaignFile
+from scenarios.campaign.campaign_report import (
+    group_table,
+    histograms,
+    overview,
+    scatters,
+    worst_draws_table,
+    worst_table,
+    write_report,
+)
+from scenarios.campaign.rows import Summary
+from scenarios.campaign.statistics import estimate, interval, percent
+
+MakeCampaign = Callable[..., pa.Table]
+
+HOSTILE = "<script>alert(1)</script> & more"
+PROBE = """<script>
+(async () => {
+  while (!("drawn" in document.documentElement.dataset)) await new Promise((done) => setTimeout(done, 50));
+  const report = document.createElement("output");
+  report.textContent = [
+    "drawn " + document.documentElement.dataset.drawn,
+    "points " + document.querySelectorAll("#scatter .scatterlayer .point").length,
+    "bars " + document.querySelectorAll("#metrics .barlayer .point").length,
+    "buttons " + [...document.querySelectorAll(".modebar-btn")].map((button) => button.dataset.title).join(","),
+  ].join("; ");
+  document.body.append(report);
+})();
+</script>"""
+NAME = "paper-robustness"
+CASES = {"five": (5, 1.0), "clean": (60, 0.0), "lost": (40, 100.0), "one": (1, 1.0), "none": (0, 1.0)}
+
+
+def write(directory: Path, table: pa.Table, text: str = "What is flown.", summary: Summary | None = None) -> str:
+    directory.mkdir(exist_ok=True)
+    failure = ["violated", "rmse.z > 0.5"]
+    spec = CampaignFile(name=NAME, description=text, scenario="hover", flights=1, failure=failure)
+    page = write_report(directory, table, json.loads(json.dumps(summary or estimate(table))), spec)
+    assert page == directory / "index.html"
+    return page.read_text()
+
+
+@pytest.fixture(scope="module")
+def estimated(thousand: pa.Table) -> Summary:
+    return estimate(thousand)
+
+
+@pytest.fixture(scope="module")
+def reported(thousand: pa.Table, estimated: Summary, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The directory of a campaign of a thousand flights, with its report."""
+    directory = tmp_path_factory.mktemp("reported") / "runs" / "my campaign"
+    directory.mkdir(parents=True)
+    (directory / "flights.parquet").write_bytes(b"")
+    write(directory, thousand, summary=estimated)
+    return directory
+
+
+def without_scripts(page: str) -> str:
+    return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+
+
+def test_the_page_shows_what_the_flights_show(estimated: Summary, reported: Path) -> None:
+    directory = reported
+    text = without_scripts((directory / "index.html").read_text())
+    assert '<p class="verdict bad">30 of 1000 flights failed: 3.0 % (95 %: 2.0 to 4.3 %)</p>' in text
+    assert "(violated, rmse.z &gt; 0.5)" in text
+    worst = estimated["worst"][0]["flight"]
+    assert f"quadsim replay &#39;{directory}&#39; --flight {worst}<" in text
+    for heading in ("How often", "Distributions", "What drives failure", "Worst flights"):
+        assert f"<h2>{heading}</h2>" in text
+    for table in ("Constraints", "Failures over each varied parameter", "Their parameters"):
+        assert f"<h3>{table}</h3>" in text
+    assert {path.name for path in directory.iterdir()} == {"index.html", "campaign.png", "flights.parquet"}
+    for url in re.findall(r'(?:href|src)="([^"#]+)"', text):
+        assert url == "data:," or (directory / url).is_file(), url
+    assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//""", text)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("case", CASES)
+def test_campaigns_of_every_kind_have_a_page(make_campaign: MakeCampaign, tmp_path: Path, case: str) -> None:
+    flights, severity = CASES[case]
+    table = make_campaign(flights, severity=severity)
+    text = without_scripts(write(tmp_path / "out", table))
+    failed = sum(table["failed"].to_pylist())
+    mark = "bad" if failed else "good" if flights else ""
+    assert f'<p class="verdict {mark}">{failed} of {flights} flight' in text
+    assert "nan" not in text.lower().replace("dominan", "")
+    assert ('class="plot"' in text) is (flights > 0)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_campaign_without_required_constraints_has_a_page(thousand: pa.Table, tmp_path: Path) -> None:
+    some = thousand.slice(0, 50)
+    for name in ("worst_margin", "worst_constraint"):
+        i = some.column_names.index(name)
+        some = some.set_column(i, some.schema.field(i), pa.nulls(50, some.schema.field(i).type))
+    assert scatters(some) == []
+    assert 'id="scatter"' not in write(tmp_path / "out", some)
+
+
+def with_values(table: pa.Table, name: str, changes: dict[int, float | None]) -> pa.Table:
+    values = [changes.get(i, value) for i, value in enumerate(table[name].to_pylist())]
+    i = table.column_names.index(name)
+    return table.set_column(i, table.schema.field(i), pa.array(values))
+
+
+def over(table: pa.Table, parameter: str) -> Panel:
+    (panel,) = (panel for panel in scatters(table) if panel.x_label.startswith(parameter))
+    return panel
+
+
+def test_every_flight_is_in_its_histogram_below_or_above_the_bound(thousand: pa.Table) -> None:
+    drawn = {panel.x_label.partition(" [")[0]: panel for panel in histograms(thousand)}
+    assert "slack_max" not in drawn, "it is the same in all flights"
+    bars = {series.label: series for series in drawn["worst_margin"].series}
+    values = np.array(thousand["worst_margin"].to_pylist(), float)
+    assert sum(series.y.sum() for series in bars.values()) == np.isfinite(values).sum()
+    assert bars["violated"].y[bars["violated"].x > 0.0].sum() == 0.0, "no bar holds both sides of 0"
+    np.testing.assert_array_equal(bars["violated"].base, bars["satisfied"].y + bars["satisfied"].base)
+
+
+def test_a_flight_far_out_is_at_the_edge_and_does_not_flatten_the_others(thousand: pa.Table) -> None:
+    table = with_values(with_values(thousand, "worst_margin", {0: -1e6, 1: None}), "draw.wind", {3: 400.0})
+    panel = over(table, "wind")
+    markers = {int(flight): s.marker for s in panel.series if s.flights is not None for flight in s.flights}
+    flights = table["flight"].to_pylist()
+    found = [markers[flights[i]] for i in (0, 1, 3)]
+    assert found == ["triangle-down", "triangle-down", "triangle-right"]
+    assert len(markers) == 1000, "every flight is a point"
+    assert panel.y_range is not None
+    assert panel.y_range[0] > -0.6
+    assert max(series.x.max() for series in panel.series) < 7.0
+
+
+def test_many_flights_are_thinned_evenly_and_by_verdict(make_campaign: MakeCampaign) -> None:
+    table = make_campaign(5000)
+    shown = {series.label: series.x.size for series in over(table, "solver").series if series.marker[:8] != "triangle"}
+    verdicts = table["verdict"].to_pylist()
+    assert shown["satisfied"] == 1000
+    assert shown["violated"] == verdicts.count("violated")
+    assert over(table, "solver").x_names == ("daqp", "gain", "piqp")
+
+
+def test_the_figure_shows_the_parameters_that_matter_most(thousand: pa.Table, estimated: Summary) -> None:
+    figure = overview(thousand, estimated, NAME)
+    assert [panel.x_label for panel in figure.panels] == [*("worst_margin", "wind [m/s]", "mass", "yaw")]
+    assert to_png(figure, dpi=40) == to_png(figure, dpi=40)
+
+
+def test_shares_are_reported_with_the_digits_they_need() -> None:
+    assert [percent(share) for share in (0.0, 0.037, 0.5, 0.00372, 0.99973, 1.0, None)] == [
+        *("0 %", "3.7 %", "50.0 %", "0.37 %", "99.973 %", "100 %", "-")
+    ]
+    assert interval(0.0262, 0.0506) == "2.6 to 5.1 %"
+    assert interval(0.0, 0.00368) == "0 to 0.37 %"
+    assert interval(0.9106, 0.999578) == "91.1 to 99.958 %"
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_browser_draws_the_page_and_has_no_complaint(make_campaign: MakeCampaign, tmp_path: Path) -> None:
+    write(tmp_path / "out", make_campaign(300), HOSTILE)
+    page = tmp_path / "out" / "index.html"
+    page.write_text(page.read_text().replace("</body>", f"{PROBE}</body>"))
+    assert "<script>alert" not in page.read_text()
+    dom, console = open_page(page, tmp_path / "profile")
+    assert console == []
+    report = dict(one.split(" ", 1) for one in re.findall(r"<output>(.*?)</output>", dom)[-1].split("; "))
+    assert report["drawn"] == "2"
+    assert int(report["points"]) == 9 * 300, "every flight over every parameter"
+    assert int(report["bars"]) > 100
+    assert "Chart Studio" not in report["buttons"]
+
+
+def test_failures_over_a_drawn_number_are_those_of_its_fifths(thousand: pa.Table) -> None:
+    found = estimate(thousand)["parameters"]["wind"]["groups"]
+    wind, failed = (np.array(thousand[name].to_pylist(), float) for name in ("draw.wind", "failed"))
+    assert [group["flights"] for group in found] == [200] * 5
+    assert found[0]["low"] == wind.min()
+    assert found[-1]["high"] == wind.max()
+    for group, after in zip(found, [*found[1:], None], strict=True):
+        inside = (wind >= group["low"]) & (wind <= group["high"])
+        assert group["count"] == failed[inside].sum()
+        assert after is None or group["high"] < after["low"]
+    assert found[-1]["share"] > found[0]["share"]
+
+
+def test_few_values_are_groups_of_their_own_and_few_flights_none(thousand: pa.Table) -> None:
+    i = thousand.column_names.index("draw.horizon")
+    horizons = pa.array([20 + 10 * (k % 3) for k in range(1000)])
+    found = estimate(thousand.set_column(i, "draw.horizon", horizons))["parameters"]["horizon"]["groups"]
+    assert [(group["low"], group["high"], group["flights"]) for group in found] == [
+        *((20.0, 20.0, 334), (30.0, 30.0, 333), (40.0, 40.0, 333))
+    ]
+    assert len(estimate(thousand.slice(0, 30))["parameters"]["mass"]["groups"]) == 3
+    assert estimate(thousand.slice(0, 11))["parameters"]["mass"]["groups"] == []
+
+
+def test_groups_are_shown_where_some_fail_and_some_do_not(make_campaign: MakeCampaign, thousand: pa.Table) -> None:
+    grid = group_table(estimate(thousand))
+    names = ["mass", "inertia", "noise", "yaw", "lag [s]", "wind [m/s]", "horizon", "solver", "payload"]
+    assert [line[0].text for line in grid.lines] == names
+    assert all(len(line) == len(grid.head) == 6 for line in grid.lines)
+    assert [cell.text.partition(":")[0] for cell in grid.lines[7]][1:4] == ["daqp", "gain", "piqp"]
+    assert not group_table(estimate(make_campaign(60, severity=0.0))).lines
+    assert not group_table(estimate(make_campaign(60, severity=100.0).slice(0, 0))).lines
+
+
+def test_the_worst_flights_have_a_table_with_one_command(thousand: pa.Table) -> None:
+    summary = estimate(thousand)
+    grid = worst_table(summary, "my runs")
+    assert grid.head == ("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason")
+    assert grid.note.endswith(f"quadsim replay 'my runs' --flight {summary['worst'][0]['flight']}")
+    drawn = worst_draws_table(summary)
+    assert drawn.head == ("flight", *(line[0].text for line in grid.lines))
+    assert not worst_table(estimate(thousand.slice(0, 0)), "a").lines
+    assert not worst_draws_table(estimate(thousand.slice(0, 0))).lines

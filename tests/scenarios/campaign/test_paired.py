@@ -1,0 +1,176 @@
+"""Two campaigns in pairs: what is found, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from quadsim.errors import InputError, OutputError
+from scenarios.campaign.events import EVENT_NAMES
+from scenarios.campaign.paired import compare_pairs
+from scenarios.campaign.statistics import holm
+
+MakeCampaign = Callable[..., pa.Table]
+
+NAMES = ("paper", "robust")
+
+
+def changed(table: pa.Table, name: str, values: list[object]) -> pa.Table:
+    i = table.column_names.index(name)
+    return table.set_column(i, table.schema.field(i), pa.array(values, table.schema.field(i).type))
+
+
+@pytest.fixture(scope="module")
+def better(make_campaign: MakeCampaign) -> pa.Table:
+    return make_campaign(1000, help_by=0.15)
+
+
+def test_a_better_controller_is_found_to_be(thousand: pa.Table, better: pa.Table) -> None:
+    found = compare_pairs(thousand, better, NAMES)
+    assert found.verdict == "better"
+    failed = [np.array(table["failed"].to_pylist()) for table in (thousand, better)]
+    failure = found.events[0]
+    assert failure.counts == (failed[0].sum(), failed[1].sum())
+    assert (failure.only_a, failure.only_b) == ((failed[0] & ~failed[1]).sum(), (failed[1] & ~failed[0]).sum())
+    assert failure.pairs == found.flights == 1000
+    assert failure.difference == (failure.only_b - failure.only_a) / 1000 < 0.0
+    assert found.sentence.startswith("robust is better than paper: of 1000 paired flights, ")
+    assert compare_pairs(better, thousand, NAMES).verdict == "worse"
+
+
+def test_losses_are_compared_beside_failures(make_campaign: MakeCampaign) -> None:
+    """Four of forty lost against none read as not distinguishable, without a word of it."""
+    one, other = make_campaign(40, seed=1, severity=100.0), make_campaign(40, seed=1, severity=100.0)
+    verdicts = ["lost"] * 4 + ["violated"] * 36
+    found = compare_pairs(changed(one, "verdict", verdicts), changed(other, "verdict", ["violated"] * 40), NAMES)
+    assert found.verdict == "not distinguishable"
+    lost = next(event for event in found.events if event.event == "lost")
+    assert (lost.counts, lost.p, lost.p_holm) == ((4, 0), 0.125, 0.125)
+    many = ["lost"] * 12 + ["violated"] * 28
+    found = compare_pairs(changed(one, "verdict", many), changed(other, "verdict", ["violated"] * 40), NAMES)
+    assert "not distinguishable by their failures" in found.sentence
+    table = found.to_markdown()
+    assert "| lost | 12 (30.0 %) | 0 (0 %) | 12 | 0 | 0 | p < 0.001 | **p < 0.001** |" in table
+    assert "| timeout |" not in table, "it never happened"
+
+
+def test_every_event_and_constraint_is_compared_and_corrected(thousand: pa.Table, better: pa.Table) -> None:
+    found = compare_pairs(thousand, better, NAMES)
+    assert [event.event for event in found.events] == [*EVENT_NAMES, "roll not held", "slew not held"]
+    tested = [event for event in found.events if event.only_a + event.only_b]
+    assert [event.p_holm for event in tested] == holm([event.p for event in tested])
+    assert all(event.p_holm == 1.0 for event in found.events if event not in tested)
+    assert found.to_json()["events"]["lost"]["p_holm"] == next(e for e in found.events if e.event == "lost").p_holm
+
+
+def test_metrics_are_compared_where_both_were_completed(thousand: pa.Table, better: pa.Table) -> None:
+    found = compare_pairs(thousand, better, NAMES)
+    status = [np.array(table["status"].to_pylist()) == "completed" for table in (thousand, better)]
+    both = status[0] & status[1]
+    assert found.completed == both.sum() < 1000
+    metric = next(metric for metric in found.metrics if metric.name == "worst_margin")
+    values = [np.array(table["worst_margin"].to_pylist(), float)[both] for table in (thousand, better)]
+    assert metric.difference.pairs == both.sum()
+    assert metric.difference.mean == pytest.approx((values[1] - values[0]).mean())
+    assert metric.difference.lower is not None
+    assert metric.difference.lower > 0.1
+
+
+def test_a_campaign_and_itself_are_not_distinguishable(thousand: pa.Table) -> None:
+    found = compare_pairs(thousand, thousand, ("a", "b"))
+    assert found.verdict == "not distinguishable"
+    assert found.sentence.startswith("b and a are not distinguishable by their failures: of 1000")
+    assert found.events[0].p == 1.0
+    assert all(metric.difference.mean == 0.0 for metric in found.metrics)
+
+
+def test_flights_of_one_campaign_alone_are_left_out(thousand: pa.Table, better: pa.Table) -> None:
+    order = np.random.default_rng(0).permutation(600)
+    found = compare_pairs(thousand, better.take(order), NAMES)
+    assert (found.flights, found.left_out) == (600, 400)
+    assert found.events == compare_pairs(thousand.slice(0, 600), better.slice(0, 600), NAMES).events
+    assert "400 flights are left out" in found.to_markdown()
+
+
+def test_campaigns_of_one_name_are_distinguished(thousand: pa.Table, better: pa.Table) -> None:
+    found = compare_pairs(thousand, better, ("paper", "paper"))
+    assert found.sentence.startswith("paper (second) is better than paper (first): of 1000")
+
+
+def test_other_draws_are_refused(thousand: pa.Table) -> None:
+    head = thousand.slice(0, 5)
+    mass = head["draw.mass"].to_pylist()
+    with pytest.raises(InputError, match=r"flight 3 of 'paper' has draw\.mass = .*, and of 'robust' 9\.0: only camp"):
+        compare_pairs(head, changed(head, "draw.mass", [*mass[:3], 9.0, mass[4]]), NAMES)
+    with pytest.raises(InputError, match="flight 0 of 'paper' has seed = 10000, and of 'robust' 1: only campaigns"):
+        compare_pairs(head, changed(head, "seed", [1, 10001, 10002, 10003, 10004]), NAMES)
+
+
+def test_other_definitions_of_failure_are_refused(thousand: pa.Table, better: pa.Table) -> None:
+    same = (["violated", "rmse.z>0.5"], ["rmse.z > 0.50", "violation"])
+    assert compare_pairs(thousand, better, NAMES, failures=same) == compare_pairs(thousand, better, NAMES)
+    error = "'paper' counts violation as failure, and 'robust' lost, rmse.z > 0.5: only campaigns with the same failure"
+    with pytest.raises(InputError, match=error):
+        compare_pairs(thousand, better, NAMES, failures=(["violated"], ["rmse.z > 0.5", "lost"]))
+
+
+def test_other_constraints_are_refused(thousand: pa.Table, better: pa.Table) -> None:
+    names = [name.replace(".slew", ".tilt") for name in better.column_names]
+    with pytest.raises(InputError, match="'paper' alone has the constraints slew: only campaigns that are audited"):
+        compare_pairs(thousand, better.rename_columns(names), NAMES)
+    with pytest.raises(InputError, match="'robust' alone has the constraints slew"):
+        compare_pairs(thousand.drop_columns(["satisfied.slew"]), better, NAMES)
+
+
+def test_flights_of_other_numbers_are_refused(thousand: pa.Table) -> None:
+    with pytest.raises(InputError, match="have no flight of one number"):
+        compare_pairs(thousand.slice(0, 5), thousand.slice(5, 5), NAMES)
+
+
+def test_what_one_campaign_alone_draws_is_reported(thousand: pa.Table, better: pa.Table) -> None:
+    found = compare_pairs(thousand.drop_columns(["draw.lag"]), better, NAMES)
+    assert found.own_draws == ("lag",)
+    assert "lag" not in found.shared_draws
+    assert "one campaign alone draws lag" in found.to_markdown()
+
+
+def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.Table) -> None:
+    found = compare_pairs(thousand, better, NAMES)
+    plain = found.to_json()
+    assert json.loads(json.dumps(plain, allow_nan=False)) == plain
+    assert plain["verdict"] == "better"
+    text = found.to_markdown()
+    assert text.startswith("# robust against paper\n\nPairs share their seed")
+    assert "\n\nrobust is better than paper" in text
+    assert "differ:" not in text.partition("robust is better")[0], "nobody said what differs"
+    same, other = (
+        compare_pairs(thousand, better, NAMES, differences=d) for d in ((), (("effects.air", None, 3e-4),) * 2)
+    )
+    assert "Fields in which the campaigns differ: 0." in same.to_markdown()
+    before = other.to_markdown().partition("robust is better")[0]
+    assert "Fields in which the campaigns differ: 2." in before
+    assert "| effects.air | absent | 0.0003 |" in before
+    assert "| failure | 30 (3.0 %) |" in text
+    assert "| worst_margin |" in text
+
+
+def test_the_page_stands_with_its_files(thousand: pa.Table, better: pa.Table, tmp_path: Path) -> None:
+    hostile = ("<b>paper</b>", "robust & more")
+    page = compare_pairs(thousand, better, hostile).write_report(tmp_path / "out")
+    names = {path.name for path in page.parent.iterdir()}
+    assert names == {"index.html", "comparison.json", "comparison.md", "summary.json"}
+    text = page.read_text()
+    assert "<b>paper</b>" not in text
+    assert "&lt;b&gt;paper&lt;/b&gt;" in text
+    compare_pairs(thousand, thousand, NAMES).write_report(tmp_path / "out", overwrite=True)
+    assert "not distinguishable" in page.read_text()
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "index.html").write_text("mine")
+    with pytest.raises(OutputError, match="it is not empty"):
+        compare_pairs(thousand, better, NAMES).write_report(theirs)

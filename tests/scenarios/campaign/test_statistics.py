@@ -1,0 +1,454 @@
+"""Intervals and tests against closed forms, published numbers, other routes through scipy, and simulation."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from scipy import stats
+
+from quadsim.errors import InputError, ParameterError
+from scenarios.campaign.campaign_report import driver_sentence, driver_table, event_table, verdict_sentence
+from scenarios.campaign.paired import compare_pairs
+from scenarios.campaign.statistics import (
+    Dependence,
+    dependence,
+    estimate,
+    holm,
+    judge,
+    lower_bounds,
+    mcnemar,
+    paired_difference,
+    parameters,
+    parse_requirement,
+    proportion,
+    ranking,
+    upper_bounds,
+    worst_flight,
+)
+
+
+@pytest.mark.parametrize(("count", "trials"), [(0, 1), (1, 1), (0, 20), (3, 20), (37, 1000), (999, 1000), (10, 10)])
+def test_the_interval_is_scipys(count: int, trials: int) -> None:
+    found = proportion(count, trials)
+    exact = stats.binomtest(count, trials).proportion_ci(0.95, method="exact")
+    assert (found["lower"], found["upper"]) == pytest.approx((exact.low, exact.high), abs=1e-9)
+    one_sided = stats.binomtest(count, trials, alternative="less").proportion_ci(0.95, method="exact")
+    assert found["upper_one_sided"] == pytest.approx(one_sided.high, abs=1e-9)
+    other = stats.binomtest(count, trials, alternative="greater").proportion_ci(0.9, method="exact")
+    assert lower_bounds(count, trials, 0.9) == pytest.approx(other.low, abs=1e-9)
+    assert found["share"] == count / trials
+
+
+def test_bounds_in_closed_form() -> None:
+    assert upper_bounds(0, 299, 0.95) == pytest.approx(1.0 - 0.05 ** (1.0 / 299.0), rel=1e-12)
+    assert lower_bounds(50, 50, 0.99) == pytest.approx(0.01 ** (1.0 / 50.0), rel=1e-12)
+    assert (upper_bounds(50, 50), lower_bounds(0, 50)) == (1.0, 0.0)
+    nothing = proportion(0, 0)
+    assert (nothing["share"], nothing["lower"], nothing["upper"], nothing["upper_one_sided"]) == (None, 0.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("p", [0.002, 0.03, 0.2, 0.5, 0.97])
+@pytest.mark.parametrize("n", [5, 40, 400])
+def test_bounds_have_their_nominal_coverage(n: int, p: float) -> None:
+    """The coverage, summed over every possible count."""
+    counts = np.arange(n + 1.0)
+    chance = stats.binom.pmf(counts, n, p)
+    trials = np.full(n + 1, float(n))
+    for confidence in (0.9, 0.95, 0.99):
+        assert chance[upper_bounds(counts, trials, confidence) >= p].sum() >= confidence - 1e-12
+        assert chance[lower_bounds(counts, trials, confidence) <= p].sum() >= confidence - 1e-12
+
+
+def test_intervals_cover_simulated_campaigns() -> None:
+    rng = np.random.default_rng(1)
+    found = [proportion(int(count), 300) for count in rng.binomial(300, 0.04, 2000)]
+    covered = np.mean([one["lower"] <= 0.04 <= one["upper"] for one in found])
+    assert 0.95 <= covered < 0.985
+
+
+def test_holm_is_holms() -> None:
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])  # p.adjust of R
+    assert holm([0.5, 0.6]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_holm_keeps_the_chance_of_a_false_find() -> None:
+    p = np.random.default_rng(3).uniform(size=(4000, 9))
+    assert np.mean([min(holm(list(row))) < 0.05 for row in p]) == pytest.approx(0.05, abs=0.012)
+
+
+def test_mcnemar_in_closed_form() -> None:
+    assert mcnemar(0, 0) == 1.0
+    assert mcnemar(0, 6) == pytest.approx(2.0 / 2**6)
+    assert mcnemar(5, 15) == pytest.approx(2.0 * sum(math.comb(20, k) for k in range(6)) / 2**20)
+    assert mcnemar(15, 5) == mcnemar(5, 15)
+
+
+def test_paired_difference_is_scipys() -> None:
+    rng = np.random.default_rng(5)
+    a = rng.normal(size=60)
+    b = a + 0.3 + 0.5 * rng.normal(size=60)
+    found = paired_difference(a, b)
+    interval = stats.ttest_rel(b, a).confidence_interval(0.95)
+    assert (found.mean, found.lower, found.upper) == pytest.approx((np.mean(b - a), interval.low, interval.high))
+
+
+def test_paired_difference_covers() -> None:
+    rng = np.random.default_rng(6)
+    found = [paired_difference(np.zeros(40), rng.exponential(size=40)) for _ in range(600)]
+    covered = [one.lower is not None and one.upper is not None and one.lower <= 1.0 <= one.upper for one in found]
+    assert 0.89 < np.mean(covered) < 0.97  # of a skewed law, the t interval is a little short
+
+
+def test_paired_difference_of_few() -> None:
+    none = paired_difference(np.empty(0), np.empty(0))
+    assert (none.pairs, none.mean, none.lower) == (0, None, None)
+    one = paired_difference(np.array([1.0]), np.array([3.0]))
+    assert (one.mean, one.lower) == (2.0, None)
+    same = paired_difference(np.ones(30), np.ones(30))
+    assert (same.mean, same.lower, same.upper) == (0.0, 0.0, 0.0)
+
+
+def related(x: np.ndarray, y: np.ndarray) -> Dependence | None:
+    return dependence(x, y, np.random.default_rng(0))
+
+
+def test_rank_correlation_is_scipys() -> None:
+    rng = np.random.default_rng(2)
+    x, y = rng.normal(size=200), np.round(rng.normal(size=200), 1)  # with ties
+    y += 0.2 * x
+    found = related(x, y)
+    expected = stats.spearmanr(x, y)
+    assert found is not None
+    assert (found.rho, found.p, found.flights) == pytest.approx((expected.statistic, expected.pvalue, 200), rel=1e-9)
+
+
+def test_rank_correlation_of_few_counts_all_permutations() -> None:
+    x, y = np.array([3.0, 1.0, 4.0, 1.5, 5.0]), np.array([0.0, 0.0, 1.0, 0.0, 1.0])
+    found = related(x, y)
+    assert found is not None
+    rho = [stats.spearmanr(x, np.array(order)).statistic for order in itertools.permutations(y)]
+    beyond = np.mean(np.array(rho) >= found.rho - 1e-12)
+    assert found.rho == pytest.approx(stats.spearmanr(x, y).statistic)
+    assert found.p == pytest.approx(2.0 * beyond)
+    perfect = related(np.arange(5.0), np.arange(5.0))
+    assert perfect is not None
+    assert (perfect.rho, perfect.p) == pytest.approx((1.0, 2.0 / 120.0))
+
+
+def test_rank_correlation_of_what_is_not_there() -> None:
+    x = np.arange(20.0)
+    assert related(x, np.zeros(20)) is None
+    assert related(x[:2], x[:2]) is None
+    assert related(x, np.full(20, np.nan)) is None
+    gaps = related(np.append(x, np.nan), np.append(-x, 3.0))
+    assert gaps is not None
+    assert (gaps.rho, gaps.flights) == (pytest.approx(-1.0), 20)
+    with_loss = related(x, np.where(x > 17.0, -np.inf, -x))
+    assert with_loss is not None
+    assert with_loss.rho < -0.99
+
+
+def bowl(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A margin that falls on both sides of a mass of 1."""
+    rng = np.random.default_rng(seed)
+    mass = rng.uniform(0.8, 1.2, n)
+    return mass, 0.9 - 3.0 * np.abs(mass - 1.0) + 0.1 * rng.normal(size=n)
+
+
+@pytest.mark.parametrize("n", [30, 60, 1000])
+def test_harm_at_both_ends_is_seen_by_xi_alone(n: int) -> None:
+    mass, margin = bowl(n, 1)
+    found = related(mass, margin)
+    assert found is not None
+    assert found.p > 0.05
+    assert found.p_xi < 0.002
+    assert found.xi > 0.25
+
+
+def test_xi_is_scipys_with_its_asymptotic_law() -> None:
+    x, y = bowl(300, 2)
+    found, expected = related(x, y), stats.chatterjeexi(x, y)
+    assert found is not None
+    assert (found.xi, found.p_xi, found.flights) == (expected.statistic, expected.pvalue, 300)
+
+
+@pytest.mark.parametrize(("ones", "zeros"), [(3, 5), (1, 6), (4, 4), (7, 2)])
+def test_xi_of_an_event_has_an_exact_p_value(ones: int, zeros: int) -> None:
+    """Against xi of every order of the flights."""
+    n = ones + zeros
+    x = np.arange(float(n))
+    orders = [np.isin(np.arange(n), chosen).astype(float) for chosen in itertools.combinations(range(n), ones)]
+    xis = np.array([stats.chatterjeexi(x, order).statistic for order in orders])
+    for order, xi in zip(orders, xis, strict=True):
+        found = related(x, order)
+        assert found is not None
+        assert found.p_xi == pytest.approx(np.mean(xis >= xi - 1e-9))
+
+
+def test_the_p_value_of_xi_has_its_nominal_level() -> None:
+    """Of few and many pairs, of numbers, of rare events, and of a varied parameter with few values."""
+    rng = np.random.default_rng(3)
+    for n, runs in ((15, 60), (60, 200), (300, 120)):
+        for y_of in (lambda size: rng.normal(size=size), lambda size: (rng.random(size) < 0.1) * 1.0):
+            for x_of in (lambda size: rng.uniform(size=size), lambda size: rng.integers(0, 4, size) * 1.0):
+                found = [dependence(x_of(n), y_of(n), rng) for _ in range(runs)]
+                p = np.array([one.p_xi for one in found if one is not None])
+                assert np.mean(p < 0.05) < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / p.size), (n, p.size)
+
+
+def test_xi_of_what_is_not_there() -> None:
+    x = np.arange(20.0)
+    assert related(np.zeros(20), x) is None
+    with_loss = related(np.append(x, np.nan), np.where(np.arange(21) > 17, -np.inf, np.arange(21.0)))
+    assert with_loss is not None
+    assert with_loss.flights == 20
+
+
+MakeCampaign = Callable[..., pa.Table]
+NONE = ("incomplete", "died", "timeout", "memory")
+
+
+def with_column(table: pa.Table, name: str, values: list[object]) -> pa.Table:
+    i = table.column_names.index(name)
+    return table.set_column(i, table.schema.field(i), pa.array(values, table.schema.field(i).type))
+
+
+@pytest.fixture(scope="module")
+def small() -> pa.Table:
+    """Eight flights: satisfied but for 3 and 6 lost, 1 and 5 violated, 4 an error; flight 7 failed by a metric."""
+    return pa.table(
+        {
+            "flight": list(range(8)),
+            "verdict": ["satisfied", "violated", "satisfied", "lost", "error", "violated", "lost", "satisfied"],
+            "reason": [None, None, None, "gone", "raised", None, "gone", None],
+            "failed": [False, True, False, True, True, True, True, True],
+            "violated": [False, True, False, True, True, True, True, False],
+            "crashed": [False, False, False, True, False, False, False, False],
+            "duration": [9.0, 9.0, 9.0, 2.0, None, 9.0, 1.0, 9.0],
+            "rmse.x": [0.1, 0.2, 0.3, 5.0, None, 0.4, 6.0, 0.9],
+            "worst_margin": [0.5, -0.1, 0.2, -3.0, None, -0.4, None, 0.8],
+            "worst_constraint": ["roll", "roll", "roll", "roll", None, "roll", None, "roll"],
+            "margin.roll": [2.5, -0.5, 1.0, -15.0, None, -2.0, None, 4.0],
+            "satisfied.roll": [True, False, True, False, None, False, False, True],
+            "draw.mass": [1.0, 1.3, 1.1, 1.5, 1.2, 1.4, 1.6, 0.9],
+            "draw.kind": ["a", "b", "a", "b", "b", "a", "b", "a"],
+        }
+    )
+
+
+def test_events_and_verdicts_are_counted(small: pa.Table) -> None:
+    found = estimate(small)
+    assert found["flights"] == 8
+    assert found["verdicts"] == {"satisfied": 3, "violated": 2, "lost": 2, "error": 1} | dict.fromkeys(NONE, 0)
+    counts = {name: event["count"] for name, event in found["events"].items()}
+    expected = {"failure": 6, "violation": 5, "lost": 2, "crash": 1, "error": 1} | dict.fromkeys(NONE, 0)
+    assert counts == expected
+    assert [line[0].text for line in event_table(found).lines] == ["failure", "violation", "lost", "crash", "error"]
+    failure = found["events"]["failure"]
+    exact = stats.binomtest(6, 8).proportion_ci(0.95)
+    assert (failure["share"], failure["lower"], failure["upper"]) == pytest.approx((0.75, exact.low, exact.high))
+
+
+def test_metrics_are_those_of_the_flights_that_have_them(small: pa.Table) -> None:
+    found = estimate(small)["metrics"]
+    assert list(found) == ["duration", "rmse.x", "worst_margin"]
+    values = np.array([0.1, 0.2, 0.3, 5.0, 0.4, 6.0, 0.9])
+    assert found["rmse.x"]["flights"] == 7
+    assert found["rmse.x"]["mean"] == pytest.approx(values.mean())
+    assert found["rmse.x"]["sd"] == pytest.approx(values.std(ddof=1))
+    assert found["rmse.x"]["p95"] == pytest.approx(np.percentile(values, 95))
+    assert (found["rmse.x"]["min"], found["rmse.x"]["max"]) == (0.1, 6.0)
+
+
+def test_a_constraint_that_lost_flights_did_not_reach_did_not_hold(small: pa.Table) -> None:
+    roll = estimate(small)["constraints"]["roll"]
+    assert (roll["not_satisfied"]["count"], roll["not_satisfied"]["flights"]) == (5, 8)
+    assert (roll["worst_margin"], roll["worst_flight"]) == (-15.0, 3)
+
+
+def test_incomplete_flights_are_neither_failures_nor_successes(small: pa.Table) -> None:
+    """Flights 0 and 2 ended before the window of `roll`."""
+    verdicts = ["incomplete" if i in (0, 2) else value for i, value in enumerate(small["verdict"].to_pylist())]
+    held = [None if i in (0, 2) else value for i, value in enumerate(small["satisfied.roll"].to_pylist())]
+    table = with_column(with_column(small, "verdict", verdicts), "satisfied.roll", held)
+    found, before = estimate(table), estimate(small)
+    assert (found["flights"], found["verdicts"]["incomplete"]) == (8, 2)
+    for event in ("failure", "violation"):
+        assert found["events"][event]["flights"] == 6
+        assert found["events"][event]["count"] == before["events"][event]["count"]
+    assert found["events"]["lost"] == before["events"]["lost"]
+    assert found["constraints"]["roll"]["not_satisfied"]["flights"] == 6
+    assert judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).flights == 6
+    assert verdict_sentence(found).startswith("6 of 6 flights failed")
+    assert verdict_sentence(found).endswith("; 2 incomplete flights not counted")
+
+
+def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(small: pa.Table) -> None:
+    table = with_column(with_column(small, "verdict", ["incomplete"] * 8), "failed", [False] * 8)
+    table = with_column(with_column(table, "violated", [False] * 8), "satisfied.roll", [None] * 8)
+    found = estimate(table)
+    assert verdict_sentence(found) == "0 of 0 flights failed; 8 incomplete flights not counted"
+    assert found["events"]["failure"]["flights"] == found["constraints"]["roll"]["not_satisfied"]["flights"] == 0
+    assert not judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).holds
+    with pytest.raises(InputError, match="no pair of flights of which both reached every required constraint"):
+        compare_pairs(table, table, ("one", "other"))
+
+
+def test_the_worst_flights_come_first(small: pa.Table) -> None:
+    assert ranking(small).tolist() == [3, 6, 4, 5, 1, 7, 2, 0]
+    assert worst_flight(small) == 3
+    worst = estimate(small)["worst"]
+    assert [flight["flight"] for flight in worst] == [3, 6, 4, 5, 1, 7, 2, 0]
+    assert worst[0]["draws"] == {"mass": 1.5, "kind": "b"}
+    assert worst[1]["worst_margin"] is None
+
+
+def test_equal_flights_come_in_the_order_of_their_numbers(small: pa.Table) -> None:
+    same = pa.concat_tables([small.slice(0, 1)] * 3).set_column(0, "flight", pa.array([12, 5, 30]))
+    assert worst_flight(same) == 5
+
+
+def test_without_margins_the_largest_error_is_the_worst(small: pa.Table) -> None:
+    free = with_column(small, "worst_margin", [None] * 8).take([0, 2, 7])
+    free = with_column(free, "failed", [False] * 3)
+    assert worst_flight(free) == 7
+
+
+def test_no_flight_is_no_worst(small: pa.Table) -> None:
+    with pytest.raises(ParameterError, match=r"campaign\.flights must be at least one"):
+        worst_flight(small.slice(0, 0))
+
+
+def test_a_lost_flight_without_margin_ranks_below_all(small: pa.Table) -> None:
+    found = estimate(small)["parameters"]["mass"]["worst_margin"]
+    mass = [1.0, 1.3, 1.1, 1.5, 1.4, 1.6, 0.9]
+    expected = stats.spearmanr(mass, [0.5, -0.1, 0.2, -3.0, -0.4, -1e9, 0.8]).statistic
+    assert found["rho"] == pytest.approx(expected)
+    assert found["flights"] == 7
+
+
+def test_what_is_drawn_from_names_has_shares(small: pa.Table) -> None:
+    found = estimate(small)["parameters"]["kind"]
+    assert found["kind"] == "name"
+    assert {level: (share["count"], share["flights"]) for level, share in found["levels"].items()} == {
+        "a": (2, 4),
+        "b": (4, 4),
+    }
+
+
+def test_drivers_are_those_that_were_put_in(thousand: pa.Table) -> None:
+    found = estimate(thousand)["parameters"]
+    tested = {name: entry["worst_margin"] for name, entry in found.items() if entry["kind"] == "number"}
+    assert {name for name, one in tested.items() if one["p_holm"] < 0.05} == {"mass", "wind"}
+    assert tested["wind"]["rho"] < tested["mass"]["rho"] < -0.3
+    assert all(one["p"] <= one["p_holm"] for one in tested.values())
+    assert found["wind"]["failed"]["rho"] > 0.1
+    assert set(found["payload"]["levels"]) == {"false", "true"}
+
+
+def test_nothing_goes_with_what_never_happens(make_campaign: MakeCampaign) -> None:
+    found = estimate(make_campaign(40, severity=0.0))
+    assert found["events"]["failure"]["count"] == 0
+    assert all(entry["failed"] is None for entry in found["parameters"].values() if entry["kind"] == "number")
+
+
+@pytest.mark.parametrize("flights", [0, 1, 2, 5])
+def test_campaigns_of_few_flights_are_strict_json(make_campaign: MakeCampaign, flights: int) -> None:
+    table = make_campaign(flights)
+    found = estimate(table)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert found["flights"] == flights
+    assert len(found["worst"]) == flights
+
+
+def test_the_summary_of_a_thousand_is_strict_json(thousand: pa.Table) -> None:
+    found = estimate(thousand)
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+    assert len(found["worst"]) == 10
+    assert found["metrics"]["rmse.x"]["unit"] == "m"
+    assert not [name for name in found["metrics"] if name.startswith(("draw.", "margin.", "time_violated.", "seed"))]
+
+
+def flown(draws: dict[str, Any], margin: np.ndarray, lost: np.ndarray | None = None) -> pa.Table:
+    """Flights of such draws and margins; those below 0 violated and failed, and some were lost."""
+    lost = np.zeros(margin.size, bool) if lost is None else lost
+    bad = (margin < 0.0) | lost
+    verdicts = np.where(lost, "lost", np.where(bad, "violated", "satisfied")).tolist()
+    n = margin.size
+    return pa.table(
+        {
+            **{"flight": list(range(n)), "verdict": verdicts, "reason": pa.nulls(n, pa.string())},
+            **{"failed": bad, "violated": bad, "crashed": np.zeros(n, bool), "duration": np.ones(n)},
+            **{"worst_margin": margin, "worst_constraint": ["roll"] * n},
+            **{f"draw.{name}": values for name, values in draws.items()},
+        }
+    )
+
+
+def bowl_table(n: int, seed: int) -> pa.Table:
+    rng = np.random.default_rng(seed)
+    draws = {name: rng.uniform(0.8, 1.2, n) for name in ("mass", "inertia", "lag", "wind")}
+    return flown(draws, 0.6 - 3.0 * np.abs(draws["mass"] - 1.0) + 0.1 * rng.normal(size=n))
+
+
+@pytest.mark.parametrize("n", [40, 200, 1000])
+def test_harm_at_both_ends_is_reported(n: int) -> None:
+    """The margin falls with the distance of the mass from 1: a rank correlation alone found nothing."""
+    summary = estimate(bowl_table(n, 4))
+    found = summary["parameters"]["mass"]["worst_margin"]
+    assert found["p_holm"] > 0.05
+    assert found["p_xi_holm"] < 0.05
+    assert driver_sentence(summary).startswith("The worst margin depends on mass (rho ")
+    line = driver_table(summary).lines[0]
+    assert (line[0].text, line[1].mark, line[3].mark) == ("mass", "", "best")
+
+
+def test_both_measures_are_corrected_together() -> None:
+    found = parameters(bowl_table(400, 5))
+    entries = [
+        (parameter[outcome], key)
+        for parameter in found.values()
+        for outcome in ("worst_margin", "failed")
+        for key in ("p", "p_xi")
+    ]
+    assert len(entries) == 4 * 2 * 2
+    least, key = min(entries, key=lambda entry: entry[0][entry[1]])
+    assert least[f"{key}_holm"] == pytest.approx(16 * least[key])
+
+
+def test_noise_is_taken_for_a_driver_in_one_campaign_of_twenty_at_most() -> None:
+    """Over 60 campaigns in which nothing matters: any claim, of any measure, varied parameter or outcome."""
+    rng = np.random.default_rng(6)
+    claims = 0
+    for _ in range(60):
+        n = 60
+        draws = {name: rng.uniform(size=n) for name in ("mass", "lag", "wind", "noise")} | {
+            "horizon": rng.integers(0, 5, n)
+        }
+        table = flown(draws, 0.3 + rng.standard_cauchy(n) * 0.2, lost=rng.random(n) < 0.05)
+        found = parameters(table)
+        corrected = [
+            parameter[outcome][key]
+            for parameter in found.values()
+            for outcome in ("worst_margin", "failed")
+            for key in ("p_holm", "p_xi_holm")
+        ]
+        claims += min(corrected) < 0.05
+    assert claims / 60 < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 60)
+
+
+def test_without_drivers_none_is_reported(make_campaign: MakeCampaign) -> None:
+    expected = "The worst margin depends on no varied parameter beyond chance."
+    assert driver_sentence(estimate(make_campaign(40, severity=0.0))) == expected
+
+
+def test_the_same_table_gives_the_same_numbers(thousand: pa.Table) -> None:
+    assert parameters(thousand) == parameters(thousand)

@@ -1,0 +1,359 @@
+"""Known conflicts: each culprit is named, by the right amount, and what is suggested makes the QP feasible."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import mpc
+import quadsim
+from mpc.constrained import ConstrainedMPC
+from mpc.fallback.contract import Guarded
+from mpc.nonlinear.controller import CONVERGED
+from mpc.ocp import InfeasiblePeriod
+from quadsim.controller import ACCEPTED, Command, Controller, Moment
+from quadsim.errors import PlanExhaustedError
+from quadsim.state import INDEX, Array, make_state
+from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
+from scenarios.catalogue import scenario_path
+from scenarios.flight import Flight
+from scenarios.infeasibility import diagnose
+from scenarios.loading import load_scenario
+from scenarios.parts.controllers import make_controller
+from scenarios.schema.scenario import Scenario
+from scenarios.schema.settings import get_field
+
+TILTED = make_state(euler=(math.radians(20.0), 0.0, 0.0))
+FENCE = '{ name = "fence", of = ["x", "y"], rows = [[1.0, 1.0]], upper = [6.8] }'
+LEAST = '{ name = "least", of = ["speed_1", "speed_2", "speed_3", "speed_4"], rows = [[1, 1, 1, 1]], lower = [780] }'
+MOST = '{ name = "most", of = ["speed_1", "speed_2", "speed_3", "speed_4"], rows = [[1, 1, 1, 1]], upper = [760] }'
+
+
+def moving(name: str, value: float, **place: Any) -> Array:
+    state = make_state(**place)
+    state[INDEX[name]] = value
+    return state
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A conflict: the state, the bounds that give way, and those that must be named as blocking."""
+
+    settings: tuple[str, ...] = ()
+    state: Array = field(default_factory=lambda: make_state())
+    acting: float | None = None
+    violated: tuple[str, ...] = ()
+    blocking: tuple[str, ...] = ()
+    field: str = ""
+
+
+HORIZON = 20
+"""Periods, of 0.05 s."""
+CASES = {
+    "start beyond the tilt bound": Case(
+        state=TILTED, violated=("roll upper",), blocking=("slew lower", "slew upper"), field="output_bounds.roll"
+    ),
+    "speeds too low to hover": Case(
+        settings=("controller.input_bounds.speed=[0.0, 190.0]", "controller.output_bounds.vz=[-0.1, 1.0]"),
+        acting=190.0,
+        violated=("vz lower",),
+        blocking=("speed upper",),
+        field="input_bounds.speed",
+    ),
+    "two polytopes": Case(
+        settings=(f"controller.polytopes=[{LEAST}, {MOST}]",),
+        violated=("least lower",),
+        blocking=("most upper",),
+        field="polytopes.least.lower",
+    ),
+    "falling too fast": Case(
+        settings=("controller.output_bounds.vz=[-0.5, 0.5]",),
+        state=moving("vz", -2.0),
+        violated=("vz lower",),
+        blocking=("slew upper",),
+        field="output_bounds.vz",
+    ),
+    "tightened bounds": Case(
+        settings=("controller.type=robust", "controller.tightening={}"),
+        state=moving("roll_rate", math.radians(9.0), euler=(math.radians(5.5), 0.0, 0.0)),
+        violated=("roll upper",),
+        blocking=("slew lower", "slew upper"),
+        field="output_bounds.roll",
+    ),
+    "outside the fence": Case(
+        settings=(f"controller.polytopes=[{FENCE}]",),
+        state=make_state(position=(5.0, 5.0, 0.0)),
+        violated=("fence upper",),
+        field="polytopes.fence.upper",
+    ),
+    "the last command outside the bounds": Case(
+        acting=290.0, violated=("speed upper",), blocking=("slew lower",), field="input_bounds.slew"
+    ),
+    "rotors that lag, and a delay": Case(
+        settings=("controller.type=robust", "controller.rotor_lag=0.05", "controller.delay=0.02"),
+        state=TILTED,
+        violated=("roll upper",),
+        field="output_bounds.roll",
+    ),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Queried:
+    """A controller after one call."""
+
+    scenario: Scenario
+    vehicle: Vehicle
+    controller: Controller
+    status: str
+    unanswered: InfeasiblePeriod | None
+
+    @cached_property
+    def found(self) -> dict[str, Any]:
+        assert self.unanswered is not None
+        found = diagnose(self.unanswered, self.scenario, self.vehicle)
+        assert found is not None
+        return found
+
+
+@pytest.fixture(scope="session")
+def file(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A hover whose file names no solver, so that its law may be another, and with a short horizon."""
+    text = scenario_path("hover").read_text(encoding="utf-8")
+    path = tmp_path_factory.mktemp("diagnosis") / "hover.toml"
+    short = text.replace('solver = "piqp-multistage"\n', "").replace("horizon = 50 ", f"horizon = {HORIZON} ")
+    assert short.count(f"horizon = {HORIZON}") == 1
+    path.write_text(short, encoding="utf-8")
+    return str(path)
+
+
+def query_case(file: str, case: Case, *more: str) -> Queried:
+    """Have the case's controller step once, without a simulator."""
+    scenario = load_scenario(file, [*case.settings, *more])
+    vehicle = Assembly(scenario).vehicle
+    controller = Assembly(scenario).controller()
+    acting = np.full(4, vehicle.hover_speed if case.acting is None else case.acting)
+    controller.reset(acting)
+    status = "plan_exhausted_error"
+    with contextlib.suppress(PlanExhaustedError):
+        status = controller.step(Moment(acting=acting), case.state, np.zeros((controller.horizon, 4))).status
+    return Queried(
+        scenario=scenario,
+        vehicle=vehicle,
+        controller=controller,
+        status=status,
+        unanswered=getattr(controller, "unanswered", None),
+    )
+
+
+@cache
+def query_cached(file: str, name: str) -> Queried:
+    """One of `CASES`, for all tests that only look at the answer."""
+    return query_case(file, CASES[name])
+
+
+def names(entries: list[dict[str, Any]]) -> set[str]:
+    return {f"{entry['name']} {entry['side']}" for entry in entries}
+
+
+def setting(field: str, value: object) -> str:
+    """As it is given to `--set`."""
+    if isinstance(value, dict):
+        return f"{field}={{{', '.join(f'{name} = {number}' for name, number in value.items())}}}"
+    return f"{field}={json.dumps(value)}"
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, file: str) -> None:
+    case = CASES[name]
+    queried = query_cached(file, name)
+    assert queried.status not in ACCEPTED
+    found = queried.found
+    assert found["feasible"] is False
+    assert names([entry for entry in found["conflict"] if entry["by"]]) == set(case.violated)
+    assert names([entry for entry in found["conflict"] if not entry["by"]]) >= set(case.blocking)
+    for part in (*case.violated, *case.blocking):
+        word, side = part.split()
+        assert re.search(rf"\b{word}\b[^;]*\b{side}\b", found["sentence"])
+    widened = [each["settings"] for each in found["suggestions"] if len(each["settings"]) == 1 and not each["after"]]
+    assert any(f"controller.{case.field}" in settings for settings in widened)
+    for suggestion in found["suggestions"]:
+        if suggestion["after"] is None:
+            changed = [setting(*item) for item in suggestion["settings"].items()]
+            assert query_case(file, case, *changed).status in ACCEPTED, changed
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_little_less_than_the_smallest_bound_is_not_enough(name: str, file: str) -> None:
+    """The suggestion is rounded up by a hundredth of the change at most."""
+    case = CASES[name]
+    queried = query_cached(file, name)
+    alone = [suggestion["settings"] for suggestion in queried.found["suggestions"] if len(suggestion["settings"]) == 1]
+    bounds = [item for settings in alone for item in settings.items() if isinstance(item[1], list)]
+    assert bounds
+    for path, value in bounds:
+        before = get_field(tomllib.loads(queried.scenario.to_toml()), path)
+        less = [old + 0.97 * (new - old) for old, new in zip(before, value, strict=True)]
+        assert query_case(file, case, setting(path, less)).status not in ACCEPTED
+
+
+def entry_of(queried: Queried, name: str) -> dict[str, Any]:
+    return next(entry for entry in queried.found["conflict"] if entry["name"] == name and entry["by"])
+
+
+def test_amounts_in_closed_form(file: str) -> None:
+    """By hand, from the model's matrices and the bounds on steps of -10 and 5 rad/s alone."""
+    tilted = query_cached(file, "start beyond the tilt bound")
+    assert tilted.unanswered is not None
+    model = tilted.unanswered.problem.model
+    row = model.B[INDEX["roll"]]
+    first = 20.0 + math.degrees(float(np.where(row > 0.0, -10.0, 5.0) @ row))
+    entry = entry_of(tilted, "roll")
+    assert entry["by"] == pytest.approx(first - 5.0, abs=1e-6)
+    assert (entry["start"], entry["unit"]) == (0.05, "deg")
+
+    lift = float(model.B[INDEX["vz"]].sum())  # of vz in a period, per rad/s of all rotors
+    falling = entry_of(query_cached(file, "falling too fast"), "vz")
+    after = -2.0 + lift * np.cumsum(5.0 * np.arange(1, HORIZON + 1))
+    assert falling["by"] == pytest.approx(-0.5 - after[0], abs=1e-6)
+    assert (falling["start"], falling["stop"]) == (0.05, pytest.approx(0.05 * np.count_nonzero(after < -0.5)))
+
+    hovering = query_cached(file, "speeds too low to hover")
+    entry, sinking = entry_of(hovering, "vz"), lift * (190.0 - float(model.u_bar[0])) * np.arange(1, HORIZON + 1)
+    assert entry["by"] == pytest.approx(-0.1 - sinking[-1], abs=1e-6)
+    assert (entry["start"], entry["stop"]) == (
+        pytest.approx(0.05 * (1 + np.count_nonzero(sinking >= -0.1))),
+        0.05 * HORIZON,
+    )
+
+    fast = entry_of(query_cached(file, "the last command outside the bounds"), "speed")
+    assert (fast["by"], fast["start"], fast["stop"]) == (pytest.approx(30.0), 0.0, 0.1)
+    assert fast["rotors"] == [1, 2, 3, 4]
+    assert entry_of(query_cached(file, "rotors that lag, and a delay"), "roll")["start"] == 0.07  # delay and period
+
+
+def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str) -> None:
+    """The contract itself flies the model from there, and the optimum is accepted again in that period."""
+    case = CASES["start beyond the tilt bound"]
+    queried = query_case(file, case)
+    after = next(each["after"] for each in queried.found["suggestions"] if "controller.fallback" in each["settings"])
+    guarded, model = query_case(file, case, "controller.fallback={}").controller, queried.unanswered.problem.model  # type: ignore[union-attr]
+    assert isinstance(guarded, Guarded)
+    state, acting = case.state, np.full(4, queried.vehicle.hover_speed)
+    guarded.reset(acting)
+    for k in range(50):
+        command = guarded.step(Moment(time=0.05 * k, acting=acting), state, np.zeros((HORIZON, 4)))
+        if command.status in ACCEPTED:
+            break
+        state, acting = model.A @ state + model.B @ (command.speeds - model.u_bar), command.speeds
+    assert after == pytest.approx(0.05 * k)
+    assert k > 0
+
+
+def test_a_solver_that_fails_where_all_constraints_can_hold_is_distinguished(file: str) -> None:
+    queried = query_case(file, CASES["start beyond the tilt bound"], "controller.output_bounds.roll=[-90.0, 90.0]")
+    assert queried.unanswered is None
+    controller = query_cached(file, "start beyond the tilt bound").unanswered
+    assert controller is not None
+    level = controller.query._replace(state=make_state())
+    failed = InfeasiblePeriod(problem=controller.problem, query=level, status="max_iterations", time=1.0)
+    found = diagnose(failed, queried.scenario, queried.vehicle)
+    assert found is not None
+    assert (found["feasible"], found["conflict"], found["suggestions"], found["advice"]) == (True, [], [], "")
+    assert found["sentence"].endswith("it is the solver that failed")
+
+
+def test_a_flight_whose_sqp_does_not_converge_says_so_and_what_helps() -> None:
+    """Upside down the real-time iteration tumbles; every QP is solved, and the plans follow no dynamics."""
+    tumble = quadsim.load("nonlinear").replace(
+        {
+            "initial.euler": [180.0, 0.0, 0.0],
+            "lost.tilt": False,
+            "control_period": 0.02,
+            "controller.horizon": 40,
+            "duration": 1.5,
+        }
+    )
+    flight = quadsim.fly(tumble)
+    summary = flight.summary
+    assert summary["controller"]["statuses"] == {"not_converged": 75}
+    assert summary["controller"]["fallbacks"] == {"0": 75}
+    assert flight.log.control.sqp is not None
+    assert flight.log.control.sqp[:, 0].min() > CONVERGED
+    found = flight.diagnosis
+    assert found is not None
+    assert (found["time"], found["status"], found["feasible"], found["conflict"]) == (0.0, "not_converged", True, [])
+    assert "the SQP did not converge" in found["sentence"]
+    text = (Path(__file__).resolve().parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
+    assert f"{found['sentence']}\n{found['advice']}\n" in text
+    helped = quadsim.fly(tumble.replace(found["suggestions"][0]["settings"]))
+    assert helped.summary["controller"]["statuses"].get("not_converged", 0) == 0
+    last = slice(-20, None)  # one sample of a tumble may be level
+    assert np.abs(helped.state["roll"][last]).max() < 0.1 < np.abs(flight.state["roll"][last]).max()
+
+
+def test_a_satisfied_flight_is_not_diagnosed_for_a_period_that_did_not_converge(
+    fly_once: Callable[..., Flight],
+) -> None:
+    flight = fly_once("inverted-start")
+    assert 0 < flight.log.control.status.count("not_converged") < 20
+    assert flight.outcome == "satisfied"
+    assert flight.diagnosis is None
+
+
+class Keeping:
+    """A controller of one's own that keeps the problem that it could not solve."""
+
+    def __init__(self, vehicle: Vehicle, period: float, horizon: int, largest: float = 2.0) -> None:
+        law = make_controller(load_scenario("paper-constrained").controller, vehicle, period)
+        assert isinstance(law, ConstrainedMPC)
+        roll = mpc.Bounds(
+            C_c=np.eye(12)[[INDEX["roll"]]],
+            y_min=np.radians([-largest]),
+            y_max=np.radians([largest]),
+            delta_min=np.full(4, -10.0),
+            delta_max=np.full(4, 5.0),
+            u_min=np.zeros(4),
+            u_max=np.full(4, 250.0),
+        )
+        self.problem = replace(law.problem, horizon=horizon, bounds=roll)
+        self.inner = ConstrainedMPC(self.problem, mpc.QPSolver("piqp-multistage", self.problem))
+        self.unanswered: InfeasiblePeriod | None = None
+
+    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        try:
+            return self.inner.step(now, state, reference)
+        finally:
+            self.unanswered = self.inner.unanswered
+
+
+def test_a_controller_of_the_user_is_diagnosed_in_the_words_of_its_problem() -> None:
+    tilted = load_scenario("hover", ["duration=0.5", "initial.euler=[10.0, 0.0, 0.0]"])
+    flight = quadsim.fly(tilted, controller=Keeping)
+    found = flight.diagnosis
+    assert found is not None
+    assert found["conflict"][0] | {"by": 0.0} == {
+        "name": "roll",
+        "rotors": [],
+        "side": "upper",
+        "unit": "deg",
+        "field": "",
+        "by": 0.0,
+        "start": 0.05,
+        "stop": found["conflict"][0]["stop"],
+    }
+    assert re.search(r"has an answer with roll upper wider by \S+ deg", found["advice"])
+    enough = quadsim.fly(tilted, controller=partial(Keeping, largest=12.0))
+    assert enough.diagnosis is None
