@@ -9,19 +9,19 @@ from timing import Record, options, run
 
 from mpc.core.library import why_missing
 from scenarios.app import load
+from scenarios.assembly import Assembly
 from scenarios.campaign.campaign import fly_campaign
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.rows import read_table
 from scenarios.campaign.store import FLIGHTS_FILE, TIMES_FILE
-from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.schema.scenario import Scenario
 
 
 def campaign(scenario: Scenario, solver: str, flights: int, workers: int) -> Record:
     """Fly one campaign; what its flights took, and what it added to them."""
     spec = CampaignFile(name="benchmark", scenario=scenario.name, flights=flights)
-    plan = Plan(spec, resolve_vehicle(scenario, build_vehicle(scenario)))
+    plan = Plan(spec, Assembly(scenario).with_vehicle)
     with tempfile.TemporaryDirectory() as scratch:
         directory = Path(scratch) / "campaign"
         result = fly_campaign(plan, directory, workers=workers, report=False)

@@ -7,31 +7,28 @@ from timing import Record, Stopwatch, options, run, undisturbed
 
 from quadsim.sim.loop import complete
 from scenarios.app import load
-from scenarios.build import build_controller, build_plant
-from scenarios.parts.navigation import build_navigation
-from scenarios.parts.vehicle import build_vehicle
-from scenarios.reference import build_reference
+from scenarios.assembly import Assembly
 from scenarios.rollout import closed_loop
 
 
 def measure(name: str, quick: bool) -> list[Record]:
     """Seconds of each part, the median over flights by turns with and without clocks around the parts."""
     scenario = load(name).replace({"duration": 2.0, "constraints": []}) if quick else load(name)
-    vehicle = build_vehicle(scenario)
-    controller = build_controller(scenario, vehicle)
-    reference = build_reference(scenario, scenario.periods + controller.horizon)
+    assembly = Assembly(scenario)
+    controller = assembly.controller()
+    reference = assembly.reference(scenario.periods + controller.horizon)
     pieces = Stopwatch()
     walls: list[float] = []
     parts: list[Record] = []
-    with build_plant(scenario, vehicle) as plain, build_plant(scenario, vehicle) as watched, undisturbed():
+    with assembly.plant() as plain, assembly.plant() as watched, undisturbed():
         pieces.watch(watched, "advance", "physics")
         pieces.watch(watched, "state", "measurement")
         for _ in range(1 if quick else 5):
             for plant in (plain, watched):
                 for laps in pieces.laps.values():
                     laps.clear()
-                navigation, watch = build_navigation(scenario, vehicle), Stopwatch()
-                loop = closed_loop(scenario, vehicle, plant, controller, reference, navigation=navigation)
+                navigation, watch = assembly.navigation(), Stopwatch()
+                loop = closed_loop(assembly, plant, controller, reference, navigation=navigation)
                 complete(loop, periods=scenario.periods)
                 log = loop.log()
                 wall = watch.elapsed

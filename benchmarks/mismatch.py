@@ -18,10 +18,10 @@ from quadsim.errors import QuadsimError
 from quadsim.flight import metrics
 from quadsim.state import INDEX, POSITION
 from scenarios.app import load
+from scenarios.catalogue import scenario_path
 from scenarios.many import fly_many
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import scenario_path
 
 SCENARIO: Final = "paper-constrained"
 TILT: Final = 5.0

@@ -20,10 +20,8 @@ from quadsim.errors import FlightError, InputError, MissingCoreError, MissingPac
 from quadsim.flight.log import ControlLog
 from quadsim.state import Array, make_state
 from scenarios.app import load
-from scenarios.build import build_controller, build_plant
+from scenarios.assembly import Assembly
 from scenarios.catalogue import read_catalogue
-from scenarios.parts.vehicle import build_vehicle
-from scenarios.reference import build_reference
 from scenarios.rollout import Rollout
 from scenarios.schema.controller import ConstrainedSpec
 from scenarios.schema.robust import RobustSpec
@@ -71,7 +69,7 @@ def entries(scenario: Scenario) -> dict[str, Scenario]:
     found = {}
     for name, changed in entries.items():
         try:
-            build_controller(changed, build_vehicle(changed))
+            Assembly(changed).controller()
         except (MissingPackageError, MissingCoreError):
             continue
         found[name] = changed
@@ -85,19 +83,20 @@ def measure(name: str, quick: bool) -> list[Record]:
         raise InputError(f"{name} is flown by no MPC of fixed matrices; choose a constrained or a robust one")
     if quick:
         scenario = scenario.replace({"duration": 2.0, "controller.horizon": 10, "constraints": []})
-    vehicle = build_vehicle(scenario)
-    log = Rollout(scenario).fly().log.control
+    flight = Rollout(scenario).fly()
+    log = flight.log.control
     candidates: dict[str, Replayed] = {}
     setup: dict[str, float] = {}
-    for solver, each in entries(scenario).items():
+    for solver, entry in entries(scenario).items():
+        assembly = flight.assembly.of(entry)
         started = clock.perf_counter()
-        controller = build_controller(each, vehicle)  # a second time: what can be shared within a process is there
+        controller = assembly.controller()  # a second time: what can be shared within a process is there
         setup[solver] = 1e3 * (clock.perf_counter() - started)
-        reference = build_reference(each, log.t.size + controller.horizon)
+        reference = assembly.reference(log.t.size + controller.horizon)
         candidates[solver] = Replayed(controller, log, reference)
     segments = [range(start, min(start + SEGMENT, log.t.size)) for start in range(0, log.t.size, SEGMENT)]
     hover = make_state(position=(0.0, 0.0, 10.0))
-    with build_plant(scenario, vehicle) as plant:
+    with flight.assembly.plant() as plant:
 
         def fly_a_period() -> None:
             plant.reset(hover)

@@ -24,6 +24,7 @@ from quadsim.errors import QuadsimError
 from quadsim.flight import metrics
 from quadsim.state import INDEX, tilt
 from quadsim.vehicle import Vehicle, load_vehicle
+from scenarios.assembly import Assembly
 from scenarios.design.first_scenario import first_scenario
 from scenarios.feasibility_check import report
 from scenarios.loading import parse_scenario
@@ -150,7 +151,7 @@ def fly(cell: tuple[str, float, str, int]) -> Record:
     tuned, period = data["controller"], data["control_period"]
     data["reference"], data["duration"] = world.course(speed, period)
     data |= {"seed": seed, "constraints": [], "lost": {"distance": world.size}, **copy.deepcopy(world.changes)}
-    bound = min(STEEPEST, round(report(parse_scenario(data), vehicle).tilt + ROOM))
+    bound = min(STEEPEST, round(report(Assembly(parse_scenario(data))).tilt + ROOM))
     data["controller"] = controllers(vehicle, tuned, period, bound)[law]
     log = Rollout(parse_scenario(data)).fly().log
     # A row of the plant covers the step that follows it; the last has none.

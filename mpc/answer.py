@@ -31,11 +31,7 @@ LARGEST_MAP: Final = 2**20
 
 @dataclass(frozen=True, kw_only=True)
 class ActuatorBounds:
-    """Hard bounds on rotor speeds, Eq. (20), and on their steps from one period to the next, Eq. (15).
-
-    Raises:
-        ParameterError: bounds that are not four numbers each, are not in order, or that forbid holding a speed.
-    """
+    """Hard bounds on rotor speeds, Eq. (20), and on their steps from one period to the next, Eq. (15)."""
 
     u_min: Array  # (4,) speeds [rad/s], finite and not negative: rotors turn one way
     u_max: Array  # likewise
@@ -72,15 +68,15 @@ class ActuatorBounds:
         """What an optimisation's hard rows on single inputs, or on single steps, leave in every period."""
         rows, nu = problem.rows, problem.model.nu
         hard = np.isinf(rows.l1) & ~rows.on_states
-        found = []
+        sides = []
         for rate, other in ((rows.D, rows.E), (rows.E, rows.D)):
             alone = hard & (np.count_nonzero(rate, axis=1) == 1) & ~other.any(axis=1)
             lower, upper = np.full(nu, -math.inf), np.full(nu, math.inf)
             for i in np.flatnonzero(alone & (rate.max(axis=1, initial=0.0) == 1.0)):
                 j = int(np.argmax(rate[i]))
                 lower[j], upper[j] = max(lower[j], rows.lower[0, i]), min(upper[j], rows.upper[0, i])
-            found += [lower, upper]
-        return cls(u_min=found[0], u_max=found[1], delta_min=found[2], delta_max=found[3])
+            sides += [lower, upper]
+        return cls(u_min=sides[0], u_max=sides[1], delta_min=sides[2], delta_max=sides[3])
 
     @classmethod
     def of_vehicle(cls, vehicle: Vehicle) -> ActuatorBounds:
@@ -103,10 +99,7 @@ class ActuatorBounds:
         return np.minimum(np.maximum(speeds, lower), upper)
 
     def clip_plan(self, plan: Array, before: Array) -> Array:
-        """A plan (N, 4) with each row in reach of the one before it, the first of `before`.
-
-        Steps that are so but for rounding stay as they are.
-        """
+        """A plan (N, 4) with each row in reach of the one before it; steps that are so but for rounding stay."""
         steps = plan - np.concatenate((before[None], plan[:-1]))
         beyond = np.maximum(self.delta_min - steps, steps - self.delta_max)
         if beyond.flat[beyond.argmax()] <= BOUND_TOLERANCE:

@@ -23,15 +23,12 @@ STATUS: Final = "given"
 class BodyRateLoop:
     """The inner loop, see `quadsim.controller.InnerLoop`: its target is its own, not the commanded rotor speeds.
 
-    Attributes:
-        rate: how often it is called [Hz].
-        thrust: collective thrust to be held [N].
-        rates: (3,) body rates to be held [rad/s].
+    To be held are the collective `thrust` [N] and the body `rates` (3,) [rad/s].
     """
 
     def __init__(self, vehicle: Vehicle, *, rate: float, bandwidth: float, bounds: ActuatorBounds) -> None:
         self.rate, self._bandwidth, self._bounds = rate, bandwidth, bounds
-        self._allocation, self._inertia = make_allocation(vehicle), vehicle.inertia
+        self._allocation, self._inertia = make_allocation(vehicle), np.array(vehicle.inertia)
         self.thrust, self.rates = vehicle.mass * vehicle.gravity, np.zeros(3)
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
@@ -40,17 +37,9 @@ class BodyRateLoop:
 
     def commanded(self, rates: Array) -> Array:
         """Rotor speeds (4,) [rad/s] at body rates (3,) [rad/s]."""
-        (p, q, r), (J_x, J_y, J_z), k = rates.tolist(), self._inertia, self._bandwidth
-        p_c, q_c, r_c = self.rates.tolist()
-        wrench = np.array(
-            [
-                self.thrust,
-                J_x * k * (p_c - p) + (J_z - J_y) * q * r,
-                J_y * k * (q_c - q) + (J_x - J_z) * r * p,
-                J_z * k * (r_c - r) + (J_y - J_x) * p * q,
-            ]
-        )
-        return allocate(self._allocation, wrench, self._bounds.u_min, self._bounds.u_max)
+        J = self._inertia
+        torque = J * self._bandwidth * (self.rates - rates) + np.cross(rates, J * rates)
+        return allocate(self._allocation, np.append(self.thrust, torque), self._bounds.u_min, self._bounds.u_max)
 
     def command(self, rates: Array, horizon: int) -> Command:
         """A period's command, from the body rates (3,) at its begin; `speeds` are those commanded first."""

@@ -18,7 +18,7 @@ from mpc.ocp import Problem, Query, predicted
 from mpc.paper import Prediction, cost, prediction, slew_matrix
 from mpc.qp import QP, Posed, QPRows, Solution
 from quadsim.controller import UNCONSTRAINED
-from quadsim.state import Array, Indices
+from quadsim.state import Array
 
 Flags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
@@ -119,10 +119,6 @@ class Condensed:
         self._of_rest = self._values.of_inputs.reshape(N, len(rows.C), N, nu).sum(axis=2)  # of u_s throughout
         self._pull = self.cost.H.reshape(N * nu, N, nu).sum(axis=1)  # by u_s throughout
         size = self._inputs + N * m_s
-        later: list[Indices] = []
-        for entries in (nu, m_s, len(rows.C)):
-            places = sum(map(len, later)) + np.arange(N * entries)
-            later.append(np.concatenate([places[entries:], places[(N - 1) * entries :]]))
         self._blank = QP(
             P=np.asfortranarray(scipy.linalg.block_diag(self.cost.H, 2.0 * np.diag(l2)) if m_s else self.cost.H),
             c=np.zeros(size),
@@ -133,7 +129,6 @@ class Condensed:
             h_u=np.zeros(rows.lower.size),
             x_l=np.concatenate([rows.u_min.ravel(), np.zeros(N * m_s)]),
             x_u=np.concatenate([rows.u_max.ravel(), np.full(N * m_s, np.inf)]),
-            later=np.concatenate(later),
         )
         nothing = np.zeros((N, problem.objective.C_r.shape[0]))
         self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp

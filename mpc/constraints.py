@@ -53,11 +53,11 @@ class Constraint:
     def __post_init__(self) -> None:
         _check_order(f"{self.name}.lower", self.lower, "upper", self.upper)
         m = self.lower.shape[-1]
-        given = [matrix for matrix in (self.C, self.D, self.E) if matrix is not None]
-        if not given or any(matrix.shape[-2] != m for matrix in given):
-            raise ParameterError("controller", self.name, [matrix.shape[-2] for matrix in given], f"{m} rows")
-        if not all(np.isfinite(matrix).all() for matrix in given):
-            raise ParameterError("controller", self.name, given, "finite numbers")
+        matrices = [matrix for matrix in (self.C, self.D, self.E) if matrix is not None]
+        if not matrices or any(matrix.shape[-2] != m for matrix in matrices):
+            raise ParameterError("controller", self.name, [matrix.shape[-2] for matrix in matrices], f"{m} rows")
+        if not all(np.isfinite(matrix).all() for matrix in matrices):
+            raise ParameterError("controller", self.name, matrices, "finite numbers")
         if self.C is not None and self.C.ndim == 3 and (self.D is not None or self.E is not None):
             raise ParameterError("controller", self.name, self.C.shape, "rows of states alone where they differ")
         if self.penalty is not None and self.penalty.l1.size != m:

@@ -80,13 +80,13 @@ def find_conflict(unanswered: InfeasiblePeriod) -> Conflict | None:
     total, violated, held = 0.0, dict[Side, Violation](), set[Side]()
     for elastic in filter(None, (of_inputs, sides.keys() - of_inputs)):
         present = {side: one for side, one in sides.items() if side in of_inputs or side in elastic}
-        found = _relaxed(problem, query, present, elastic)
-        if found is None:
+        relaxed = _relaxed(problem, query, present, elastic)
+        if relaxed is None:
             return None
-        total += found.total
-        if found.total <= FEASIBLE:
+        total += relaxed.total
+        if relaxed.total <= FEASIBLE:
             continue
-        giving = {side: slack for side, slack in found.slacks.items() if (slack > FEASIBLE).any()}
+        giving = {side: slack for side, slack in relaxed.slacks.items() if (slack > FEASIBLE).any()}
         for side, slack in giving.items():
             steps, share = np.flatnonzero(slack > FEASIBLE), float(slack.max())
             of_inputs_too = (parts[side.place].D, parts[side.place].E)
@@ -99,7 +99,7 @@ def find_conflict(unanswered: InfeasiblePeriod) -> Conflict | None:
             )
             one, wider = sides[side], share + FEASIBLE  # for what comes next, as wide as it has to be
             sides[side] = replace(one, lower=one.lower - wider, upper=one.upper + wider)
-        held |= _needed(problem, query, present, elastic, found, giving)
+        held |= _needed(problem, query, present, elastic, relaxed, giving)
     return Conflict(total=total, violated=violated, blocking=tuple(sorted(held - violated.keys())))
 
 
@@ -110,8 +110,8 @@ def smallest_widening(unanswered: InfeasiblePeriod, sides: Collection[Side]) -> 
     """
     problem, query = unanswered.problem, unanswered.query
     scales = {side: _scales(problem)[side.place][side.row] for side in sides}
-    found = _relaxed(problem, query, _sides(problem), sides, together=scales)
-    return None if found is None else found.total
+    relaxed = _relaxed(problem, query, _sides(problem), sides, together=scales)
+    return None if relaxed is None else relaxed.total
 
 
 def has_answer(problem: Problem, query: Query) -> bool:
@@ -178,17 +178,17 @@ def _needed(
     query: Query,
     sides: Mapping[Side, Constraint],
     elastic: Collection[Side],
-    found: _Relaxed,
+    relaxed: _Relaxed,
     giving: Collection[Side],
 ) -> set[Side]:
     """Of the bounds that are held, those without each of which there is less violation; no fewer would do."""
 
     def is_enough(held: Mapping[Side, Constraint]) -> bool:
         less = _relaxed(problem, query, held, elastic)
-        return less is not None and less.total >= found.total * (1.0 - 1e-6) - FEASIBLE
+        return less is not None and less.total >= relaxed.total * (1.0 - 1e-6) - FEASIBLE
 
     # Multipliers may fall by powers of ten along a chain of bounds, each at the next step, below what can be resolved.
-    priced = {side: one for side, one in sides.items() if side in found.priced or side in giving}
+    priced = {side: one for side, one in sides.items() if side in relaxed.priced or side in giving}
     present = priced if is_enough(priced) else dict(sides)
     for side in sorted(present.keys() - set(giving)):
         fewer = {other: one for other, one in present.items() if other != side}
@@ -229,7 +229,7 @@ def _relaxed(
         cost, box = np.append(np.zeros(others.size), 1.0), np.vstack([box[others], [0.0, math.inf]])
     above, below = np.isfinite(qp.h_u), np.isfinite(qp.h_l)
     for method in ("highs-ds", "highs-ipm"):  # the simplex fails now and then where the optimum is degenerate
-        found = linprog(
+        optimum = linprog(
             cost,
             A_ub=sparse.vstack([qp.G[above], -qp.G[below]]) @ basis,
             b_ub=np.concatenate([qp.h_u[above], -qp.h_l[below]]),
@@ -238,20 +238,20 @@ def _relaxed(
             bounds=box,
             method=method,
         )
-        if not found.status:
+        if not optimum.status:
             break
     else:
         return None
-    slacks = dict(zip(named, form.slacks(basis @ found.x).T, strict=True))
+    slacks = dict(zip(named, form.slacks(basis @ optimum.x).T, strict=True))
     if together is not None:
-        return _Relaxed(total=float(found.fun), slacks=slacks, priced=set())
+        return _Relaxed(total=float(optimum.fun), slacks=slacks, priced=set())
     z = np.zeros(qp.h_u.size)
-    z[above] -= found.ineqlin.marginals[: np.count_nonzero(above)]
-    z[below] += found.ineqlin.marginals[np.count_nonzero(above) :]
-    z_box = -found.upper.marginals - found.lower.marginals
-    multipliers = form.multipliers(Solution(x=found.x, y=np.zeros(0), z=z, z_box=z_box))
+    z[above] -= optimum.ineqlin.marginals[: np.count_nonzero(above)]
+    z[below] += optimum.ineqlin.marginals[np.count_nonzero(above) :]
+    z_box = -optimum.upper.marginals - optimum.lower.marginals
+    multipliers = form.multipliers(Solution(x=optimum.x, y=np.zeros(0), z=z, z_box=z_box))
     return _Relaxed(
-        total=float(found.fun),
+        total=float(optimum.fun),
         slacks=slacks,
         priced={side for side, priced in zip(sides, multipliers.T, strict=True) if (np.abs(priced) > PRICED).any()},
     )

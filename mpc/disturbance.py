@@ -146,8 +146,7 @@ class RampObserver:
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
         """What is missed so long [s] after the last measurement, (3,) each.
 
-        Returns:
-            acceleration [m/s^2] and its rate of change [m/s^3], world axes; angular acceleration, body axes [rad/s^2].
+        Acceleration [m/s^2], its rate of change [m/s^3], world axes; angular acceleration, body axes [rad/s^2].
         """
         value = self._value + (0.5 * self._period + ahead) * self._change  # estimated for the middle of the last period
         return value[:3], self._change[:3], value[3:]

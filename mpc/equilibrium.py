@@ -26,11 +26,7 @@ _ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]
 
 @dataclass(frozen=True, kw_only=True)
 class Trim:
-    """The estimated equilibrium of a vehicle.
-
-    Raises:
-        ParameterError: they are not as many finite numbers, or lift does not point upwards.
-    """
+    """The estimated equilibrium of a vehicle."""
 
     speeds: Array  # (4,) of the rotors [rad/s]
     lift: Array  # (3,) along which thrust points, world frame, of any length; upwards
@@ -38,12 +34,12 @@ class Trim:
     twist: Array = field(default_factory=zero)
 
     def __post_init__(self) -> None:
-        if np.shape(self.speeds) != (N_ROTORS,) or not all_true(np.isfinite(self.speeds)):
-            raise ParameterError("trim", "speeds", self.speeds, f"{N_ROTORS} finite numbers")
-        if np.shape(self.lift) != (3,) or not (all_true(np.isfinite(self.lift)) and self.lift[2] > 0.0):
-            raise ParameterError("trim", "lift", self.lift, "three finite numbers, the last one positive")
-        if np.shape(self.twist) != (3,) or not all_true(np.isfinite(self.twist)):
-            raise ParameterError("trim", "twist", self.twist, "three finite numbers")
+        for name, count in (("speeds", N_ROTORS), ("lift", 3), ("twist", 3)):
+            value = getattr(self, name)
+            if np.shape(value) != (count,) or not all_true(np.isfinite(value)):
+                raise ParameterError("trim", name, value, f"{count} finite numbers")
+        if not self.lift[2] > 0.0:
+            raise ParameterError("trim", "lift", self.lift, "upwards")
 
     def lean(self, yaw: float) -> tuple[float, float]:
         """Roll and pitch at rest with a yaw [rad]."""
@@ -62,9 +58,9 @@ class Trim:
 
 def twisted(effectiveness: Array, twist: Array) -> Array:
     """(4, 4) the effectiveness of a model whose thrust brings about an angular acceleration; see `Trim.twist`."""
-    found = effectiveness.copy()
-    found[1:] += twist[:, None] * effectiveness[0]
-    return found
+    changed = effectiveness.copy()
+    changed[1:] += twist[:, None] * effectiveness[0]
+    return changed
 
 
 def equilibrium(
@@ -72,10 +68,7 @@ def equilibrium(
 ) -> Trim:
     """What rest takes under a model's disturbance; a rotor that would have to pull stands still.
 
-    Args:
-        model: its effectiveness not yet `twisted`.
-        acceleration: (3,) of the disturbance, world frame [m/s^2]; None for the model's.
-        twist: (3,) see `Trim.twist`; None for none.
+    The model is not yet `twisted`; `acceleration` (3,), world frame [m/s^2], is in place of the model's.
     """
     a_x, a_y, a_z = model.acceleration.tolist() if acceleration is None else acceleration
     twist = np.zeros(3) if twist is None else twist

@@ -55,11 +55,7 @@ def motion_along(
 
 
 def attitudes(acceleration: Array, *, period: float, gravity: float, yaw: Array | float) -> tuple[Array, Array]:
-    """(K, 4) quaternions, and (K, 3) body rates [rad/s], along accelerations (K, 3); arguments as of `motion_along`.
-
-    Raises:
-        ParameterError: the heading is to be held upside down.
-    """
+    """(K, 4) quaternions, and (K, 3) body rates [rad/s], along accelerations (K, 3); arguments as of `motion_along`."""
     pushed = _pushed(acceleration, gravity)
     b = pushed / np.linalg.norm(pushed, axis=1)[:, None]
     if b[:, 2].min() < STEEP:

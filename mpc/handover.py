@@ -20,10 +20,10 @@ def hand_over(law: object, previous: object) -> None:
 
 def within(previous: object, kind: type[Law]) -> Law | None:
     """A law of the given kind, or the first such within it, as inside a fallback contract; None where there is none."""
-    found: Any = previous
-    while found is not None and not isinstance(found, kind):
-        found = getattr(found, "inner", None)
-    return found
+    law: Any = previous
+    while law is not None and not isinstance(law, kind):
+        law = getattr(law, "inner", None)
+    return law
 
 
 def observed(previous: object) -> Array | None:

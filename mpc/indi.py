@@ -51,9 +51,6 @@ class TorqueIncrement:
     """The inner loop: commanded rotor speeds to those that turn the vehicle as the law's model would have turned.
 
     See `quadsim.controller.InnerLoop`.
-
-    Attributes:
-        rate: how often it is called [Hz].
     """
 
     def __init__(self, vehicle: Vehicle, settings: INDISettings, bounds: ActuatorBounds) -> None:

@@ -71,10 +71,7 @@ class DisturbanceObserver:
     def __init__(self, settings: ObserverSettings, period: float) -> None:
         doubled = math.sqrt(2.0)
         _, force = observer_gain(
-            period,
-            noise=doubled * settings.velocity_noise,
-            walk=settings.velocity_walk,
-            change=settings.force_walk,
+            period, noise=doubled * settings.velocity_noise, walk=settings.velocity_walk, change=settings.force_walk
         )
         _, torque = observer_gain(
             period, noise=doubled * settings.rate_noise, walk=settings.rate_walk, change=settings.torque_walk
@@ -97,10 +94,10 @@ class DisturbanceObserver:
         """Take note of a measured state (12,) and of what was predicted for it (12,), disturbances included."""
         now, then = measured.tolist(), predicted.tolist()
         axis, rates, expected_rates = thrust_axis(now), body_rates_of(now), body_rates_of(then)
-        x, y, z = (found - wanted for found, wanted in zip(now[VELOCITIES], then[VELOCITIES], strict=True))
+        x, y, z = (a - b for a, b in zip(now[VELOCITIES], then[VELOCITIES], strict=True))
         along = z / max(axis[2], UPRIGHT)
         velocity = x - along * axis[0], y - along * axis[1], along
-        self.learn([*velocity, *(found - wanted for found, wanted in zip(rates, expected_rates, strict=True))])
+        self.learn([*velocity, *(a - b for a, b in zip(rates, expected_rates, strict=True))])
 
     def learn(self, surprise: Sequence[float] | Array) -> None:
         """Take note of by how much three velocities and three body rates (6,) are other than predicted."""

@@ -29,7 +29,7 @@ from mpc.constraints import Constraint, Penalty
 from mpc.ocp import Problem, Query, predicted
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.solvers import Answer, Solver
-from mpc.solvers.piqp import PiqpMultistage
+from mpc.solvers.piqp import Piqp
 from quadsim.controller import ACCEPTED
 from quadsim.fields import NonNegative
 from quadsim.space import AnyObstacle, Corridor, Fence, Obstacle, Solids
@@ -68,7 +68,7 @@ class Space:
     Args:
         shapes: the obstacles and regions.
         radius: of the vehicle's bounding ball [m].
-        period: from one of the N = `horizon` predicted instants to the next [s].
+        period: from one predicted instant to the next [s].
         horizon: N.
         settings: how closely.
         margins: (N, 3) further ones along x, y, z at each predicted instant [m], as of a disturbance; None for none.
@@ -156,7 +156,7 @@ class ObstacleQP:
 
     def reset(self) -> None:
         """Forget the last plan."""
-        self._forms: dict[int, tuple[PartiallyCondensed, PiqpMultistage]] = {}
+        self._forms: dict[int, tuple[PartiallyCondensed, Piqp]] = {}
         self._last: Array | None = None
 
     def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> tuple[Answer, Problem]:
@@ -233,12 +233,12 @@ class ObstacleQP:
             room[at] = -LOOSE  # what was there stays
             count *= 2
 
-    def _form(self, count: int) -> tuple[PartiallyCondensed, PiqpMultistage]:
+    def _form(self, count: int) -> tuple[PartiallyCondensed, Piqp]:
         """The QP with so many half-spaces at each instant, and what solves it."""
         if count not in self._forms:
             normals = np.full((count, self.problem.horizon, 3), 3.0**-0.5)  # in general position
             form = PartiallyCondensed(self._posed(normals, np.zeros(normals.shape[:2])), changing=self._changing)
-            backend = PiqpMultistage(changing=True)
+            backend = Piqp(changing=True)
             backend.setup(form.qp)
             self._forms[count] = form, backend
         return self._forms[count]

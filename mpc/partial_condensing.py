@@ -144,7 +144,7 @@ def condense(at: Layout, start: Array, free: Array, *steps: Array) -> tuple[Arra
 
 
 class PartiallyCondensed:
-    """The partially condensed QP of a problem.
+    """The partially condensed QP of a problem; `qp` is that for xi(k) and y_d zero and u(k-1) = u_bar.
 
     Args:
         problem: with constraints.
@@ -152,10 +152,6 @@ class PartiallyCondensed:
             takes what is left of the horizon, and where M > 1 as many more steps as there is room for in blocks of the
             others' size.
         changing: whether the model's matrices will be others; then no entry is left out that might be needed.
-
-    Attributes:
-        fixed: the matrices of the problem's model.
-        qp: of these, for xi(k) and y_d zero and u(k-1) = u_bar.
     """
 
     def __init__(self, problem: Problem, *, steps_per_stage: int | None = None, changing: bool = False) -> None:

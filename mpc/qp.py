@@ -12,7 +12,7 @@ from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem
 from quadsim.controller import SOLVED
-from quadsim.state import Array, Indices
+from quadsim.state import Array
 
 Matrix: TypeAlias = Array | csc_matrix
 
@@ -36,9 +36,6 @@ class QP:
     h_u: Array
     x_l: Array
     x_u: Array
-    # Which bound of [x; G x] is the same one step later in the plan, its own at the last step; None where that is
-    # not known.  What is active moves one step earlier from one period to the next
-    later: Indices | None = None
 
 
 class QPRows:

@@ -90,6 +90,8 @@ def _is_deeper(value: Any, levels: int) -> bool:
     """Whether tables and lists are nested more than this many levels deep."""
     layer = [value]
     for _ in range(levels + 1):
-        tables = (each.values() if isinstance(each, dict) else each for each in layer if isinstance(each, dict | list))
+        tables = (
+            value.values() if isinstance(value, dict) else value for value in layer if isinstance(value, dict | list)
+        )
         layer = [inner for table in tables for inner in table]
     return bool(layer)

@@ -24,7 +24,8 @@ def printable(text: str, *, keep: str = "") -> str:
     if text.isprintable():
         return text
     return "".join(
-        each if each in keep or unicodedata.category(each) not in _HIDDEN else ascii(each)[1:-1] for each in text
+        character if character in keep or unicodedata.category(character) not in _HIDDEN else ascii(character)[1:-1]
+        for character in text
     )
 
 

@@ -291,14 +291,14 @@ class Wall(Obstacle):
         """The wall left and right of the window, as high as the wall, and above and below it, as wide."""
         turn = _upright(self.yaw)
         thickness, width, height = self.size
-        found = []
+        solids = []
         for i, (opening, middle) in enumerate(zip(self.window, self.window_centre, strict=True)):
             reach = 0.5 * (width, height)[i]
             for low, high in ((-reach, middle - 0.5 * opening), (middle + 0.5 * opening, reach)):
                 half, centre = np.array([thickness, width, height]) / 2.0, np.zeros(3)
                 half[1 + i], centre[1 + i] = 0.5 * (high - low), 0.5 * (high + low)
-                found.append(Solid("box", (half[0], half[1], half[2]), turn @ centre, turn))
-        return tuple(found)
+                solids.append(Solid("box", (half[0], half[1], half[2]), turn @ centre, turn))
+        return tuple(solids)
 
 
 AnyObstacle = Sphere | Capsule | Box | Cylinder | Wall
@@ -321,8 +321,8 @@ class Region:
 
     def __post_init__(self) -> None:
         box, polytope = (self.position, self.size), (self.rows, self.upper)
-        given = [part is not None for part in (*box, *polytope)]
-        if given not in ([True, True, False, False], [False, False, True, True]):
+        stated = [part is not None for part in (*box, *polytope)]
+        if stated not in ([True, True, False, False], [False, False, True, True]):
             raise InputError("position must be given with size, or rows with upper, and not both")
         if self.rows is not None and self.upper is not None:
             if len(self.rows) != len(self.upper):
@@ -359,12 +359,12 @@ class Region:
                 corner = np.linalg.solve(chosen, upper[list(planes)])
                 if (rows @ corner <= upper + 1e-9).all():
                     corners.setdefault(tuple((corner.round(6) + 0.0).tolist()), set()).update(planes)
-        found = []
+        edges = []
         for (a, of_a), (b, of_b) in itertools.combinations(corners.items(), 2):
             shared = rows[sorted(of_a & of_b)]  # two at least that are not parallel, as where a face is cut off
             if len(shared) > 1 and np.linalg.norm(np.cross(shared[0], shared), axis=1).max() > _PARALLEL:
-                found.append((a, b))
-        return np.array(found).reshape(-1, 2, 3)
+                edges.append((a, b))
+        return np.array(edges).reshape(-1, 2, 3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -450,7 +450,7 @@ def shape_from_json(entry: Mapping[str, Any]) -> Constraining:
     kind = SHAPES[entry["type"]]
     values = {name: _frozen(value) for name, value in entry.items() if name != "type"}
     if "path" in values and issubclass(kind, Obstacle):
-        values["path"] = tuple(Place(time=each["time"], position=tuple(each["position"])) for each in entry["path"])
+        values["path"] = tuple(Place(time=place["time"], position=tuple(place["position"])) for place in entry["path"])
     shape: Constraining = kind(**values)
     points = np.zeros((1, 3))
     if not np.isfinite(shape.clearance(np.zeros(1), points)).all():
@@ -462,10 +462,7 @@ def _frozen(value: Any) -> Any:
     return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
-def footprint(solid: Solid, low: float, high: float) -> Array | None:
-    """(n, 2) outline from above of a solid that reaches between two heights, relative to its obstacle; None: not."""
-    bottom, top = solid.support(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))[:, 2]
-    if bottom > high or top < low:
-        return None
+def footprint(solid: Solid) -> Array:
+    """(n, 2) outline of a solid from above, relative to its obstacle."""
     around = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
     return solid.support(np.stack([np.cos(around), np.sin(around), np.zeros(around.size)], axis=1))[:, :2]

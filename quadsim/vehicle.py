@@ -73,21 +73,20 @@ class Vehicle:
     extent: Annotated[float | None, doc("[m] radius of the ball about the centre of mass that holds all of it")] = None
 
     def __post_init__(self) -> None:
-        for name in ("mass", "gravity", "arm_length", "thrust_coefficient", "drag_to_thrust", "speed_max"):
-            self._check_number(name, getattr(self, name), positive=True)
-        self._check_number("speed_min", self.speed_min, positive=False)
+        for name in VEHICLE_UNITS:
+            value, length = getattr(self, name), _LENGTHS.get(name)
+            if value is None and name in OPTIONAL_PARAMETERS:
+                continue
+            if length is not None:
+                if not isinstance(value, (tuple, list)) or len(value) != length:
+                    self._refuse(name, f"a list of {length} numbers")
+                object.__setattr__(self, name, tuple(value))
+            for number in (value,) if length is None else value:
+                _check_number(name, number, positive=name not in _ANY_SIGN)
         if self.speed_min < 0.0:
             self._refuse("speed_min", ">= 0 rad/s")
         if self.speed_min >= self.speed_max:
             self._refuse("speed_min", f"below speed_max = {self.speed_max}")
-        self._check_vector("inertia", 3, positive=True)
-        self._check_vector("rotor_azimuths", N_ROTORS, positive=False)
-        self._check_vector("rotor_spins", N_ROTORS, positive=False)
-        for name in OPTIONAL_PARAMETERS:
-            if name == "body_drag" and self.body_drag is not None:
-                self._check_vector(name, 3, positive=True)
-            elif getattr(self, name) is not None:
-                self._check_number(name, getattr(self, name), positive=True)
         for name in ("rotor_rise", "rotor_fall"):
             if (getattr(self, name) or 0.0) > SLOWEST_ROTOR:
                 self._refuse(name, f"above 0 and at most {SLOWEST_ROTOR:g} s, usually 0.01 to 0.3 s")
@@ -136,24 +135,6 @@ class Vehicle:
                     f"{speed:g} rad/s)",
                 )
 
-    def _check_number(self, name: str, value: object, *, positive: bool) -> None:
-        if isinstance(value, int) and abs(value) > LARGEST:  # of any length: more than a float, or a text, can hold
-            value = math.copysign(math.inf, value > 0 or -1)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise ParameterError("vehicle", name, value, "a finite number")
-        if positive and value <= 0.0:
-            raise ParameterError("vehicle", name, value, "positive")
-        if abs(value) > LARGEST or (positive and value < SMALLEST):
-            raise ParameterError("vehicle", name, value, f"between {SMALLEST:g} and {LARGEST:g}")
-
-    def _check_vector(self, name: str, length: int, *, positive: bool) -> None:
-        value = getattr(self, name)
-        if not isinstance(value, (tuple, list)) or len(value) != length:
-            raise ParameterError("vehicle", name, value, f"a list of {length} numbers")
-        for item in value:
-            self._check_number(name, item, positive=positive)
-        object.__setattr__(self, name, tuple(value))
-
     @property
     def drag_coefficient(self) -> float:
         """Drag coefficient d [N m s^2/rad^2]."""
@@ -189,6 +170,17 @@ class Vehicle:
         b, d = self.thrust_coefficient, self.drag_coefficient
         x, y, _ = self.rotor_positions.T
         return np.stack([np.full(N_ROTORS, b), b * y, -b * x, d * np.array(self.rotor_spins, float)])
+
+
+def _check_number(name: str, value: object, *, positive: bool) -> None:
+    if isinstance(value, int) and abs(value) > LARGEST:  # of any length: more than a float, or a text, can hold
+        value = math.copysign(math.inf, value > 0 or -1)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise ParameterError("vehicle", name, value, "a finite number")
+    if positive and value <= 0.0:
+        raise ParameterError("vehicle", name, value, "positive")
+    if abs(value) > LARGEST or (positive and value < SMALLEST):
+        raise ParameterError("vehicle", name, value, f"between {SMALLEST:g} and {LARGEST:g}")
 
 
 def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehicle:
@@ -252,3 +244,5 @@ MEANT: Final[dict[str, tuple[str, ...]]] = {"rotor_lag": ("rotor_rise", "rotor_f
 """Parameters by what else they are called, where another one is spelt more alike."""
 OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if field.default is None)
 """Parameters that a vehicle file may leave out."""
+_LENGTHS: Final = {"inertia": 3, "rotor_azimuths": N_ROTORS, "rotor_spins": N_ROTORS, "body_drag": 3}
+_ANY_SIGN: Final = ("rotor_azimuths", "rotor_spins", "speed_min")

@@ -20,18 +20,19 @@ from cyclopts import App, Parameter
 from quadsim import __version__
 from quadsim.assets import vehicle_names
 from quadsim.errors import FileError, InputError, OutputError, ParameterError
-from scenarios import shipped
+from scenarios.catalogue import campaign_names, paper_names, scenario_names, tuning_names
 
 if TYPE_CHECKING:
     from quadsim.controller import Controller
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
+    from scenarios.assembly import Assembly
     from scenarios.campaign.campaign import CampaignResult, Replay, Sweep
     from scenarios.campaign.paired import PairedComparison
     from scenarios.catalogue import Catalogue
-    from scenarios.comparison import Comparison
     from scenarios.design.vehicle_report import VehicleReport
     from scenarios.flight import Flight
+    from scenarios.flight_comparison import FlightComparison
     from scenarios.papers.reproduction import Reproductions
     from scenarios.progress import Progress
     from scenarios.reaudit import Reaudit
@@ -69,13 +70,13 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
             raise ValueError(f"must be a whole number; got {text!r:.100}")
         return int(text)
 
-    PairedComparison = CampaignResult = Catalogue = Comparison = Document = Flight = Listing = Reaudit = Any
+    PairedComparison = CampaignResult = Catalogue = FlightComparison = Document = Flight = Listing = Reaudit = Any
     Replay = Reproductions = ScenarioFile = TuningResult = VehicleReport = Any
     File = Path
     VehicleName = _one_of(vehicle_names)
-    Target = ScenarioName = _one_of(shipped.scenario_names)
-    CampaignName, PaperName = _one_of(shipped.campaign_names), _one_of(shipped.paper_names)
-    TuningName = _one_of(shipped.tuning_names)
+    Target = ScenarioName = _one_of(scenario_names)
+    CampaignName, PaperName = _one_of(campaign_names), _one_of(paper_names)
+    TuningName = _one_of(tuning_names)
     Changes = Annotated[Sequence[str], Parameter(name="--set")]
     Whole = Annotated[int, Parameter(converter=_whole)]
     Flag = Annotated[bool, Parameter(negative="")]
@@ -112,9 +113,9 @@ def load(name: str | Path, changes: Changes = ()) -> Scenario:
         >>> scenario.controller.horizon, scenario.duration
         (30, 60.0)
     """
-    from scenarios.loading import as_scenario
+    from scenarios.loading import load_scenario
 
-    return as_scenario(name, changes)
+    return load_scenario(name, changes)
 
 
 def feasibility(scenario: ScenarioName) -> Feasibility:
@@ -137,12 +138,9 @@ def feasibility(scenario: ScenarioName) -> Feasibility:
         >>> quadsim.feasibility(fast).problems[0]
         'roll up to 40.43 deg (bound 5)'
     """
-    from scenarios import feasibility_check
-    from scenarios.loading import as_scenario
-    from scenarios.parts.vehicle import build_vehicle
+    from scenarios import feasibility_check, loading
 
-    scenario = as_scenario(scenario)
-    return feasibility_check.report(scenario, build_vehicle(scenario))
+    return feasibility_check.report(loading.assemble(scenario))
 
 
 def make_controller(scenario: ScenarioName) -> Controller:
@@ -160,12 +158,9 @@ def make_controller(scenario: ScenarioName) -> Controller:
         >>> command.speeds.shape, command.plan.shape
         ((4,), (50, 4))
     """
-    from scenarios.build import build_controller
-    from scenarios.loading import as_scenario
-    from scenarios.parts.vehicle import build_vehicle
+    from scenarios.loading import assemble
 
-    scenario = as_scenario(scenario)
-    return build_controller(scenario, build_vehicle(scenario))
+    return assemble(scenario).controller()
 
 
 # --- flights -------------------------------------------------------------------------------------------------------
@@ -254,26 +249,25 @@ def run(
         ...     flown.outcome, flown.directory.name
         ('satisfied', 'run')
     """
-    from scenarios import loading
+    from scenarios import loading, user_code
     from scenarios.flight import require_rendering
     from scenarios.progress import reporting
+    from scenarios.rollout import Rollout
 
     if video:
         require_rendering()
-    flown = loading.as_scenario(scenario, changes, seed)
-    with run_directory(flown.name, out, overwrite=overwrite) as directory:
-        rollout = start(flown, controller=controller, forces=forces)
-        _announce(rollout.scenario, progress)
-        with reporting(progress) as report:
-            flight = replace(rollout.fly(report), directory=directory)
-            products: dict[str, Any] = {"video": video, "recording": recording, "figures": figures}
-            try:
-                flight.save(directory, overwrite=overwrite, progress=report, **products)
-            except OutputError as error:
-                if error.path.parent == directory:  # a product that was asked for by name
-                    error.result = flight
-                raise
-            return flight
+    parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces)
+    _announce(parts[0], progress)
+    products: dict[str, Any] = {"video": video, "recording": recording, "figures": figures}
+    with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory, reporting(progress) as report:
+        flight = replace(Rollout(*parts).fly(report), directory=directory)
+        try:
+            flight.save(directory, overwrite=overwrite, progress=report, **products)
+        except OutputError as error:
+            if error.path.parent == directory:  # a product that was asked for by name
+                error.result = flight
+            raise
+    return flight
 
 
 def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> AbstractContextManager[Path]:
@@ -285,15 +279,13 @@ def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> Abst
     return reserving(Path("runs") / name, overwrite=overwrite, free=not overwrite)
 
 
-def _announce(scenario: Scenario, progress: Watched) -> None:
+def _announce(assembly: Assembly, progress: Watched) -> None:
     """On a terminal, report what the course requires before it is flown; the summary repeats it."""
-    from scenarios import console
-    from scenarios.feasibility_check import fitting
-    from scenarios.parts.vehicle import build_vehicle
+    from scenarios import console, feasibility_check
 
     if progress is True and (terminal := console.stderr()).is_terminal:
-        required = feasibility(scenario)
-        fits = fitting(scenario, build_vehicle(scenario)) if required.problems else ""
+        required = feasibility_check.report(assembly)
+        fits = feasibility_check.fitting(assembly) if required.problems else ""
         console.show([f"{required.sentence} {fits}".rstrip()], terminal)
 
 
@@ -329,7 +321,7 @@ def start(
     from scenarios import loading, user_code
     from scenarios.rollout import Rollout
 
-    parts = user_code.set_up(loading.as_scenario(scenario), controller, forces)
+    parts = user_code.set_up(loading.assemble(scenario), controller, forces)
     return Rollout(*parts, live=live, recorded=recorded)
 
 
@@ -353,6 +345,7 @@ def read(directory: str | Path) -> Flight:
     from quadsim.flight import rundir
     from quadsim.flight.rundir import finding_from_json
     from quadsim.vehicle import Vehicle
+    from scenarios.assembly import Assembly
     from scenarios.flight import Flight
     from scenarios.reaudit import stored_scenario
 
@@ -360,8 +353,7 @@ def read(directory: str | Path) -> Flight:
     run = rundir.load_run(directory)
     law = run.summary["controller"]
     return Flight(
-        scenario=stored_scenario(directory),
-        vehicle=Vehicle(**run.summary["vehicle"]),
+        assembly=Assembly(stored_scenario(directory), Vehicle(**run.summary["vehicle"])),
         log=run.log,
         findings=tuple(finding_from_json(entry) for entry in run.summary["constraints"]),
         controller=law["name"],
@@ -410,6 +402,8 @@ def check(
     from scenarios import loading, reaudit
     from scenarios.campaign.store import is_campaign
     from scenarios.junit import junit_file, write_junit
+    from scenarios.progress import reporting
+    from scenarios.rollout import Rollout
 
     file = None if junit is None else junit_file(junit)
     if isinstance(target, str | Path) and Path(target).is_dir():
@@ -425,9 +419,10 @@ def check(
         for note in audited.notes:
             _log.info("%s: %s", target, note)
     else:
-        scenario = loading.as_scenario(target, changes, seed)
-        _announce(scenario, progress)
-        flight = fly(scenario, progress=progress)
+        assembly = loading.assemble(target, changes, seed)
+        _announce(assembly, progress)
+        with reporting(progress) as report:
+            flight = Rollout(assembly).fly(report)
         audited = reaudit.Reaudit(summary=dict(flight.summary), findings=flight.findings, satisfied=flight.satisfied)
     if file is not None:
         write_junit(audited, file)
@@ -441,7 +436,7 @@ def compare(
     overwrite: Flag = False,
     markdown: Flag = False,
     progress: Watched = True,
-) -> Comparison | PairedComparison | Document:
+) -> FlightComparison | PairedComparison | Document:
     """Flights, or two campaigns flight by flight, side by side: table, figures, HTML page.
 
     Args:
@@ -463,14 +458,14 @@ def compare(
         True
     """
     from quadsim.outputs import absolute
-    from scenarios.comparison import compare_campaigns, compare_flights, is_campaign
+    from scenarios.flight_comparison import compare_campaigns, compare_flights, is_campaign
     from scenarios.progress import reporting
     from scenarios.results import Document
 
     if not targets:
         raise InputError("compare needs runs, scenarios, or two campaigns")
     page = None if out is None else absolute(out)
-    compared: Comparison | PairedComparison
+    compared: FlightComparison | PairedComparison
     if any(isinstance(target, str | Path) and is_campaign(Path(target)) for target in targets):
         compared = compare_campaigns([Path(str(target)) for target in targets], page, overwrite=overwrite)
     else:
@@ -616,7 +611,7 @@ def live(
         quadsim.errors.ParameterError: --port must be from 1 to 65535, or 0 for any that is free; got 70000
     """
     from scenarios.live.serving import fly_live
-    from scenarios.loading import as_scenario
+    from scenarios.loading import load_scenario
     from scenarios.reaudit import reaudit, stored_scenario
 
     onward = isinstance(scenario, str | Path) and Path(scenario).is_dir()
@@ -625,8 +620,8 @@ def live(
             raise ParameterError("", "--set" if changes else "--seed", "given", "absent where a run is flown on")
         reaudit(Path(str(scenario)), products=False)
         scenario = stored_scenario(Path(str(scenario)))
-    flown = as_scenario(scenario, changes, seed)
-    other = None if against is None else as_scenario(against).controller
+    flown = load_scenario(scenario, changes, seed)
+    other = None if against is None else load_scenario(against).controller
     place = {"port": port, "host": host, "browser": browser}
     return fly_live(flown, other, script, onward=onward, out=out, overwrite=overwrite, video=video, **place)
 
@@ -667,12 +662,12 @@ def sweep(
         ([20.0, 40.0], ['satisfied', 'satisfied'])
     """
     from scenarios.campaign.campaign import fly_sweep
-    from scenarios.loading import as_scenario
+    from scenarios.loading import load_scenario
     from scenarios.progress import reporting
     from scenarios.user_code import importable
 
     with reporting(progress) as report:
-        return fly_sweep(importable(as_scenario(scenario), controller, forces), values, workers, report)
+        return fly_sweep(importable(load_scenario(scenario), controller, forces), values, workers, report)
 
 
 @app.command
@@ -931,7 +926,7 @@ def reproduce(
     from scenarios.progress import reporting
 
     file = None if junit is None else junit_file(junit)
-    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else shipped.paper_names())]
+    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
     with reporting(progress) as report:
         found = Reproductions(reproduce_paper(each, report) for each in papers)
     if file is not None:
@@ -975,7 +970,7 @@ def export(
     from scenarios import loading, results
     from scenarios.export import exporter, in_the_loop
 
-    flown, options = loading.as_scenario(scenario, changes, seed), {"precision": precision, "target": target}
+    flown, options = loading.load_scenario(scenario, changes, seed), {"precision": precision, "target": target}
     directory = exporter.export(flown, out, overwrite=overwrite, rows=rows, **options)  # type: ignore[arg-type]
     room = exporter.room_sentence(json.loads((directory / exporter.FACTS).read_text()))
     make = f"make -C {shlex.quote(str(directory))} check"
@@ -1026,10 +1021,9 @@ def scenario(
     import json
     from dataclasses import replace
 
-    from scenarios import build, loading, results
+    from scenarios import loading, results
     from scenarios.courses.csv_course import Csv
     from scenarios.design.first_scenario import first_scenario
-    from scenarios.parts.vehicle import build_vehicle
     from scenarios.schema.json_schema import scenario_schema
 
     if schema:
@@ -1043,10 +1037,9 @@ def scenario(
     for option, value in choice.items():
         raise ParameterError("", "--course" if option == "course" else "--controller", value, "given with --for alone")
     if name is None:
-        names = ", ".join(shipped.scenario_names())
+        names = ", ".join(scenario_names())
         raise InputError(f"scenario needs a name or a TOML file, or --schema (there are: {names})")
-    given = loading.as_scenario(name, changes, seed)
-    whole = build.resolve(given, build_vehicle(given))
+    whole = loading.assemble(name, changes, seed).resolved.scenario
     if isinstance(whole.reference, Csv):  # another table may take the place of its own
         whole = whole.model_copy(update={"reference": replace(whole.reference, sha256=None)})
     return results.ScenarioFile(whole.to_toml())
@@ -1099,7 +1092,7 @@ def vehicle_report(
         names = ", ".join(vehicle_names())
         raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
     loaded = load_vehicle(name)
-    against = None if scenario is None else loading.as_scenario(scenario)
+    against = None if scenario is None else loading.load_scenario(scenario)
     if out is not None:
         if Path(out).suffix != ".png":
             raise ParameterError("", "--out", str(out), "a file ending in .png")
@@ -1171,7 +1164,7 @@ def doctor() -> Listing:
         >>> sorted(found)
         ['machine', 'packages', 'rendering', 'solvers', 'viewer']
     """
+    from scenarios.machine import capabilities
     from scenarios.results import Listing
-    from scenarios.self_check import doctor as check_machine
 
-    return Listing(check_machine())
+    return Listing(capabilities())

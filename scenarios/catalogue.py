@@ -1,30 +1,55 @@
-"""What ships, each with a sentence; found without anything heavy."""
+"""What ships, by name: scenarios, campaigns, tunings, papers, controllers; found without anything heavy."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Final, get_args
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
 
-from mpc.solvers import solver_entries
 from quadsim.assets import read_toml, vehicle_names, vehicle_path
-from quadsim.vehicle import load_vehicle
+from quadsim.errors import FileError, UnknownNameError
 from scenarios.results import Result, Shown
-from scenarios.shipped import (
-    CONTROLLERS,
-    Group,
-    campaign_names,
-    campaign_path,
-    paper_names,
-    paper_path,
-    scenario_names,
-    scenario_path,
-    tuning_names,
-    tuning_path,
-)
 
+_HERE: Final = Path(__file__).resolve().parent
+LIBRARY, CAMPAIGNS, TUNINGS, PAPERS = (_HERE / name for name in ("library", "campaigns", "tunings", "papers"))
+
+Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
+
+CONTROLLERS: Final = {
+    "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
+    "constrained": "the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
+    "robust": "constrained, with soft bounds, rotor lag, delay, disturbances, heading and more, each switched on alone",
+    "nonlinear": "nonlinear MPC at any attitude: a quaternion model, sequential quadratic programming",
+    "lqr": "infinite-horizon LQR on the hover model, following the reference's velocity",
+    "pid": "cascaded PID, as autopilots fly it",
+    "geometric": "geometric tracking control on SE(3)",
+}
 _MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
 """The mark of a scenario that is to defeat its controller."""
+
+
+def _names(folder: Path) -> list[str]:
+    """Names of what ships in a folder, sorted."""
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
+def _path(kind: str, folder: Path, name: str) -> Path:
+    """The file of a name that ships, or the path itself where it ends in `.toml`; refused where there is none."""
+    if name.endswith(".toml"):
+        if not Path(name).is_file():
+            raise FileError(name, f"no such {kind} file")
+        return Path(name)
+    if name not in _names(folder):
+        raise UnknownNameError(kind, name, _names(folder), hint="or give a path ending in .toml")
+    return folder / f"{name}.toml"
+
+
+scenario_names, scenario_path = partial(_names, LIBRARY), partial(_path, "scenario", LIBRARY)
+campaign_names, campaign_path = partial(_names, CAMPAIGNS), partial(_path, "campaign", CAMPAIGNS)
+tuning_names, tuning_path = partial(_names, TUNINGS), partial(_path, "tuning", TUNINGS)
+paper_names, paper_path = partial(_names, PAPERS), partial(_path, "paper", PAPERS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +83,7 @@ class Catalogue(Result):
             for group in get_args(Group)
             if (
                 lines := {
-                    n: each.description + _MEANT.get(each.expect, "") for n, each in shipped if each.group == group
+                    n: entry.description + _MEANT.get(entry.expect, "") for n, entry in shipped if entry.group == group
                 }
             )
         }
@@ -69,12 +94,15 @@ class Catalogue(Result):
         """As plain values, those of scenarios by their field."""
         shipped = self.scenarios.items()
         columns = {"scenarios": "description", "groups": "group", "expected": "expect"}
-        by_field = {title: {name: getattr(each, field) for name, each in shipped} for title, field in columns.items()}
+        by_field = {title: {name: getattr(entry, field) for name, entry in shipped} for title, field in columns.items()}
         return {**by_field, **{title: value for title, value in asdict(self).items() if title != "scenarios"}}
 
 
 def read_catalogue() -> Catalogue:
     """Everything that ships; files are right, and not checked."""
+    from mpc.solvers import solver_entries
+    from quadsim.vehicle import load_vehicle
+
     scenarios = {}
     for name in scenario_names():
         read = {"group": "other", "expect": "satisfied"} | read_toml(scenario_path(name))

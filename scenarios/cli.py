@@ -12,7 +12,8 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from inspect import BoundArguments
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -30,28 +31,23 @@ app.register_install_completion_command(help="Install completion for this shell:
 
 
 @app.meta.default
-def _launch(
+def _parse(
     *words: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
     json: Annotated[bool, Parameter(negative="", help="print the result alone, as JSON on stdout.")] = False,
-) -> int:
-    """Run one command, and show its result, or what there is of it where it failed."""
+) -> tuple[Callable[..., object], BoundArguments, bool]:
+    """A command, its arguments, and whether its result is printed as JSON."""
     command, bound, ignored = app.parse_args(words, exit_on_error=False, print_error=False)
     if json and "progress" in ignored:
         bound.arguments["progress"] = False
-    try:
-        result = command(*bound.args, **bound.kwargs)
-    except QuadsimError as error:
-        _show(error.result, json)
-        raise
-    return _show(result, json)
+    return command, bound, json
 
 
 def _show(result: object, json: bool) -> int:
     """Print a result; returns its exit status."""
     if isinstance(result, Path):
-        from scenarios.console import shown
+        from scenarios.console import short_path
 
-        result = Document(f"written to {printable(shown(result))}\n", str(result))
+        result = Document(f"written to {printable(short_path(result))}\n", str(result))
     if not isinstance(result, Result):
         return 0
     if json:
@@ -68,10 +64,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not words:
             app.help_print()
             return EXIT_WRONG_INPUT
+        status = 0
         with _notices():
-            status: Any = app.meta(words, exit_on_error=False, print_error=False, result_action="return_value")
+            parsed: Any = app.meta(words, exit_on_error=False, print_error=False, result_action="return_value")
+            if parsed is not None:  # as after --help
+                command, bound, json = parsed
+                try:
+                    status = _show(command(*bound.args, **bound.kwargs), json)
+                except QuadsimError as error:  # what there is of a result where it failed
+                    _show(error.result, json)
+                    raise
         sys.stdout.flush()
-        return status or 0
+        return status
     except CycloptsError as error:
         print(f"quadsim: {_brief(str(error))}", file=sys.stderr)
         return EXIT_WRONG_INPUT

@@ -83,10 +83,10 @@ def say(text: str) -> None:
 
 def written_to(path: Path) -> Text:
     """Where something was written."""
-    return styled("written to ", (shown(path), "bold"))
+    return styled("written to ", (short_path(path), "bold"))
 
 
-def shown(path: Path) -> str:
+def short_path(path: Path) -> str:
     """A path for a person: relative to the current directory where it is in there."""
     with contextlib.suppress(ValueError, OSError):  # it is not in there; the current directory is gone
         return str(path.relative_to(Path.cwd()))
@@ -120,7 +120,7 @@ def cell(cell: Cell) -> Text:
 def grids(grids: Iterable[Grid], *, left: Collection[str] = ()) -> Iterator[RenderableType]:
     """Tables of a report, each with what a reader has to know of it; `left` names columns of words."""
     for grid in grids:
-        lines = [[cell(each) for each in line] for line in grid.lines]
+        lines = [[cell(value) for value in line] for line in grid.lines]
         yield table(grid.title, grid.head, lines, caption=grid.note.replace("`", "") or None, left=left)
         yield ""
 

@@ -18,18 +18,18 @@ from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course
 from scenarios.courses.smoothing import within_rounding
-from scenarios.reference import build_course, filtered, initial_pose
 from scenarios.schema.events import SetpointEvent
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.robust import RobustSpec
 
 if TYPE_CHECKING:
+    from scenarios.assembly import Assembly
     from scenarios.schema.scenario import Scenario
 
 Range = tuple[float, float]
 
 
-def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
+def report(assembly: Assembly) -> Feasibility:
     """What the filtered course requires, up to a set-point, against the vehicle's limits and the controller's bounds.
 
     A table that was rounded is taken for the smoothest one within its last decimal: differences of the fourth order
@@ -38,10 +38,10 @@ def report(scenario: Scenario, vehicle: Vehicle) -> Feasibility:
     Raises:
         InputError: the course cannot be built.
     """
-    return _required(build_course(scenario), scenario, vehicle, duration=_followed(scenario))
+    return _required(assembly.course, assembly, duration=_followed(assembly.scenario))
 
 
-def fitting(scenario: Scenario, vehicle: Vehicle) -> str:
+def fitting(assembly: Assembly) -> str:
     """At which speed, size or response time a course that is beyond limits or bounds would be within them.
 
     The course is flown more slowly, made smaller about its start, or filtered more, to the nearest percent; jumps count
@@ -50,18 +50,19 @@ def fitting(scenario: Scenario, vehicle: Vehicle) -> str:
     Returns:
         A sentence; empty where the course fits as it is, or at none of them down to a tenth.
     """
-    course, duration, filtered_by = build_course(scenario), _followed(scenario), scenario.reference.response_time
+    scenario, course = assembly.scenario, assembly.course
+    duration, filtered_by = _followed(scenario), scenario.reference.response_time
 
     def slower(share: float) -> bool:
-        return not _required(_scaled(course, pace=share), scenario, vehicle, duration=duration / share).problems
+        return not _required(_scaled(course, pace=share), assembly, duration=duration / share).problems
 
     def smaller(share: float) -> bool:
-        return not _required(_scaled(course, size=share), scenario, vehicle, duration=duration).problems
+        return not _required(_scaled(course, size=share), assembly, duration=duration).problems
 
     def smoother(share: float) -> bool:
         changed = replace(scenario.reference, response_time=filtered_by / share)
-        softened = scenario.model_copy(update={"reference": changed})
-        return not _required(course, softened, vehicle, duration=duration).problems
+        softened = assembly.of(scenario.model_copy(update={"reference": changed}))
+        return not _required(course, softened, duration=duration).problems
 
     if smaller(1.0):
         return ""
@@ -108,16 +109,17 @@ def _scaled(course: Course, *, pace: float = 1.0, size: float = 1.0) -> Course:
     )
 
 
-def _required(course: Course, scenario: Scenario, vehicle: Vehicle, *, duration: float) -> Feasibility:
+def _required(course: Course, assembly: Assembly, *, duration: float) -> Feasibility:
     """What a course, in place of the scenario's and for this duration [s], requires."""
+    scenario, vehicle = assembly.scenario, assembly.vehicle
     period = scenario.control_period
     samples = round(duration / period) + 1
-    flown = filtered(course, scenario, samples + STENCIL)
+    flown = assembly.followed(course).first(samples + STENCIL)
     poses = np.vstack([np.tile(course.initial, (STENCIL, 1)), flown])  # before the flight the vehicle is at rest
     t: Array = period * np.arange(-STENCIL, samples + STENCIL, dtype=np.float64)
     raw = np.vstack([np.tile(course.initial, (STENCIL, 1)), course.sample(t[STENCIL:])])
     changes = np.any(raw[1:] != raw[:-1], axis=1)
-    away = () if np.allclose(initial_pose(scenario), course.initial, rtol=0.0, atol=1e-9) else (0.0,)
+    away = () if np.allclose(assembly.initial_pose, course.initial, rtol=0.0, atol=1e-9) else (0.0,)
     jumps = sorted({time for time in (*course.jumps, *away) if time < duration})
     jumped, kinked = _touched(t, course.jumps) & changes, _touched(t, _isolated(course.kinks, period))
     channels = zip(poses.T, course.resolution, strict=True)

@@ -30,13 +30,10 @@ from quadsim.sim.sensing import SensorName
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.feasibility_check import report
+from scenarios.flight_events import story
 from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
-from scenarios.parts.effects import build_computation
-from scenarios.parts.events import story
-from scenarios.parts.vehicle import build_actual
 from scenarios.progress import Progress, silent
-from scenarios.reference import build_course_steps
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario, Verdict
 from scenarios.schema.settings import leaves
@@ -45,6 +42,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from mpc.ocp import InfeasiblePeriod
+    from scenarios.assembly import Assembly
 
 _LONGEST: Final = 500  # characters of why a product failed
 _log: Final = logging.getLogger("quadsim")
@@ -59,8 +57,7 @@ class Flight(Result):
     `log_rate`).  Angles are in rad, world frame z up, Euler angles roll, pitch, yaw (Z-Y-X).
 
     Attributes:
-        scenario: resolved, with every number of its vehicle in it.
-        vehicle: as modelled, what the controller knows.
+        assembly: the parts of its scenario, which is resolved, with every number of its vehicle in it.
         log: the flight as stacked arrays.
         findings: the audit, one per constraint of the scenario.
         controller: name of the control law.
@@ -80,8 +77,7 @@ class Flight(Result):
         True
     """
 
-    scenario: Scenario
-    vehicle: Vehicle
+    assembly: Assembly
     log: FlightLog = field(repr=False)
     findings: tuple[Finding, ...] = field(repr=False)
     controller: str
@@ -91,6 +87,21 @@ class Flight(Result):
     directory: Path | None = None
     recorded: Mapping[str, Any] | None = field(default=None, repr=False)
     unanswered: InfeasiblePeriod | None = field(default=None, repr=False)
+
+    @property
+    def scenario(self) -> Scenario:
+        """What was flown, with every number of its vehicle in it."""
+        return self.assembly.scenario
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """As modelled, what the controller knows."""
+        return self.assembly.vehicle
+
+    @property
+    def actual(self) -> Vehicle:
+        """The vehicle as it was flown: the modelled one, but for what the scenario's `[actual]` states."""
+        return self.assembly.actual
 
     @property
     def satisfied(self) -> bool:
@@ -126,10 +137,10 @@ class Flight(Result):
         """
         if self.recorded is not None:
             return self.recorded.get("diagnosis")
-        from scenarios.diagnosis import diagnose
-
         if self.unanswered is None or (self.unanswered.status == NOT_CONVERGED and self.satisfied):
             return None
+        from scenarios.infeasibility import diagnose
+
         spec = self.scenario.controller_at(self.unanswered.time)
         posed = self.scenario.model_copy(update={"controller": spec, "events": []})
         return diagnose(self.unanswered, posed, self.vehicle)
@@ -138,11 +149,6 @@ class Flight(Result):
     def audit(self) -> tuple[Finding, ...]:
         """What the audit found at the physics rate, one entry per constraint of the scenario."""
         return self.findings
-
-    @cached_property
-    def actual(self) -> Vehicle:
-        """The vehicle as it was flown: the modelled one, but for what the scenario's `[actual]` states."""
-        return build_actual(self.scenario, self.vehicle)
 
     @property
     def time(self) -> Array:
@@ -185,15 +191,15 @@ class Flight(Result):
         """
         plant, t = self.log.plant, self.time
         starts = np.minimum(np.searchsorted(plant.t, t - 1e-9), max(plant.t.size - 1, 0))
-        found: dict[str, Array] = {}
+        margins: dict[str, Array] = {}
         for finding in self.findings:
             limit, signal = finding.limit, finding.limit.source
             if signal.plant is None or not t.size:
-                found[limit.name] = margins_sampled(limit, self.log)
+                margins[limit.name] = margins_sampled(limit, self.log)
             else:
                 between = margins_at(limit, plant.t, signal.plant(plant))
-                found[limit.name] = np.fmin.reduceat(between, starts)
-        return found
+                margins[limit.name] = np.fmin.reduceat(between, starts)
+        return margins
 
     @cached_property
     def summary(self) -> Mapping[str, Any]:
@@ -203,8 +209,10 @@ class Flight(Result):
     @cached_property
     def metrics(self) -> dict[str, float]:
         """The flight's numbers by name, e.g. `rmse.x`, `speed_max`, `step_ms.p99`; units as in `summary`."""
-        found = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self.summary[name]))
-        return {name: value for name, value in found if isinstance(value, int | float) and not isinstance(value, bool)}
+        numbers = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self.summary[name]))
+        return {
+            name: value for name, value in numbers if isinstance(value, int | float) and not isinstance(value, bool)
+        }
 
     @property
     def run(self) -> rundir.Run:
@@ -382,12 +390,12 @@ def require_rendering() -> None:
 def summarise(flight: Flight) -> dict[str, Any]:
     """`summary.json` of a flight, but for the hashes of its files and the total wall time."""
     scenario, log = flight.scenario, flight.log
-    course = build_course_steps(scenario)
     ground = scenario.effects.ground
     flown = log.control.t.size > 0
     samples = {str(name): asdict(tally) for name, tally in flight.tallies.items()}
     estimation = {} if log.control.measured_perfectly else {**metrics.estimation(log.control), "samples": samples}
-    numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=course)
+    steps = flight.assembly.course_steps
+    numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=steps)
     return {
         "scenario": scenario.name,
         "description": scenario.description,
@@ -402,11 +410,11 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "as_expected": flight.outcome == scenario.expect,
         "duration": round(log.control.t.size * scenario.control_period, 9),
         "seed": scenario.seed,
-        "course": asdict(report(scenario, flight.vehicle)),
+        "course": asdict(report(flight.assembly)),
         **({"events": events} if (events := story(scenario, log.control.t.size * scenario.control_period)) else {}),
         "tracking": numbers["tracking"],
         "constraints": [limit_to_json(finding) for finding in flight.findings],
-        "audit_notes": audit_notes(scenario),
+        "audit_notes": audit_notes(flight.assembly),
         "control": numbers["control"],
         "diagnosis": flight.diagnosis,
         "controller": {
@@ -415,7 +423,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
             "horizon": scenario.controller.horizon,
             **numbers["controller"],
         },
-        **({"computation": metrics.computation(log.control)} if flown and build_computation(scenario) else {}),
+        **({"computation": metrics.computation(log.control)} if flown and flight.assembly.computation() else {}),
         **({"estimation": estimation} if estimation else {}),
         **({"ground": metrics.ground(log, outline(flight.actual))} if flown and ground and ground.contact else {}),
         "vehicle": asdict(flight.vehicle),

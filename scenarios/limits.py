@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Final
 
 from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
 from quadsim.report.table import format_number
-from scenarios.parts.vehicle import build_actual, build_vehicle
-from scenarios.reference import timed_regions
 from scenarios.schema.controller import NonlinearSpec
 
 if TYPE_CHECKING:
     from quadsim.vehicle import Vehicle
+    from scenarios.assembly import Assembly
     from scenarios.schema.controller import ControllerSpec
     from scenarios.schema.scenario import Scenario
 
@@ -29,42 +28,41 @@ SHARE, SHARE_SAMPLED, ROUNDING = 0.01, 0.002, 1e-6
 """Tolerances of bounds that no entry names: shares of half the band, and of commands their rounding [rad/s]."""
 
 
-def build_limits(scenario: Scenario) -> tuple[Limit, ...]:
+def audited(assembly: Assembly) -> tuple[Limit, ...]:
     """What the flight is audited against: its constraints, the bounds of its controller, obstacles and regions."""
-    bounds = controller_bounds(scenario.controller, build_vehicle(scenario))
+    scenario, bounds = assembly.scenario, assembly.bounds
     return (
         *_stated(scenario, bounds),
         *_unnamed(scenario, bounds),
         *_sum_limits(scenario),
-        *space_limits(scenario),
+        *space_limits(assembly),
     )
 
 
-def with_bounds_stated(scenario: Scenario) -> Scenario:
+def with_bounds_stated(assembly: Assembly) -> Scenario:
     """The scenario with its controller's bounds as constraints, for another controller to be held to the same."""
-    bounds = controller_bounds(scenario.controller, build_vehicle(scenario))
+    scenario, bounds = assembly.scenario, assembly.bounds
     return scenario.model_copy(update={"constraints": [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]})
 
 
 def controller_bounds(spec: ControllerSpec, vehicle: Vehicle) -> dict[str, Range]:
     """The bounds that a controller has on signals of the audit, hard or soft, in their units."""
-    found: dict[str, Range] = {name: (pair[0], pair[1]) for name, pair in getattr(spec, "output_bounds", {}).items()}
+    bounds: dict[str, Range] = {name: (pair[0], pair[1]) for name, pair in getattr(spec, "output_bounds", {}).items()}
     if isinstance(spec, NonlinearSpec) and spec.tilt is not None:
-        found["tilt"] = (-math.inf, spec.tilt)
+        bounds["tilt"] = (-math.inf, spec.tilt)
     if isinstance(spec, NonlinearSpec) and spec.body_rate is not None:
         largest = spec.body_rate if isinstance(spec.body_rate, list) else [spec.body_rate] * 3
-        found |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", largest, strict=True)}
+        bounds |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", largest, strict=True)}
     inputs = getattr(spec, "input_bounds", None)
     if inputs is not None:
         pairs = {"speed": inputs.speed or (vehicle.speed_min, vehicle.speed_max), "slew": inputs.slew}
-        found |= {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
-    return found
+        bounds |= {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
+    return bounds
 
 
-def audit_notes(scenario: Scenario) -> list[str]:
+def audit_notes(assembly: Assembly) -> list[str]:
     """What a reader of the audit has to know: bounds that no constraint names, and others than the controller's."""
-    vehicle = build_vehicle(scenario)
-    bounds = controller_bounds(scenario.controller, vehicle)
+    scenario, vehicle, bounds = assembly.scenario, assembly.vehicle, assembly.bounds
     unnamed = [limit.name for limit in _unnamed(scenario, bounds)]
     absent = [entry.name for entry in scenario.constraints if not (entry.has_bounds or entry.signal in bounds)]
     notes = []
@@ -129,14 +127,14 @@ def _range(lower: float, upper: float) -> str:
     return f"±{format_number(upper)}" if lower == -upper else f"{format_number(lower)} .. {format_number(upper)}"
 
 
-def space_limits(scenario: Scenario) -> tuple[SpaceLimit, ...]:
+def space_limits(assembly: Assembly) -> tuple[SpaceLimit, ...]:
     """The obstacles to keep clear of, then the regions to stay in."""
-    regions = timed_regions(scenario)
-    if not scenario.obstacles and not regions:
+    obstacles, regions = assembly.scenario.obstacles, assembly.regions
+    if not obstacles and not regions:
         return ()
-    radius = build_actual(scenario, build_vehicle(scenario)).enclosing_radius
+    radius = assembly.actual.enclosing_radius
     return (
-        *(SpaceLimit(name=obstacle.name, shape=obstacle, radius=radius) for obstacle in scenario.obstacles),
+        *(SpaceLimit(name=obstacle.name, shape=obstacle, radius=radius) for obstacle in obstacles),
         *(
             SpaceLimit(
                 name=region.name,

@@ -1,15 +1,18 @@
-"""The machine and the packages that numbers depend on, and how many cores there are."""
+"""The machine: the packages that numbers depend on, its cores, and what it can do."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import os
 import platform
+import shutil
+import time as clock
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 from quadsim import __version__
+from quadsim.errors import FlightError, QuadsimError
 
 PACKAGES: Final = ("mujoco", "numpy", "scipy", "piqp", "rerun-sdk", "imageio", "pyarrow", "matplotlib")
 
@@ -43,3 +46,53 @@ def processor_name() -> str:
 def usable_cores() -> int:
     """Cores that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def capabilities() -> dict[str, dict[str, str]]:
+    """What this machine can do, by section; every installed QP solver is tried on a step of the constrained MPC."""
+    from mpc.solvers import solver_entries
+    from quadsim.report.recording import viewer_problem
+
+    here = machine()
+    return {
+        "machine": {
+            "system": here["system"],
+            "processor": f"{here['processor']}, {usable_cores()} of {here['cores']} cores usable",
+            "disk": f"{shutil.disk_usage('.').free / 1e9:.1f} GB free here",
+        },
+        "packages": versions(),
+        "rendering": {"video": _rendering()},
+        "viewer": {"native": viewer_problem() or "can be opened", "browser": "quadsim view RUN --web"},
+        "solvers": {
+            name: _try_solver(name) if entry.installed else entry.line for name, entry in solver_entries().items()
+        },
+    }
+
+
+def _rendering() -> str:
+    from quadsim.report.film.video import rendering_backend
+
+    try:
+        return f"renders off screen through {rendering_backend().upper()}"
+    except QuadsimError as error:
+        return str(error)
+
+
+def _try_solver(name: str) -> str:
+    """Solve the first step of the paper's constrained flight."""
+    from quadsim.controller import SOLVED, Moment
+    from scenarios.loading import assemble
+
+    assembly = assemble("paper-constrained", [f"controller.solver={name}"])
+    started = clock.perf_counter()
+    controller = assembly.controller()
+    built = clock.perf_counter()
+    controller.reset(assembly.initial_speeds)
+    reference = assembly.reference(controller.horizon + 1)[1:]
+    try:
+        command = controller.step(Moment(), assembly.initial_state(), reference)
+    except FlightError as error:
+        return f"fails: {error}"
+    verdict = "works" if command.status == SOLVED else f"answers {command.status}"
+    setup_ms, step_ms = 1e3 * (built - started), 1e3 * (clock.perf_counter() - built)
+    return f"{verdict}: set up in {setup_ms:.0f} ms, first step in {step_ms:.1f} ms"

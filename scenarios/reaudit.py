@@ -27,9 +27,8 @@ from quadsim.report.comparison import verdict
 from quadsim.sim.effects.rotors import LagChange
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
-from scenarios.limits import build_limits
+from scenarios.assembly import Assembly
 from scenarios.loading import parse_scenario
-from scenarios.reference import build_course_steps
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.bases import read_whole
 from scenarios.schema.plugin import LAWS, is_plugin
@@ -94,7 +93,7 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
         scenario = stored_scenario(directory)
         run = rundir.load_run(directory)
         log = run.log
-        findings = audit(log, build_limits(scenario))
+        findings = audit(log, Assembly(scenario).limits)
     except InputError as error:
         raise _contradiction(directory, differing or [f"it cannot be audited again: {error}"]) from error
     differing += _inconsistencies(scenario, run)
@@ -150,8 +149,8 @@ def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> 
 
 def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     """Files in a run's directory that its summary does not list, sorted."""
-    found = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
-    return sorted(found - {rundir.SUMMARY_FILE, *summary["files"]})
+    files = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
+    return sorted(files - {rundir.SUMMARY_FILE, *summary["files"]})
 
 
 def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
@@ -218,7 +217,7 @@ def _differences(
     if completed != (reason is None):
         yield f"status is recorded as {summary['status']!r:.40}, and reason as {reason!r:.80}"
     deadline_ms = 1e3 * scenario.control_period
-    numbers = metrics.flight_numbers(log, deadline_ms=deadline_ms, course=build_course_steps(scenario))
+    numbers = metrics.flight_numbers(log, deadline_ms=deadline_ms, course=Assembly(scenario).course_steps)
     before = dict(leaves({key: summary[key] for key in numbers}))
     for key, again in leaves(numbers):
         yield from _recorded(key, before.get(key, again), again, "the tables give", ROUNDING)

@@ -20,26 +20,17 @@ from quadsim.sim.loop import ClosedLoop, Observation, Reference, Sample, complet
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.state import Array
-from quadsim.vehicle import Vehicle
-from scenarios.build import build_controller, build_ground, build_plant, resolve
+from scenarios.assembly import Assembly
 from scenarios.flight import Flight
-from scenarios.limits import build_limits
-from scenarios.parts.effects import build_computation
-from scenarios.parts.events import prepared
-from scenarios.parts.live import FlightEvents, Successor
-from scenarios.parts.navigation import build_navigation
-from scenarios.parts.randomness import generator
-from scenarios.parts.vehicle import build_actual, build_initial_speeds, build_initial_state, build_vehicle
+from scenarios.flight_events import FlightEvents, Successor, prepared
 from scenarios.progress import Progress, silent
-from scenarios.reference import build_motion, follow_course
-from scenarios.schema.controller import ControllerSpec, NonlinearSpec
+from scenarios.schema.controller import NonlinearSpec
 from scenarios.schema.events import ControllerEvent, Event
 from scenarios.schema.scenario import LONGEST_FLIGHT, MOST_STEPS, Scenario
 
 
 def closed_loop(
-    scenario: Scenario,
-    vehicle: Vehicle,
+    assembly: Assembly,
     plant: Plant,
     controller: Controller,
     reference: Array | Reference,
@@ -47,21 +38,21 @@ def closed_loop(
     navigation: Navigation | None,
     recorded: bool = True,
 ) -> ClosedLoop:
-    """The loop of a scenario, at t = 0; the reference is (K + N, 4), or an object (see `scenarios.reference`)."""
-    motion = build_motion(scenario, vehicle)
+    """The loop of a scenario, at t = 0; the reference is (K + N, 4), or an object (see `Assembly.followed`)."""
+    scenario = assembly.scenario
     return ClosedLoop(
         plant,
         controller,
         reference,
-        initial_state=build_initial_state(scenario, motion),
-        initial_speeds=build_initial_speeds(scenario, vehicle),
+        initial_state=assembly.initial_state(assembly.motion),
+        initial_speeds=assembly.initial_speeds,
         steps_per_period=scenario.steps_per_period,
         navigation=navigation,
-        computation=build_computation(scenario),
-        rng=generator(scenario.seed, "computation"),
-        ground=build_ground(scenario, vehicle),
+        computation=assembly.computation(),
+        rng=assembly.generator("computation"),
+        ground=assembly.ground(),
         loss=scenario.lost.limits,
-        motion=motion,
+        motion=assembly.motion,
         quaternions=needs_quaternions(scenario),
         recorded=recorded,
     )
@@ -115,7 +106,7 @@ class Rollout:
     @_staying()
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: Scenario | Assembly,
         law: Controller | None = None,
         forces: Sequence[Force] | None = None,
         *,
@@ -125,7 +116,7 @@ class Rollout:
         """Set up at t = 0.
 
         Args:
-            scenario: what is flown.
+            scenario: what is flown, or what has been built of it.
             law: flies it in place of the scenario's controller.
             forces: act in place of the scenario's forces.
             live: as of `scenarios.app.start`.
@@ -134,39 +125,31 @@ class Rollout:
         Raises:
             InputError: something cannot be built.
         """
-        self.vehicle = build_vehicle(scenario)
-        scenario = prepared(scenario, self.vehicle) if live else scenario
-        self._started, self.limits = scenario, build_limits(scenario)
-        self.actual = build_actual(scenario, self.vehicle)
+        assembly = scenario if isinstance(scenario, Assembly) else Assembly(scenario)
+        assembly = assembly.of(prepared(assembly)) if live else assembly
+        self.vehicle, self.actual, self.limits = assembly.vehicle, assembly.actual, assembly.limits
+        self._started = scenario = assembly.scenario
         threadpool_limits(limits=1)  # the matrices are small, and results do not depend on the number of cores
         if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
             raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
-        controller = self._build(scenario.controller) if law is None else law
+        controller = assembly.controller() if law is None else law
         for _, spec in scenario.controller_changes:
-            self._build(spec)  # to be refused before anything is flown; one by one, as each may take megabytes
+            assembly.controller(spec)  # to be refused before anything is flown; one by one, as each may take megabytes
         self._law = controller.name, controller.solver
-        self._plant = build_plant(scenario, self.vehicle, forces=forces)
-        self._navigation = build_navigation(scenario, self.vehicle)
+        self._plant, self._navigation = assembly.plant(forces), assembly.navigation()
         started = clock.perf_counter()
-        reference = follow_course(scenario)
+        reference = assembly.followed()
         self.loop = closed_loop(
-            scenario,
-            self.vehicle,
-            self._plant,
-            controller,
-            reference,
-            navigation=self._navigation,
-            recorded=recorded,
+            assembly, self._plant, controller, reference, navigation=self._navigation, recorded=recorded
         )
         self._simulate_s = clock.perf_counter() - started
         self._events = FlightEvents(
-            scenario,
-            self.vehicle,
+            assembly,
             plant=self._plant,
             navigation=self._navigation,
             reference=reference,
             loop=self.loop,
-            build=self._build if law is None else None,
+            build=assembly.controller if law is None else None,
         )
         self._longest = controller.horizon
 
@@ -301,8 +284,7 @@ class Rollout:
         self.loop.quaternions = needs_quaternions(scenario)
         log = self.loop.log()
         return Flight(
-            scenario=resolve(scenario, self.vehicle),
-            vehicle=self.vehicle,
+            assembly=self._events.assembly.of(scenario).resolved,
             log=log,
             findings=audit(log, self.limits),
             controller=self._law[0],
@@ -311,6 +293,3 @@ class Rollout:
             tallies={} if self._navigation is None else self._navigation.tallies,
             unanswered=self._events.first_unanswered(),
         )
-
-    def _build(self, spec: ControllerSpec) -> Controller:
-        return build_controller(self._started.model_copy(update={"controller": spec}), self.vehicle)

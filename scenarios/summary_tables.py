@@ -28,7 +28,7 @@ from scenarios import console
 def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) -> Iterator[RenderableType]:
     """All of it, and where it was written."""
     flown = console.styled(f"  {summary['duration']:.2f} s flown")
-    yield console.styled((summary["scenario"], "bold"), "  ") + outcome(summary) + flown
+    yield console.styled((summary["scenario"], "bold"), "  ") + outcome_line(summary) + flown
     if summary.get("description"):
         yield summary["description"]
     yield from summary.get("traceback", ())
@@ -51,7 +51,7 @@ def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) ->
         yield console.written_to(directory)
 
 
-def outcome(summary: Mapping[str, Any]) -> Text:
+def outcome_line(summary: Mapping[str, Any]) -> Text:
     """Completed or aborted with its reason, the verdict on the required constraints, and whether that was expected."""
     expected, as_expected = summary.get("expected", "satisfied"), summary.get("as_expected", True)
     remark = ""
@@ -97,10 +97,10 @@ def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def _verdict(entry: Mapping[str, Any]) -> Text:
-    found = constraint_verdict(entry)
-    if found == "violated":
+    verdict = constraint_verdict(entry)
+    if verdict == "violated":
         return console.styled(("VIOLATED", "red") if entry["required"] else ("exceeded*", "yellow"))
-    return console.styled((HELD[found], "green" if found == "satisfied" else "yellow"))
+    return console.styled((HELD[verdict], "green" if verdict == "satisfied" else "yellow"))
 
 
 def _tracking_table(tracking: Mapping[str, Any]) -> Table:

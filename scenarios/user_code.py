@@ -7,10 +7,8 @@ from typing import Any
 
 from quadsim.controller import Controller
 from quadsim.sim.effects import Force
-from scenarios.loading import check_parts
+from scenarios.assembly import Assembly
 from scenarios.parts.plugin import import_plugin, make_force, make_law, refer_to, require_importable
-from scenarios.parts.randomness import generator
-from scenarios.parts.vehicle import build_actual, build_vehicle
 from scenarios.schema.scenario import Scenario
 
 
@@ -42,22 +40,21 @@ def importable(scenario: Scenario, controller: object, forces: Sequence[object] 
 
 
 def set_up(
-    scenario: Scenario, controller: object, forces: Sequence[object]
-) -> tuple[Scenario, Controller | None, list[Force] | None]:
-    """The same, checked, and the controller and the forces as the closed loop takes them.
+    assembly: Assembly, controller: object, forces: Sequence[object]
+) -> tuple[Assembly, Controller | None, list[Force] | None]:
+    """The same, and the controller and the forces as the closed loop takes them.
 
     Raises:
-        InputError: the scenario cannot be flown, or the controller cannot be set up.
+        InputError: the controller or a force cannot be set up.
     """
-    flown, law, own = named(scenario, controller, forces), None, None
+    scenario, law, acting = assembly.scenario, None, None
+    flown = named(scenario, controller, forces)
     if controller is not None and not isinstance(controller, str):
         spec = refer_to(controller, scenario.controller.horizon)
-        law = make_law(controller, spec, build_vehicle(scenario), scenario.control_period)
+        law = make_law(controller, spec, assembly.vehicle, scenario.control_period)
     if forces:
-        vehicle = build_actual(scenario, build_vehicle(scenario))
-        rng = generator(scenario.seed, "forces")
+        rng = assembly.generator("forces")
         pairs = [(import_plugin(spec), spec) for spec in scenario.forces]
         pairs += zip(forces, flown.forces[len(pairs) :], strict=True)
-        own = [make_force(force, spec, vehicle, rng) for force, spec in pairs]
-    check_parts(flown)
-    return flown, law, own
+        acting = [make_force(force, spec, assembly.actual, rng) for force, spec in pairs]
+    return assembly.of(flown), law, acting

@@ -18,12 +18,12 @@ from support import NO_PRODUCTS, draw_nothing, fly_here
 from quadsim.flight import rundir
 from quadsim.flight.rundir import Run
 from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
+from scenarios.catalogue import scenario_names
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.rollout import Rollout
-from scenarios.shipped import scenario_names
 
 # Compiled code is cached, whatever the environment sets: the workers, and all processes that tests
 # start, would compile the same modules again.  `make clean` removes it.
@@ -39,7 +39,7 @@ LONG = (
     "scenarios/campaign/test_campaign_report.py",
     *("scenarios/gym/test_environment.py", "scenarios/gym/test_learning.py", "scenarios/tuning/test_run.py"),
     *("scenarios/test_library.py", "scenarios/test_many.py", "scenarios/campaign/test_campaign.py"),
-    *("scenarios/design/test_first_flights.py", "scenarios/test_api.py", "scenarios/test_diagnosis.py"),
+    *("scenarios/design/test_first_flights.py", "scenarios/test_api.py", "scenarios/test_infeasibility.py"),
     *("quadsim/report/film/test_video.py", "test_documents.py", "scenarios/test_process.py", "test_refusals.py"),
     *("scenarios/test_nothing_lost.py", "mpc/robust/test_robust.py", "scenarios/papers/test_reproduction.py"),
     *("scenarios/test_any_scenario.py", "mpc/test_partial_condensing.py"),
@@ -102,7 +102,7 @@ def fly_once(session_directory: Path) -> Fly:
 
 @pytest.fixture(scope="session")
 def vehicle() -> Vehicle:
-    return build_vehicle(load_scenario("paper-constrained"))
+    return Assembly(load_scenario("paper-constrained")).vehicle
 
 
 @pytest.fixture(scope="session")

@@ -18,10 +18,10 @@ import numpy as np
 from quadsim.controller import ACCEPTED, SOLVED
 from quadsim.flight.audit import Finding
 from quadsim.flight.metrics import peak_tilt, tracking
+from scenarios.catalogue import scenario_names
 from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
-from scenarios.shipped import scenario_names
 
 GOLDEN: Final = Path(__file__).resolve().parent / "golden"
 PAPER: Final = ("paper-unconstrained", "paper-unconstrained-clipped", "paper-constrained")

@@ -219,19 +219,12 @@ def least_violation(
 
 @dataclass(frozen=True, kw_only=True)
 class Optimum:
-    """What the peer finds.
+    """What the peer finds."""
 
-    Attributes:
-        plan: (N, nu).
-        slacks: (N, m_s).
-        solution: of `dense_qp`.
-        residual: its largest KKT residual.
-    """
-
-    plan: Array
-    slacks: Array
-    solution: Solution
-    residual: float
+    plan: Array  # (N, nu)
+    slacks: Array  # (N, m_s)
+    solution: Solution  # of `dense_qp`
+    residual: float  # its largest KKT residual
 
 
 def optimum(problem: Problem, given: Period) -> Optimum:

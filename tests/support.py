@@ -21,14 +21,12 @@ from quadsim.sim.loop import complete
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES, Array
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.vehicle import N_ROTORS
 from scenarios import many
-from scenarios.build import build_problem
+from scenarios.assembly import Assembly
 from scenarios.campaign.rows import Row
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
-from scenarios.reference import build_reference
 from scenarios.rollout import closed_loop
 from scenarios.schema.scenario import Scenario
 
@@ -58,12 +56,12 @@ def draw_nothing(patch: pytest.MonkeyPatch) -> None:
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:
     """The optimisation of one of the paper's scenarios."""
     scenario = load_scenario(name, settings)
-    return build_problem(scenario, build_vehicle(scenario))
+    return Assembly(scenario).problem()
 
 
 def paper_reference(samples: int) -> Array:
     """The paper's filtered reference."""
-    return build_reference(load_scenario("paper-constrained"), samples)
+    return Assembly(load_scenario("paper-constrained")).reference(samples)
 
 
 def random_problem(rng: np.random.Generator, *, horizon: int, n: int = 3, nu: int = 2, n_c: int = 1) -> Problem:
@@ -196,6 +194,13 @@ def linearised(model: NonlinearModel, x: Array, u: Array) -> tuple[Array, Array,
     return A, B, after(joint) - A @ x - B @ u
 
 
+def derivative(model: NonlinearModel, x: Array, u: Array) -> Array:
+    """dx/dt (..., n) of states x (..., n) under inputs u (..., 4), by central differences over short periods."""
+    h, points = 1e-5, list(zip(x.reshape(-1, x.shape[-1]), u.reshape(-1, 4), strict=True))
+    ends = [np.array([advance(replace(model, period=s), *point) for point in points]) for s in (h, -h)]
+    return np.asarray((ends[0] - ends[1]) / (2.0 * h)).reshape(x.shape)
+
+
 def flight_queries(flight: Flight, problem: Problem, stride: int) -> list[Query]:
     """xi(k), y_d, u(k-1) of every `stride`-th period of a flight."""
     log, N = flight.log.control, problem.horizon
@@ -296,7 +301,6 @@ def logged(state_name: str, *, samples: Sequence[float], plant: Sequence[float])
 
 def fly_once(
     scenario: Scenario,
-    vehicle: Vehicle,
     plant: Plant,
     controller: Controller,
     reference: Array,
@@ -304,6 +308,6 @@ def fly_once(
     navigation: Navigation | None,
 ) -> FlightLog:
     """Fly a scenario with a plant and a controller that were built for it; no set-points, no other controllers."""
-    loop = closed_loop(scenario, vehicle, plant, controller, reference, navigation=navigation)
+    loop = closed_loop(Assembly(scenario), plant, controller, reference, navigation=navigation)
     complete(loop, periods=scenario.periods)
     return loop.log()

@@ -22,7 +22,7 @@ MPC_MAY_IMPORT = {
 }  # fmt: skip
 RENDER_WORKER = "quadsim.report.film.render_worker"
 """Only ever run as a child process, so it may import at its top what is heavy."""
-RECORDING = re.compile(r"quadsim\.report\.recording\.(plots|style|world)")
+RECORDING = re.compile(r"quadsim\.report\.recording\.(plots|world)")
 """Imported when a recording is made, and so may import rerun at their top."""
 OF_ONE_PLACE = {
     "rerun": "quadsim.report.recording",

@@ -17,11 +17,7 @@ MIRRORS: Final = (
 
 
 def load() -> ctypes.CDLL:
-    """The library, loaded once per process.
-
-    Raises:
-        MissingCoreError: it was not compiled, or is of other sources.
-    """
+    """The library, loaded once per process; `MissingCoreError` where it was not compiled, or of other sources."""
     reason = why_missing()
     if reason is not None:
         raise MissingCoreError(reason)

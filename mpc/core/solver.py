@@ -79,11 +79,7 @@ class Work(ctypes.Structure):
 
 @cache
 def core_library() -> ctypes.CDLL:
-    """The library, its functions declared.
-
-    Raises:
-        MissingCoreError: there is none here.
-    """
+    """The library, its functions declared."""
     library = load()
     check_mirrors(quadsim_axis=_Axis, quadsim_row=_Row, quadsim_term=_Term, quadsim_problem=_Problem, quadsim_work=Work)
     library.quadsim_work_reals.restype, library.quadsim_work_reals.argtypes = ctypes.c_long, [_AT]
@@ -94,11 +90,9 @@ def core_library() -> ctypes.CDLL:
 
 
 class CoreProblem:
-    """A problem's tables where the core reads them; any number of controllers may share them.
+    """A problem's `tables` where the core reads them; any number of controllers may share them.
 
-    Attributes:
-        tables: the numbers.
-        struct: the `quadsim_problem`, which points to memory that this object holds.
+    `struct` is the `quadsim_problem`, which points to memory that this object holds.
     """
 
     def __init__(self, problem: Problem) -> None:

@@ -149,10 +149,7 @@ def tables(problem: Problem) -> Tables:
 def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
     """Those of a `quadsim_problem`: integers, arrays of numbers or bytes, and lists of structs' members.
 
-    Args:
-        tables: the numbers.
-        room: for so many active rows, and one more.
-        changes: of the active set in a search, after which it is given up.
+    There is `room` for so many active rows and one more; a search is given up after so many `changes` of their set.
     """
     problem, rows = tables.problem, tables.rows
     past = np.cumsum([len(row.terms) for row in rows]).tolist()

@@ -26,11 +26,7 @@ class CText:
     prefix: str = ""
 
     def number(self, value: float) -> str:
-        """A number, e.g. `-1.5F`; the compiler rounds it once.
-
-        Raises:
-            ValueError: it is not finite.
-        """
+        """A finite number, e.g. `-1.5F`; the compiler rounds it once."""
         if not np.isfinite(value):
             raise ValueError(f"{value} has no place in C")
         text = "0.0" if abs(value) < LEAST_FLOAT else repr(float(value))

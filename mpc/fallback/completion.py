@@ -78,19 +78,18 @@ def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) ->
     Its attitude and body rates are left out where the state's are predicted.  Next to a pitch of 90 deg the rates of
     Euler angles are implausibly large; those of the body are not.
     """
-    found = {**vars(now), "acting": acting, "unseen": unseen}
+    values = {**vars(now), "acting": acting, "unseen": unseen}
     if unseen[ANGLES].any():
-        found["attitude"] = None
+        values["attitude"] = None
     if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
-        found["body_rates"] = None
-    return CompletedMoment(**found)
+        values["body_rates"] = None
+    return CompletedMoment(**values)
 
 
 class StateCompletion:
     """Completes one state after the other, one per control period.
 
-    Attributes:
-        unseen: (12,) periods since each channel was last measured; infinite before it ever was.
+    `unseen` (12,) is the number of periods since each channel was last measured; infinite before it ever was.
     """
 
     def __init__(self, model: LinearModel) -> None:
@@ -119,7 +118,7 @@ class StateCompletion:
             measured: (12,) in part perhaps not finite; of another shape, nothing was measured.
             acting: (4,) rotor speeds in force since the last state [rad/s].
             trim: what holds the vehicle at rest.
-            free: whether the vehicle flies, so that the model predicts its motion; otherwise nothing counts as frozen.
+            free: whether the vehicle flies, as the model predicts; otherwise nothing counts as frozen.
         """
         if np.shape(measured) != (N_STATES,):
             measured = np.full(N_STATES, np.nan)

@@ -36,17 +36,7 @@ from mpc.handover import hand_over, resized, within
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
 from mpc.ocp import InfeasiblePeriod
-from quadsim.controller import (
-    ACCEPTED,
-    FALLBACK,
-    GROUNDED,
-    Command,
-    Controller,
-    Moment,
-    Phase,
-    check_command,
-    stopped,
-)
+from quadsim.controller import ACCEPTED, FALLBACK, GROUNDED, Command, Controller, Moment, Phase, check_command, stopped
 from quadsim.errors import FlightError
 from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
@@ -61,20 +51,11 @@ class Guarded:
     """A controller that keeps the fallback contract, whatever the one inside it does.
 
     A command that is not finite or not within the bounds cannot leave it.  While all is well, the inner controller's
-    commands pass unchanged.
-
-    Attributes:
-        inner: the controller called first; one that falls back by itself does no harm.
-        law: what levels 1 to 3 are made of.
+    commands pass unchanged; one that falls back by itself does no harm.
     """
 
     def __init__(
-        self,
-        inner: Controller,
-        model: LinearModel,
-        *,
-        bounds: ActuatorBounds,
-        settings: FallbackSettings = _USUAL,
+        self, inner: Controller, model: LinearModel, *, bounds: ActuatorBounds, settings: FallbackSettings = _USUAL
     ) -> None:
         self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
         self.law = HoverLaw(model, tilt=math.radians(USUAL_TILT if settings.tilt is None else settings.tilt))
@@ -145,8 +126,8 @@ class Guarded:
     @property
     def unanswered(self) -> InfeasiblePeriod | None:
         """The first period since `reset` whose QP had no answer; None where all had, or there is no QP."""
-        found = getattr(self.inner, "unanswered", None)
-        return found if isinstance(found, InfeasiblePeriod) else None
+        period = getattr(self.inner, "unanswered", None)
+        return period if isinstance(period, InfeasiblePeriod) else None
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; by the hover model where the inner controller cannot."""

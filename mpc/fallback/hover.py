@@ -43,11 +43,9 @@ ACCEPTABLE: Final = by_group(0.5, 1.0, 0.2, 1.0)  # [m], [m/s], [rad], yaw as we
 
 
 class HoverLaw:
-    """The LQR of hover, set up once; `tilt` is the largest roll and pitch demanded together [rad].
+    """The LQR of hover, set up once: `gain` (4, 12) is K, from errors in the heading frame, and `slope` (4, 4) is S.
 
-    Attributes:
-        gain: (4, 12) K, from errors in the heading frame to accelerations.
-        slope: (4, 4) S; see `mpc.heading.slope`.
+    `tilt` is the largest roll and pitch demanded together [rad].
     """
 
     def __init__(self, model: LinearModel, *, tilt: float) -> None:

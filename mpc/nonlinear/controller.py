@@ -95,10 +95,8 @@ def frames_of(q: Array) -> Array:
 class NonlinearMPC:
     """One step of sequential quadratic programming per period, or more; see the module.
 
-    Attributes:
-        problem: the optimisation; its states and inputs are those of the module.
-        unanswered: the first period since `reset` whose QP had no answer; where all had, the first whose plan had not
-            converged; None where all had.
+    Of `unanswered`, see `mpc.ocp.InfeasiblePeriod`; a period without an answer takes precedence over one that has not
+    converged.
     """
 
     name: Final = "nonlinear"
@@ -226,11 +224,7 @@ class NonlinearMPC:
         return Penalty(l1=np.full(rows, l1 * scale), l2=np.full(rows, l2 * scale**2), largest=True)
 
     def _of_states(self, constraint: Constraint, n: int) -> Constraint:
-        """Rows over the 12 states of `quadsim.state` and rotor speeds as rows over the model's.
-
-        Raises:
-            ParameterError: they are of what is not linear in those.
-        """
+        """Rows over the 12 states and rotor speeds as rows over the model's; refused where not linear in those."""
         C, D = (np.zeros((constraint.lower.shape[-1], size)) for size in (n, N_ROTORS))
         if constraint.C is not None:
             if constraint.C[:, [*EULER, *EULER_RATE]].any():
@@ -296,17 +290,14 @@ class NonlinearMPC:
                 self._plan = resized(law._plan[0], self._nodes + 1), resized(law._plan[1], self._nodes)
             if self._ramp is not None and law._ramp is not None:
                 self._ramp.adopt(law._ramp)
-        own = None if law is None else law._observer
-        estimate = observed(previous) if own is None else own.estimate
+        observer = None if law is None else law._observer
+        estimate = observed(previous) if observer is None else observer.estimate
         if self._observer is not None and estimate is not None:
             self._observer.adopt(estimate)
             self._update_disturbance(self._observer.estimate)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """See `quadsim.controller.Controller.step`.
-
-        Numbers that are not finite, or that lead to such, are answered with the status `invalid_data`.
-        """
+        """See `quadsim.controller.Controller.step`; numbers out of hand are answered with the status `invalid_data`."""
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
         last, self._last = self._last, None
@@ -470,10 +461,10 @@ class NonlinearMPC:
             if answer.states is None or answer.status not in ACCEPTED:
                 return query, answer, problem, None
             states, plan = answer.states[:, :n], answer.plan
-            found = np.concatenate([measured[None], states])
-            found[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
-            self._plan = found, plan
-            moved = max(np.abs(found - x).max(), np.abs(plan - u).max())
+            end = np.concatenate([measured[None], states])
+            end[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
+            self._plan = end, plan
+            moved = max(np.abs(end - x).max(), np.abs(plan - u).max())
             if self.settings.iterations > 1:
                 if moved <= self.settings.tolerance:
                     break
@@ -488,8 +479,8 @@ class NonlinearMPC:
                     largest, patience = 0.5 * largest, PATIENCE
                 share = min(max(share / max(undone, SHORTEST), SHORTEST), largest)
                 last = step
-                self._plan = x + share * (found - x), u + share * (plan - u)
-        defect = np.abs(found[1:] - advance_nodes(self._model, found[:-1], plan)).max()
+                self._plan = x + share * (end - x), u + share * (plan - u)
+        defect = np.abs(end[1:] - advance_nodes(self._model, end[:-1], plan)).max()
         return query, answer, problem, SQP(float(defect), float(moved))
 
     def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:
@@ -531,14 +522,9 @@ def _body(states: Array) -> Array:
 
 
 def _converges(
-    make: Callable[..., NonlinearMPC],
-    settings: NonlinearSettings,
-    start: Mapping[str, object],
-    time: float,
-    measured: Array,
-    nodes: Nodes,
-    iterations: int,
-) -> bool:
+    make: Callable[..., NonlinearMPC], settings: NonlinearSettings, start: Mapping[str, object], time: float,
+    measured: Array, nodes: Nodes, iterations: int,
+) -> bool:  # fmt: skip
     """Whether a period's plan converges within so many iterations, from a law's attributes before it.
 
     All but the number of iterations is data of that period, so that a flight can be pickled.

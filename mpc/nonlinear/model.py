@@ -16,10 +16,10 @@ integrated by the classical Runge-Kutta method of fourth order.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -77,19 +77,6 @@ def nonlinear_model(
     )
 
 
-def derivative(model: NonlinearModel, x: Array, u: Array) -> Array:
-    """dx/dt (..., n) of states x (..., n) under inputs u (..., 4) [rad/s]."""
-    speeds, columns = u if model.rotor_lag is None else x[..., N_STATES:], np.moveaxis(x, -1, 0)
-    euler, drive = columns[ANGLES], np.moveaxis(np.square(speeds) @ model.effectiveness.T, -1, 0)
-    constants = model.gyration, model.gravity, model.acceleration, model.angular_acceleration
-    slope = np.empty_like(columns)
-    slope[0:N_STATES:2] = columns[1:N_STATES:2]
-    slope[1:N_STATES:2] = _accelerations(np.sin(euler), np.cos(euler), columns[ANGLE_RATES], drive, *constants)
-    if model.rotor_lag is not None:
-        slope[N_STATES:] = np.moveaxis((u - speeds) / model.rotor_lag, -1, 0)
-    return np.moveaxis(slope, 0, -1)
-
-
 def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
     """The state (n,) one period after a state x (n,) under inputs u (4,) [rad/s]."""
     return advance_disturbed(model, x, u, model.period, model.effectiveness, model.acceleration.tolist())
@@ -105,15 +92,26 @@ def advance_disturbed(
     step = period / model.substeps
     speeds = _rotor_speeds(model, step, x[N_STATES:], u)
     drive = np.dot(np.square(speeds), effectiveness.T).tolist()
-    constants = model.gyration.tolist(), model.gravity, acceleration, model.angular_acceleration.tolist()
+    (k_p, k_q, k_r), (d_x, d_y, d_z) = model.gyration.tolist(), acceleration
+    d_p, d_q, d_r = model.angular_acceleration.tolist()
     half, sixth = 0.5 * step, step / 6.0
     sin, cos = math.sin, math.cos
 
     def slopes(angles: Triple, rates: Triple, k: int) -> tuple[Triple, Triple]:
-        roll, pitch, yaw = angles
-        sines, cosines = (sin(roll), sin(pitch), sin(yaw)), (cos(roll), cos(pitch), cos(yaw))
-        found = _accelerations(sines, cosines, rates, drive[k], *constants)
-        return found[:3], found[3:]
+        """d2(p)/dt2 [m/s^2] and d2(eta)/dt2 [rad/s^2].
+
+        With a, b, c the rates of roll, pitch and yaw, E^-1 dE/dt d(eta)/dt is (-b c cos - sin(pitch) l / cos, a c cos,
+        -l / cos), where l = b (a + c sin(pitch)) and cos is that of pitch.
+        """
+        (roll, pitch, yaw), (a, b, c), (thrust, t_p, t_q, t_r) = angles, rates, drive[k]
+        sr, sp, sy, cr, cp, cy = sin(roll), sin(pitch), sin(yaw), cos(roll), cos(pitch), cos(yaw)
+        level, side, turn = thrust * sp * cr, thrust * sr, c * cp
+        p, q, r = a - c * sp, b * cr + turn * sr, turn * cr - b * sr
+        dp, dq, dr = t_p + k_p * q * r + d_p, t_q + k_q * r * p + d_q, t_r + k_r * p * q + d_r
+        bend = (dq * sr + dr * cr + b * (a + c * sp)) / cp
+        up = thrust * cp * cr + (d_z - model.gravity)
+        moved = cy * level + sy * side + d_x, sy * level - cy * side + d_y, up
+        return moved, (dp + b * turn + sp * bend, dq * cr - dr * sr - a * turn, bend)
 
     numbers = x.tolist()
     p, v, q, s = numbers[POSITIONS], numbers[VELOCITIES], numbers[ANGLES], numbers[ANGLE_RATES]
@@ -155,42 +153,6 @@ def _rotor_speeds(model: NonlinearModel, step: float, rotors: Array, inputs: Arr
     if model.rotor_lag is None:
         return np.broadcast_to(inputs, (instants.size, *inputs.shape))
     return inputs + np.exp(-instants * step / model.rotor_lag)[:, None] * (rotors - inputs)
-
-
-def _accelerations(
-    sines: Iterable[Any],
-    cosines: Iterable[Any],
-    rates: Iterable[Any],
-    drive: Iterable[Any],
-    gyration: Iterable[Any],
-    gravity: float,
-    acceleration: Iterable[Any],
-    angular_acceleration: Iterable[Any],
-) -> tuple[Any, Any, Any, Any, Any, Any]:
-    """d2(p)/dt2 [m/s^2] and d2(eta)/dt2 [rad/s^2], of eta, its rate and of U/m, I^-1 tau, as plain numbers.
-
-    With a, b, c the rates of roll, pitch and yaw, E^-1 dE/dt d(eta)/dt is (-b c cos - sin(pitch) l / cos, a c cos,
-    -l / cos), where l = b (a + c sin(pitch)) and cos is that of pitch.
-    """
-    (sr, sp, sy), (cr, cp, cy) = sines, cosines
-    a, b, c = rates
-    thrust, t_p, t_q, t_r = drive
-    k_p, k_q, k_r = gyration
-    d_x, d_y, d_z = acceleration
-    d_p, d_q, d_r = angular_acceleration
-    level, side = thrust * sp * cr, thrust * sr
-    turn = c * cp
-    p, q, r = a - c * sp, b * cr + turn * sr, turn * cr - b * sr
-    dp, dq, dr = t_p + k_p * q * r + d_p, t_q + k_q * r * p + d_q, t_r + k_r * p * q + d_r
-    yaw = (dq * sr + dr * cr + b * (a + c * sp)) / cp
-    return (
-        cy * level + sy * side + d_x,
-        sy * level - cy * side + d_y,
-        thrust * cp * cr + (d_z - gravity),
-        dp + b * turn + sp * yaw,
-        dq * cr - dr * sr - a * turn,
-        yaw,
-    )
 
 
 def spun(model: NonlinearModel, rotors: Array, command: Array, time: float) -> Array:

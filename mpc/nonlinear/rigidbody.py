@@ -151,11 +151,8 @@ def rotation(q: Array) -> Array:
 
 def _rotation_slopes() -> Array:
     """(4, 36): takes q to the derivatives (4, 3, 3) of R(q) by its components."""
-    found, basis = np.zeros((4, 4, 3, 3)), np.eye(4)
-    for i in range(4):
-        for j in range(4):  # R - I is a quadratic form: its polarisation
-            found[i, j] = rotation(basis[i] + basis[j]) - rotation(basis[i]) - rotation(basis[j]) + np.eye(3)
-    return found.reshape(4, 36)
+    q = np.eye(4)  # R - I is a quadratic form: its polarisation
+    return (rotation(q[:, None] + q) - rotation(q)[:, None] - rotation(q) + np.eye(3)).reshape(4, 36)
 
 
 _SLOPES: Final = _rotation_slopes()
@@ -254,15 +251,15 @@ def _drives(model: RigidBody, x: Array, u: Array) -> Array:
     lagging = model.rotor_lag is not None
     now = u[None] if not lagging else u + decay[:, None, None] * (x[:, N_BODY:] - u)  # (K, M, 4)
     effect = model.effectiveness * model.largest_thrust
-    found = np.empty((len(decay), len(x), 4, N_ROTORS * (1 + lagging) + 1))
+    drives = np.empty((len(decay), len(x), 4, N_ROTORS * (1 + lagging) + 1))
     by_share = effect if model.inputs is Inputs.THRUST else effect * (2.0 * now[:, :, None, :])
-    found[..., -N_ROTORS - 1 : -1] = by_share
+    drives[..., -N_ROTORS - 1 : -1] = by_share
     if lagging:
-        found[..., :N_ROTORS] = decay[:, None, None, None] * by_share
-        found[..., N_ROTORS:-1] *= 1.0 - decay[:, None, None, None]
-    found[..., -1] = (now if model.inputs is Inputs.THRUST else np.square(now)) @ effect.T
-    found[..., 1:, -1] += model.angular_acceleration
-    return found
+        drives[..., :N_ROTORS] = decay[:, None, None, None] * by_share
+        drives[..., N_ROTORS:-1] *= 1.0 - decay[:, None, None, None]
+    drives[..., -1] = (now if model.inputs is Inputs.THRUST else np.square(now)) @ effect.T
+    drives[..., 1:, -1] += model.angular_acceleration
+    return drives
 
 
 def _drag(model: RigidBody, F: Array, state: Array) -> Array:

@@ -77,21 +77,12 @@ def robust_problem(
 
 
 class RobustMPC:
-    """One optimum per period; see the module.
+    """One optimum per period of a `robust_problem`; see the module.
 
     It holds no earlier plan: where nothing is solved, the status reports it, with the command in force, for
     `mpc.fallback.contract.Guarded` to act on.
 
-    Args:
-        vehicle: that it flies.
-        problem: the optimisation, a `robust_problem` of these settings.
-        settings: these.
-        solver: the problem's; see `mpc.solvers.make_solver`.
-        space: what to keep clear of.
-        kkt_every: see `mpc.answer.AnswerCheck`.
-
     Attributes:
-        problem: as given.
         trim: what holds the vehicle at rest against the disturbance that is estimated.
         unanswered: the first period since `reset` whose QP had no answer; None where all had.
         answer: of the last period that had one to solve; None before the first.
@@ -143,8 +134,8 @@ class RobustMPC:
             self._called_at, self._measured = law._called_at, law._measured
             if self.settings.delay == law.settings.delay:
                 self._ahead = law._ahead
-        own = None if law is None else law._observer
-        estimate = observed(previous) if own is None else own.estimate
+        observer = None if law is None else law._observer
+        estimate = observed(previous) if observer is None else observer.estimate
         if self._observer is not None and estimate is not None:
             self._observer.adopt(estimate)
             self._update_trim()
@@ -224,10 +215,7 @@ class RobustMPC:
         return Query(x0, desired, self._acting, Equilibrium(x_s, u_s))
 
     def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`.
-
-        The hover model turned by each yaw predicts, with the disturbance estimated last.
-        """
+        """See `quadsim.controller.Controller.predict`; by the hover model, with the disturbance estimated last."""
         return predict_in_heading_frame(self._nominal, states, plans, replace(self.trim, speeds=self._balanced()))
 
     @property
@@ -242,13 +230,9 @@ class RobustMPC:
             self._observer.reset()
         self._update_trim()
 
-    @property
-    def _estimate(self) -> Array:
-        """(6,) see `mpc.observer.DisturbanceObserver.estimate`."""
-        return np.zeros(6) if self._observer is None else self._observer.estimate
-
     def _update_trim(self) -> None:
         """Rest against the disturbance that is estimated now."""
+        self._estimate = np.zeros(6) if self._observer is None else self._observer.estimate
         estimate, gravity = self._estimate, self._model.gravity
         (x, y), twist = estimate[:2].tolist(), estimate[3:] / gravity
         lift = math.hypot(x, y, gravity)

@@ -31,7 +31,7 @@ from mpc.partial_condensing import PartiallyCondensed
 from mpc.robust.controller import RobustMPC
 from mpc.robust.tightening import observed
 from mpc.solvers import Answer
-from mpc.solvers.piqp import PiqpMultistage
+from mpc.solvers.piqp import Piqp
 from quadsim.controller import ACCEPTED, UNCONSTRAINED, Command, Moment
 from quadsim.state import Array
 
@@ -57,10 +57,7 @@ class SafetyFilter:
     `mpc.fallback.contract.Guarded` to fly the last good plan.
 
     The robust MPC, one without half-spaces, lends its model, observer and constraints; it solves nothing itself.
-
-    Attributes:
-        problem: the constraints, all hard.
-        wanted: (4,) the command to let pass in the next period [rad/s].
+    `wanted` (4,) is the command to let pass in the next period [rad/s].
     """
 
     name: Final = "safety-filter"
@@ -88,10 +85,7 @@ class SafetyFilter:
         self.wanted = np.array(speeds, float)
 
     def step(self, now: Moment, state: Array, reference: Array) -> Command:
-        """The nearest command to `wanted` after which the constraints can hold.
-
-        One that passes as it is, the optimum without constraints, has the status `unconstrained`.
-        """
+        """The nearest command to `wanted` after which the constraints can hold; `unconstrained` where that is it."""
         query = self._mpc.pose(now, state, reference)
         if isinstance(query, Command):
             return query
@@ -121,7 +115,7 @@ class _Nearest:
         self._first = form.inputs(np.arange(form.qp.c.size, dtype=np.float64))[0].astype(np.intp)
         self._P = form.qp.P.copy()
         self._P[self._first, self._first] += 2.0
-        self._backend = PiqpMultistage()
+        self._backend = Piqp()
         self._backend.setup(replace(form.qp, P=self._P))
         earlier, last = (form.qp.h_u.reshape(self._horizon, -1)[i] for i in (0, -1))
         self._ends = (earlier == LOOSE) & (last < LOOSE)  # rows that hold at the last state alone

@@ -66,8 +66,7 @@ class TighteningSettings:
     ] = 0.5
     angular_acceleration: Annotated[NonNegative, doc("[rad/s^2] the same of angular ones, body frame")] = 0.5
     turning: Annotated[
-        NonNegative,
-        doc("[unit of the state/s^2, rad for angles] largest second derivative of an output at its bound"),
+        NonNegative, doc("[unit of the state/s^2, rad for angles] largest second derivative of an output at its bound")
     ] = 3.0
 
 
@@ -95,8 +94,7 @@ def margins(
         estimated: whether the prediction holds an estimate of the disturbance, which may be wrong by twice its bounds.
 
     Raises:
-        ParameterError: an output is bounded on one side only, or too narrowly for these disturbances, of which the one
-            that takes most is named; or the lag is too short.
+        ParameterError: an output is bounded on one side only, or too narrowly; the lag is too short.
     """
     if 0.0 < rotor_lag < SHORTEST_LAG:
         raise ParameterError("controller", "rotor_lag", rotor_lag, f"0, or at least {SHORTEST_LAG:g} s")

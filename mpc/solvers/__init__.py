@@ -129,9 +129,9 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
     if not entry.installed:
         raise MissingPackageError(f"the solver {name!r}", entry.package, extra=entry.extra)
     if entry.package == "piqp":
-        from mpc.solvers.piqp import PiqpDense, PiqpMultistage
+        from mpc.solvers.piqp import Piqp
 
-        return (PiqpDense if entry.dense else PiqpMultistage)(changing=changing)
+        return Piqp(dense=entry.dense, changing=changing)
     if entry.package == "daqp":
         from mpc.solvers.daqp import DaqpDense
 

@@ -1,8 +1,5 @@
 """DAQP: a dual active-set method that factorises the Hessian once and starts from the last active set.
 
-Where the QP states which bound is the same one step later in the plan, that set is moved one step earlier: where active
-bounds alternate along the plan, it is wrong nearly everywhere as it was.
-
 Arnström, Bemporad and Axehill, A Dual Active-Set Solver for Embedded Quadratic Programming Using Recursive LDL'
 Updates, IEEE TAC 2022.
 """
@@ -14,14 +11,11 @@ from typing import Final
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
 from mpc.qp import QP, Matrix, Solution
 from quadsim.controller import SOLVED
 from quadsim.state import Array
-
-Sense = NDArray[np.intc]
 
 SETTINGS: Final = {
     "primal_tol": 1e-8,  # rad or rad/s; its own 1e-6 is as fast
@@ -38,10 +32,6 @@ STATUS: Final = {
     -6: "overdetermined_start",
     -7: "max_time",
 }
-_ACTIVE: Final = 1
-_LOWER: Final = 2
-_EQUALITY: Final = 5
-"""How DAQP marks bounds: active at first, at the lower side, always active."""
 
 
 class DaqpDense:
@@ -50,11 +40,10 @@ class DaqpDense:
     def setup(self, qp: QP) -> None:
         """See `mpc.qp.Backend.setup`."""
         self._qp = qp
-        self._sense: Sense | None = None
         self._model = daqp.Model()
         self._model.settings = SETTINGS
         sense = np.zeros(qp.c.size + qp.h_l.size + qp.b.size, dtype=np.intc)
-        sense[qp.c.size + qp.h_l.size :] = _EQUALITY
+        sense[qp.c.size + qp.h_l.size :] = 5  # always active
         rows = np.concatenate([_dense(qp.G), _dense(qp.A)])
         self._model.setup(_dense(qp.P), qp.c.copy(), rows, *_bounds(qp), sense)
 
@@ -65,9 +54,8 @@ class DaqpDense:
             self.setup(qp)
         else:
             upper, lower = _bounds(qp)
-            self._model.update(f=qp.c, bupper=upper, blower=lower, sense=self._sense)
+            self._model.update(f=qp.c, bupper=upper, blower=lower)
         x, _, flag, info = self._model.solve()
-        self._sense = self._moved(info["lam"]) if flag == 1 else None
         elapsed = clock.perf_counter() - started
         z_box, z, y = np.split(info["lam"], [qp.c.size, qp.c.size + qp.h_l.size])
         return Solution(
@@ -80,16 +68,6 @@ class DaqpDense:
             active=int(np.count_nonzero(z) + np.count_nonzero(z_box)),
             solve_s=elapsed,
         )
-
-    def _moved(self, multipliers: Array) -> Sense | None:
-        """The active set moved one step earlier, with nothing active at the last step; None to start as it was."""
-        later = self._qp.later
-        if later is None:
-            return None
-        found = (multipliers != 0.0) * (_ACTIVE + _LOWER * (multipliers < 0.0))
-        sense = np.full(multipliers.size, _EQUALITY, dtype=np.intc)
-        sense[: later.size] = np.where(later == np.arange(later.size), 0, found[later])
-        return sense
 
 
 def _dense(matrix: Matrix) -> Array:

@@ -41,16 +41,17 @@ CHANGING_SCALINGS: Final = 3
 """Passes of PIQP's scaling, which new matrices need again: its usual ten take 0.2 ms longer, and save nothing."""
 
 
-class _Piqp:
-    """Back end on a solver of PIQP's; see `mpc.qp.Backend`.
+class Piqp:
+    """See `mpc.qp.Backend`; multistage, for block-banded QPs with the variables in stage order, or `dense`.
 
-    Args:
-        solver: with its factorisation chosen.
-        changing: whether values of the matrices change from one period to the next.
+    `changing`: whether values of the matrices change from one period to the next.
     """
 
-    def __init__(self, solver: Any, *, changing: bool) -> None:
-        self._solver, settings = solver, solver.settings
+    def __init__(self, *, dense: bool = False, changing: bool = False) -> None:
+        self._solver: Any = piqp.DenseSolver() if dense else piqp.SparseSolver()
+        settings = self._solver.settings
+        if not dense:
+            settings.kkt_solver = piqp.KKTSolver.sparse_multistage
         settings.max_iter = MAX_ITERATIONS
         settings.eps_abs, settings.eps_rel = TOLERANCE, 0.1 * TOLERANCE
         settings.eps_duality_gap_abs = settings.eps_duality_gap_rel = GAP
@@ -95,19 +96,3 @@ class _Piqp:
             reported_dual=float(info.dual_res),
             solve_s=elapsed,
         )
-
-
-class PiqpDense(_Piqp):
-    """PIQP with a dense Cholesky factorisation, for dense QPs."""
-
-    def __init__(self, *, changing: bool = False) -> None:
-        super().__init__(piqp.DenseSolver(), changing=changing)
-
-
-class PiqpMultistage(_Piqp):
-    """PIQP with its multistage factorisation, for block-banded QPs with the variables in stage order."""
-
-    def __init__(self, *, changing: bool = False) -> None:
-        solver = piqp.SparseSolver()
-        solver.settings.kkt_solver = piqp.KKTSolver.sparse_multistage
-        super().__init__(solver, changing=changing)

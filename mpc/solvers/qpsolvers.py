@@ -30,11 +30,7 @@ SETTINGS: Final[dict[str, dict[str, Any]]] = {
 
 
 class AnyOfQpsolvers:
-    """A back end; see `mpc.qp.Backend`.
-
-    Args:
-        name: in `qpsolvers.available_solvers`.
-    """
+    """A back end, by its name in `qpsolvers.available_solvers`; see `mpc.qp.Backend`."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -55,13 +51,13 @@ class AnyOfQpsolvers:
         )
         try:
             with warnings.catch_warnings(action="ignore"):  # of what is converted, or not solved, which the status says
-                found = qpsolvers.solve_problem(problem, solver=self._name, **SETTINGS.get(self._name, {}))
+                answer = qpsolvers.solve_problem(problem, solver=self._name, **SETTINGS.get(self._name, {}))
         except qpsolvers.QPError:
-            found = qpsolvers.Solution(problem)
+            answer = qpsolvers.Solution(problem)
         elapsed = clock.perf_counter() - started
         multipliers = np.zeros(upper.size)
-        if found.found and found.x is not None and found.z is not None:
-            x, (of_upper, of_lower) = found.x, np.split(found.z, [np.count_nonzero(above)])
+        if answer.found and answer.x is not None and answer.z is not None:
+            x, (of_upper, of_lower) = answer.x, np.split(answer.z, [np.count_nonzero(above)])
             multipliers[above] += of_upper
             multipliers[below] -= of_lower
         else:

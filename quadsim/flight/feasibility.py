@@ -175,17 +175,17 @@ def _problems(
 ) -> tuple[str, ...]:
     """A line for each side of a limit or bound that the demand leaves."""
     least, most = vehicle.speed_min, vehicle.speed_max
-    found = _beyond("rotor speed", "rad/s", needed.speeds, (least, most), "limit")
+    problems = _beyond("rotor speed", "rad/s", needed.speeds, (least, most), "limit")
     thrust = float(needed.thrusts.min())
     if thrust < -TOLERANCE * vehicle.mass * vehicle.gravity:
-        found.append(f"not flyable: a rotor would need a negative thrust, down to {thrust:.4g} N")
+        problems.append(f"not flyable: a rotor would need a negative thrust, down to {thrust:.4g} N")
     for name, (lower, upper) in bounds.items():
         if name == "speed":  # where the vehicle's limit is as narrow, it has been named
             tighter = (lower if lower > least else -math.inf, upper if upper < most else math.inf)
-            found += _beyond("rotor speed", "rad/s", needed.speeds, tighter, "bound")
+            problems += _beyond("rotor speed", "rad/s", needed.speeds, tighter, "bound")
         elif name == "slew":
             slews = needed.slews[np.isfinite(needed.slews)]
-            found += _beyond("change of rotor speed", "rad/s per period", slews, (lower, upper), "bound")
+            problems += _beyond("change of rotor speed", "rad/s per period", slews, (lower, upper), "bound")
         else:
             unit, scale = shown_unit(STATE_UNITS[INDEX[name]])
             values = scale * needed.state[:, INDEX[name]]
@@ -193,20 +193,20 @@ def _problems(
             if not beyond and name in tightened:
                 left = (scale * tightened[name][0], scale * tightened[name][1])
                 beyond = _beyond(name, unit, values, left, f"bound {scale * upper:.4g}, tightened to")
-            found += beyond
-    return tuple(found)
+            problems += beyond
+    return tuple(problems)
 
 
 def _beyond(name: str, unit: str, values: Array, allowed: tuple[float, float], kind: str) -> list[str]:
     if not values.size:
         return []
     (lower, upper), low, high = allowed, float(values.min()), float(values.max())
-    found = []
+    problems = []
     if high > upper + TOLERANCE * (1.0 + abs(upper)):
-        found.append(f"{name} up to {high:.4g} {unit} ({kind} {upper:.4g})")
+        problems.append(f"{name} up to {high:.4g} {unit} ({kind} {upper:.4g})")
     if low < lower - TOLERANCE * (1.0 + abs(lower)):
-        found.append(f"{name} down to {low:.4g} {unit} ({kind} {lower:.4g})")
-    return found
+        problems.append(f"{name} down to {low:.4g} {unit} ({kind} {lower:.4g})")
+    return problems
 
 
 def _sentence(

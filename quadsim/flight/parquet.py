@@ -136,12 +136,12 @@ def read_parquet(path: Path) -> pa.Table:
 
 def _fields(table: pa.Table, fields: _Fields) -> dict[str, Any]:
     """The fields of a log by name; None for those that its table may lack and does."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for field, units in fields.items():
         there = field not in _OPTIONAL or set(units) <= set(table.column_names)
         columns: list[Any] = [_values(table, name) for name in units] if there else [None]
-        found[field] = columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
-    return found
+        values[field] = columns[0] if len(columns) == 1 else np.stack(columns, axis=1)
+    return values
 
 
 def _values(table: pa.Table, name: str) -> Any:

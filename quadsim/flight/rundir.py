@@ -52,14 +52,14 @@ def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise FileError(path, f"is not {what}: it must be of {LARGEST_FILE} or fewer bytes")
-        found = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+        table = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
     except (OSError, RecursionError, ValueError) as error:
         if isinstance(error, FileError):
             raise
         raise FileError(path, f"is not {what} ({printable(str(error))[:200]})") from error
-    if wrong := _misfits(found, form):
+    if wrong := _misfits(table, form):
         raise FileError(path, f"is not {what}: it lacks or misstates {', '.join(wrong)}")
-    return dict(found)
+    return dict(table)
 
 
 def _refuse(constant: str) -> None:
@@ -110,14 +110,14 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
     """One entry of `constraints` in `summary.json`; an absent bound, or a window the flight never reached, is null."""
     limit = finding.limit
     stated = {name: value for name, value in vars(limit).items() if name not in ("name", "signal", "terms", "shape")}
-    found = {name: value for name, value in vars(finding).items() if name != "limit"}
+    audited = {name: value for name, value in vars(finding).items() if name != "limit"}
     return {
         "name": limit.name,
         "signal": limit.signal,
         **({"terms": dict(limit.terms)} if isinstance(limit, SumLimit) else {}),
         **({"shape": shape_to_json(limit.shape)} if isinstance(limit, SpaceLimit) else {}),
         "unit": limit.unit,
-        **{name: value if math.isfinite(value) else None for name, value in (stated | found).items()},
+        **{name: value if math.isfinite(value) else None for name, value in (stated | audited).items()},
         "satisfied": finding.satisfied,
         "verdict": finding.verdict,
     }
@@ -200,5 +200,5 @@ def load_run(directory: Path) -> Run:
 
 def damaged_files(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     """Files named in the summary that are missing or whose SHA-256 is not the recorded one."""
-    found = file_hashes(directory)
-    return [name for name, digest in summary["files"].items() if found.get(name) != digest]
+    digests = file_hashes(directory)
+    return [name for name, digest in summary["files"].items() if digests.get(name) != digest]

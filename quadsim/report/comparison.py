@@ -120,9 +120,9 @@ def crash(summary: Summary) -> str | None:
 
 def failure_sentences(summary: Summary) -> list[str]:
     """What prevented the optimum: permanent fallback, and why the first QP without an answer had none."""
-    periods, found = summary["controller"].get("unrecovered"), summary.get("diagnosis")
+    periods, diagnosis = summary["controller"].get("unrecovered"), summary.get("diagnosis")
     sentences = [fallback_sentence(periods)] if periods else []
-    return sentences + ([] if found is None else [found["sentence"], *filter(None, [found["advice"]])])
+    return sentences + ([] if diagnosis is None else [diagnosis["sentence"], *filter(None, [diagnosis["advice"]])])
 
 
 def event_sentences(events: Sequence[Summary]) -> list[str]:
@@ -133,24 +133,24 @@ def event_sentences(events: Sequence[Summary]) -> list[str]:
 
 def verdict_cell(summary: Summary) -> Cell:
     """The verdict, and whether it is the one that the scenario states; a run of an older version states none."""
-    found, expected = verdict(summary), summary.get("expected")
+    word, expected = verdict(summary), summary.get("expected")
     if expected is None:
-        return Cell(text=found)
+        return Cell(text=word)
     if summary.get("as_expected"):
-        return Cell(text=f"{found}, as expected", mark=Mark.GOOD if found == "satisfied" else Mark.NONE)
-    return Cell(text=f"{found}, expected: {expected}", mark=Mark.BAD)
+        return Cell(text=f"{word}, as expected", mark=Mark.GOOD if word == "satisfied" else Mark.NONE)
+    return Cell(text=f"{word}, expected: {expected}", mark=Mark.BAD)
 
 
 def required(summary: Summary) -> Cell:
     """The verdict on the constraints that the scenario demands, naming those that do not hold."""
     demanded = [entry for entry in summary["constraints"] if entry["required"]]
-    found = {
+    failing = {
         what: [entry["name"] for entry in demanded if constraint_verdict(entry) == verdict]
         for verdict, what in HELD.items()
         if verdict != "satisfied"
     }
-    if parts := [f"{what}: {', '.join(names)}" for what, names in found.items() if names]:
-        return Cell(text="; ".join(parts), mark=Mark.BAD if found["violated"] else Mark.WARN)
+    if parts := [f"{what}: {', '.join(names)}" for what, names in failing.items() if names]:
+        return Cell(text="; ".join(parts), mark=Mark.BAD if failing["violated"] else Mark.WARN)
     return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none")
 
 
@@ -238,11 +238,11 @@ def _verdict(entry: Summary) -> Cell:
 
     For example `holds (margin -0.0376 deg, tolerance 0.05)`.
     """
-    found = constraint_verdict(entry)
-    finding = HELD[found]
-    if found == "violated" and not entry["required"]:
+    held = constraint_verdict(entry)
+    finding = HELD[held]
+    if held == "violated" and not entry["required"]:
         finding = "exceeded, not required"
-    if found != "incomplete":
+    if held != "incomplete":
         margin, tolerance = deciding_margin(entry)
         at_samples = " at the samples" if margin != entry["worst_margin"] else ""
         finding += f" (margin {format_number(margin)} {entry['unit']}{at_samples}, tolerance {tolerance:g})"
@@ -250,10 +250,10 @@ def _verdict(entry: Summary) -> Cell:
 
 
 def _verdict_mark(entry: Summary) -> Mark:
-    found = constraint_verdict(entry)
-    if found == "satisfied":
+    held = constraint_verdict(entry)
+    if held == "satisfied":
         return Mark.GOOD
-    return Mark.BAD if found == "violated" and entry["required"] else Mark.WARN
+    return Mark.BAD if held == "violated" and entry["required"] else Mark.WARN
 
 
 def _margin(key: str, tolerance: str) -> Callable[[Summary], Cell]:

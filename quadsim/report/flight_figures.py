@@ -27,10 +27,13 @@ from quadsim.report.figure import (
     break_at_wraps,
     commanded_speeds,
     effect_curves,
+    has_space,
     line_colour,
+    obstacles_in,
+    outlines,
     reference_curve,
+    region_edges,
 )
-from quadsim.report.scene import has_space, obstacles_in, outlines, region_edges
 from quadsim.report.to_matplotlib import write_pngs
 from quadsim.state import POSITION, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
@@ -62,8 +65,8 @@ def write_figures(run: Run, directory: Path) -> list[Path]:
     figures = [states([run]), inputs([run]), times([run]), *effects(run), *space(run)]
     return write_pngs(
         (
-            replace(each, key=prefixes.get(each.key, "") + each.key, title=f"{run.name}{ended}: {each.title}")
-            for each in figures
+            replace(figure, key=prefixes.get(figure.key, "") + figure.key, title=f"{run.name}{ended}: {figure.title}")
+            for figure in figures
         ),
         directory,
     )
@@ -74,10 +77,10 @@ def page_figures(runs: Sequence[Run]) -> list[Figure | Scene]:
     flown = [run for run in runs if run.log.control.t.size]
     if not flown:
         return []
-    found: list[Figure | Scene] = [states(runs), inputs(runs), times(runs)]
+    figures: list[Figure | Scene] = [states(runs), inputs(runs), times(runs)]
     if len(runs) == 1:
-        found += [*effects(runs[0]), *space(runs[0])]
-    return [*found, path(runs)]
+        figures += [*effects(runs[0]), *space(runs[0])]
+    return [*figures, path(runs)]
 
 
 def overview(runs: Sequence[Run]) -> Figure:
@@ -175,7 +178,7 @@ def effects(run: Run) -> list[Figure]:
     panels = (
         [] if commanded is None else [_acting(rotor, plant.t, commanded, plant.speeds) for rotor in range(N_ROTORS)]
     )
-    panels += [_several(each.title, each.unit, plant.t, each.values, "xyz") for each in effect_curves(run.log)]
+    panels += [_several(curves.title, curves.unit, plant.t, curves.values, "xyz") for curves in effect_curves(run.log)]
     if not control.measured_perfectly:
         for what, names in {"position": ("x", "y", "z"), "attitude": ("roll", "pitch", "yaw")}.items():
             errors = [SIGNALS[f"{name}_estimate_error"] for name in names]
@@ -195,7 +198,7 @@ def space(run: Run) -> list[Figure]:
         t, values = clearances[obstacle.name]
         near = t[values < _NEAR]
         for instant in np.arange(near[0], near[-1], _EVERY) if obstacle.moves and near.size else [0.0]:
-            for outline, _ in outlines(obstacle, instant, 0.0, np.inf):
+            for outline in outlines(obstacle, instant):
                 opacity = 0.3 if obstacle.moves else 0.55
                 areas.append(Area(outline=outline, colour=OBSTACLE, opacity=opacity, label="obstacle"))
     regions = [
@@ -288,8 +291,8 @@ def _acting(rotor: int, t: Array, commanded: Array, speeds: Array) -> Panel:
 
 def _bounds(runs: Sequence[Run], signal: str) -> tuple[Bound, ...]:
     limits = [limit for run in runs for limit in run.limits]
-    found = bounds_of(limits, signal, _end(runs))
-    return tuple(Bound(value=value, start=start, stop=stop) for value, start, stop in found)
+    bounds = bounds_of(limits, signal, _end(runs))
+    return tuple(Bound(value=value, start=start, stop=stop) for value, start, stop in bounds)
 
 
 def _end(runs: Sequence[Run]) -> float:

@@ -317,11 +317,11 @@ class ClosedLoop:
             return None
         states = np.stack([sample.observation.state for sample in samples])
         try:
-            found: Array = predict(states, np.stack([sample.command.plan for sample in samples]))[:, :, [0, 2, 4]]
+            positions: Array = predict(states, np.stack([sample.command.plan for sample in samples]))[:, :, [0, 2, 4]]
         except (Exception, SystemExit) as error:  # after the flight, which is not to be lost by it
             _log.warning("no predictions are kept: predict raised %s: %s", type(error).__name__, error)
             return None
-        return found
+        return positions
 
     def _fly(self, observed: Observation, given: Command | None) -> Sample:
         plant, computation, steps, now = self._plant, self.computation, self._steps, observed.moment
@@ -434,11 +434,11 @@ def _hold(plant: Plant, inner: InnerLoop | None, speeds: Array, steps: int) -> I
         yield plant.advance(speeds, steps), plant.applied(speeds)
         return
     with _ending_flight(plant.time):
-        each = inner_steps(inner.rate, plant.timestep)
-    for first in range(0, steps, each):
+        stride = inner_steps(inner.rate, plant.timestep)
+    for first in range(0, steps, stride):
         with _ending_flight(plant.time):
             commanded = inner.speeds(plant.time, speeds, plant.physics[_BODY_RATES], plant.speeds)
-        yield plant.advance(commanded, min(each, steps - first)), plant.applied(commanded)
+        yield plant.advance(commanded, min(stride, steps - first)), plant.applied(commanded)
 
 
 def _control_log(samples: list[Sample], initial_speeds: Array, period: float) -> ControlLog:
@@ -452,9 +452,11 @@ def _control_log(samples: list[Sample], initial_speeds: Array, period: float) ->
     residuals = [sample.command.sqp for sample in samples]
     return ControlLog(
         t=_times(len(samples), period),
-        state=np.array([each.state for each in observed], float).reshape(-1, N_STATES),
-        truth=np.array([each.truth for each in observed], float).reshape(-1, N_STATES),
-        reference=np.array([each.reference for each in observed], float).reshape(-1, len(REFERENCE_NAMES)),
+        state=np.array([observation.state for observation in observed], float).reshape(-1, N_STATES),
+        truth=np.array([observation.truth for observation in observed], float).reshape(-1, N_STATES),
+        reference=np.array([observation.reference for observation in observed], float).reshape(
+            -1, len(REFERENCE_NAMES)
+        ),
         speeds=np.array([sample.speeds for sample in samples], float).reshape(-1, N_ROTORS),
         speeds_before=np.array(initial_speeds, float),
         status=tuple(MISSED if sample.missed else sample.command.status for sample in samples),
@@ -501,8 +503,8 @@ def _times(count: int, spacing: float) -> Array:
 
 def _joined(parts: list[Array | None]) -> np.ndarray[Any, np.dtype[np.float32]] | None:
     """The positions that each controller predicted, as far ahead as all of them did; None where one did not."""
-    found = [part for part in parts if part is not None]
-    if not found or len(found) < len(parts):
+    known = [part for part in parts if part is not None]
+    if not known or len(known) < len(parts):
         return None
-    shortest = min(part.shape[1] for part in found)
-    return np.ascontiguousarray(np.concatenate([part[:, :shortest] for part in found]), dtype=np.float32)
+    shortest = min(part.shape[1] for part in known)
+    return np.ascontiguousarray(np.concatenate([part[:, :shortest] for part in known]), dtype=np.float32)

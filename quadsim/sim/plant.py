@@ -81,7 +81,7 @@ class Plant:
         self.timestep = timestep
         self.effects = effects
         self._load, air = effects.load or _AS_IN_THE_FILE, effects.air or Air()
-        self._reweighed = self._load != _AS_IN_THE_FILE or any(isinstance(each, LOADING) for each in changes)
+        self._reweighed = self._load != _AS_IN_THE_FILE or any(isinstance(change, LOADING) for change in changes)
         self.model = compile_model(
             vehicle,
             timestep=timestep,
@@ -105,7 +105,7 @@ class Plant:
         self._integrator = integrator
         self._by_step = effects.follows_state or wind is not None or bool(self._own)
         self._by_step = self._by_step or bool(self._moving) or integrator == "rk4"
-        self._by_step = self._by_step or any(isinstance(each, PushChange) for each in changes)
+        self._by_step = self._by_step or any(isinstance(change, PushChange) for change in changes)
         bodies = [self.model.body(obstacle_body(obstacle)).id for obstacle in self._moving]
         self._mocaps = self.model.body_mocapid[bodies]
         self._changes = self._scheduled(changes)
@@ -226,8 +226,8 @@ class Plant:
 
     def allows(self, changes: Sequence[Change]) -> bool:
         """Whether it was made for changes of these kinds, as it was for those that it was made with."""
-        weighing = not self._reweighed and any(isinstance(each, LOADING) for each in changes)
-        return not (weighing or (not self._by_step and any(isinstance(each, PushChange) for each in changes)))
+        weighing = not self._reweighed and any(isinstance(change, LOADING) for change in changes)
+        return not (weighing or (not self._by_step and any(isinstance(change, PushChange) for change in changes)))
 
     def reschedule(self, changes: Sequence[Change]) -> None:
         """Schedule these changes, of kinds that it `allows`; past ones are left out."""
@@ -386,8 +386,8 @@ class Plant:
             except (Exception, SystemExit) as error:
                 raise RaisedError(f"the force {name}", error, time=time) from error
             if wrench.shape != (6,) or not np.all(np.isfinite(wrench)):
-                given = f"{wrench.tolist()!r:.80}"
-                raise ForceError(f"the force {name} must give six finite numbers [N, N m]; got {given}", time=time)
+                shown = f"{wrench.tolist()!r:.80}"
+                raise ForceError(f"the force {name} must give six finite numbers [N, N m]; got {shown}", time=time)
             total += wrench
         return total.tolist()
 

@@ -28,11 +28,11 @@ def check_free(effects: Effects, changes: Iterable[Change], obstacles: Sequence[
     unknown = {
         "contact with the ground": effects.ground is not None and effects.ground.contact,
         "obstacles": bool(obstacles),
-        "a load": effects.load not in (None, Load()) or any(isinstance(each, LOADING) for each in changes),
+        "a load": effects.load not in (None, Load()) or any(isinstance(change, LOADING) for change in changes),
         "effects.air.body_drag": effects.air is not None and effects.air.body_drag is not None,
     }
-    if found := [name for name, present in unknown.items() if present]:
-        raise ParameterError("plant", "integrator", "rk4", f"mujoco where there is {' and '.join(found)}")
+    if names := [name for name, present in unknown.items() if present]:
+        raise ParameterError("plant", "integrator", "rk4", f"mujoco where there is {' and '.join(names)}")
 
 
 class RigidBody:

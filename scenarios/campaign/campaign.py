@@ -21,6 +21,7 @@ import pyarrow.compute as pc
 
 from quadsim.errors import InputError, OutputError, ParameterError, UnknownNameError
 from quadsim.outputs import Growing, growing
+from scenarios.assembly import Assembly
 from scenarios.campaign import store as records
 from scenarios.campaign.campaign_report import write_report
 from scenarios.campaign.plan import Plan, parse_campaign
@@ -37,7 +38,6 @@ from scenarios.campaign.store import (
 )
 from scenarios.flight import Flight, to_pandas
 from scenarios.many import MEMORY, TIMEOUT, count_workers
-from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario
@@ -268,7 +268,7 @@ def fly_sweep(
     count = math.prod(map(len, lists))
     data = {"name": scenario.name, "scenario": scenario.name, "flights": count, "vary": entries}
     spec = parse_campaign(data, source="sweep")
-    plan = Plan(spec, resolve_vehicle(scenario, build_vehicle(scenario)), one_seed=True)
+    plan = Plan(spec, Assembly(scenario).with_vehicle, one_seed=True)
     plan.check()
     progress("sweep", 0, count)
     rows = []

@@ -50,7 +50,7 @@ def campaign_lines(summary: Summary, judgements: Sequence[Judgement], directory:
     """What came of a campaign, as a console shows it."""
     from scenarios import console
 
-    where = console.shown(directory)
+    where = console.short_path(directory)
     yield console.styled((summary["campaign"], "bold"), f": {verdict_sentence(summary)}")
     if summary["parameters"]:
         yield driver_sentence(summary)

@@ -14,22 +14,21 @@ from typing import Any, Final
 import pyarrow as pa
 
 from quadsim.errors import FileError, InputError, ParameterError, QuadsimError
+from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import CampaignFile, Draws, Value, Varied
 from scenarios.campaign.events import Event, parse_event
 from scenarios.campaign.rows import DRAW, TIMES, Row, flown_row, make_schema
+from scenarios.catalogue import campaign_path, scenario_path
 from scenarios.flight import Flight
-from scenarios.limits import build_limits
-from scenarios.loading import check_parts, parse_scenario
+from scenarios.loading import parse_scenario
 from scenarios.machine import processor_name
 from scenarios.many import ERROR, MEMORY, fly_many
-from scenarios.parts.vehicle import build_vehicle, resolve_vehicle
 from scenarios.rollout import Rollout
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import NOT_DESCRIBED, apply_setting, differences, get_field, note_changes, set_field
-from scenarios.shipped import campaign_path, scenario_path
 
 FIRST: Final = 5  # flights of which one at least has to be possible
 Change = tuple[Varied, Value]
@@ -53,7 +52,7 @@ class Plan:
     def schema(self) -> pa.Schema:
         """The columns of its results."""
         kinds = {entry.name: (column_type(entry), entry.unit) for entry in self.spec.vary}
-        return make_schema(kinds, build_limits(self.scenario))
+        return make_schema(kinds, Assembly(self.scenario).limits)
 
     @property
     def flies_user_code(self) -> bool:
@@ -107,13 +106,14 @@ class Plan:
         _ = self.failure
         check_ends(
             self.spec.vary,
-            lambda entry, value: check_parts(self._varied([(entry, value)], name=self.scenario.name, seed=0)),
+            lambda entry, value: Assembly(self._varied([(entry, value)], name=self.scenario.name, seed=0)).check(),
             table="vary",
         )
         refusals = []
         for flight in range(min(FIRST, self.spec.flights)):
             try:
-                return check_parts(self.of(flight))
+                Assembly(self.of(flight)).check()
+                return
             except InputError as error:
                 refusals.append(error)
         raise InputError(f"none of the first {len(refusals)} flights can be flown, the first since {refusals[0]}")
@@ -192,7 +192,7 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
 def make_plan(scenario: Scenario, data: Mapping[str, Any]) -> Plan:
     """A campaign of a scenario that is there already, its other fields given as in a file."""
     spec = parse_campaign({"name": scenario.name, **data, "scenario": scenario.name}, source="campaign")
-    plan = Plan(spec, resolve_vehicle(scenario, build_vehicle(scenario)))
+    plan = Plan(spec, Assembly(scenario).with_vehicle)
     plan.check()
     return plan
 
@@ -220,8 +220,8 @@ def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ())
         scenario = parse_scenario(data, source=f"{path.name}, {file.name}", directory=file.parent)
     except OSError as error:
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
-    check_parts(scenario)
-    return resolve_vehicle(scenario, build_vehicle(scenario))
+    Assembly(scenario).check()
+    return Assembly(scenario).with_vehicle
 
 
 def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], ...]:

@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
 from scenarios.design.authority import Authority, authority
 from scenarios.feasibility_check import fitting, report
 from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
@@ -39,9 +40,10 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
             )
     if any("hover is" in line for line in missed):  # the course's rotor speeds would repeat it
         return tuple(missed)
-    problems = report(scenario, vehicle).problems
+    assembly = Assembly(scenario)
+    problems = report(assembly).problems
     missed += [f"the course requires {problem}" for problem in problems]
-    fits = fitting(scenario, vehicle) if problems else ""
+    fits = fitting(assembly) if problems else ""
     return (*missed, fits) if fits else tuple(missed)
 
 

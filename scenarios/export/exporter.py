@@ -21,10 +21,10 @@ from mpc.ocp import Problem
 from quadsim.errors import ParameterError
 from quadsim.outputs import absolute, reserving, writing
 from quadsim.state import N_STATES, POSITION, VELOCITY, Array
+from scenarios.assembly import Assembly
 from scenarios.export.record import Recording, record
-from scenarios.loading import as_scenario
+from scenarios.loading import load_scenario
 from scenarios.parts.controllers import exportable
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 
 DISTANCES: Final = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
@@ -152,7 +152,7 @@ def export(
             raise ParameterError("", f"--{name}", value, f"one of {', '.join(allowed)}")
     if rows is not None and rows < 1:
         raise ParameterError("", "--rows", rows, "at least 1")
-    scenario = as_scenario(scenario)
+    scenario = load_scenario(scenario)
     with reserving(out, overwrite=overwrite) as directory:
         controller = c_controller(scenario, precision, rows)
         facts = _facts(controller)
@@ -181,7 +181,7 @@ def exported_law(scenario: Scenario) -> Exportable:
         ExportError: it cannot be exported.
     """
     shapes = (*scenario.obstacles, *scenario.regions)
-    return exportable(scenario.controller, build_vehicle(scenario), scenario.control_period, shapes)
+    return exportable(scenario.controller, Assembly(scenario).vehicle, scenario.control_period, shapes)
 
 
 def _facts(controller: CController) -> dict[str, Any]:

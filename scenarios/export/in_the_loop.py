@@ -34,10 +34,11 @@ from quadsim.flight.audit import Limit
 from quadsim.outputs import reserving
 from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS
+from scenarios.assembly import Assembly
 from scenarios.export.exporter import c_controller, exported_law, programs
 from scenarios.flight import Flight
 from scenarios.limits import with_bounds_stated
-from scenarios.loading import as_scenario
+from scenarios.loading import load_scenario
 from scenarios.progress import Progress, reporting
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
@@ -278,7 +279,7 @@ def fly_exported(
         >>> import quadsim
         >>> flight = quadsim.fly_exported("hover", target="cortex-m4f", precision="float")  # doctest: +SKIP
     """
-    scenario = as_scenario(scenario)
+    scenario = load_scenario(scenario)
     machine = TARGETS[target]
     files = c_controller(scenario, precision).files | programs(machine, precision)
     require_programs(machine, "to fly an exported controller")
@@ -310,5 +311,5 @@ def _allowing(scenario: Scenario, spacing: float) -> Scenario:
         tolerances = {name: max(spacing, getattr(limit, name)) for name in ("tolerance", "tolerance_sampled")}
         return replace(limit, **tolerances)
 
-    limits = [*map(widened, with_bounds_stated(scenario).constraints)]
+    limits = [*map(widened, with_bounds_stated(Assembly(scenario)).constraints)]
     return scenario.model_copy(update={"constraints": limits})

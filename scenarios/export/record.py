@@ -21,8 +21,7 @@ from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import ACCEPTED, CORE, GAIN, Command, Moment, Phase
 from quadsim.errors import ExportError, PlanExhaustedError
 from quadsim.state import Array
-from scenarios.build import build_controller
-from scenarios.parts.vehicle import build_vehicle
+from scenarios.assembly import Assembly
 from scenarios.rollout import Rollout
 from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.scenario import Scenario
@@ -79,7 +78,7 @@ def record(scenario: Scenario) -> Recording:
     scenario = scenario.replace({"controller.compiled": False})
     if isinstance(scenario.controller, BoundedSpec):
         scenario = scenario.replace({"controller.solver": CORE})
-    law = build_controller(scenario, build_vehicle(scenario))
+    law = Assembly(scenario).controller()
     inner = law.inner if isinstance(law, Guarded) else law
     assert isinstance(inner, MPC)
     recorder = Recorder(inner)

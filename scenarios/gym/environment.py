@@ -22,18 +22,16 @@ from quadsim.flight.log import FlightLog
 from quadsim.report.film.camera import Camera
 from quadsim.sim.loop import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array
-from scenarios.build import build_controller, preferring_core
+from scenarios.assembly import Assembly, preferring_core
 from scenarios.campaign.plan import Plan, make_plan, read_campaign
+from scenarios.catalogue import scenario_names, scenario_path
 from scenarios.flight import Flight
 from scenarios.gym.spaces import USUAL, Action, Actions, Observations
-from scenarios.limits import build_limits
-from scenarios.loading import as_scenario, parse_scenario
-from scenarios.parts.vehicle import build_vehicle
+from scenarios.loading import load_scenario, parse_scenario
 from scenarios.rollout import Rollout
 from scenarios.schema.base import LARGEST_SEED
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import scenario_names, scenario_path
 
 Reward = Callable[[Array, Array, Array], float]
 """From the true state (12,) after a step, the reference (4,) there, and the rotor speeds commanded (4,) [rad/s]."""
@@ -110,7 +108,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         Raises:
             InputError: one of these is not possible.
         """
-        scenario = preferring_core(as_scenario(scenario))
+        scenario = preferring_core(load_scenario(scenario))
         self._plan = None if vary is None else _varying(scenario, str(vary))
         self._base = scenario if self._plan is None else self._plan.scenario
         if render_mode not in (None, "rgb_array"):
@@ -121,13 +119,13 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             raise ParameterError("", "preview", preview, f"from 1 to controller.horizon = {horizon} periods")
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self._base.control_period))}
         self.observations = Observations(observation, preview)
-        self.actions = Actions(action, self._base, build_vehicle(self._base))
+        self.actions = Actions(action, self._base, Assembly(self._base).vehicle)
         self.action_space, self.observation_space = self.actions.space, self.observations.space
         self.render_mode, self._size = render_mode, (width, height)
         self._preview, self._reward, self._action = preview, reward, action
         self._flight: Rollout | None = None
         self._camera: Camera | None = None
-        self.scenario, self.limits = self._base, build_limits(self._base)
+        self.scenario, self.limits = self._base, Assembly(self._base).limits
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
@@ -167,7 +165,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             self._flight.close()
         self.scenario = scenario
         if self._plan is not None:
-            self.actions = Actions(self._action, scenario, build_vehicle(scenario))
+            self.actions = Actions(self._action, scenario, Assembly(scenario).vehicle)
         # events that change the controller need a real one
         law: Any = None if scenario.controller_changes else Agent(scenario.controller.horizon)
         self._flight = Rollout(scenario, law)
@@ -235,7 +233,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             seen = self._seen
             self.actions.of(np.zeros(4))  # which those without equivalent speeds refuse
             if isinstance(agent := flight.loop.controller, Agent):
-                flight.loop.controller = build_controller(self.scenario, flight.vehicle)
+                flight.loop.controller = Assembly(self.scenario).controller()
                 flight.loop.controller.reset(agent.speeds)
             command = flight.loop.controller.step(seen.moment, seen.state, seen.preview)
             self.action_for(command)
@@ -400,7 +398,7 @@ def make_env(scenario: Scenario | str | Path, **options: Any) -> gymnasium.Env[A
         ((12,), 200, 0)
         >>> env.close()
     """
-    scenario = as_scenario(scenario)
+    scenario = load_scenario(scenario)
     return gymnasium.make(_specification(scenario, scenario=scenario), **options)
 
 
@@ -424,5 +422,5 @@ def make_vec(scenario: Scenario | str | Path, num_envs: int, **options: Any) -> 
     """
     if num_envs < 1:
         raise ParameterError("", "num_envs", num_envs, "at least 1")
-    scenario = as_scenario(scenario)
+    scenario = load_scenario(scenario)
     return gymnasium.make_vec(_specification(scenario, scenario=scenario), num_envs, "async", **options)

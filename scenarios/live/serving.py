@@ -27,12 +27,12 @@ from urllib.parse import parse_qs, urlsplit
 from quadsim.errors import MissingPackageError, ParameterError, QuadsimError
 from scenarios import console
 from scenarios.app import run_directory
+from scenarios.catalogue import scenario_names
 from scenarios.live.session import Frame, Session, read_script
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Document
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import scenario_names
 
 if TYPE_CHECKING:
     from scenarios.live.page import Page
@@ -198,7 +198,7 @@ def fly_live(
             nonlocal replaced
             session.flight().save(directory, overwrite=replaced, video=video)
             replaced = True  # the next time it is this session's own
-            return console.shown(directory)
+            return console.short_path(directory)
 
         try:
             while onward and session.reason is None and session.k < scenario.periods:

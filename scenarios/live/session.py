@@ -22,10 +22,10 @@ from quadsim.fields import Fraction, Vector
 from quadsim.flight.audit import Limit
 from quadsim.sim.loop import Sample
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
-from scenarios.build import preferring_core
+from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
+from scenarios.flight_events import Successor
 from scenarios.limits import with_bounds_stated
-from scenarios.parts.live import Successor
 from scenarios.rollout import Rollout
 from scenarios.schema.controller import ControllerSpec
 from scenarios.schema.problems import parse_table
@@ -123,7 +123,9 @@ class Session:
         self._queue.clear()
         scenarios = [self.scenario]
         if self._against is not None:
-            scenarios.append(with_bounds_stated(self.scenario).model_copy(update={"controller": self._against}))
+            scenarios.append(
+                with_bounds_stated(Assembly(self.scenario)).model_copy(update={"controller": self._against})
+            )
         self.flights = tuple(Rollout(flown, live=True) for flown in scenarios)
         self._held = _Hand()
         self.reason: str | None = None

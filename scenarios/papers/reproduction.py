@@ -15,7 +15,9 @@ from quadsim.assets import read_toml
 from quadsim.errors import InputError
 from quadsim.fields import NonNegative, Number, Positive
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
-from scenarios.loading import check_parts, parse_scenario
+from scenarios.assembly import Assembly
+from scenarios.catalogue import paper_path, scenario_path
+from scenarios.loading import parse_scenario
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.rollout import Rollout
@@ -23,7 +25,6 @@ from scenarios.schema.base import MOST_ENTRIES, Pair
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import parse_table
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import paper_path, scenario_path
 
 HEAD: Final = ("number", "unit", "published", "ours", "difference", "tolerance", "reproduced")
 _RULE: Final = "measure must lead to a number of the flight's summary"
@@ -102,7 +103,7 @@ class Paper(PaperFile):
         path = scenario_path(str(beside) if own_file else number.scenario)
         data = merge(read_scenario(path, scenario_path), number.set)
         scenario = parse_scenario(data, source=f"{number.name}: {path.name}", directory=path.parent)
-        check_parts(scenario)
+        Assembly(scenario).check()
         return scenario
 
 

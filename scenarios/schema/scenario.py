@@ -23,6 +23,7 @@ from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.state import STATE_NAMES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from scenarios.catalogue import Group
 from scenarios.courses.table import ReferenceTable
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, fields_of
 from scenarios.schema.controller import ControllerSpec, NonlinearSpec, changed
@@ -33,7 +34,6 @@ from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.settings import set_field
 from scenarios.schema.writing import to_toml
-from scenarios.shipped import Group
 
 
 class ActualSpec(Spec):

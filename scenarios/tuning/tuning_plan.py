@@ -19,6 +19,7 @@ from pydantic import Field
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.state import Array
+from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import (
     MOST_FLIGHTS,
     CampaignFile,
@@ -45,14 +46,13 @@ from scenarios.campaign.plan import (
 )
 from scenarios.campaign.rows import Row
 from scenarios.campaign.statistics import Requirement, parse_requirement
-from scenarios.limits import build_limits
-from scenarios.loading import check_parts, parse_scenario
+from scenarios.catalogue import tuning_path
+from scenarios.loading import parse_scenario
 from scenarios.schema.bases import merge
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
 from scenarios.schema.writing import to_toml
-from scenarios.shipped import tuning_path
 
 START: Final = 0  # the candidate that is the scenario as it is
 Searched = Annotated[Uniform | LogUniform | Integer | Choice, Field(discriminator="distribution")]
@@ -227,13 +227,13 @@ class TuningPlan:
 
     def _check_at(self, entry: Varied, value: Value) -> None:
         scenario = self.candidate({entry.name: value}, self.spec.name)
-        if build_limits(scenario) != build_limits(self.start.scenario):
+        if Assembly(scenario).limits != Assembly(self.start.scenario).limits:
             rule = (
                 "of fields that leave alone what flights are audited against: constraints, obstacles, regions, and the "
                 "controller's bounds and polytopes"
             )
             raise ParameterError(f"search.{entry.name}", "fields", entry.fields, rule)
-        check_parts(scenario)
+        Assembly(scenario).check()
 
     def to_toml(self) -> str:
         """The file with every field, for a directory that has the start as `scenario.toml`."""

@@ -20,13 +20,12 @@ from mpc.ocp import Query
 from mpc.solvers import Method
 from quadsim.errors import ExportError, OutputError, ParameterError
 from quadsim.state import REFERENCE_STATES, Array
-from scenarios.build import build_problem
+from scenarios.assembly import Assembly
 from scenarios.catalogue import read_catalogue
 from scenarios.cli import main
 from scenarios.export.exporter import FACTS, c_controller, export, exported_law, room_sentence
 from scenarios.export.record import record
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 
 SHORT = {"duration": 1.0}
 NUMBER = re.compile(r"(?<![\w.])-?(\d[\d.e+-]*)\b(?!F?\])")
@@ -41,7 +40,7 @@ def test_every_problem_of_the_library_that_qualifies_is_exported() -> None:
     exported, refused, seen = 0, {}, set()
     for name in read_catalogue().scenarios:
         scenario = load_scenario(name)
-        key = scenario.controller.model_dump_json(), repr(build_vehicle(scenario)), bool(scenario.obstacles)
+        key = scenario.controller.model_dump_json(), repr(Assembly(scenario).vehicle), bool(scenario.obstacles)
         if key in seen:
             continue
         seen.add(key)
@@ -155,8 +154,7 @@ def test_a_problem_with_too_many_numbers_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
-    [(1.5, "1.5"), (-0.1, "-0.1"), (1e-39, "0.0"), (-5e-324, "0.0"), (1.2e-38, "1.2e-38")],
+    ("value", "text"), [(1.5, "1.5"), (-0.1, "-0.1"), (1e-39, "0.0"), (-5e-324, "0.0"), (1.2e-38, "1.2e-38")]
 )
 def test_numbers_are_exact_and_none_is_denormal(value: float, text: str) -> None:
     assert CText("double").number(value) == text
@@ -189,7 +187,7 @@ def optimum(axis: AxisTables, start: Array, reference: Array) -> Array:
 @pytest.mark.parametrize("settings", [[], ["controller.terminal=lqr"], ["controller.horizon=10"]])
 def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None:
     scenario = load_scenario("paper-constrained", settings)
-    problem = build_problem(scenario, build_vehicle(scenario))
+    problem = Assembly(scenario).problem()
     found, rng = tables(problem), np.random.default_rng(0)
     state, reference = rng.normal(size=12), rng.normal(size=(problem.horizon, 4))
     query = Query(1e-6 * state, problem.objective.desired(1e-6 * reference), problem.model.u_bar)

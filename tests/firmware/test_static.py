@@ -26,10 +26,7 @@ CPPCHECK = ["--quiet", "--std=c99", "--enable=warning,style,performance,portabil
 CPPCHECK += ["--suppress=variableScope", "--suppress=unusedStructMember"]  # of members that other controllers use
 ALLOWED = {"memcpy", "memset"}
 DEFINES = {"double": [], "float": ["-DQUADSIM_FLOAT"]}
-EXPORTS = {
-    "double": ("cortex-m7", "double"),
-    "float": ("cortex-m4f", "float"),
-}
+EXPORTS = {"double": ("cortex-m7", "double"), "float": ("cortex-m4f", "float")}
 CONTROLLER = ("quadsim_mpc.c", "quadsim_core.c")
 PROGRAMS = (*CONTROLLER, "main.c", "serial.c", "vectors.c")
 

@@ -162,10 +162,7 @@ def test_a_command_need_not_be_the_plans_first_input() -> None:
     assert rejection(SOLVED, HOVER, off(math.nan), BOUNDS, HOVER) == "not_finite"
 
 
-@given(
-    st.integers(0, 2**32 - 1),
-    st.floats(0.0, 260.0, allow_nan=False),
-)
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 260.0, allow_nan=False))
 def test_whatever_is_clipped_is_not_rejected(seed: int, level: float) -> None:
     rng = np.random.default_rng(seed)
     before = level + rng.normal(size=4)

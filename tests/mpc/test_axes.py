@@ -113,10 +113,7 @@ def test_a_bounded_axis_that_nothing_moves_or_without_a_set_point_leaves_one_pie
 
 
 def test_an_unbounded_axis_without_a_set_point_is_left_out() -> None:
-    problem = paper_problem(
-        "paper-constrained",
-        "controller.output_weights={x=1.0, y=1.0, z=1.0}",
-    )
+    problem = paper_problem("paper-constrained", "controller.output_weights={x=1.0, y=1.0, z=1.0}")
     assert names(problem) == QUADROTOR
     assert len(axes(problem)) == 3
 

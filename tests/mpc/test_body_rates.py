@@ -9,15 +9,15 @@ from mpc.answer import ActuatorBounds
 from mpc.body_rates import BodyRateLoop
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 
 BANDWIDTH = 20.0
 
 
 @pytest.fixture(scope="module")
 def vehicle() -> Vehicle:
-    return build_vehicle(load_scenario("gust"))
+    return Assembly(load_scenario("gust")).vehicle
 
 
 def make_loop(vehicle: Vehicle) -> BodyRateLoop:

@@ -62,17 +62,6 @@ def test_data_that_is_not_finite_or_of_no_vehicle_is_refused(part: str, number: 
     np.testing.assert_allclose(solved(solver, now).plan, before.plan, atol=1e-9)
 
 
-def test_an_answer_has_the_states_of_its_plan() -> None:
-    problem = soft_problem()
-    solver = changing(problem)
-    for seed in range(5):
-        now = changing_period(np.random.default_rng(seed), problem)
-        answer = solved(solver, now)
-        assert answer.status == SOLVED
-        assert answer.states is not None
-        np.testing.assert_allclose(answer.states, ocp_peer.trajectory(now, answer.plan)[1:], atol=1e-6)
-
-
 def test_a_failure_leaves_the_next_solve_alone_and_has_no_states() -> None:
     problem = paper_problem()
     solver = changing(problem)
@@ -86,30 +75,6 @@ def test_a_failure_leaves_the_next_solve_alone_and_has_no_states() -> None:
     hover = solved(solver, ocp_peer.period(problem, np.zeros(12), desired, u_bar))
     assert hover.status == SOLVED
     np.testing.assert_allclose(hover.plan, np.tile(u_bar, (50, 1)), atol=1e-3)
-
-
-@pytest.mark.parametrize("solver", ["piqp-dense", "daqp"])
-@pytest.mark.parametrize("terminal", [0.0, 3.0])
-def test_condensed_and_staged_forms_have_one_optimum(solver: str, terminal: float) -> None:
-    """With weights of changes and of the last state, inputs pulled to others in each step, and without these."""
-    rng = np.random.default_rng(7)
-    problem = soft_problem()
-    Q_d = 0.3 * np.eye(problem.model.nu)
-    objective = replace(problem.objective, Q_d=Q_d, P=terminal * problem.objective.weights[0])
-    problem = replace(problem, objective=objective)
-    ways = changing(problem), changing(problem, solver), changing(problem, solver, free_first=True)
-    for _ in range(8):
-        now = changing_period(rng, problem)
-        u = now.equilibrium.u + 0.2 * rng.normal(size=(problem.horizon, problem.model.nu))
-        now = replace(now, equilibrium=now.equilibrium._replace(u=u))
-        staged, condensed, free_first = (solved(way, now) for way in ways)
-        for other in (condensed, free_first):
-            assert {staged.status, other.status} <= ACCEPTED
-            np.testing.assert_allclose(other.plan, staged.plan, atol=1e-4)
-            np.testing.assert_allclose(other.slacks, staged.slacks, atol=1e-4)
-        assert condensed.states is not None
-        assert staged.states is not None
-        np.testing.assert_allclose(condensed.states, staged.states, atol=1e-4)
 
 
 def test_the_unconstrained_optimum_is_answered_where_it_violates_nothing() -> None:

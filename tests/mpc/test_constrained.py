@@ -98,14 +98,6 @@ def test_reset_forgets_the_plan() -> None:
         controller.step(Moment(), STATE, reference)
 
 
-def test_back_ends_do_not_accept_a_measured_nan() -> None:
-    solver = FaultySolver({})
-    controller = ConstrainedMPC(solver.problem, solver)
-    controller.reset(solver.problem.model.u_bar)
-    with pytest.raises(PlanExhaustedError):
-        controller.step(Moment(), STATE * np.nan, paper_reference(60)[1:51])
-
-
 def test_slews_count_from_the_command_that_acts() -> None:
     """Where an earlier command was dropped, the next one is bound to what acts, not to what was commanded."""
     problem = paper_problem()

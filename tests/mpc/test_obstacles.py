@@ -17,7 +17,7 @@ from mpc.paper import prediction
 from mpc.qp import kkt_residuals
 from mpc.robust.tightening import TighteningSettings, position_margins
 from mpc.solvers import Answer, QPSolver, make_solver
-from mpc.solvers.piqp import PiqpDense
+from mpc.solvers.piqp import Piqp
 from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError
 from quadsim.space import Capsule, Corridor, Cylinder, Fence, Sphere
@@ -81,9 +81,8 @@ def by_dense_qp(problem: Problem, posed: Query, normals: Array, bounds: Array) -
         G=np.vstack([qp.G, rows @ maps.Psi]),
         h_l=np.concatenate([qp.h_l, bounds.ravel() - rows @ free]),
         h_u=np.concatenate([qp.h_u, np.full(bounds.size, np.inf)]),
-        later=None,
     )
-    backend = PiqpDense()
+    backend = Piqp(dense=True)
     backend.setup(qp)
     solution = backend.solve(qp)
     assert solution.status == SOLVED

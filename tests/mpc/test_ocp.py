@@ -45,8 +45,7 @@ def test_desired_outputs_are_the_reference_and_zero_elsewhere() -> None:
 
 
 @pytest.mark.parametrize(
-    "matrix",
-    [-np.eye(4), np.diag([1.0, 1.0, 1.0, np.nan]), np.eye(4) + np.eye(4, k=1), np.ones((4, 3))],
+    "matrix", [-np.eye(4), np.diag([1.0, 1.0, 1.0, np.nan]), np.eye(4) + np.eye(4, k=1), np.ones((4, 3))]
 )
 @pytest.mark.parametrize("weight", ["Q_d", "P"])
 def test_weights_of_moves_and_of_the_last_state_must_be_semidefinite(matrix: Array, weight: str) -> None:

@@ -15,7 +15,7 @@ from mpc.ocp import Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Backend, Solution, kkt_residuals
 from mpc.solvers import SOLVERS, Formulation, QPSolver, make_backend
-from mpc.solvers.piqp import PiqpDense
+from mpc.solvers.piqp import Piqp
 from quadsim.controller import SOLVED
 from quadsim.state import Array
 from scenarios.flight import Flight
@@ -43,22 +43,6 @@ def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: s
     assert active > 100  # the flight does press against its bounds
 
 
-def test_first_input_agrees_with_solvers_of_other_families(constrained_flight: Flight) -> None:
-    """Of two interior-point methods and an active-set one."""
-    problem = paper_problem()
-    ours, daqp, clarabel = (QPSolver(name, problem) for name in ("piqp-multistage", "daqp", "clarabel"))
-    agreed = 0
-    for query in flight_queries(constrained_flight, problem, stride=150):
-        plan = ours.solve(Query(*query)).plan
-        np.testing.assert_allclose(daqp.solve(Query(*query)).plan[0], plan[0], atol=1e-3)
-        other = clarabel.solve(Query(*query))
-        assert other.status in {SOLVED, "unsolved"}
-        if other.status == SOLVED:
-            np.testing.assert_allclose(other.plan[0], plan[0], atol=1e-3)
-            agreed += other.active > 0
-    assert agreed >= 3  # also where constraints are active
-
-
 def solved(formulation: Formulation, backend: Backend, query: Query) -> tuple[QP, Solution]:
     backend.setup(formulation.qp)
     qp = formulation.pose(Query(*query)).qp
@@ -71,7 +55,7 @@ def at(solution: Solution, **parts: Array) -> Solution:
 
 def test_kkt_residuals_see_every_kind_of_fault() -> None:
     problem = paper_problem()
-    formulation, backend = Condensed(problem), PiqpDense()
+    formulation, backend = Condensed(problem), Piqp(dense=True)
     query = (STATE, problem.objective.desired(paper_reference(60)[1:51]), problem.model.u_bar)
     qp, solution = solved(formulation, backend, query)
     assert kkt_residuals(qp, solution).worst < 1e-3
@@ -118,7 +102,7 @@ def test_multipliers_of_rows_are_those_of_the_qp_and_back() -> None:
     tighter = Constraint(name="late", D=np.eye(4), lower=np.full((15, 4), -1.0), upper=late)
     problem = replace(problem, constraints=(again, tighter))
     desired = problem.objective.desired(np.tile([0.0, 0.0, 30.0, 0.0], (15, 1)))
-    form, backend = Condensed(problem), PiqpDense()
+    form, backend = Condensed(problem), Piqp(dense=True)
     qp, solution = solved(form, backend, (np.zeros(12), desired, problem.model.u_bar))
     optimum = polish(qp, solution)
     assert kkt_residuals(qp, optimum).worst < 1e-5

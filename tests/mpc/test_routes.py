@@ -16,7 +16,6 @@ import pytest
 from ocp_peer import Optimum, Period
 from support import changing_period, paper_problem, random_problem, random_rows
 
-from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Constraint, Penalty, tightened
 from mpc.model import LinearModel, continuous_model, discretise
 from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
@@ -200,18 +199,6 @@ def test_rows_of_states_alone_are_held_axis_by_axis(soft: bool) -> None:
     beyond = ocp_peer.violation(row, given, answer.plan)
     assert (beyond.max() > 1e-3) == soft
     np.testing.assert_allclose(beyond, answer.slacks if soft else 0.0, atol=1e-7)
-
-
-@pytest.mark.parametrize("soft", [False, True])
-def test_the_papers_controller_holds_it(soft: bool) -> None:
-    problem, given, _, peer = paper(soft=soft)
-    for name in ("piqp-multistage", CORE):
-        controller = ConstrainedMPC(problem, make_solver(name, problem))
-        controller.reset(given.u_before)
-        command = controller.step(Moment(), given.state, given.desired)
-        assert command.status == SOLVED
-        np.testing.assert_allclose(command.speeds, peer.plan[0], atol=1e-3)
-        assert command.slack == pytest.approx(peer.slacks.max(initial=0.0), abs=1e-5)
 
 
 # The robust controller

@@ -18,7 +18,7 @@ from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import kkt_residuals
 from mpc.solvers import CORE_OR_PIQP, SOLVERS, Answer, QPSolver, find_solver, make_backend, make_solver, solver_entries
 from mpc.solvers.daqp import DaqpDense
-from mpc.solvers.piqp import PiqpDense, PiqpMultistage
+from mpc.solvers.piqp import Piqp
 from quadsim.controller import CORE, GAIN, SOLVED, Moment
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
 from scenarios.flight import Flight
@@ -102,7 +102,7 @@ def test_equality_rows_and_multipliers() -> None:
         query = (0.1 * rng.normal(size=3), rng.normal(size=(6, 3)), problem.model.u_bar)
         plans = []
         for formulation in (PartiallyCondensed(problem, steps_per_stage=2), Condensed(problem)):
-            backend, peer = DaqpDense(), PiqpDense()
+            backend, peer = DaqpDense(), Piqp(dense=True)
             qp = formulation.pose(Query(*query)).qp
             backend.setup(formulation.qp)
             peer.setup(Condensed(problem).qp)
@@ -126,31 +126,6 @@ def test_a_flight_by_daqp_holds_its_audit_and_is_the_same(constrained_flight: Fl
     np.testing.assert_allclose(flight.log.control.speeds, constrained_flight.log.control.speeds, atol=0.01)
 
 
-def test_daqp_starts_from_the_active_set_one_step_earlier(constrained_flight: Flight) -> None:
-    """Over whole QPs of the paper's flight: a third of the changes, the same optima."""
-    problem = paper_problem()
-    form = Condensed(problem)
-    later = form.qp.later
-    assert later is not None
-    rows = np.asarray(form.qp.G).reshape(50, -1, 200)
-    for i in (3, 17):  # a row's values one step later are those of its entry in `later`, inputs one step later too
-        own = 200 + i * rows.shape[1] + np.arange(rows.shape[1])
-        np.testing.assert_array_equal(later[own], own + rows.shape[1])
-        np.testing.assert_allclose(rows[i + 1][:, 4:], rows[i][:, :-4], atol=1e-9)
-    np.testing.assert_array_equal(later[:200], [*range(4, 200), *range(196, 200)])
-    changes, found = {}, {}
-    for name, qp in (("moved", form.qp), ("unmoved", replace(form.qp, later=None))):
-        backend = DaqpDense()
-        backend.setup(qp)
-        queries = flight_queries(constrained_flight, problem, stride=1)[800:900]
-        solutions = [backend.solve(form.pose(Query(*query)).qp) for query in queries]
-        assert {solution.status for solution in solutions} == {SOLVED}
-        changes[name] = sum(solution.iterations for solution in solutions)
-        found[name] = np.array([solution.x for solution in solutions])
-    assert changes["moved"] < changes["unmoved"] / 3
-    np.testing.assert_allclose(found["moved"], found["unmoved"], atol=1e-5)
-
-
 def test_unknown_solver_lists_those_there_are() -> None:
     with pytest.raises(UnknownNameError, match=r"no solver named 'piqp-dens'; did you mean 'piqp-dense'"):
         QPSolver("piqp-dens", paper_problem())
@@ -171,7 +146,7 @@ def test_without_qpsolvers_its_names_say_how_to_install_it(monkeypatch: pytest.M
 def test_piqp_is_the_staged_one_and_no_other_packages() -> None:
     assert find_solver("piqp") is SOLVERS["piqp-multistage"]
     assert "piqp" not in solver_entries()
-    assert isinstance(make_backend("piqp"), PiqpMultistage)
+    assert isinstance(make_backend("piqp"), Piqp)
 
 
 def test_a_solver_of_qpsolvers_keeps_nothing_and_meets_the_kkt_conditions(constrained_flight: Flight) -> None:

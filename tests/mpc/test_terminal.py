@@ -15,7 +15,7 @@ from mpc.core.axes import axes
 from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.solvers import Formulation, Method, QPSolver
-from mpc.solvers.piqp import PiqpDense, PiqpMultistage
+from mpc.solvers.piqp import Piqp
 from quadsim.errors import ParameterError
 from quadsim.state import Array
 
@@ -54,7 +54,7 @@ def first_inputs(problem: Problem, query: tuple[Array, Array, Array, Equilibrium
     found = {"free": answer.plan[0]}
     forms: tuple[Formulation, ...] = (Condensed(problem), PartiallyCondensed(problem, steps_per_stage=3))
     for form in forms:
-        backend = PiqpDense() if isinstance(form, Condensed) else PiqpMultistage()
+        backend = Piqp(dense=True) if isinstance(form, Condensed) else Piqp()
         backend.setup(form.qp)
         qp = form.pose(Query(*query)).qp
         found[type(form).__name__] = form.inputs(polish(qp, backend.solve(qp)).x)[0]

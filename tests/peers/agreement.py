@@ -37,21 +37,13 @@ ALLOWED_DIFFERENCE, ALLOWED_RESIDUAL = 1e-3, 1e-2
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """One solver on the recorded QPs; difference and residuals are the worst over those it calls solved.
+    """One solver on the recorded QPs; difference and residuals are the worst over those it calls solved."""
 
-    Attributes:
-        solver: its name in `PACKAGES`.
-        queried: number of QPs.
-        failures: how many it did not call solved.
-        difference: its first inputs from the reference, the largest over rotors and QPs [rad/s].
-        residuals: of its solutions, in the units of the QP it was given.
-    """
-
-    solver: str
-    queried: int
-    failures: int
-    difference: float
-    residuals: KKTResiduals
+    solver: str  # its name in `PACKAGES`
+    queried: int  # number of QPs
+    failures: int  # how many it did not call solved
+    difference: float  # its first inputs from the reference, the largest over rotors and QPs [rad/s]
+    residuals: KKTResiduals  # of its solutions, in the units of the QP it was given
 
     @property
     def checks(self) -> tuple[Check, ...]:

@@ -11,21 +11,13 @@ HEAD: Final = ("check", "peer", "measured", "allowed")
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One figure that must not exceed what is allowed.
+    """One figure that must not exceed what is allowed."""
 
-    Attributes:
-        what: the difference measured.
-        peer: the distribution that it is a difference from.
-        measured: the largest found, in `unit`.
-        allowed: the largest that passes.
-        unit: unit of both; empty for a ratio.
-    """
-
-    what: str
-    peer: str
-    measured: float
-    allowed: float
-    unit: str = ""
+    what: str  # the difference measured
+    peer: str  # the distribution that it is a difference from
+    measured: float  # the largest found, in `unit`
+    allowed: float  # the largest that passes
+    unit: str = ""  # unit of both; empty for a ratio
 
     @property
     def holds(self) -> bool:

@@ -14,11 +14,8 @@ from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import tracking
 from quadsim.sim.loop import fly
 from quadsim.sim.plant import Plant
-from scenarios.build import build_controller, build_plant
-from scenarios.limits import build_limits
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_initial_state, build_vehicle
-from scenarios.reference import build_reference
 from scenarios.schema.scenario import Scenario
 
 SCENARIO: Final = "paper-constrained"
@@ -41,22 +38,16 @@ class Quantity:
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedLoop:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        scenario: what was flown.
-        mujoco: the flight on our plant.
-        rotorpy: the flight on RotorPy's.
-    """
-
-    scenario: Scenario
-    mujoco: FlightLog
-    rotorpy: FlightLog
+    scenario: Scenario  # what was flown
+    mujoco: FlightLog  # the flight on our plant
+    rotorpy: FlightLog  # the flight on RotorPy's
 
     @property
     def peaks(self) -> tuple[Quantity, ...]:
         """The largest roll and pitch at the samples and at 1 kHz, signed, as the audit reports them [deg]."""
-        limits = build_limits(self.scenario)
+        limits = Assembly(self.scenario).limits
         pairs = zip(audit(self.mujoco, limits), audit(self.rotorpy, limits), strict=True)
         return tuple(
             Quantity(
@@ -96,20 +87,20 @@ class ClosedLoop:
 def measure() -> ClosedLoop:
     """Fly the scenario on both plants."""
     scenario = load_scenario(SCENARIO)
-    vehicle = build_vehicle(scenario)
-    with build_plant(scenario, vehicle) as plant:
+    vehicle = Assembly(scenario).vehicle
+    with Assembly(scenario).plant() as plant:
         mujoco = fly_on(plant, scenario)
     return ClosedLoop(scenario=scenario, mujoco=mujoco, rotorpy=fly_on(RotorPyPlant(vehicle), scenario))
 
 
 def fly_on(plant: Plant | RotorPyPlant, scenario: Scenario) -> FlightLog:
     """Fly a scenario on a plant, with a controller of its own."""
-    controller = build_controller(scenario, plant.vehicle)
+    controller = Assembly(scenario).controller()
     return fly(
         plant,
         controller,
-        build_reference(scenario, scenario.periods + controller.horizon),
-        initial_state=build_initial_state(scenario),
+        Assembly(scenario).reference(scenario.periods + controller.horizon),
+        initial_state=Assembly(scenario).initial_state(),
         initial_speeds=np.full(4, plant.vehicle.hover_speed),
         periods=scenario.periods,
         steps_per_period=scenario.steps_per_period,

@@ -96,19 +96,12 @@ class QpmpcController:
 
 @dataclass(frozen=True, kw_only=True)
 class ConstrainedQP:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        speeds: (K, 4) the first inputs of qpmpc's plans [rad/s]; NaN where it found none.
-        differences: (K,) of our QP's first inputs from them, the largest over the rotors [rad/s].
-        flown: (K,) the same of what the controller flew, found with or without a QP [rad/s].
-        constrained: (K,) whether a constraint is active at qpmpc's optimum.
-    """
-
-    speeds: Array
-    differences: Array
-    flown: Array
-    constrained: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    speeds: Array  # (K, 4) the first inputs of qpmpc's plans [rad/s]; NaN where it found none
+    differences: Array  # (K,) of our QP's first inputs from them, the largest over the rotors [rad/s]
+    flown: Array  # (K,) the same of what the controller flew, found with or without a QP [rad/s]
+    constrained: np.ndarray[tuple[int], np.dtype[np.bool_]]  # (K,) whether a constraint is active at qpmpc's optimum
 
     @property
     def checks(self) -> tuple[Check, ...]:

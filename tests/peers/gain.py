@@ -36,21 +36,13 @@ ALLOWED: Final = {10: 1e-12, 20: 1e-12, 50: 1e-10, 100: 1e-8}
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """K_N for one horizon.
+    """K_N for one horizon."""
 
-    Attributes:
-        horizon: N.
-        difference: of K_N from do-mpc's gain for N, relative to it in the Frobenius norm.
-        one_step_more: the same from do-mpc's gain for N + 1, which a wrong index would compare with.
-        infinite: the same from the gain of scipy's discrete algebraic Riccati equation.
-        rounding: cond(H) times the unit roundoff: how well Eq. (21) determines K_N in double precision.
-    """
-
-    horizon: int
-    difference: float
-    one_step_more: float
-    infinite: float
-    rounding: float
+    horizon: int  # N
+    difference: float  # of K_N from do-mpc's gain for N, relative to it in the Frobenius norm
+    one_step_more: float  # the same from do-mpc's gain for N + 1, which a wrong index would compare with
+    infinite: float  # the same from the gain of scipy's discrete algebraic Riccati equation
+    rounding: float  # cond(H) times the unit roundoff: how well Eq. (21) determines K_N in double precision
 
     @property
     def checks(self) -> tuple[Check, ...]:

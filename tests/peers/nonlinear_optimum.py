@@ -19,9 +19,8 @@ from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
 from quadsim.controller import ACCEPTED, Moment
 from quadsim.motion import Motion
 from quadsim.state import N_STATES, POSITIONS, VELOCITIES, Array
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
-from scenarios.reference import build_motion
 
 COURSE: Final = "torrente-loop8-drag"
 """Whose reference motion and vehicle these are; the plant is not flown."""
@@ -73,8 +72,8 @@ class Course:
 
     def __init__(self, case: Case) -> None:
         scenario = load_scenario(COURSE)
-        self.case, self.vehicle = case, build_vehicle(scenario)
-        motion = build_motion(scenario, self.vehicle)
+        self.case, self.vehicle = case, Assembly(scenario).vehicle
+        motion = Assembly(scenario).motion
         assert motion is not None
         self.motion: Motion = motion
         self.stride = round(case.node / PERIOD[case])

@@ -30,15 +30,10 @@ BETRAYAL: Final = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Path:
-    """Where a vehicle was at the end of each hold.
+    """Where a vehicle was at the end of each hold."""
 
-    Attributes:
-        position: (HOLDS, 3) in the world frame [m].
-        attitude: HOLDS rotations, body to world.
-    """
-
-    position: Array
-    attitude: Rotation
+    position: Array  # (HOLDS, 3) in the world frame [m]
+    attitude: Rotation  # HOLDS rotations, body to world
 
     @property
     def tilt(self) -> float:
@@ -48,30 +43,19 @@ class Path:
 
 @dataclass(frozen=True, kw_only=True)
 class Difference:
-    """The largest over all flights and holds.
+    """The largest over all flights and holds."""
 
-    Attributes:
-        position: distance along any axis [m].
-        attitude: angle of the rotation from one to the other [rad].
-    """
-
-    position: float
-    attitude: float
+    position: float  # distance along any axis [m]
+    attitude: float  # angle of the rotation from one to the other [rad]
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpenLoop:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        differences: MuJoCo from RotorPy, for each of `TIMESTEPS`.
-        betrayal: the same at the last of them, when MuJoCo's Ixx is off by `BETRAYAL`.
-        tilt: the largest angle between body and world z [rad].
-    """
-
-    differences: tuple[Difference, ...]
-    betrayal: Difference
-    tilt: float
+    differences: tuple[Difference, ...]  # MuJoCo from RotorPy, for each of `TIMESTEPS`
+    betrayal: Difference  # the same at the last of them, when MuJoCo's Ixx is off by `BETRAYAL`
+    tilt: float  # the largest angle between body and world z [rad]
 
     @property
     def checks(self) -> tuple[Check, ...]:

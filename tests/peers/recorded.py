@@ -10,9 +10,8 @@ import numpy as np
 from mpc import ocp
 from mpc.ocp import Problem
 from quadsim.state import Array
-from scenarios.build import build_problem
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
-from scenarios.reference import build_reference
 from scenarios.rollout import Rollout
 
 SCENARIO: Final = "paper-constrained"
@@ -20,21 +19,13 @@ SCENARIO: Final = "paper-constrained"
 
 @dataclass(frozen=True, kw_only=True)
 class Query:
-    """One control period's.
+    """One control period's."""
 
-    Attributes:
-        state: (12,) xi(k).
-        desired: (N, n_r) y_d(k+1) .. y_d(k+N).
-        u_before: (4,) u(k-1) [rad/s].
-        status: how the controller found its answer.
-        speeds: (4,) the answer, u(k) [rad/s].
-    """
-
-    state: Array
-    desired: Array
-    u_before: Array
-    status: str
-    speeds: Array
+    state: Array  # (12,) xi(k)
+    desired: Array  # (N, n_r) y_d(k+1) .. y_d(k+N)
+    u_before: Array  # (4,) u(k-1) [rad/s]
+    status: str  # how the controller found its answer
+    speeds: Array  # (4,) the answer, u(k) [rad/s]
 
     @property
     def posed(self) -> ocp.Query:
@@ -46,8 +37,8 @@ def record() -> tuple[Problem, tuple[Query, ...]]:
     """Fly the scenario; the optimisation, and every period's query."""
     flight = Rollout(load_scenario(SCENARIO)).fly()
     log = flight.log.control
-    problem = build_problem(flight.scenario, flight.vehicle)
-    reference = build_reference(flight.scenario, log.t.size + problem.horizon)
+    problem = Assembly(flight.scenario).problem()
+    reference = Assembly(flight.scenario).reference(log.t.size + problem.horizon)
     desired = problem.objective.desired(reference)
     before = np.vstack([log.speeds_before, log.speeds[:-1]])
     queries = tuple(

@@ -17,10 +17,9 @@ from quadsim.flight import rundir
 from quadsim.report.comparison import comparison_rows
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import VEHICLE_UNITS
-from scenarios.build import build_plant, build_problem, resolve
+from scenarios.assembly import Assembly
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.reaudit import reaudit
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
@@ -56,7 +55,7 @@ def flown(scenario: Scenario) -> Array:
     """Truth after 20 ms of commands from the lowest to the highest, near a floor and an obstacle, moving."""
     state = np.zeros(len(STATE_NAMES))
     state[[STATE_NAMES.index(name) for name in ("x", "z", "vx", "vz", "pitch")]] = 0.15, 0.2, 1.0, 0.1, 0.05
-    with build_plant(scenario, build_vehicle(scenario)) as plant:
+    with Assembly(scenario).plant() as plant:
         plant.reset(state)
         plant.advance(np.array([100.0, 180.0, 220.0, 240.0]), 20)
         return plant.state()
@@ -68,7 +67,7 @@ def test_each_parameter_moves_the_plant_and_not_the_controller(name: str) -> Non
     modelled, real = (load_scenario("hover", [*BASE, *lag, *more]) for more in ([], [f"actual.{name}={ACTUAL[name]}"]))
     assert np.abs(flown(real) - flown(modelled)).max() > 1e-9
 
-    first, second = (build_problem(scenario, build_vehicle(scenario)) for scenario in (modelled, real))
+    first, second = (Assembly(scenario).problem() for scenario in (modelled, real))
     for of in (lambda p: p.model.A, lambda p: p.model.B, lambda p: p.model.u_bar, lambda p: p.bounds.u_max):
         np.testing.assert_array_equal(of(first), of(second))
     speeds, state, target = np.full(4, 190.0), np.full(12, 0.02), np.full((modelled.controller.horizon, 4), 0.1)
@@ -113,9 +112,9 @@ def test_both_vehicles_are_recorded_and_shown(tmp_path: Path) -> None:
 
 def test_what_the_effects_leave_to_the_vehicle_is_that_of_the_actual_one() -> None:
     scenario = load_scenario("hummingbird-real-rotors", ["actual.rotor_rise=0.05"])
-    written = resolve(scenario, build_vehicle(scenario))
+    written = Assembly(scenario).resolved.scenario
     assert written.effects.rotors is not None
     assert written.effects.rotors.rise == 0.05
     assert written.vehicle.rotor_rise == 0.0125
     again = parse_scenario(tomllib.loads(written.to_toml()))
-    assert resolve(again, build_vehicle(again)).to_toml() == written.to_toml()
+    assert Assembly(again).resolved.scenario.to_toml() == written.to_toml()

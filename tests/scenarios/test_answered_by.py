@@ -13,7 +13,7 @@ from mpc.answer import INFEASIBLE, AnswerCheck
 from mpc.ocp import Query, predicted
 from mpc.qp import KKT_EVERY
 from mpc.solvers import QPSolver
-from mpc.solvers.piqp import PiqpMultistage
+from mpc.solvers.piqp import Piqp
 from scenarios.flight import summarise
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
@@ -31,8 +31,8 @@ def test_as_many_periods_are_a_solvers_as_it_had_calls(
     name: str, settings: tuple[str, ...], answered_by: dict[str, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls = Counter[str]()
-    real = PiqpMultistage.solve
-    monkeypatch.setattr(PiqpMultistage, "solve", lambda *given: (calls.update(["piqp-multistage"]), real(*given))[1])
+    real = Piqp.solve
+    monkeypatch.setattr(Piqp, "solve", lambda *given: (calls.update(["piqp-multistage"]), real(*given))[1])
     flight = Rollout(load_scenario(name, settings)).fly()
     counted: dict[str, Any] = summarise(flight)["controller"]
     assert counted["answered_by"] == answered_by == Counter(flight.log.control.answered_by)

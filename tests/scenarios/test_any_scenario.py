@@ -20,10 +20,9 @@ from hypothesis import strategies as st
 from quadsim.errors import InputError
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import write_log
-from scenarios.build import resolve
+from scenarios.assembly import Assembly
 from scenarios.flight import summarise
-from scenarios.loading import check_parts, parse_scenario
-from scenarios.parts.vehicle import build_vehicle
+from scenarios.loading import parse_scenario
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
@@ -200,7 +199,7 @@ def accepted(table: dict[str, Any]) -> Scenario | None:
     """The scenario, or None where it is refused by a typed error."""
     try:
         scenario = parse_scenario(table)
-        check_parts(scenario)
+        Assembly(scenario).check()
     except InputError:
         return None
     return scenario
@@ -212,7 +211,7 @@ def test_any_valid_scenario_flies_and_its_resolved_file_flies_it_again(table: di
     scenario = accepted(table)
     if scenario is None:
         return
-    resolved = resolve(scenario, build_vehicle(scenario))
+    resolved = Assembly(scenario).resolved.scenario
     reread = parse_scenario(tomllib.loads(resolved.to_toml()))
     assert reread == resolved
 

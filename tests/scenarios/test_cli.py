@@ -19,10 +19,10 @@ from quadsim.errors import RenderingUnavailableError
 from quadsim.flight import rundir
 from scenarios.app import app
 from scenarios.campaign.plan import read_campaign
+from scenarios.catalogue import campaign_names, scenario_names, tuning_names
 from scenarios.cli import main
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
-from scenarios.shipped import campaign_names, scenario_names, tuning_names
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
 SHORT = ("--set", "duration=0.5")

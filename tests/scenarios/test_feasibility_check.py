@@ -13,10 +13,9 @@ from support import scenario_table
 from quadsim.flight.feasibility import Feasibility
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
 from scenarios.feasibility_check import fitting, report
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.parts.vehicle import build_vehicle
-from scenarios.reference import build_course
 from scenarios.schema.scenario import Scenario
 
 
@@ -25,13 +24,13 @@ def scenario(reference: dict[str, Any], *, duration: float = 20.0, **fields: Any
 
 
 def found(reference: dict[str, Any], vehicle: Vehicle, **fields: Any) -> Feasibility:
-    return report(scenario(reference, **fields), vehicle)
+    return report(Assembly(scenario(reference, **fields), vehicle))
 
 
 def test_the_papers_course_steps_and_what_its_filter_leaves_is_beyond_the_bound() -> None:
     """After a step of d m the filter leaves d (3 / tau_r)^2 exp(-3 t / tau_r): 20 deg for 10 m in one axis."""
     made = load_scenario("paper-constrained")
-    finding = report(made, build_vehicle(made))
+    finding = report(Assembly(made))
     assert finding.jumps == (0.0, 10.0, 20.0, 40.0)
     assert finding.tilt == pytest.approx(20.0, abs=0.1)
     assert [problem.split()[0] for problem in finding.problems] == ["roll", "roll", "pitch", "pitch"]
@@ -79,8 +78,8 @@ def test_a_rounded_table_of_a_smooth_course_requires_what_the_course_does(
 ) -> None:
     """Fourth differences of 0.1 mm of rounding are steps of tens of rad/s: no controller has to follow those."""
     eight = scenario({"type": "figure_eight", "length": 6.0, "period": 12.0, "turns": 1.5, "ramp": 4.0})
-    smooth = report(eight, vehicle)
-    found = report(scenario(rounded(tmp_path / "eight.csv", poses_of(eight), decimals)), vehicle)
+    smooth = report(Assembly(eight, vehicle))
+    found = report(Assembly(scenario(rounded(tmp_path / "eight.csv", poses_of(eight), decimals)), vehicle))
     assert not any("change of rotor speed" in problem for problem in found.problems)
     assert found.tilt == pytest.approx(smooth.tilt, abs=0.05)
     assert (found.rotor_min, found.rotor_max) == pytest.approx((smooth.rotor_min, smooth.rotor_max), abs=0.2)
@@ -88,7 +87,7 @@ def test_a_rounded_table_of_a_smooth_course_requires_what_the_course_does(
 
 def poses_of(made: Scenario) -> Array:
     """(420, 4) samples of a course, one per control period."""
-    return build_course(made).sample(0.05 * np.arange(420))
+    return Assembly(made).course.sample(0.05 * np.arange(420))
 
 
 def test_bounds_are_those_of_the_controller(vehicle: Vehicle) -> None:
@@ -125,7 +124,7 @@ def test_a_course_within_the_bounds_but_not_within_the_tightened_ones_is_reporte
     assert len(problems) == 4
     assert problems[0].startswith("roll up to 4.9 deg (bound 5, tightened to 4.83")
     tight = scenario(circle, controller=TIGHT)
-    assert fitting(tight, vehicle) == "It would fit at 99 % of its speed, or at 98 % of its size."
+    assert fitting(Assembly(tight, vehicle)) == "It would fit at 99 % of its speed, or at 98 % of its size."
 
 
 def test_the_speed_at_which_a_course_fits_is_that_of_the_closed_form(vehicle: Vehicle) -> None:
@@ -133,17 +132,17 @@ def test_the_speed_at_which_a_course_fits_is_that_of_the_closed_form(vehicle: Ve
     circle = {"type": "circle", "radius": 3.0, "speed": 3.0, "turns": 9.0, "ramp": 10.0}
     made = scenario(circle)
     share = math.tan(math.radians(5.0)) * 3.0 * vehicle.gravity / 3.0**2
-    assert fitting(made, vehicle) == (
+    assert fitting(Assembly(made, vehicle)) == (
         f"It would fit at {math.floor(100 * math.sqrt(share))} % of its speed, or at "
         f"{math.floor(100 * share)} % of its size."
     )
-    assert fitting(scenario(circle | {"speed": 1.0, "turns": 2.0}), vehicle) == ""
+    assert fitting(Assembly(scenario(circle | {"speed": 1.0, "turns": 2.0}), vehicle)) == ""
 
 
 def test_filtered_steps_would_fit_with_a_slower_filter_or_smaller(vehicle: Vehicle) -> None:
     """What the filter leaves is d (3 / tau_r)^2: at 5 deg and with 2 m in one axis tau_r = 4.58 s."""
     steps = {"response_time": 3.0, "y": [{"start": 1.0, "stop": 15.0, "value": 2.0}]}
-    advice = fitting(scenario(steps), vehicle)
+    advice = fitting(Assembly(scenario(steps), vehicle))
     time = 3.0 * math.sqrt(2.0 / (vehicle.gravity * math.tan(math.radians(5.0))))
     assert advice.startswith("It would fit at ")
     assert float(advice.removesuffix(" s.").rpartition(" ")[2]) == pytest.approx(time, rel=0.06)

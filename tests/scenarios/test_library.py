@@ -16,12 +16,12 @@ from golden_numbers import library_entry, read
 from mpc.answer import INFEASIBLE
 from quadsim.controller import FALLBACK, LAW, MISSED, STOPPED
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
+from scenarios.catalogue import LIBRARY, scenario_names
 from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.rollout import Rollout
 from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Lost, Scenario
-from scenarios.shipped import LIBRARY, scenario_names
 
 SHARED = (
     *("paper-constrained", "paper-constrained-lag20", "paper-unconstrained", "paper-unconstrained-clipped"),

@@ -12,10 +12,8 @@ from mpc.ocp import Problem
 from quadsim.flight.audit import SUM, audit
 from quadsim.flight.rundir import limit_from_json, limit_to_json
 from quadsim.state import INDEX
-from scenarios.build import build_controller, build_problem
-from scenarios.limits import build_limits
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.parts.vehicle import build_vehicle
 from tests.support import scenario_table, small_log
 
 MIXED: dict[str, Any] = {
@@ -35,7 +33,7 @@ def table(**changes: Any) -> dict[str, Any]:
 
 def problem_of(small: dict[str, Any]) -> Problem:
     scenario = parse_scenario(small)
-    return build_problem(scenario, build_vehicle(scenario))
+    return Assembly(scenario).problem()
 
 
 def test_rows_are_in_the_units_of_the_file() -> None:
@@ -51,7 +49,7 @@ def test_rows_are_in_the_units_of_the_file() -> None:
 
 def test_the_audit_sees_the_same_rows_at_the_physics_rate() -> None:
     scenario, log = parse_scenario(table()), small_log()
-    limits = [limit for limit in build_limits(scenario) if limit.signal == SUM]
+    limits = [limit for limit in Assembly(scenario).limits if limit.signal == SUM]
     assert [limit.name for limit in limits] == ["mixed_1", "mixed_2"]
     assert [limit.unit for limit in limits] == ["-", "rad/s"]
     (constraint,) = problem_of(table()).constraints
@@ -72,8 +70,8 @@ def test_the_robust_controller_takes_them_too() -> None:
         'controller.polytopes=[{name="fence", of=["x"], rows=[[1.0]], upper=[3.0], soft={}}]',
     ]
     scenario = load_scenario("robust", settings)
-    assert build_controller(scenario, build_vehicle(scenario)).name == "robust"
-    assert "fence" in [limit.name for limit in build_limits(scenario)]
+    assert Assembly(scenario).controller().name == "robust"
+    assert "fence" in [limit.name for limit in Assembly(scenario).limits]
 
 
 def test_a_terminal_weight_needs_a_riccati_equation_with_a_solution() -> None:

@@ -18,6 +18,7 @@ import pytest
 from quadsim.errors import FileError
 from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
+from scenarios.assembly import Assembly
 from scenarios.cli import main
 from scenarios.flight import Flight
 from scenarios.reaudit import reaudit
@@ -199,7 +200,7 @@ def test_what_a_run_records_is_what_its_tables_give(
     """
     flight = fly_once(name)
     scenario = flight.scenario.model_copy(update={"log_rate": rate})
-    monkeypatch.setattr("scenarios.rollout.Rollout.fly", lambda *_: replace(flight, scenario=scenario))
+    monkeypatch.setattr("scenarios.rollout.Rollout.fly", lambda *_: replace(flight, assembly=Assembly(scenario)))
     out = str(tmp_path / "run")
     status = main(["run", name, "--set", f"log_rate={rate}", *TABLES, "--json", "--out", out])
     assert main(["check", out]) == status

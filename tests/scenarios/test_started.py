@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from quadsim.errors import CommandError, FlightError, InputError
+from scenarios.assembly import Assembly
 from scenarios.flight import Flight
+from scenarios.flight_events import prepared
 from scenarios.loading import load_scenario
-from scenarios.parts.events import prepared
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
@@ -118,7 +118,7 @@ def test_what_was_applied_flies_again_to_the_bit(name: str, inputs: list[tuple[i
         except FlightError:
             assert started.done
         flight = started.flight()
-    assert len(flight.scenario.events) <= applied + len(prepared(cut(name), build_vehicle(cut(name))).events)
+    assert len(flight.scenario.events) <= applied + len(prepared(Assembly(cut(name))).events)
     assert_same_bits(flight, Rollout(written_and_read(flight.scenario)).fly())
 
 

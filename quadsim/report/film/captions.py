@@ -16,12 +16,13 @@ from quadsim.flight.rundir import Run
 from quadsim.report.comparison import failure_sentences
 from quadsim.report.film import painter as ink
 from quadsim.report.film.frames import Footage, MarginTrack
-from quadsim.report.film.painter import Colour, Painter, Picture, TopView, shade, text_width
+from quadsim.report.film.painter import Colour, Painter, Picture, shade, text_width
 from quadsim.report.table import ABSENT
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
 
 _STRIP: Final = 150  # height of the bottom strip, in design pixels of a 1280 x 720 frame
-_MAP: Final = (236, 190)  # width and height of the map, in design pixels
+_LEGEND: Final = (230, "reference", ink.AMBER), (150, "flown", ink.BLUE), (100, "predicted", ink.GREEN)
+"""How far left of the right edge [design pixels] the colours of the paths are named."""
 _MOST_MARGINS: Final = 6
 
 
@@ -30,7 +31,7 @@ _LAST: Final = 1.0
 _SHOWN: Final = 2.0  # time [s] for which it shows what has happened
 _MOST_EVENTS: Final = 3
 _MOST_LINES: Final = 10  # of that: more would reach the strip at the bottom
-_WIDEST: Final = 140  # letters of a line of that, between the frame's edge and the map
+_WIDEST: Final = 140  # letters of a line of that, between the frame's edge and the legend
 
 
 class Overlay:
@@ -47,7 +48,6 @@ class Overlay:
         self._subtitle = law_name(controller.get("name", ""))
         self._grounded = any(phase != Phase.FLYING for phase in run.log.control.phase)
         self._ranked = sorted(footage.margins, key=lambda track: track.rank)  # of the whole flight: rows stay in place
-        self._top_view = TopView(run, footage, *_MAP)
 
     def draw(self, frame: Picture, i: int) -> Picture:
         """Frame `i` (height, width, 3) with its captions; `frame` itself is changed."""
@@ -61,17 +61,17 @@ class Overlay:
         lefts = [24.0 + gap * j + sum(width for width, _ in columns[:j]) for j in range(len(columns))]
         strip = self._height - _STRIP
 
-        map_left, map_size = self._width - self._top_view.width - 16, (self._top_view.width, self._top_view.height)
         longest = max(text_width(text, size, scale=self._scale) for text, size, _ in lines)
         shade(frame, 16, 16, 24 + longest, 14 + 27 * len(lines), scale=self._scale)
-        shade(frame, map_left, 16, *map_size, scale=self._scale)
+        shade(frame, self._width - 246, 16, 230, 30, scale=self._scale)
         shade(frame, 0, strip, self._width, _STRIP, scale=self._scale)
 
         image = Image.fromarray(frame)
         painter = Painter(image, self._scale)
         for j, (text, size, colour) in enumerate(lines):
             painter.text(28, 38 + 27 * j, text, size=size, colour=colour, anchor="lm")
-        self._top_view.draw(painter, map_left, 16, i)
+        for right, text, colour in _LEGEND:
+            painter.text(self._width - right, 24, text, size=13, colour=colour)
         for left, (_, panel) in zip(lefts, columns, strict=True):
             panel(painter, left, strip + 10.0, i)
         return np.asarray(image)

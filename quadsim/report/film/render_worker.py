@@ -20,11 +20,11 @@ import numpy as np
 
 from quadsim.controller import Phase
 from quadsim.flight.rundir import Run, load_run
+from quadsim.report.figure import obstacles_in, region_edges
 from quadsim.report.film.camera import REQUEST
 from quadsim.report.film.captions import Overlay
 from quadsim.report.film.frames import Footage, Shot, make_footage, thin
 from quadsim.report.film.painter import Picture
-from quadsim.report.scene import obstacles_in, region_edges
 from quadsim.sim.airframe import FLOOR, PROPELLER_NAMES, compile_model, obstacle_body
 from quadsim.space import Obstacle
 from quadsim.state import Array

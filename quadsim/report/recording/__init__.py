@@ -52,8 +52,7 @@ def _encode(run: Run, path: Path) -> bytes:
     import rerun.blueprint as rrb
 
     from quadsim.report.recording.plots import send_plots, send_texts
-    from quadsim.report.recording.style import TIMELINE
-    from quadsim.report.recording.world import scene_views, send_airframe, send_scene, send_space
+    from quadsim.report.recording.world import TIMELINE, scene_views, send_airframe, send_scene, send_space
 
     digest = hashlib.sha256(repr((run.vehicle, run.limits)).encode())
     for array in (run.log.control.state, run.log.control.reference, run.log.control.speeds, run.log.plant.state):

@@ -24,7 +24,7 @@ from quadsim.report.figure import (
     line_colour,
     reference_curve,
 )
-from quadsim.report.recording.style import (
+from quadsim.report.recording.world import (
     BOUND,
     FRONT_PANELS,
     REFERENCE,
@@ -172,7 +172,7 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     fallback begins; the flight's events and its end.
     """
     log, summary = run.log.control, run.summary
-    found, periods = summary.get("diagnosis") or {}, unrecovered(log)
+    diagnosis, periods = summary.get("diagnosis") or {}, unrecovered(log)
     answers = list(zip(log.status, log.answered_by, log.fallback.tolist(), strict=True))
     events = [
         (
@@ -185,7 +185,7 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     if any(phase != Phase.FLYING for phase in log.phase):
         for t, phase in _changes(log.t, log.phase):
             events.append((t, f"phase: {phase}", "WARN" if phase == Phase.CRASHED else "INFO"))
-    events += [(found["time"], found[name], "ERROR") for name in ("sentence", "advice") if found.get(name)]
+    events += [(diagnosis["time"], diagnosis[name], "ERROR") for name in ("sentence", "advice") if diagnosis.get(name)]
     if periods:
         events.append((float(log.t[-periods]), fallback_sentence(periods), "ERROR"))
     events += [(event["time"], event["text"], "WARN") for event in summary.get("events", ())]

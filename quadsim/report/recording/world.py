@@ -1,4 +1,4 @@
-"""What is seen in the 3-D views: the vehicle, its paths, and what the controller predicts."""
+"""What is seen in the 3-D views, and how a recording looks: timeline, which signals share a plot, colours."""
 
 from __future__ import annotations
 
@@ -11,15 +11,80 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from quadsim.controller import Phase
+from quadsim.flight.audit import SIGNALS
+from quadsim.flight.log import FlightLog
 from quadsim.flight.rundir import Run
-from quadsim.report.recording import style
-from quadsim.report.recording.style import TIMELINE, Colour, time_column
-from quadsim.report.scene import obstacles_in, region_edges
+from quadsim.report.figure import line_colour, obstacles_in, region_edges
 from quadsim.rotation import euler_to_quaternion
 from quadsim.sim.airframe import DISC_NAMES, DRAWN_ARM, FLOOR, compile_model
 from quadsim.space import Solid
 from quadsim.state import EULER, POSITION, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
+
+TIMELINE: Final = "sim_time"
+
+PANELS: Final[dict[str, tuple[str, ...]]] = {
+    "Position": ("x", "y", "z"),
+    "Roll and pitch": ("roll", "pitch"),
+    "Rotor speeds": ("speed",),
+    "Steps of the rotor speeds, per period": ("slew",),
+    "Velocity": ("vx", "vy", "vz"),
+    "Position errors": ("x_error", "y_error", "z_error"),
+    "Attitude rates": ("roll_rate", "pitch_rate", "yaw_rate"),
+    "Body rates": ("body_rate_x", "body_rate_y", "body_rate_z"),
+    "Yaw and tilt": ("yaw", "tilt", "yaw_error"),
+    "Position as measured, less the true one": ("x_estimate_error", "y_estimate_error", "z_estimate_error"),
+    "Attitude as measured, less the true one": ("roll_estimate_error", "pitch_estimate_error", "yaw_estimate_error"),
+}
+"""Title of each plot, and its signals; every signal is in one, so that every limit is drawn."""
+assert sorted(name for names in PANELS.values() for name in names) == sorted(SIGNALS)
+_ANY_ATTITUDE: Final = {
+    "Roll and pitch": ("Tilt", ("tilt",)),
+    "Yaw and tilt": ("Roll, pitch and yaw", ("roll", "pitch", "yaw", "yaw_error")),
+}
+"""What takes a plot's place where the vehicle may turn upside down: Euler angles jump there."""
+FRONT_PANELS: Final = 4  # how many of the plots are seen first
+
+Colour = tuple[int, int, int, int]
+
+
+def panels(log: FlightLog) -> dict[str, tuple[str, ...]]:
+    """The plots of a flight, `FRONT_PANELS` of them first."""
+    if log.plant.attitude is None:
+        return PANELS
+    return dict(_ANY_ATTITUDE.get(title, (title, names)) for title, names in PANELS.items())
+
+
+def on_screen(colour: str) -> Colour:
+    """A colour made for paper, lightened: the viewer's background may be black or white."""
+    red, green, blue = (round(0.7 * int(colour[i : i + 2], 16) + 0.3 * 255) for i in (1, 3, 5))
+    return red, green, blue, 255
+
+
+SERIES: Final = tuple(on_screen(line_colour(i)) for i in range(N_ROTORS))
+FLOWN: Final = (70, 160, 255, 255)
+WHOLE_PATH: Final = (70, 160, 255, 60)
+REFERENCE: Final = (165, 170, 178, 255)
+PREDICTED: Final = (255, 160, 40, 255)
+BOUND: Final = (255, 70, 70, 255)
+FORCE: Final = (225, 90, 200, 255)
+WIND: Final = (110, 220, 225, 255)
+OBSTACLE: Final = (184, 92, 72, 255)
+REGION: Final = (215, 205, 90, 255)
+AXES: Final = ((230, 90, 90, 255), (90, 200, 110, 255), (90, 140, 250, 255))
+
+VERDICTS: Final = {
+    "holds": (46, 125, 80, 255),
+    "active": (214, 150, 30, 255),
+    "violated": (220, 50, 50, 255),
+    "not in force": (0, 0, 0, 0),
+}
+
+
+def time_column(t: Array) -> rr.TimeColumn:
+    """Instants [s] on the recording's one timeline."""
+    return rr.TimeColumn(TIMELINE, duration=t)
+
 
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
@@ -31,7 +96,7 @@ def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
     model = compile_model(vehicle, visuals=True)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    colours = dict(zip(DISC_NAMES, ((*colour[:3], 110) for colour in style.SERIES), strict=True))
+    colours = dict(zip(DISC_NAMES, ((*colour[:3], 110) for colour in SERIES), strict=True))
     for i in range(model.ngeom):
         geom = model.geom(i)
         if geom.name != FLOOR and not geom.name.startswith("blades"):
@@ -42,7 +107,7 @@ def send_airframe(recording: rr.RecordingStream, vehicle: Vehicle) -> None:
             recording.log(f"world/vehicle/body/{geom.name}", _part(solid, colour), static=True)
     unit = vehicle.arm_length / DRAWN_ARM
     origins = vehicle.rotor_positions + np.array([0.0, 0.0, 0.036 * unit])
-    arrows = rr.Arrows3D.from_fields(origins=origins, radii=0.01 * unit, colors=list(style.SERIES))
+    arrows = rr.Arrows3D.from_fields(origins=origins, radii=0.01 * unit, colors=list(SERIES))
     recording.log("world/vehicle/body/thrust", arrows, static=True)
 
 
@@ -69,12 +134,12 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     position = plant.state[:, POSITION]
     thickness = min(0.02, 0.06 * run.vehicle.arm_length)
     axes = rr.Arrows3D(
-        origins=np.zeros((3, 3)), vectors=np.eye(3), radii=thickness, colors=style.AXES, labels=["x", "y", "z"]
+        origins=np.zeros((3, 3)), vectors=np.eye(3), radii=thickness, colors=AXES, labels=["x", "y", "z"]
     )
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("world/axes", axes, static=True)
-    _log_lines(recording, "world/reference", style.REFERENCE, 1.2, _dashes(control.reference[:, :3]))
-    _log_lines(recording, "world/path", style.WHOLE_PATH, 1.0, [position])
+    _log_lines(recording, "world/reference", REFERENCE, 1.2, _dashes(control.reference[:, :3]))
+    _log_lines(recording, "world/path", WHOLE_PATH, 1.0, [position])
 
     # The body turns below an entity that only moves: views that start there follow the vehicle without tilting.
     thrusts = np.zeros((plant.t.size, N_ROTORS, 3))
@@ -88,24 +153,24 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     if plant.wrench is not None and np.any(plant.wrench[:, :3]):
         vehicle = run.vehicle
         scale = _FORCE_SCALE * vehicle.arm_length / (vehicle.mass * vehicle.gravity / N_ROTORS)
-        _send_arrows(recording, run, "external_force", scale * plant.wrench[:, :3], style.FORCE, behind=0.0)
+        _send_arrows(recording, run, "external_force", scale * plant.wrench[:, :3], FORCE, behind=0.0)
     if plant.wind is not None and np.any(plant.wind):
         strongest = float(np.linalg.norm(plant.wind, axis=1).max())
         drawn = _WIND_LENGTH * run.vehicle.arm_length / strongest * plant.wind
-        _send_arrows(recording, run, "wind", drawn, style.WIND, behind=1.3)
+        _send_arrows(recording, run, "wind", drawn, WIND, behind=1.3)
 
     if control.t.size:
         starts = np.searchsorted(plant.t, control.t - 1e-9)
         ends = np.append(starts[1:], plant.t.size - 1)
         pieces = [position[start : end + 1] for start, end in zip(starts, ends, strict=True)]
-        _log_lines(recording, "world/flown", style.FLOWN, 2.2)
+        _log_lines(recording, "world/flown", FLOWN, 2.2)
         recording.send_columns("world/flown", [time_column(plant.t[ends])], rr.LineStrips3D.columns(strips=pieces))
     if control.t.size and run.log.predicted is not None:
         horizons = np.concatenate([control.state[:, None, POSITION], run.log.predicted], axis=1)
         flying = np.array([phase == Phase.FLYING for phase in control.phase])
         # A prediction knows no ground: from there it would fall through it.
         shown = [horizon if aloft else horizon[:0] for horizon, aloft in zip(horizons, flying, strict=True)]
-        _log_lines(recording, "world/horizon", style.PREDICTED, 2.5)
+        _log_lines(recording, "world/horizon", PREDICTED, 2.5)
         recording.send_columns("world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=shown))
 
 
@@ -114,7 +179,7 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
     for obstacle in obstacles_in(run.limits):
         entity = f"world/obstacles/{obstacle.name}"
         for i, solid in enumerate(obstacle.solids):
-            recording.log(f"{entity}/{i}", _part(solid, style.OBSTACLE), static=True)
+            recording.log(f"{entity}/{i}", _part(solid, OBSTACLE), static=True)
         if obstacle.moves:
             t = run.log.plant.t
             moving = rr.Transform3D.columns(translation=obstacle.positions(t))
@@ -123,7 +188,7 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
             recording.log(entity, rr.Transform3D(translation=obstacle.position), static=True)
     for limit, edges in region_edges(run):
         entity = f"world/regions/{limit.name}"
-        _log_lines(recording, entity, style.REGION, 1.2)
+        _log_lines(recording, entity, REGION, 1.2)
         times = np.array([max(limit.start, 0.0), limit.stop])
         strips = rr.LineStrips3D.columns(strips=[*edges]).partition([len(edges), 0][: 1 + np.isfinite(limit.stop)])
         recording.send_columns(entity, [time_column(times[np.isfinite(times)])], strips)

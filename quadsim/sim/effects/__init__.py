@@ -54,11 +54,11 @@ class Ground:
         """
         if not self.effect:
             return self
-        found = filled(self, rotor_radius=vehicle.rotor_radius)
-        if found.rotor_radius is None:
+        ground = filled(self, rotor_radius=vehicle.rotor_radius)
+        if ground.rotor_radius is None:
             rule = f"given for the ground effect, as the vehicle {vehicle.name!r} states none"
             raise ParameterError("effects.ground", "rotor_radius", None, rule)
-        return found
+        return ground
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -94,15 +94,15 @@ def mass_properties(vehicle: Vehicle, load: Load, payloads: Sequence[Payload]) -
     Raises:
         ParameterError: the moments of inertia are those of no rigid body.
     """
-    own = np.diag(np.array(vehicle.inertia) * load.inertia_factor)
-    if 2.0 * own.max() > np.trace(own) * (1.0 + 1e-12):
-        rule = f"such that no moment of {np.diagonal(own).tolist()} kg m^2 exceeds the sum of the other two"
+    moments = np.diag(np.array(vehicle.inertia) * load.inertia_factor)
+    if 2.0 * moments.max() > np.trace(moments) * (1.0 + 1e-12):
+        rule = f"such that no moment of {np.diagonal(moments).tolist()} kg m^2 exceeds the sum of the other two"
         raise ParameterError("effects.load", "inertia_factor", list(load.inertia_factor), rule)
     masses = np.array([vehicle.mass * load.mass_factor, *(payload.mass for payload in payloads)])
     positions = np.array([load.centre_of_mass, *(payload.position for payload in payloads)], float)
     total = float(masses.sum())
     centre = masses @ positions / total
-    inertia = own
+    inertia = moments
     for mass, arm in zip(masses, positions - centre, strict=True):
         inertia = inertia + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return MassProperties(mass=total, centre=centre, inertia=inertia)

@@ -57,9 +57,9 @@ class RotorDynamics:
             ParameterError: rotors with inertia change their speed at once.
         """
         inertia = vehicle.rotor_inertia or 0.0
-        found = filled(self, rise=vehicle.rotor_rise, fall=vehicle.rotor_fall, inertia=inertia)
-        found._check_torque()
-        return found
+        rotors = filled(self, rise=vehicle.rotor_rise, fall=vehicle.rotor_fall, inertia=inertia)
+        rotors._check_torque()
+        return rotors
 
     def lagging(self, change: LagChange) -> RotorDynamics:
         """With other time constants.
@@ -67,9 +67,9 @@ class RotorDynamics:
         Raises:
             ParameterError: rotors with inertia change their speed at once.
         """
-        found = replace(self, rise=change.rise, fall=change.rise if change.fall is None else change.fall)
-        found._check_torque()
-        return found
+        rotors = replace(self, rise=change.rise, fall=change.rise if change.fall is None else change.fall)
+        rotors._check_torque()
+        return rotors
 
     def _check_torque(self) -> None:
         if self.inertia and not self.acceleration and not (self.rise and self.fall):

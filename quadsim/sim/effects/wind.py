@@ -63,10 +63,10 @@ class Air:
 
     def resolved(self, vehicle: Vehicle) -> Air:
         """With the sizes that are left to the vehicle, and to the mean wind."""
-        found = filled(self, rotor_drag=vehicle.rotor_drag or 0.0, body_drag=vehicle.body_drag)
-        if found.turbulence is None:
-            return found
-        return replace(found, turbulence=filled(found.turbulence, airspeed=math.hypot(*found.wind)))
+        air = filled(self, rotor_drag=vehicle.rotor_drag or 0.0, body_drag=vehicle.body_drag)
+        if air.turbulence is None:
+            return air
+        return replace(air, turbulence=filled(air.turbulence, airspeed=math.hypot(*air.wind)))
 
 
 @dataclass(frozen=True, kw_only=True)

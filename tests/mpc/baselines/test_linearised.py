@@ -23,12 +23,7 @@ from quadsim.vehicle import Vehicle
 
 PERIOD = 0.05
 AT_REST = Target(
-    position=np.zeros(3),
-    velocity=np.zeros(3),
-    acceleration=np.zeros(3),
-    yaw=0.0,
-    yaw_rate=0.0,
-    yaw_acceleration=0.0,
+    position=np.zeros(3), velocity=np.zeros(3), acceleration=np.zeros(3), yaw=0.0, yaw_rate=0.0, yaw_acceleration=0.0
 )
 NO_BOUNDS = np.zeros(4), np.full(4, np.inf)
 

@@ -29,10 +29,9 @@ from mpc.solvers import Answer, Method, QPSolver, make_solver, solver_entries
 from quadsim.controller import ACCEPTED, CORE, GAIN, SOLVED, UNCONSTRAINED
 from quadsim.errors import MissingCoreError, ParameterError
 from quadsim.state import Array
-from scenarios.build import build_controller
+from scenarios.assembly import Assembly
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.rollout import Rollout
 
 PIQP = "piqp-multistage"
@@ -298,11 +297,11 @@ def test_without_a_library_the_reason_is_named_and_piqp(monkeypatch: pytest.Monk
     assert solver_entries()[CORE].line == "no core: it was not compiled"
     scenario = load_scenario("hover", [f"controller.solver={CORE}"])
     with pytest.raises(MissingCoreError, match=r"it was not compiled; or choose controller\.solver = 'piqp'"):
-        build_controller(scenario, build_vehicle(scenario))
+        Assembly(scenario).controller()
     assert Rollout(load_scenario("hover", ["duration=0.2"])).fly().satisfied
 
 
 def test_half_spaces_are_no_matter_for_the_core() -> None:
     scenario = load_scenario("pillar", [f"controller.solver={CORE}"])
     with pytest.raises(ParameterError, match=r"solver must be a QP solver such as 'piqp' with controller\.avoidance"):
-        build_controller(scenario, build_vehicle(scenario))
+        Assembly(scenario).controller()

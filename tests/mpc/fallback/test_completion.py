@@ -7,13 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from scripted_controller import (
-    PERIOD,
-    advance,
-    level,
-    model,
-    random_state,
-)
+from scripted_controller import PERIOD, advance, level, model, random_state
 
 from mpc.fallback.completion import PLAUSIBLE, StateCompletion
 from quadsim.state import EULER, EULER_RATE, INDEX, POSITION, VELOCITY, Array

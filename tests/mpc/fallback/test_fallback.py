@@ -7,17 +7,7 @@ import math
 import numpy as np
 import piqp
 import pytest
-from scripted_controller import (
-    PERIOD,
-    Scripted,
-    advance,
-    call,
-    failing,
-    following,
-    guard,
-    model,
-    random_state,
-)
+from scripted_controller import PERIOD, Scripted, advance, call, failing, following, guard, model, random_state
 
 from mpc.fallback.completion import CompletedMoment
 from mpc.fallback.settings import FallbackSettings

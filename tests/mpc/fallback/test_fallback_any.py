@@ -8,12 +8,7 @@ from typing import Any
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scripted_controller import (
-    Scripted,
-    bounds,
-    guard,
-    model,
-)
+from scripted_controller import Scripted, bounds, guard, model
 
 from mpc.fallback.settings import FallbackSettings
 from quadsim.controller import Command, Moment, Phase

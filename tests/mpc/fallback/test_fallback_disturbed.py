@@ -7,17 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scripted_controller import (
-    Pressed,
-    Scripted,
-    advance,
-    at_rest,
-    call,
-    failing,
-    guard,
-    model,
-    pressed,
-)
+from scripted_controller import Pressed, Scripted, advance, at_rest, call, failing, guard, model, pressed
 
 from mpc.answer import ActuatorBounds
 from mpc.fallback.hover import LARGEST_CLIMB, HoverLaw

@@ -7,12 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scripted_controller import (
-    PERIOD,
-    bounds,
-    model,
-    problem,
-)
+from scripted_controller import PERIOD, bounds, model, problem
 from support import paper_reference
 
 from mpc.constrained import ConstrainedMPC

@@ -7,25 +7,14 @@ import math
 import numpy as np
 import pytest
 import scipy.linalg
-from scripted_controller import (
-    PERIOD,
-    advance,
-    bounds,
-    level,
-    model,
-    random_state,
-)
+from scripted_controller import PERIOD, advance, bounds, level, model, random_state
 
-from mpc.fallback.hover import (
-    ACCEPTABLE,
-    ACCEPTABLE_ACCELERATION,
-    HoverLaw,
-)
+from mpc.fallback.hover import ACCEPTABLE, ACCEPTABLE_ACCELERATION, HoverLaw
 from mpc.heading import predict_in_heading_frame, turn
 from mpc.model import hover_model
 from quadsim.assets import vehicle_path
 from quadsim.state import INDEX
-from quadsim.vehicle import Vehicle, load_vehicle
+from quadsim.vehicle import load_vehicle
 
 VEHICLES = ("lopes2011", "hummingbird", "crazyflie2")
 
@@ -49,12 +38,6 @@ def test_the_gain_is_the_infinite_horizon_s() -> None:
     expected = np.linalg.solve(weight + B.T @ P @ B, B.T @ P @ A)
     error = random_state(1, 1e-3)
     np.testing.assert_allclose(law.correction(error, 0.0), -expected @ error, rtol=1e-6)
-
-
-def test_rotor_speeds_accelerate_as_the_vehicle_defines(vehicle: Vehicle) -> None:
-    allocation = 2.0 * vehicle.hover_speed * vehicle.allocation
-    resistance = np.array([vehicle.mass, *vehicle.inertia])
-    np.testing.assert_allclose(HoverLaw(model(), tilt=0.2).slope, allocation / resistance[:, None], atol=1e-12)
 
 
 @pytest.mark.parametrize("yaw", [0.5, math.pi / 2, math.pi, -2.0])

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import derivative
 
-from mpc.nonlinear.model import derivative, nonlinear_model
+from mpc.nonlinear.model import nonlinear_model
 from mpc.nonlinear.rigidbody import (
     N_BODY,
     Inputs,

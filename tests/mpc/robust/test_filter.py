@@ -17,11 +17,11 @@ from mpc.robust.filter import STANDING, SafetyFilter
 from mpc.solvers import make_backend, make_solver
 from quadsim.controller import UNCONSTRAINED, Command, Moment
 from quadsim.state import INDEX, Array
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 
 HORIZON, PERIOD = 40, 0.05
-VEHICLE = build_vehicle(load_scenario("paper-constrained"))
+VEHICLE = Assembly(load_scenario("paper-constrained")).vehicle
 HOVER = np.full(4, VEHICLE.hover_speed)
 
 

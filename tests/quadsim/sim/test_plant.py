@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from quadsim.errors import CommandError, DivergenceError, ParameterError
-from quadsim.sim.physics import physics_to_state, steps_per_period
+from quadsim.sim.physics import physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
@@ -175,12 +175,6 @@ def test_rotors_saturate_only_where_the_scenario_limits_them(vehicle: Vehicle) -
 def test_impossible_starts_are_refused(vehicle: Vehicle, state: Array) -> None:
     with Plant(vehicle) as plant, pytest.raises(ParameterError, match=r"plant\.state must be 12 finite numbers"):
         plant.reset(state)
-
-
-@pytest.mark.parametrize("period", [0.0505, 0.0001, 0.0])
-def test_control_period_must_be_whole_steps(period: float) -> None:
-    with pytest.raises(ParameterError, match=r"control_period must be a whole multiple of the physics step"):
-        steps_per_period(period, 1e-3)
 
 
 def test_equal_commands_give_equal_bits(vehicle: Vehicle) -> None:

@@ -10,9 +10,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from quadsim.assets import vehicle_path
-from quadsim.errors import ForceError, ParameterError
+from quadsim.errors import ForceError
 from quadsim.sim.effects import Disturbance, Effects, Ground, ThrustNoise
-from quadsim.sim.effects.load import Load, PayloadPickup
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator
@@ -136,20 +135,6 @@ def test_its_wrench_is_the_mean_of_what_acted(torrente: Vehicle) -> None:
     gained = segment.physics[-1, 8:11] - START[[1, 3, 5]]
     fallen = np.array([0.0, 0.0, -torrente.gravity * 0.1])
     np.testing.assert_allclose(gained - fallen, segment.wrench[:, :3].sum(axis=0) * 5e-4 / torrente.mass, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("settings", "named"),
-    [
-        ({"effects": Effects(ground=Ground(contact=True))}, "contact with the ground"),
-        ({"effects": Effects(load=Load(mass_factor=1.1))}, "a load"),
-        ({"changes": [PayloadPickup(at=1.0, mass=0.1)]}, "a load"),
-        ({"effects": Effects(air=Air(body_drag=(0.01, 0.01, 0.02)))}, "effects.air.body_drag"),
-    ],
-)
-def test_what_it_does_not_know_is_refused(settings: dict[str, Any], named: str, torrente: Vehicle) -> None:
-    with pytest.raises(ParameterError, match=f"plant.integrator must be mujoco where there is {named}; got 'rk4'"):
-        Plant(torrente, integrator="rk4", **settings)
 
 
 def test_drag_along_the_axes_alone_slows_a_fall_as_its_closed_form(torrente: Vehicle) -> None:

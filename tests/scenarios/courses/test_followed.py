@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from quadsim.state import Array
+from scenarios.assembly import Assembly
 from scenarios.courses.followed import FollowedCourse
 from scenarios.feasibility_check import report
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
-from scenarios.reference import build_course, build_course_steps, build_reference, follow_course
 from scenarios.schema.scenario import Scenario
 
 SAMPLES = 700
@@ -25,17 +24,17 @@ def rows(followed: FollowedCourse, count: int = SAMPLES) -> Array:
 @pytest.mark.parametrize("name", ["paper-constrained", "figure-eight", "csv-trefoil", "minimum-snap", "nonlinear"])
 def test_without_set_points_it_is_the_filtered_course(name: str) -> None:
     scenario = load_scenario(name)
-    followed = follow_course(scenario)
-    np.testing.assert_array_equal(rows(followed), build_reference(scenario, SAMPLES))
-    np.testing.assert_array_equal(followed.preview(10, 50), build_reference(scenario, SAMPLES)[11:61])
+    followed = Assembly(scenario).followed()
+    np.testing.assert_array_equal(rows(followed), Assembly(scenario).reference(SAMPLES))
+    np.testing.assert_array_equal(followed.preview(10, 50), Assembly(scenario).reference(SAMPLES)[11:61])
 
 
 def test_a_set_point_runs_the_filter_on_from_its_row() -> None:
     scenario = load_scenario("paper-constrained")
-    course, tau_r, tau_s = build_course(scenario), scenario.reference.response_time, scenario.control_period
+    course, tau_r, tau_s = Assembly(scenario).course, scenario.reference.response_time, scenario.control_period
     keep = math.exp(-3.0 * tau_s / tau_r)
-    followed = follow_course(scenario)
-    before = build_reference(scenario, SAMPLES)
+    followed = Assembly(scenario).followed()
+    before = Assembly(scenario).reference(SAMPLES)
     preview = followed.preview(100, 50)
     followed.set(100, {"x": 2.0})
     followed.set(300, {"yaw": -1.0, "x": 0.5})
@@ -53,7 +52,7 @@ def test_a_set_point_runs_the_filter_on_from_its_row() -> None:
 
 
 def test_without_a_response_time_a_set_point_is_reached_at_once() -> None:
-    followed = follow_course(load_scenario("hover", ["reference.response_time=0.0"]))
+    followed = Assembly(load_scenario("hover", ["reference.response_time=0.0"])).followed()
     before = followed.row(0)[2]
     followed.set(5, {"z": 3.0})
     assert rows(followed, 10)[:, 2].tolist() == [before] * 6 + [3.0] * 4
@@ -65,9 +64,8 @@ def with_setpoint(at: float) -> Scenario:
 
 def test_what_is_reported_of_a_course_is_what_was_followed_of_it() -> None:
     plain = load_scenario("paper-constrained")
-    assert {step.channel for step in build_course_steps(plain)} == {"x", "y", "z", "yaw"}
-    assert {step.channel for step in build_course_steps(with_setpoint(5.0))} == {"y", "z", "yaw"}
-    vehicle = build_vehicle(plain)
-    whole, nearly = report(plain, vehicle), report(with_setpoint(59.9), vehicle)
+    assert {step.channel for step in Assembly(plain).course_steps} == {"x", "y", "z", "yaw"}
+    assert {step.channel for step in Assembly(with_setpoint(5.0)).course_steps} == {"y", "z", "yaw"}
+    whole, nearly = report(Assembly(plain)), report(Assembly(with_setpoint(59.9)))
     assert nearly.tilt == whole.tilt
-    assert report(with_setpoint(0.05), vehicle).tilt < 0.1 * whole.tilt
+    assert report(Assembly(with_setpoint(0.05))).tilt < 0.1 * whole.tilt

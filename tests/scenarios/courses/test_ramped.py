@@ -14,9 +14,8 @@ from quadsim.motion import Motion
 from quadsim.rotation import quaternion_to_euler
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_initial_state, build_vehicle
-from scenarios.reference import build_course, build_motion, build_reference
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
 
@@ -42,8 +41,8 @@ CHECKS: dict[str, dict[int, str]] = {
 
 
 def motion_of(scenario: Scenario) -> tuple[Motion, Vehicle]:
-    vehicle = build_vehicle(scenario)
-    motion = build_motion(scenario, vehicle)
+    vehicle = Assembly(scenario).vehicle
+    motion = Assembly(scenario).motion
     assert motion is not None
     return motion, vehicle
 
@@ -56,7 +55,7 @@ def changed(**fields: Any) -> Scenario:
 @pytest.mark.parametrize("fields", [{"speed": 6.0}, {"speed": 6.005, "ramp": 1.99}, {"start": 1.5}, {"sampling": 0.03}])
 def test_a_flight_without_a_duration_ends_with_its_course(fields: dict[str, float]) -> None:
     scenario = changed(**fields)
-    least = build_course(scenario).end + scenario.reference.sampling  # type: ignore[union-attr]
+    least = Assembly(scenario).course.end + scenario.reference.sampling  # type: ignore[union-attr]
     assert least - 1e-9 <= scenario.duration < least + scenario.control_period
     again = Scenario.parse(tomllib.loads(scenario.to_toml()))
     assert again == scenario
@@ -65,7 +64,7 @@ def test_a_flight_without_a_duration_ends_with_its_course(fields: dict[str, floa
 
 def test_turns_end_a_flight_too() -> None:
     eight = load_scenario("hummingbird-figure-eight").replace({"duration": None, "reference.response_time": 0.0})
-    assert abs(eight.duration - build_course(eight).end) <= eight.control_period
+    assert abs(eight.duration - Assembly(eight).course.end) <= eight.control_period
     with pytest.raises(ScenarioError, match=r"duration must be <= 86400\.0; the course takes"):
         eight.replace({"duration": None, "reference.turns": 1e5, "control_period": 0.05, "plant.timestep": 0.01})
 
@@ -102,7 +101,7 @@ def test_the_motion_is_flat(name: str, heading: str) -> None:
 def test_a_free_heading_drifts_as_specified_and_the_reference_has_its_yaw() -> None:
     scenario = load_scenario("torrente-loop8-ideal")
     motion, _ = motion_of(scenario)
-    reference = build_reference(scenario, 1010)
+    reference = Assembly(scenario).reference(1010)
     euler = quaternion_to_euler(motion.attitude)
     np.testing.assert_allclose(np.angle(np.exp(1j * (reference[:1000, 3] - euler[:, 2]))), 0.0, atol=1e-9)
     assert reference[999, 3] == pytest.approx(-3.7023, abs=1e-3)  # at rest and level, yaw is the heading
@@ -134,15 +133,15 @@ def test_it_waits_for_its_start_at_rest() -> None:
 def test_a_flight_starts_in_the_state_of_the_reference() -> None:
     scenario = load_scenario("torrente-loop8-ideal")
     motion, _ = motion_of(scenario)
-    state = build_initial_state(scenario, motion)
+    state = Assembly(scenario).initial_state(motion)
     np.testing.assert_allclose(state, [0, 0, 0, 0, 1, 0, 0, 0, 0, 0.001257, 0, 0], atol=6e-7)
     at_rest = scenario.replace({"initial.on_reference": False})
-    np.testing.assert_array_equal(build_initial_state(at_rest, motion)[5:], 0.0)
+    np.testing.assert_array_equal(Assembly(at_rest).initial_state(motion)[5:], 0.0)
 
 
 def test_flatness_of_a_hover_that_turns() -> None:
     """A heading held along a turning direction leaves its rate about body z, and the torque of its acceleration."""
-    vehicle = build_vehicle(load_scenario("torrente-loop4-ideal"))
+    vehicle = Assembly(load_scenario("torrente-loop4-ideal")).vehicle
     t = PERIOD * np.arange(200)
     yaw: Array = 0.4 * t**2
     still = np.zeros((200, 3))

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
+from scenarios.assembly import Assembly
 from scenarios.courses.smoothing import smooth
 from scenarios.courses.steps import Window, steps, switches
 from scenarios.loading import load_scenario
-from scenarios.reference import build_course_steps, build_reference
 
 PERIOD = 0.05
 
@@ -44,7 +44,7 @@ def test_a_course_switches_where_its_value_does() -> None:
 
 def test_the_steps_of_the_papers_course() -> None:
     """A step is watched until the next is within the preview of 50 periods, 2.5 s; yaw starts 30 deg off its course."""
-    found = build_course_steps(load_scenario("paper-constrained"))
+    found = Assembly(load_scenario("paper-constrained")).course_steps
     rows = [(step.channel, step.time, step.before, step.after, step.until) for step in found]
     assert rows == [
         *(("x", 10.0, 0.0, 10.0, 37.5), ("x", 40.0, 10.0, 0.0, 60.0)),
@@ -52,7 +52,7 @@ def test_the_steps_of_the_papers_course() -> None:
         *(("z", 0.0, 0.0, 10.0, 37.5), ("z", 40.0, 10.0, 0.0, 60.0)),
         ("yaw", 0.0, math.radians(30.0), 0.0, 60.0),
     ]
-    short = build_course_steps(load_scenario("paper-constrained", ["duration=15"]))
+    short = Assembly(load_scenario("paper-constrained", ["duration=15"])).course_steps
     assert [(step.channel, step.until) for step in short] == [("x", 15.0), ("z", 15.0), ("yaw", 15.0)]
 
 
@@ -65,7 +65,7 @@ def test_the_filter_is_the_first_order_lag_in_closed_form() -> None:
 
 
 def test_the_paper_course_is_eq_30() -> None:
-    reference = build_reference(load_scenario("paper-constrained", ["reference.response_time=0.0"]), 1200)
+    reference = Assembly(load_scenario("paper-constrained", ["reference.response_time=0.0"])).reference(1200)
     t = np.round(np.arange(1200) * PERIOD, 9)
     for column, start in ((0, 10.0), (1, 20.0), (2, 0.0)):
         np.testing.assert_array_equal(reference[:, column], np.where((t > start) & (t < 40.0), 10.0, 0.0))
@@ -74,5 +74,5 @@ def test_the_paper_course_is_eq_30() -> None:
 
 def test_yaw_windows_are_in_degrees() -> None:
     settings = ["reference.yaw=[{start=0.0, stop=1.0, value=90.0}]", "reference.response_time=0.0"]
-    reference = build_reference(load_scenario("paper-constrained", settings), 3)
+    reference = Assembly(load_scenario("paper-constrained", settings)).reference(3)
     np.testing.assert_allclose(reference[:, 3], [0.0, math.pi / 2, math.pi / 2])

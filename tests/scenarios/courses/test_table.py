@@ -13,9 +13,9 @@ from support import scenario_table
 
 from quadsim.errors import FileError
 from quadsim.state import Array
+from scenarios.assembly import Assembly
 from scenarios.courses.smoothing import smooth
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.reference import build_course, build_reference
 from scenarios.schema.scenario import Scenario
 
 INITIAL = (1.0, -2.0, 3.0)
@@ -42,7 +42,7 @@ def scenario(kind: str, euler: tuple[float, float, float] = (0.0, 0.0, 30.0), **
 
 
 def sampled(kind: str, *times: float, **fields: Any) -> Array:
-    return build_course(scenario(kind, **fields)).sample(np.array(times))
+    return Assembly(scenario(kind, **fields)).course.sample(np.array(times))
 
 
 # --- what is right -------------------------------------------------------------------------------------------------
@@ -50,7 +50,7 @@ def sampled(kind: str, *times: float, **fields: Any) -> Array:
 
 @pytest.mark.parametrize("kind", [kind for kind in REFERENCES if kind != "steps"])
 def test_every_course_begins_at_the_initial_position_and_stays_at_its_end(kind: str) -> None:
-    course = build_course(scenario(kind))
+    course = Assembly(scenario(kind)).course
     np.testing.assert_allclose(course.sample(np.zeros(1))[0, :3], INITIAL, atol=1e-12)
     np.testing.assert_allclose(course.initial, [*INITIAL, math.radians(30.0)])
     last = course.kinks[-1]
@@ -61,15 +61,15 @@ def test_every_course_begins_at_the_initial_position_and_stays_at_its_end(kind: 
 @pytest.mark.parametrize("kind", ["waypoints", "minimum_snap", "circle", "helix", "figure_eight"])
 def test_every_course_waits_for_its_start(kind: str) -> None:
     t = np.arange(0.0, 20.0, 0.05)
-    at_once, later = build_course(scenario(kind)), build_course(scenario(kind, start=2.5))
+    at_once, later = Assembly(scenario(kind)).course, Assembly(scenario(kind, start=2.5)).course
     np.testing.assert_allclose(later.sample(t + 2.5), at_once.sample(t), atol=1e-12)
     np.testing.assert_array_equal(later.sample(np.array([0.0, 1.0, 2.45])), np.tile(later.initial, (3, 1)))
 
 
 @pytest.mark.parametrize("kind", REFERENCES)
 def test_every_course_passes_through_the_filter_from_its_initial_pose(kind: str) -> None:
-    course, t = build_course(scenario(kind)), 0.05 * np.arange(100)
-    reference = build_reference(scenario(kind, response_time=2.0), 100)
+    course, t = Assembly(scenario(kind)).course, 0.05 * np.arange(100)
+    reference = Assembly(scenario(kind, response_time=2.0)).reference(100)
     for column in range(4):
         expected = smooth(course.sample(t)[:, column], initial=course.initial[column], response_time=2.0, period=0.05)
         np.testing.assert_array_equal(reference[:, column], expected)
@@ -91,12 +91,12 @@ def test_minimum_snap_passes_its_points_when_its_speed_or_its_times_require() ->
 
 def test_a_circle_is_about_its_centre_or_begins_where_the_vehicle_is() -> None:
     t = np.linspace(0.0, 17.0, 60)
-    free = build_course(scenario("circle", angle=90.0)).sample(t)
+    free = Assembly(scenario("circle", angle=90.0)).course.sample(t)
     np.testing.assert_allclose(np.linalg.norm(free[:, :2] - [1.0, -4.0], axis=1), 2.0)
-    course = build_course(scenario("circle", centre=[5.0, 5.0], height=1.0, angle=180.0, yaw=-45.0))
+    course = Assembly(scenario("circle", centre=[5.0, 5.0], height=1.0, angle=180.0, yaw=-45.0)).course
     np.testing.assert_allclose(course.sample(np.zeros(1)), [[3.0, 5.0, 1.0, math.radians(-45.0)]], atol=1e-12)
     assert course.jumps == (0.0,)
-    assert build_course(scenario("circle")).jumps == ()
+    assert Assembly(scenario("circle")).course.jumps == ()
 
 
 def test_speed_is_that_at_full_speed_for_every_loop() -> None:
@@ -106,7 +106,7 @@ def test_speed_is_that_at_full_speed_for_every_loop() -> None:
         ("figure_eight", {"period": None, "speed": 1.0, "turns": 3.0}),
     ):
         t = np.arange(5.5, 12.0, 1e-3)
-        poses = build_course(scenario(kind, **fields)).sample(t)
+        poses = Assembly(scenario(kind, **fields)).course.sample(t)
         fastest = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max() / 1e-3
         assert fastest == pytest.approx(1.0, rel=1e-4), kind
 
@@ -138,7 +138,7 @@ def test_a_table_is_found_beside_its_scenario_and_stored_by_its_whole_path_and_h
     assert made.reference.file == str(tmp_path / "course.csv")
     again = parse_scenario(tomllib.loads(made.to_toml()))
     assert again == made
-    poses = build_course(again).sample(np.array([0.0, 1.45, 1.5, 2.5, 3.5, 9.0]))
+    poses = Assembly(again).course.sample(np.array([0.0, 1.45, 1.5, 2.5, 3.5, 9.0]))
     np.testing.assert_allclose(poses[:, 0], [0.0, 0.0, 1.0, 3.0, 5.0, 5.0])  # row 1 is at 1 s, and start at 0.5 s
     np.testing.assert_allclose(poses[-1], [5.0, -2.0, 3.0, 0.5])  # yaw in radians
 
@@ -149,4 +149,4 @@ def test_a_table_that_changed_after_the_scenario_was_resolved_is_refused(tmp_pat
     with pytest.raises(
         FileError, match=r"course\.csv: is not the file of the scenario: its SHA-256 is not [0-9a-f]{64}$"
     ):
-        build_course(made)
+        _ = Assembly(made).course

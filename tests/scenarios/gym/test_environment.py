@@ -21,7 +21,7 @@ from quadsim.errors import InputError, ParameterError, RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
 from quadsim.state import INDEX
 from scenarios.campaign.plan import load_plan
-from scenarios.shipped import scenario_names
+from scenarios.catalogue import scenario_names
 
 HOVER = np.zeros(4, np.float32)
 

@@ -13,7 +13,7 @@ from drawn_events import HAPPENING, kind, number, vector
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-import scenarios.parts.live
+import scenarios.flight_events
 from quadsim.errors import InputError
 from scenarios.cli import main
 from scenarios.live.knobs import knobs
@@ -121,7 +121,7 @@ def test_what_is_refused_is_reported_and_changes_nothing(session: Session) -> No
 def test_what_cannot_be_held_any_more_is_released_and_reported_once(
     session: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scenarios.parts.live, "MOST_EVENTS", 20)
+    monkeypatch.setattr(scenarios.flight_events, "MOST_EVENTS", 20)
     session.submit({"type": "pull", "to": [0.3, 0.0, 1.0]})
     session.submit({"type": "wear", "rotor": 2, "loss": 0.02})
     (refusal,) = [refusal for frame in flown(session, 30) for refusal in frame.refused]

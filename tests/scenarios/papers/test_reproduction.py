@@ -16,6 +16,7 @@ import pytest
 import quadsim
 from quadsim.errors import FileError, UnknownNameError
 from quadsim.report.table import grid_to_markdown
+from scenarios.catalogue import paper_names, scenario_names
 from scenarios.cli import main
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
@@ -29,7 +30,6 @@ from scenarios.papers.reproduction import (
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.rollout import Rollout
 from scenarios.schema.problems import ScenarioError
-from scenarios.shipped import paper_names, scenario_names
 
 HEAD = 'title = "A paper"\nauthors = "N. N."\nabout = "A hover"\n'
 NUMBER = """

@@ -27,9 +27,8 @@ from mpc.robust.controller import RobustMPC, RobustSettings
 from mpc.robust.tightening import TighteningSettings, margins
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
-from scenarios.build import build_controller, build_problem, resolve
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.json_schema import scenario_schema
 from scenarios.schema.scenario import Scenario
 
@@ -60,7 +59,7 @@ def scenario(controller: Any, vehicle: str = "lopes2011") -> Scenario:
 
 def built(controller: Any, vehicle: str = "lopes2011") -> Controller:
     one = scenario(controller, vehicle)
-    return build_controller(one, build_vehicle(one))
+    return Assembly(one).controller()
 
 
 def robust(**parts: Any) -> RobustMPC:
@@ -120,7 +119,7 @@ def test_soft_bounds_have_their_penalties() -> None:
 def test_tightening_is_that_of_the_stated_bounds_lag_and_delay() -> None:
     drawn_in = robust(tightening={"acceleration": 0.2, "turning": 1.0}, rotor_lag=0.02, delay=0.01).settings.margins
     expected = margins(
-        build_vehicle(scenario(ROBUST)),
+        Assembly(scenario(ROBUST)).vehicle,
         period=0.05,
         horizon=20,
         bounds=BOUNDS,
@@ -133,7 +132,7 @@ def test_tightening_is_that_of_the_stated_bounds_lag_and_delay() -> None:
 
 
 def test_weights_and_bounds_arrive_in_si_units() -> None:
-    problem = build_problem(scenario(ROBUST), build_vehicle(scenario(ROBUST)))
+    problem = Assembly(scenario(ROBUST)).problem()
     assert problem.bounds is not None
     assert same(problem.bounds, BOUNDS)
     objective = Objective(C_r=np.eye(12)[[0, 2, 4, 10]], Q_y=np.diag([10.0, 10.0, 100.0, 100.0]), Q_u=0.1 * np.eye(4))
@@ -143,7 +142,7 @@ def test_weights_and_bounds_arrive_in_si_units() -> None:
 def test_the_vehicles_lag_is_its_rotor_rise() -> None:
     lag = {"rotor_lag": "vehicle", "fallback": {"enabled": False}}
     law = built({**ROBUST, **lag, "input_bounds": {"speed": [0.0, 800.0], "slew": [-50.0, 50.0]}}, "hummingbird")
-    vehicle = build_vehicle(scenario(ROBUST, "hummingbird"))
+    vehicle = Assembly(scenario(ROBUST, "hummingbird")).vehicle
     assert isinstance(law, RobustMPC)
     assert law.settings.rotor_lag == vehicle.rotor_rise
     assert vehicle.rotor_rise
@@ -233,7 +232,7 @@ def test_fields_of_nonlinear_mpc_arrive() -> None:
     assert (made.soft, made.observer) == ((9.0, 10.0), ObserverSettings(force_walk=0.3))
     constraints = {part.name: part for part in law.problem.every_constraint}
     assert list(constraints) == ["inputs", "slews", "tilt", "body_rates", "outputs", "wall"]
-    np.testing.assert_allclose(constraints["inputs"].upper, 200.0 / build_vehicle(scenario("pid")).speed_max)
+    np.testing.assert_allclose(constraints["inputs"].upper, 200.0 / Assembly(scenario("pid")).vehicle.speed_max)
     assert constraints["outputs"].penalty is not None
     assert constraints["wall"].penalty is None
 
@@ -293,7 +292,7 @@ def test_fields_of_the_baselines_arrive() -> None:
     for law in (lqr, pid, geometric):
         assert same(law.settings.bounds, ActuatorBounds.alike((1.0, 300.0), (-20.0, 30.0)))
         assert (law.settings.tilt_max, law.horizon) == (12.0, 7)
-    vehicle = build_vehicle(scenario("lqr"))
+    vehicle = Assembly(scenario("lqr")).vehicle
     assert same(lqr.settings.objective, bryson_objective(vehicle))
     assert not lqr.settings.heading_frame
     assert pid.settings.velocity_max == 3.0
@@ -314,7 +313,7 @@ TABLES = ["pid", "a.b:C", {"type": "a:B", "settings": NESTED}]
 @pytest.mark.parametrize("controller", TABLES, ids=str)
 def test_it_comes_back_from_its_resolved_file_which_the_schema_allows(controller: Any) -> None:
     one = scenario(controller, "hummingbird")
-    text = resolve(one, build_vehicle(one)).to_toml()
+    text = Assembly(one).resolved.scenario.to_toml()
     again = parse_scenario(tomllib.loads(text))
     assert again.controller == one.controller
     assert again.to_toml() == text

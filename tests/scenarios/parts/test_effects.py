@@ -14,15 +14,14 @@ from quadsim.sim.effects.load import Load, Payload, PayloadDrop, PayloadPickup
 from quadsim.sim.effects.rotors import RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air
 from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
-from scenarios.parts.effects import build_changes, build_computation, build_wind
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 
 
 def scenario(*settings: str, vehicle: str = "lopes2011") -> tuple[Scenario, Vehicle]:
     loaded = load_scenario("hover", [f"vehicle.file={vehicle}", *settings])
-    return loaded, build_vehicle(loaded)
+    return loaded, Assembly(loaded).vehicle
 
 
 def effects(*settings: str, vehicle: str = "lopes2011") -> Effects:
@@ -41,9 +40,9 @@ def events(*entries: str) -> str:
 def test_without_effects_nothing_acts() -> None:
     loaded, vehicle = scenario()
     assert loaded.effects.resolved(vehicle) == Effects()
-    assert build_changes(loaded) == ()
-    assert build_wind(loaded, vehicle) is None
-    assert build_computation(loaded) is None
+    assert Assembly(loaded).changes() == ()
+    assert Assembly(loaded).wind() is None
+    assert Assembly(loaded).computation() is None
 
 
 def test_every_field_arrives() -> None:
@@ -94,7 +93,7 @@ def test_losses_of_a_rotor_multiply_while_they_last(order: int) -> None:
         event(**LOSS, at=3.0, loss=0.3),
         event(type="rotor_loss", rotor=4, at=2.0, loss=1.0),
     ][::order]
-    found = build_changes(scenario("effects.rotors.efficiency=[1.0, 0.9, 1.0, 1.0]", events(*entries))[0])
+    found = Assembly(scenario("effects.rotors.efficiency=[1.0, 0.9, 1.0, 1.0]", events(*entries))[0]).changes()
     shares = {change.at: change.efficiency for change in found if isinstance(change, RotorChange) and change.rotor == 2}
     expected = {1.0: 0.8, 2.0: 0.4, 3.0: 0.4 * 0.9 * 0.7, 4.0: 0.8 * 0.9 * 0.7, 6.0: 0.8 * 0.7}
     assert shares == pytest.approx({time: 0.9 * share for time, share in expected.items()})
@@ -107,19 +106,19 @@ def test_payloads_come_and_go() -> None:
         event(type="payload_pickup", at=1.0, mass=0.5, position=[0.1, 0.0, 0.0]),
         event(type="payload_drop", at=2.0),
     )
-    found = build_changes(scenario(events(*entries))[0])
+    found = Assembly(scenario(events(*entries))[0]).changes()
     assert found == (PayloadPickup(at=1.0, mass=0.5, position=(0.1, 0.0, 0.0)), PayloadDrop(at=2.0))
 
 
 def test_wind_is_mean_gusts_and_changes() -> None:
-    loaded, vehicle = scenario(
+    loaded, _ = scenario(
         "effects.air={rotor_drag=1e-4, wind=[1.0, 0.0, 0.0]}",
         events(
             event(type="gust", at=1.0, duration=2.0, velocity=[0.0, 3.0, 0.0]),
             event(type="wind", at=4.0, velocity=[0.0, 0.0, -2.0]),
         ),
     )
-    field = build_wind(loaded, vehicle)
+    field = Assembly(loaded).wind()
     assert field is not None
     wind = field.advance(6000)
     np.testing.assert_allclose(wind[[500, 1999, 3999, 4000]], [[1, 0, 0], [1, 3, 0], [1, 0, 0], [0, 0, -2]], atol=1e-5)
@@ -136,12 +135,12 @@ def test_turbulence_passes_at_the_mean_wind_s_speed() -> None:
 
 def test_computation_takes_its_times_and_stalls() -> None:
     stall = events(event(type="stall", at=1.0, duration=0.2))
-    found = build_computation(scenario(stall)[0])
+    found = Assembly(scenario(stall)[0]).computation()
     assert found is not None
     assert [(each.at, each.duration) for each in found.stalls] == [(1.0, 0.2)]
     assert replace(found, stalls=()) == Computation(plan=False)
     loaded, _ = scenario("computation={delay=0.01, per_iteration=1e-4, jitter=0.002}")
-    assert build_computation(loaded) == Computation(delay=0.01, per_iteration=1e-4, plan=False, jitter=0.002)
+    assert Assembly(loaded).computation() == Computation(delay=0.01, per_iteration=1e-4, plan=False, jitter=0.002)
 
 
 @pytest.mark.parametrize(
@@ -160,6 +159,6 @@ def test_within_the_fallback_contract_a_missed_deadline_applies_the_plan(
     name: str, settings: list[str], expected: bool
 ) -> None:
     loaded = load_scenario(name, [events(event(type="stall", at=1.0, duration=0.2)), *settings])
-    computation = build_computation(loaded)
+    computation = Assembly(loaded).computation()
     assert computation is not None
     assert computation.plan is expected

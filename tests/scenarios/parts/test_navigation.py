@@ -10,8 +10,9 @@ from support import scenario_table
 
 from quadsim.sim.sensing import FaultKind, SensorFault, SensorName
 from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly, make_fault
 from scenarios.loading import parse_scenario
-from scenarios.parts.navigation import build_fault, build_navigation, build_sensors
+from scenarios.schema.events import SensorFaultEvent
 from scenarios.schema.scenario import Scenario
 
 SENSORS: dict[str, Any] = {
@@ -27,7 +28,7 @@ def scenario(**tables: Any) -> Scenario:
 
 
 def test_sensors_are_in_si_units() -> None:
-    position, attitude, rates = build_sensors(scenario(sensors=SENSORS))
+    position, attitude, rates = Assembly(scenario(sensors=SENSORS)).sensors
     assert (position.name, position.rate, position.delay) == (SensorName.POSITION, 20.0, 0.11)
     assert position.noise == (0.1, 0.1, 0.2)
     assert attitude.noise == pytest.approx([math.radians(1.0)] * 3)
@@ -43,17 +44,17 @@ def test_the_estimator_flies_by_its_table(vehicle: Vehicle) -> None:
     assert spec is not None
     assert (spec.initial_attitude, spec.initial_gyro_bias) == (2.0, 0.5)
     assert (spec.acceleration_noise, spec.initial_position, spec.gate) == (0.3, 0.05, 0.9999)
-    navigation = build_navigation(scenario(sensors=SENSORS, estimator=ESTIMATOR), vehicle)
+    navigation = Assembly(scenario(sensors=SENSORS, estimator=ESTIMATOR)).navigation()
     assert navigation is not None
 
 
 def test_faults_are_in_si_units() -> None:
-    assert build_fault("rates", "bias", start=2.0, duration=1.5, offset=[180.0, 0.0, 0.0]) == SensorFault(
+    event = SensorFaultEvent(at=2.0, sensor="rates", fault="bias", duration=1.5, offset=(180.0, 0.0, 0.0))
+    assert make_fault(event) == SensorFault(
         sensor=SensorName.RATES, kind=FaultKind.BIAS, start=2.0, stop=3.5, offset=(math.pi, 0.0, 0.0)
     )
-    assert build_fault("position", "nan", start=0.0).stop == math.inf
 
 
 def test_perfect_state_stays_the_default(vehicle: Vehicle) -> None:
-    assert build_navigation(scenario(), vehicle) is None
-    assert build_navigation(scenario(sensors=SENSORS), vehicle) is not None
+    assert Assembly(scenario()).navigation() is None
+    assert Assembly(scenario(sensors=SENSORS)).navigation() is not None

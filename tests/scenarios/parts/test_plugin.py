@@ -17,10 +17,9 @@ from support import NO_PRODUCTS
 from quadsim.controller import Command, Moment
 from quadsim.errors import CommandError, InputError
 from quadsim.state import Array
-from scenarios.build import build_controller
+from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
 from scenarios.parts.plugin import PluginController
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.rollout import Rollout
 
 HOVER = """
@@ -57,7 +56,7 @@ def written(tmp_path: Path) -> Iterator[Write]:
 
 def build(path: str, *settings: str) -> PluginController:
     scenario = load_scenario(path, settings)
-    controller = build_controller(scenario, build_vehicle(scenario))
+    controller = Assembly(scenario).controller()
     assert isinstance(controller, PluginController)
     return controller
 
@@ -77,7 +76,7 @@ def message(path: str) -> str:
 def test_it_is_found_beside_the_scenario_and_called_with_what_is_documented(written: Write) -> None:
     law = build(written(HOVER), "controller.horizon=7", "controller.settings.offset=2.0")
     command = law.step(Moment(), np.zeros(12), np.zeros((7, 4)))
-    vehicle = build_vehicle(load_scenario("hover"))
+    vehicle = Assembly(load_scenario("hover")).vehicle
     np.testing.assert_array_equal(command.speeds, np.full(4, vehicle.hover_speed + 2.0))
     np.testing.assert_array_equal(command.plan, np.tile(command.speeds, (7, 1)))
     assert law._law.received == (0.05, 7)

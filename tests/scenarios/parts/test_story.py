@@ -6,9 +6,9 @@ from typing import Any, get_args
 
 import pytest
 
+from scenarios.assembly import Assembly
+from scenarios.flight_events import prepared, story
 from scenarios.loading import load_scenario
-from scenarios.parts.events import prepared, story
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.base import fields_of
 from scenarios.schema.events import Event
 from scenarios.schema.scenario import Scenario
@@ -60,7 +60,7 @@ def test_many_of_a_kind_are_reported_in_one() -> None:
 
 def test_what_changes_nothing_or_comes_later_is_not_reported() -> None:
     flown = scenario([{"type": "stall", "duration": 0.1}])
-    live = prepared(flown, build_vehicle(flown))
+    live = prepared(Assembly(flown))
     assert len(live.events) > 5
     assert [entry["text"] for entry in story(live, 10.0)] == ["the computer stalls for 0.1 s"]
     assert story(flown, 1.0) == []

@@ -9,9 +9,9 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from quadsim.assets import read_toml
+from scenarios.catalogue import scenario_names, scenario_path
 from scenarios.loading import load_scenario
 from scenarios.schema.json_schema import scenario_schema
-from scenarios.shipped import scenario_names, scenario_path
 
 SCHEMA = scenario_schema()
 VALIDATOR = Draft202012Validator(SCHEMA)

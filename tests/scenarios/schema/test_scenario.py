@@ -15,12 +15,11 @@ from support import scenario_table
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import UnknownNameError
-from scenarios.limits import build_limits
+from scenarios.assembly import Assembly
+from scenarios.catalogue import LIBRARY
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
-from scenarios.shipped import LIBRARY
 
 
 def reread(scenario: Scenario) -> Scenario:
@@ -46,10 +45,14 @@ def test_counts_follow_from_the_times() -> None:
     assert (scenario.periods, scenario.steps_per_period, scenario.plant_stride) == (3, 300, 10)
 
 
+def test_a_scenario_that_is_given_takes_another_seed() -> None:
+    assert load_scenario(load_scenario("hover"), seed=7).seed == 7
+
+
 def test_absent_bounds_are_infinite() -> None:
-    limit, *_ = build_limits(
+    limit, *_ = Assembly(
         parse_scenario(scenario_table() | {"constraints": [{"name": "a", "signal": "z", "lower": 1}]})
-    )
+    ).limits
     assert (limit.lower, limit.upper, limit.start, limit.stop) == (1.0, np.inf, 0.0, np.inf)
 
 
@@ -59,7 +62,7 @@ def test_a_vehicle_file_beside_the_scenario_is_found_and_stored_by_its_whole_pat
     (tmp_path / "course.toml").write_text(text)
     scenario = load_scenario(str(tmp_path / "course.toml"))
     assert scenario.vehicle.file == str(tmp_path / "mine.toml")
-    assert build_vehicle(scenario).mass == 3.0
+    assert Assembly(scenario).vehicle.mass == 3.0
 
 
 # --- what its description says was changed ---------------------------------------------------------------------------

@@ -8,12 +8,11 @@ from typing import Any
 import pytest
 from support import scenario_table
 
-from scenarios.build import resolve
+from scenarios.assembly import Assembly
+from scenarios.catalogue import scenario_names
 from scenarios.loading import load_scenario, parse_scenario
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import is_absent
-from scenarios.shipped import scenario_names
 
 
 def present(value: Any) -> Any:
@@ -23,7 +22,7 @@ def present(value: Any) -> Any:
     return [present(each) for each in value] if isinstance(value, list) else value
 
 
-SHIPPED = [resolve(scenario, build_vehicle(scenario)) for scenario in map(load_scenario, scenario_names())]
+SHIPPED = [Assembly(scenario).resolved.scenario for scenario in map(load_scenario, scenario_names())]
 
 
 @pytest.mark.parametrize("scenario", SHIPPED, ids=lambda scenario: scenario.name)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tuning_formula import TUNING, write_tuning
 
 from quadsim.errors import InputError
-from scenarios.shipped import tuning_names
+from scenarios.catalogue import tuning_names
 from scenarios.tuning.tuning_plan import load_tuning, value_of
 
 

@@ -19,7 +19,7 @@ from quadsim.controller import SOLVED, UNCONSTRAINED
 from quadsim.flight.audit import SIGNALS, margins_sampled
 from quadsim.flight.rundir import Run
 from quadsim.report.recording import open_viewer, world, write_recording
-from quadsim.report.recording.style import PANELS, TIMELINE
+from quadsim.report.recording.world import PANELS, TIMELINE
 from quadsim.rotation import body_to_world
 from quadsim.state import EULER, POSITION
 

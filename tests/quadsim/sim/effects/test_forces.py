@@ -9,6 +9,7 @@ import pytest
 
 from quadsim.sim.airframe import added_mass, compile_model, semi_axes
 from quadsim.sim.effects import Disturbance, Effects, Ground
+from quadsim.sim.effects.forces import LOWEST_RATIO, thrust_ratio
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.effects.wind import Air, Gust, WindField
 from quadsim.sim.plant import Plant
@@ -219,3 +220,21 @@ def test_a_plant_taken_step_by_step_flies_as_in_one_call(vehicle: Vehicle) -> No
             plant.reset(make_state())
             ends.append(np.concatenate([plant.advance(command, 50).physics for command in commands]))
     np.testing.assert_allclose(ends[1], ends[0], rtol=0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize(("ratio", "expected"), [(0.5, 4.0 / 3.0), (1.0, 16.0 / 15.0), (2.0, 64.0 / 63.0)])
+@pytest.mark.parametrize("radius", [0.02, 0.125])
+def test_the_ratio_depends_on_heights_in_radii(ratio: float, expected: float, radius: float) -> None:
+    assert thrust_ratio(ratio * radius, radius) == pytest.approx(expected, rel=1e-12)
+
+
+def test_far_from_the_ground_there_is_no_effect() -> None:
+    """The excess falls with the square of the height."""
+    assert thrust_ratio(100.0, 0.125) - 1.0 == pytest.approx((0.125 / 400.0) ** 2, rel=1e-5)
+    assert thrust_ratio(10.0, 0.125) - 1.0 == pytest.approx(100.0 * (thrust_ratio(100.0, 0.125) - 1.0), rel=1e-3)
+
+
+@pytest.mark.parametrize("height", [0.9 * LOWEST_RATIO, 0.25, 0.1, 0.0, -1.0])
+def test_below_where_the_formula_holds_the_ratio_stays(height: float) -> None:
+    """At a quarter of the radius the formula is singular, and negative below."""
+    assert thrust_ratio(height, 1.0) == thrust_ratio(LOWEST_RATIO, 1.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadsim.errors import ParameterError
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.load import Load, Payload, PayloadDrop, PayloadPickup, mass_properties
 from quadsim.sim.plant import Plant
@@ -76,8 +75,3 @@ def test_payload_is_taken_up_and_let_go(vehicle: Vehicle) -> None:
             for first, last, carried in ((0, 199, 0.0), (200, 499, 1.0), (500, 999, 2.0), (1000, 1498, 0.0)):
                 expected = m * g / (m + carried) - g
                 np.testing.assert_allclose(slopes[max(first - 1, 0) : last], expected, rtol=1e-9, atol=1e-9)
-
-
-def test_inertia_of_no_rigid_body_is_refused(vehicle: Vehicle) -> None:
-    with pytest.raises(ParameterError, match=r"effects\.load\.inertia_factor must be such that no moment of"):
-        mass_properties(vehicle, Load(inertia_factor=(1.0, 1.0, 1.5)), [])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from quadsim.errors import ParameterError
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.rotors import RotorChange, RotorDynamics
 from quadsim.sim.plant import Plant
@@ -60,11 +59,6 @@ def test_an_answer_in_two_parts_is_the_answer_in_one() -> None:
     second, _ = dynamics.respond(first[0], TARGET, np.array([0.04]))
     whole, _ = dynamics.respond(START, TARGET, np.array([0.07]))
     np.testing.assert_allclose(second, whole, rtol=1e-12)
-
-
-def test_inertia_of_rotors_that_change_their_speed_at_once_is_refused(vehicle: Vehicle) -> None:
-    with pytest.raises(ParameterError, match=r"effects\.rotors\.inertia must be 0 where rotors change their speed at"):
-        RotorDynamics(inertia=1e-5).resolved(vehicle)
 
 
 def test_the_plant_climbs_as_its_lagging_rotors_do(vehicle: Vehicle) -> None:

@@ -36,7 +36,7 @@ Target = Flight | Scenario | str | Path
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison(Result):
+class FlightComparison(Result):
     """Flights side by side."""
 
     runs: tuple[rundir.Run, ...]  # the flights
@@ -64,7 +64,7 @@ class Comparison(Result):
         ]
         yield console.table("comparison", ["", *self.names], lines)
         if self.page is not None:
-            yield console.styled("every number, plots and films: ", (console.shown(self.page), "bold"))
+            yield console.styled("every number, plots and films: ", (console.short_path(self.page), "bold"))
 
     def to_json(self) -> list[dict[str, Any]]:
         """A row per quantity, with a text for each flight."""
@@ -85,7 +85,7 @@ def compare_flights(
     progress: Progress = silent,
     *,
     overwrite: bool = False,
-) -> Comparison:
+) -> FlightComparison:
     """Compare flights, and write the page to `out`; what has to be flown is saved beside it, in `OUT-runs`.
 
     Raises:
@@ -104,7 +104,7 @@ def compare_flights(
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
         runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
         page = None if out is None else write_comparison(runs, out, overwrite=overwrite)
-    return Comparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page)
+    return FlightComparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page)
 
 
 def _check(target: Target) -> None:

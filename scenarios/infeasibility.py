@@ -69,15 +69,15 @@ def diagnose(unanswered: InfeasiblePeriod, scenario: Scenario, vehicle: Vehicle)
     conflict = find_conflict(unanswered)
     entries = [] if conflict is None else _merged([*case.entries(conflict)])
     suggestions = [] if conflict is None or conflict.feasible else [*case.suggestions(conflict)]
-    found = {
+    report = {
         "time": round(unanswered.time, 9),
         "status": unanswered.status,
         "feasible": None if conflict is None else conflict.feasible,
         "conflict": entries,
         "suggestions": suggestions,
     }
-    advice = case.widenings(conflict) if isinstance(case, _OwnCase) else _advice(found)
-    return {**found, "sentence": _sentence(found), "advice": advice}
+    advice = case.widenings(conflict) if isinstance(case, _OwnCase) else _advice(report)
+    return {**report, "sentence": _sentence(report), "advice": advice}
 
 
 def _unconverged(unanswered: InfeasiblePeriod, converges: Callable[[int], bool], before: int) -> dict[str, Any]:
@@ -113,7 +113,7 @@ class _Case:
             field, rotor = f"controller.input_bounds.{name}", side.row + 1
             return _Bound(name=name, rotor=rotor, side=which, unit="rad/s", field=field, entry=entry)
         if side.place == 0:
-            name = [each for each in STATE_NAMES if each in self._spec.output_bounds][side.row]
+            name = [state for state in STATE_NAMES if state in self._spec.output_bounds][side.row]
             factor, field = math.degrees(1.0) if name in ANGLES else 1.0, f"controller.output_bounds.{name}"
             return _Bound(name=name, side=which, unit=TERMS[name].unit, factor=factor, field=field, entry=entry)
         polytope, name = self._polytope(side), self._unanswered.problem.every_constraint[side.place].name
@@ -138,10 +138,10 @@ class _Case:
     def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """What is violated, the largest share first, and what blocks it, each with its times and amount."""
         delay, period = self._unanswered.delay, self._period
-        for side, found in sorted(conflict.violated.items(), key=lambda item: -item[1].share):
+        for side, violation in sorted(conflict.violated.items(), key=lambda item: -item[1].share):
             bound = self.bound(side)
-            first, last = (round(delay + steps * period, 9) for steps in (found.first, found.last))
-            yield {**_named(bound), "by": found.amount * bound.factor, "start": first, "stop": last}
+            first, last = (round(delay + steps * period, 9) for steps in (violation.first, violation.last))
+            yield {**_named(bound), "by": violation.amount * bound.factor, "start": first, "stop": last}
         for side in conflict.blocking:
             yield {**_named(self.bound(side)), "by": 0.0, "start": None, "stop": None}
 
@@ -159,9 +159,9 @@ class _Case:
         alone = [settings for change in changes if (settings := self._widened(change))]
         if not alone:
             most: dict[str, float] = {}
-            for side, found in conflict.violated.items():
+            for side, violation in conflict.violated.items():
                 field = self.bound(side).field
-                most[field] = max(found.amount, most.get(field, 0.0))
+                most[field] = max(violation.amount, most.get(field, 0.0))
             together = self._widened({field: (sides, most[field]) for field, sides in fields.items() if field in most})
             alone = [together] if together else []
         for settings in (*alone, *self._softened(conflict)):
@@ -174,10 +174,10 @@ class _Case:
         tables = ["controller.soft"] if any(side.place == 0 for side in conflict.violated) else []
         tables += dict.fromkeys(f"controller.polytopes.{each.name}.soft" for each in polytopes if each is not None)
         tables += ["controller.avoidance.soft"] if any(map(self._is_space, conflict.violated)) else []
-        found = [settings for table in tables if (settings := self._soft([table]))]
-        if not found and len(tables) > 1 and (settings := self._soft(tables)):
-            found = [settings]
-        return found
+        softened = [settings for table in tables if (settings := self._soft([table]))]
+        if not softened and len(tables) > 1 and (settings := self._soft(tables)):
+            softened = [settings]
+        return softened
 
     def _soft(self, tables: Sequence[str]) -> Settings | None:
         other_law = "controller.soft" in tables and not isinstance(self._spec, RobustSpec)
@@ -276,13 +276,13 @@ class _OwnCase(_Case):
             rows = range(N_ROTORS) if self.bound(side).rotor else (side.row,)
             key = (self.bound(side).name, self.bound(side).side)
             sides.setdefault(key, set()).update(side._replace(row=row) for row in rows)
-        found = []
+        widenings = []
         for (name, which), alike in sides.items():
             least, bound = smallest_widening(self._unanswered, alike), self.bound(next(iter(alike)))
             if least is not None:
                 amount = f"{least * bound.factor:.3g} {bound.unit.replace('-', '')}".rstrip()
-                found.append(f"{name} {which} wider by {amount}")
-        return f"has an answer with {'; or '.join(found)}" if found else "no bound alone gives it an answer"
+                widenings.append(f"{name} {which} wider by {amount}")
+        return f"has an answer with {'; or '.join(widenings)}" if widenings else "no bound alone gives it an answer"
 
 
 def _named(bound: _Bound) -> dict[str, Any]:
@@ -314,14 +314,14 @@ def _outwards(bound: float, amount: float, *, upper: bool) -> float:
     return round(bound + moved if upper else bound - moved, max(digits, 0) + 3)
 
 
-def _sentence(found: Mapping[str, Any]) -> str:
+def _sentence(report: Mapping[str, Any]) -> str:
     """When, and what cannot hold together."""
-    begin = f"no answer at t = {found['time']:.2f} s ({found['status']})"
-    if found["feasible"] is None:
+    begin = f"no answer at t = {report['time']:.2f} s ({report['status']})"
+    if report["feasible"] is None:
         return f"{begin}, nor to its elastic problem: its numbers are beyond what can be solved"
-    if found["feasible"]:
+    if report["feasible"]:
         return f"{begin}, though all constraints can hold together: it is the solver that failed"
-    return f"{begin}; cannot hold together: {'; '.join(map(_phrase, found['conflict']))}"
+    return f"{begin}; cannot hold together: {'; '.join(map(_phrase, report['conflict']))}"
 
 
 def _phrase(entry: Mapping[str, Any]) -> str:
@@ -335,15 +335,15 @@ def _phrase(entry: Mapping[str, Any]) -> str:
     return f"{name} at {' .. '.join(times)} by {entry['by']:.3g} {entry['unit'].replace('-', '')}".rstrip()
 
 
-def _advice(found: Mapping[str, Any]) -> str:
+def _advice(report: Mapping[str, Any]) -> str:
     """What to try."""
-    if found["feasible"] is not False:
+    if report["feasible"] is not False:
         return ""
     tried = [
-        ", ".join(f"{field} = {_toml(value)}" for field, value in each["settings"].items())
-        + (" (without the field solver)" if "controller.type" in each["settings"] else "")
-        + (f" (level hover; an answer again after {each['after']:.2f} s, by the model)" if each["after"] else "")
-        for each in found["suggestions"]
+        ", ".join(f"{field} = {_toml(value)}" for field, value in change["settings"].items())
+        + (" (without the field solver)" if "controller.type" in change["settings"] else "")
+        + (f" (level hover; an answer again after {change['after']:.2f} s, by the model)" if change["after"] else "")
+        for change in report["suggestions"]
     ]
     return f"to try: {'; '.join(tried)}" if tried else "no bound alone, nor all of them by as much, gives it an answer"
 

@@ -1,4 +1,9 @@
-"""What happens in a flight besides the course and the controller that it starts with, known in advance or not."""
+"""What happens in a flight besides the course and the controller that it starts with, known in advance or not.
+
+A model is compiled, sensors are sampled and forces are evaluated in one way where something may happen to them, and in
+another where nothing can, with other last bits.  An event that changes nothing decides: it is in the scenario of a
+live flight and in the one that is saved of it, whether or not anything of its kind happened.
+"""
 
 from __future__ import annotations
 
@@ -6,39 +11,41 @@ import math
 from bisect import insort
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, get_args
 
 from mpc.ocp import InfeasiblePeriod
 from quadsim.controller import Controller
-from quadsim.errors import InputError, ParameterError
-from quadsim.sim.computation import Computation, Stall
-from quadsim.sim.effects.load import PayloadDrop, PayloadPickup
-from quadsim.sim.effects.wind import Gust, WindChange
+from quadsim.errors import InputError, ParameterError, printable
+from quadsim.sim.computation import Stall
+from quadsim.sim.effects import LOADING, Push
+from quadsim.sim.effects.load import Load, MassChange, PayloadDrop, PayloadPickup
+from quadsim.sim.effects.wind import Air, Gust, WindChange
 from quadsim.sim.loop import ClosedLoop
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing import SensorName
-from quadsim.vehicle import Vehicle
-from scenarios.parts.effects import build_changes, build_computation, check_changes, moving_air, winds_of
-from scenarios.parts.events import neutral
-from scenarios.parts.navigation import build_faults
 from scenarios.schema.controller import ControllerSpec, changed
 from scenarios.schema.events import (
     MOST_EVENTS,
     ControllerEvent,
     Event,
     SensorFaultEvent,
+    SensorText,
     SetpointEvent,
 )
 from scenarios.schema.problems import parse_table
 
 if TYPE_CHECKING:
+    from scenarios.assembly import Assembly
     from scenarios.courses.followed import FollowedCourse
     from scenarios.schema.scenario import Scenario
 
 _DEPENDENT: Final = (ControllerEvent, PayloadDrop, PayloadPickup, SensorFaultEvent)
 """The events that depend on what else the scenario has."""
+_MOST: Final = 3  # events of one kind in a row that are reported one by one; more of them in one entry
+_LONGEST: Final = 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,14 +67,13 @@ class FlightEvents:
     """The events of a flight, those of its scenario and those that are applied, each put to what it acts on.
 
     Attributes:
-        scenario: what is flown, with the events that were applied.
+        assembly: of what is flown, with the events that were applied.
         unanswered: the first period whose QP had no answer, of the controllers before the one that flies now.
     """
 
     def __init__(
         self,
-        scenario: Scenario,
-        vehicle: Vehicle,
+        assembly: Assembly,
         *,
         plant: Plant,
         navigation: Navigation | None,
@@ -76,7 +82,8 @@ class FlightEvents:
         build: Callable[[ControllerSpec], Controller] | None,
     ) -> None:
         """Set up, before the first period; `build` makes a controller, None where the user's own one flies."""
-        self.scenario, self._vehicle, self._spec = scenario, vehicle, scenario.controller
+        self.assembly, scenario = assembly, assembly.scenario
+        self._spec = scenario.controller
         self._plant, self._navigation, self._reference, self._loop = plant, navigation, reference, loop
         self._build = build
         self._recent: list[Event] = scenario.events  # those that the plant may still have to do with, and others
@@ -90,36 +97,41 @@ class FlightEvents:
         """Let go of what refers back here, so that nothing of the flight stays in a cycle."""
         self._loop.before = self._build = None
 
+    @property
+    def scenario(self) -> Scenario:
+        """What is flown, with the events that were applied."""
+        return self.assembly.scenario
+
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
         """See `scenarios.rollout.Rollout.apply`."""
-        found = self._stamped(event)
-        scenario = self._with(found)
-        if isinstance(found, SetpointEvent):
-            self._schedule(found)
-        elif isinstance(found, ControllerEvent):
-            self._succeed(found, scenario, successor)
-        elif isinstance(found, Stall):
-            self._loop.computation = self._computation(scenario)
-        elif isinstance(found, SensorFaultEvent):
-            if self._navigation is None or not self._navigation.watches(SensorName(found.sensor)):
-                raise _not_started_for(found)
-            self._navigation.reschedule(build_faults(scenario))
-        elif isinstance(found, Gust | WindChange):
-            moving_air(scenario, self._vehicle)
+        event = self._stamped(event)
+        scenario = self._with(event)
+        assembly = self.assembly.of(scenario)
+        if isinstance(event, SetpointEvent):
+            self._schedule(event)
+        elif isinstance(event, ControllerEvent):
+            self._succeed(event, scenario, successor)
+        elif isinstance(event, Stall):
+            self._loop.computation = assembly.computation(self._spec)
+        elif isinstance(event, SensorFaultEvent):
+            if self._navigation is None or not self._navigation.watches(SensorName(event.sensor)):
+                raise _not_started_for(event)
+            self._navigation.reschedule(assembly.faults)
+        elif isinstance(event, Gust | WindChange):
+            _ = assembly.moving_air
             if self._plant.wind is None:
-                raise _not_started_for(found)
-            self._plant.wind.reschedule(*winds_of(scenario))
+                raise _not_started_for(event)
+            self._plant.wind.reschedule(*assembly.winds)
         else:
             past = self._loop.time - scenario.control_period
-            recent = [each for each in (*self._recent, found) if each.at + _lasting(each) >= past]
-            changes = build_changes(scenario, recent)
-            check_changes(scenario, self._vehicle, changes)
+            recent = [e for e in (*self._recent, event) if e.at + _lasting(e) >= past]
+            changes = assembly.changes(recent)
             if not self._plant.allows(changes):
-                raise _not_started_for(found)
+                raise _not_started_for(event)
             self._plant.reschedule(changes)
             self._recent = recent
-        self.scenario = scenario
-        return found
+        self.assembly = assembly
+        return event
 
     def successor(self, fields: Mapping[str, Any]) -> Successor:
         """See `scenarios.rollout.Rollout.successor`."""
@@ -186,23 +198,23 @@ class FlightEvents:
 
     def first_unanswered(self) -> InfeasiblePeriod | None:
         """Of all controllers so far: the first QP without an answer, or else the first SQP that did not converge."""
-        found = [each for each in (self.unanswered, unanswered_by(self._loop.controller)) if each is not None]
-        return min(found, key=lambda each: each.converges is not None, default=None)
+        periods = [period for period in (self.unanswered, unanswered_by(self._loop.controller)) if period is not None]
+        return min(periods, key=lambda period: period.converges is not None, default=None)
 
     def _switch(self, spec: ControllerSpec, ready: Successor | None) -> None:
-        found = ready if ready is not None and ready.spec == spec else self._built(spec)
+        successor = ready if ready is not None and ready.spec == spec else self._built(spec)
         self.unanswered = self.first_unanswered()
-        self._loop.switch(found.controller)
+        self._loop.switch(successor.controller)
         self._spec = spec
-        self._loop.computation = self._computation(self.scenario)
+        self._loop.computation = self.assembly.computation(spec)
 
     def _succeed(self, event: ControllerEvent, scenario: Scenario, ready: Successor | None) -> None:
         """Schedule a change of the controller, once it and later ones of the file are known to be possible."""
         specs = [spec for at, spec in scenario.controller_changes if at >= event.at]
         before = sum(at == event.at for at, _ in self.scenario.controller_changes)
-        found, *later = specs[before:]
-        if ready is None or ready.spec != found:
-            ready = self._built(found)
+        succeeding, *later = specs[before:]
+        if ready is None or ready.spec != succeeding:
+            ready = self._built(succeeding)
         for spec in later:
             self._built(spec)
         self._schedule(event, ready)
@@ -212,15 +224,11 @@ class FlightEvents:
             raise ParameterError("event", "type", "controller", "another one where the controller is one's own")
         return Successor(spec=spec, controller=self._build(spec))
 
-    def _computation(self, scenario: Scenario) -> Computation | None:
-        """How long commands of the controller that flies now take."""
-        return build_computation(scenario.model_copy(update={"controller": self._spec}))
-
 
 def unanswered_by(controller: Controller) -> InfeasiblePeriod | None:
     """The first period whose QP had no answer; None where all had, or there is none."""
-    found = getattr(controller, "unanswered", None)  # a controller of another kind has none
-    return found if isinstance(found, InfeasiblePeriod) else None
+    period = getattr(controller, "unanswered", None)  # a controller of another kind has none
+    return period if isinstance(period, InfeasiblePeriod) else None
 
 
 def _lasting(event: Event) -> float:
@@ -232,3 +240,74 @@ def _lasting(event: Event) -> float:
 def _not_started_for(event: Event) -> InputError:
     rule = "of a kind that the flight was started for, with live=True or by an event of its scenario"
     return ParameterError("event", "type", event.type, rule)
+
+
+def prepared(assembly: Assembly) -> Scenario:
+    """A scenario in whose flight anything may happen that can happen to its vehicle.
+
+    Wind needs drag to push; with the integrator rk4 the mass is fixed, and with an estimator there are the sensors that
+    it has.
+    """
+    scenario, air = assembly.scenario, assembly.effects.air
+    sensed = {} if scenario.sensors is None else scenario.sensors.present()
+    names = [*sensed] if scenario.estimator is not None else [*get_args(SensorText)]
+    possible: list[Event] = [
+        _push(scenario),
+        *([_mass(scenario)] if scenario.plant.integrator == "mujoco" else []),
+        *([_wind(scenario)] if air is not None and air.drags else []),
+        *(_fault(scenario, name) for name in get_args(SensorText) if name in names),
+    ]
+    added = [event for event in possible if event not in scenario.events]
+    return scenario.model_copy(update={"events": [*added, *scenario.events]})  # what the file has at 0 comes after
+
+
+def neutral(scenario: Scenario, event: Event) -> Event | None:
+    """An event at the start that changes nothing, and prepares a flight for one; None where it needs no preparing."""
+    if isinstance(event, Push):
+        return _push(scenario)
+    if isinstance(event, LOADING):
+        return _mass(scenario)
+    if isinstance(event, Gust | WindChange):
+        return _wind(scenario)
+    return _fault(scenario, event.sensor) if isinstance(event, SensorFaultEvent) else None
+
+
+def _push(scenario: Scenario) -> Push:
+    return Push(at=0.0, duration=scenario.plant.timestep, force=(0.0, 0.0, 0.0))
+
+
+def _mass(scenario: Scenario) -> MassChange:
+    return MassChange(at=0.0, factor=(scenario.effects.load or Load()).mass_factor)
+
+
+def _wind(scenario: Scenario) -> WindChange:
+    return WindChange(at=0.0, velocity=(scenario.effects.air or Air()).wind)
+
+
+def _fault(scenario: Scenario, sensor: SensorText) -> SensorFaultEvent:
+    step = scenario.plant.timestep
+    return SensorFaultEvent(at=0.0, sensor=sensor, fault="bias", offset=(0.0, 0.0, 0.0), duration=step)
+
+
+def story(scenario: Scenario, duration: float) -> list[dict[str, Any]]:
+    """`events` of a summary: `time` [s] and `text` of what happened in so long [s], in order of time.
+
+    What changes nothing, as at a live flight's beginning, is left out.
+    """
+    events = sorted((event for event in scenario.events if event.at < duration), key=lambda event: event.at)
+    happened = [event for event in events if event != neutral(scenario, event)]
+    entries = []
+    for _, group in groupby(happened, key=lambda event: event.type):
+        alike = list(group)
+        if len(alike) <= _MOST:
+            entries += [{"time": event.at, "text": _text(event)} for event in alike]
+        else:
+            text = f"{len(alike)} times until {alike[-1].at:g} s: {_text(alike[0])} first, {_text(alike[-1])} last"
+            entries.append({"time": alike[0].at, "text": text})
+    return entries
+
+
+def _text(event: Event) -> str:
+    duration = getattr(event, "duration", None)
+    lasting = "" if duration is None else f" for {duration:g} s"
+    return printable(f"{event.text()}{lasting}")[:_LONGEST]

@@ -26,15 +26,14 @@ from quadsim.controller import ACCEPTED, Command, Controller, Moment
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios.build import build_controller
-from scenarios.diagnosis import diagnose
+from scenarios.assembly import Assembly
+from scenarios.catalogue import scenario_path
 from scenarios.flight import Flight
+from scenarios.infeasibility import diagnose
 from scenarios.loading import load_scenario
 from scenarios.parts.controllers import make_controller
-from scenarios.parts.vehicle import build_vehicle
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
-from scenarios.shipped import scenario_path
 
 TILTED = make_state(euler=(math.radians(20.0), 0.0, 0.0))
 FENCE = '{ name = "fence", of = ["x", "y"], rows = [[1.0, 1.0]], upper = [6.8] }'
@@ -143,8 +142,8 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> str:
 def query_case(file: str, case: Case, *more: str) -> Queried:
     """Have the case's controller step once, without a simulator."""
     scenario = load_scenario(file, [*case.settings, *more])
-    vehicle = build_vehicle(scenario)
-    controller = build_controller(scenario, vehicle)
+    vehicle = Assembly(scenario).vehicle
+    controller = Assembly(scenario).controller()
     acting = np.full(4, vehicle.hover_speed if case.acting is None else case.acting)
     controller.reset(acting)
     status = "plan_exhausted_error"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -166,3 +167,12 @@ def test_the_fault_of_another_sensor_changes_nothing(physics: Array) -> None:
     samples = sampler(Sensor(name=SensorName.POSITION, rate=100.0), fault).sample(physics[:301], 0)
     assert len(samples) == 31
     assert np.abs(errors(samples, physics)).max() == 0.0
+
+
+def test_windows_begin_and_end_at_the_steps_meant() -> None:
+    def window(start: float, stop: float) -> tuple[int, int | None]:
+        return SensorFault(sensor=SensorName.RATES, kind=FaultKind.NAN, start=start, stop=stop).window(1e-3)
+
+    assert window(0.3, 0.7) == (300, 700)  # 0.7 / 1e-3 is 700.0000000000001 in binary
+    assert window(0.0001, 0.0009) == (1, 1)  # between two steps: none
+    assert window(0.0, math.inf) == (0, None)

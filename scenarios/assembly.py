@@ -1,0 +1,526 @@
+"""From a scenario to what flies: vehicle, course, controller, plant and sensors, each built once."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property
+from operator import itemgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import numpy as np
+
+from mpc.fallback.settings import FallbackSettings
+from mpc.flatness import motion_along
+from mpc.solvers import CORE_OR_PIQP
+from quadsim.assets import vehicle_path
+from quadsim.errors import InputError, ParameterError
+from quadsim.fields import filled
+from quadsim.flight.metrics import CourseStep
+from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance
+from quadsim.sim.airframe import outline
+from quadsim.sim.computation import Computation, ComputationTime, Stall
+from quadsim.sim.effects import LOADING, Change, Effects, Force, Push, PushChange
+from quadsim.sim.effects.load import Load, mass_properties
+from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics, RotorLoss
+from quadsim.sim.effects.wind import Air, Gust, WindChange, WindField
+from quadsim.sim.navigation import Navigation
+from quadsim.sim.physics import physics_to_state
+from quadsim.sim.plant import Plant
+from quadsim.sim.rigid_body import check_free
+from quadsim.sim.sensing import AXES, FaultKind, Sensor, SensorFault, SensorName
+from quadsim.space import Corridor, Fence, Region
+from quadsim.state import POSITION, REFERENCE_NAMES, Array, make_state
+from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
+from scenarios.courses.course import Course
+from scenarios.courses.followed import FollowedCourse
+from scenarios.courses.steps import Steps, switches
+from scenarios.limits import audited, controller_bounds, space_limits
+from scenarios.parts.controllers import make_controller, make_problem
+from scenarios.parts.plugin import import_plugin, make_force
+from scenarios.schema.events import Event, SensorFaultEvent, SetpointEvent
+from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
+
+if TYPE_CHECKING:
+    from mpc.ocp import Problem
+    from quadsim.controller import Controller
+    from quadsim.flight.audit import Limit
+    from quadsim.motion import Motion
+    from scenarios.schema.controller import ControllerSpec
+    from scenarios.schema.scenario import Scenario
+
+_SIZES: Final = {
+    "rotor_rise": ("rotors", "rise", RotorDynamics),
+    "rotor_fall": ("rotors", "fall", RotorDynamics),
+    "rotor_inertia": ("rotors", "inertia", RotorDynamics),
+    "rotor_drag": ("air", "rotor_drag", Air),
+    "body_drag": ("air", "body_drag", Air),
+    "rotor_radius": ("ground", "rotor_radius", None),
+}
+"""Parameters of vehicles that act in an effect: its table, the field that states it too, and what switches it on."""
+_UNITS: Final = {
+    SensorName.POSITION: 1.0,
+    SensorName.VELOCITY: 1.0,
+    SensorName.ATTITUDE: math.radians(1.0),
+    SensorName.RATES: math.radians(1.0),
+}
+"""The scenario file's unit of each sensor in the testbed's."""
+_OF_ALL_EVENTS: Final = ("vehicle", "actual", "effects", "course")
+"""Parts that neither events nor the controller nor the duration change."""
+
+
+class Assembly:
+    """The parts of a scenario; those with a state are made anew by each call of their method.
+
+    Attributes:
+        scenario: the file's content.
+    """
+
+    def __init__(self, scenario: Scenario, vehicle: Vehicle | None = None) -> None:
+        """Build nothing yet; `vehicle` where it has been loaded already."""
+        self.scenario = scenario
+        if vehicle is not None:
+            self.vehicle = vehicle
+
+    def __reduce__(self) -> tuple[type[Assembly], tuple[Scenario, Vehicle]]:
+        """Pickled as what it is built from: courses hold functions."""
+        return Assembly, (self.scenario, self.vehicle)
+
+    def of(self, scenario: Scenario) -> Assembly:
+        """The assembly of a scenario with other events, another controller or duration; vehicle and course stay."""
+        other = Assembly(scenario)
+        vars(other).update({name: part for name, part in vars(self).items() if name in _OF_ALL_EVENTS})
+        return other
+
+    @property
+    def resolved(self) -> Assembly:
+        """That of the scenario with every number that it leaves to its vehicle: its file alone defines the flight."""
+        return self.of(self.with_vehicle.model_copy(update={"effects": self.effects}))
+
+    @property
+    def with_vehicle(self) -> Scenario:
+        """The scenario with the numbers of its vehicle's file in it; effects go on taking theirs from the vehicle."""
+        numbers = {name: getattr(self.vehicle, name) for name in VEHICLE_UNITS}
+        table = self.scenario.vehicle.model_copy(update=numbers)
+        return self.scenario.model_copy(update={"vehicle": table})
+
+    # --- vehicle -----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def vehicle(self) -> Vehicle:
+        """The modelled vehicle: its file with the scenario's overrides; a resolved scenario needs no file."""
+        file, overrides = self.scenario.vehicle.file, self.scenario.vehicle.overrides()
+        try:
+            path = vehicle_path(file)
+        except InputError:
+            if not overrides.keys() >= VEHICLE_UNITS.keys() - set(OPTIONAL_PARAMETERS):
+                raise
+            return Vehicle(name=Path(file).stem, **overrides)
+        return load_vehicle(path, overrides)
+
+    @cached_property
+    def actual(self) -> Vehicle:
+        """The vehicle as it really is: the modelled one, with `[actual]` in its place.
+
+        Plant, forces, drawings and audit have it; controller, estimator and reference have the modelled one.
+
+        Raises:
+            ParameterError: there can be no such vehicle.
+        """
+        modelled = self.vehicle
+        try:
+            return replace(modelled, **self._stated)
+        except ParameterError as error:
+            raise ParameterError("actual", error.name, error.value, error.rule) from error
+
+    @property
+    def _stated(self) -> dict[str, Any]:
+        """The parameters of vehicles that `[actual]` states."""
+        return {} if self.scenario.actual is None else self.scenario.actual.overrides()
+
+    @cached_property
+    def effects(self) -> Effects:
+        """What acts on the plant: `[effects]`, with every size that it leaves to the vehicle as it really is.
+
+        Lag, rotor inertia and drag that `[actual]` states act, whether or not `[effects]` has their table.
+
+        Raises:
+            ParameterError: `[effects]` states another size than `[actual]`, or lacks one, or a combination is not
+                possible.
+        """
+        effects = self.scenario.effects
+        acting: dict[str, Any] = {}
+        for name, size in self._stated.items():
+            table, field, kind = _SIZES.get(name, ("", "", None))
+            settings = getattr(effects, table, None) or (kind and kind())
+            if settings is None:
+                continue
+            stated = getattr(settings, field)
+            if stated not in (None, size):
+                raise ParameterError("actual", name, size, f"absent where effects.{table}.{field} = {stated} states it")
+            acting[table] = settings
+        return replace(effects, **acting).resolved(self.actual)
+
+    def initial_state(self, motion: Motion | None = None) -> Array:
+        """(12,) state at t = 0, of the reference motion where the scenario starts on it."""
+        initial = self.scenario.initial
+        if initial.on_reference and motion is not None:
+            physics = np.array(
+                [0.0, *motion.position[0], *motion.attitude[0], *motion.velocity[0], *motion.body_rates[0]]
+            )
+            return physics_to_state(physics[None], yaw=math.radians(initial.euler[2]))[0]
+        x, y, z = initial.position
+        roll, pitch, yaw = np.radians(initial.euler)
+        return make_state(position=(x, y, z), euler=(roll, pitch, yaw))
+
+    @property
+    def initial_speeds(self) -> Array:
+        """(4,) u(-1), and the rotor speeds at t = 0 [rad/s]."""
+        return np.full(N_ROTORS, 0.0 if self.scenario.initial.cold else self.vehicle.hover_speed)
+
+    # --- course ------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def course(self) -> Course:
+        """The course before its filter.
+
+        Raises:
+            InputError: its file is wrong, or it does not suit the initial position.
+        """
+        return self.scenario.reference.build(self.initial_pose, self.vehicle.gravity)
+
+    @property
+    def initial_pose(self) -> Array:
+        """(4,) x, y, z [m], yaw [rad] of the vehicle at t = 0."""
+        initial = self.scenario.initial
+        return np.array([*initial.position, math.radians(initial.euler[2])])
+
+    def followed(self, course: Course | None = None) -> FollowedCourse:
+        """The filtered reference row by row, with set-points in flight; of another course where one is given."""
+        course, response_time = self.course if course is None else course, self.scenario.reference.response_time
+        return FollowedCourse(course, response_time=response_time, period=self.scenario.control_period)
+
+    def reference(self, samples: int) -> Array:
+        """(samples, 4) filtered x, y, z [m], yaw [rad] at t_k = k tau_s, but for set-points.  Eqs. (30)-(31)."""
+        return self.followed().first(samples)
+
+    @cached_property
+    def motion(self) -> Motion | None:
+        """The reference motion at t_k = k tau_s, to the course's end; None where the course states positions alone."""
+        course, period = self.course, self.scenario.control_period
+        if course.derivatives is None:
+            return None
+        t = np.arange(max(math.floor(course.end / period + 1e-6), 1) + 1, dtype=np.float64) * period
+        velocity, acceleration = course.derivatives(t)
+        yaw = float(course.initial[3]) if course.free_heading else np.full(len(t), course.initial[3])
+        position = course.sample(t)[:, :3]
+        return motion_along(position, velocity, acceleration, period=period, vehicle=self.vehicle, yaw=yaw)
+
+    @cached_property
+    def regions(self) -> tuple[Corridor | Fence, ...]:
+        """The corridors, each with a window of time, then the fence.
+
+        The reference is known before the flight, and where it is along its path never falls: a window of the one is a
+        window of the other.
+
+        Raises:
+            InputError: the reference's path is over before a window begins, or cannot be built.
+        """
+        regions = self.scenario.regions
+        if all(isinstance(region, Fence) or region.path is None for region in regions):
+            return regions
+        reference = self.reference(self.scenario.periods + 1)[:, :3]
+        t = self.scenario.control_period * np.arange(len(reference), dtype=np.float64)
+        return tuple(region if isinstance(region, Fence) else region.timed(t, reference) for region in regions)
+
+    @property
+    def course_steps(self) -> tuple[CourseStep, ...]:
+        """The steps of the unfiltered course, channel by channel; a start away from the course is a step at 0.
+
+        Only a course of windows has steps whose settling can be watched, and only on axes that no set-point takes from
+        it.
+        """
+        scenario, initial = self.scenario, self.initial_pose
+        if not isinstance(scenario.reference, Steps):
+            return ()
+        taken = {name for event in scenario.events if isinstance(event, SetpointEvent) for name in event.values}
+        preview = scenario.controller.horizon * scenario.control_period
+        steps = []
+        channels = scenario.reference.channels(initial)
+        for name, (windows, elsewhere), start in zip(REFERENCE_NAMES, channels, initial.tolist(), strict=True):
+            if name in taken:
+                continue
+            flown = [step for step in switches(windows, elsewhere, initial=start) if step[0] < scenario.duration]
+            ends = [*(time - preview for time, _, _ in flown[1:]), scenario.duration]
+            for (time, before, after), until in zip(flown, ends, strict=False):
+                steps.append(CourseStep(channel=name, time=time, before=before, after=after, until=until))
+        return tuple(steps)
+
+    # --- controller --------------------------------------------------------------------------------------------------
+
+    def controller(self, spec: ControllerSpec | None = None) -> Controller:
+        """The controller, or that of another table, set up and ready to be flown.
+
+        Raises:
+            InputError: it cannot be made from these numbers, or its code cannot be found or called.
+        """
+        spec = self.scenario.controller if spec is None else spec
+        return make_controller(
+            spec, self.vehicle, self.scenario.control_period, (*self.scenario.obstacles, *self.regions)
+        )
+
+    def problem(self) -> Problem:
+        """The controller's optimisation.
+
+        Raises:
+            InputError: the controller has none.
+        """
+        spec = self.scenario.controller
+        if not isinstance(spec, WeightedSpec):
+            raise ParameterError("controller", "type", spec.type, "one that minimises over a horizon")
+        return make_problem(spec, self.vehicle, self.scenario.control_period)
+
+    @cached_property
+    def bounds(self) -> dict[str, tuple[float, float]]:
+        """See `scenarios.limits.controller_bounds`."""
+        return controller_bounds(self.scenario.controller, self.vehicle)
+
+    @cached_property
+    def limits(self) -> tuple[Limit, ...]:
+        """What the flight is audited against."""
+        return audited(self)
+
+    def computation(self, spec: ControllerSpec | None = None) -> Computation | None:
+        """How long commands of a controller take, of the scenario's by default; None where they take no time."""
+        stalls = tuple(event for event in self.scenario.events if isinstance(event, Stall))
+        settings = self.scenario.computation
+        if settings is None and not stalls:
+            return None
+        fallback = getattr(self.scenario.controller if spec is None else spec, "fallback", None)
+        guarded = isinstance(fallback, FallbackSettings) and fallback.enabled  # within the fallback contract
+        return Computation(**vars(filled(settings or ComputationTime(), plan=guarded)), stalls=stalls)
+
+    # --- plant -------------------------------------------------------------------------------------------------------
+
+    def generator(self, purpose: str) -> np.random.Generator:
+        """Random numbers for one purpose, e.g. `wind`, from the scenario's seed, the same whatever else draws any."""
+        return np.random.default_rng(np.random.SeedSequence([self.scenario.seed, zlib.crc32(purpose.encode())]))
+
+    def plant(self, forces: Sequence[Force] | None = None) -> Plant:
+        """The simulated vehicle, and what acts on it; `forces` instead of those that the scenario names.
+
+        Raises:
+            InputError: a combination of effects is not possible, or a force cannot be imported.
+        """
+        scenario, rng = self.scenario, self.generator("forces")
+        if forces is None:
+            forces = [make_force(import_plugin(spec), spec, self.actual, rng) for spec in scenario.forces]
+        return Plant(
+            self.actual,
+            timestep=scenario.plant.timestep,
+            integrator=scenario.plant.integrator,
+            limit_speeds=scenario.plant.limit_speeds or not {"speed_min", "speed_max"}.isdisjoint(self._stated),
+            effects=self.effects,
+            changes=self.changes(),
+            wind=self.wind(),
+            forces=forces,
+            obstacles=scenario.obstacles,
+            rng=self.generator("disturbance"),
+        )
+
+    def ground(self) -> PhaseMonitor | None:
+        """What knows where the flight stands with the ground and obstacles; None where there are none."""
+        ground, obstacles = self.scenario.effects.ground, self.scenario.obstacles
+        there = ground is not None and ground.contact
+        if not there and not obstacles:
+            return None
+        shape, radius = outline(self.actual) if there else None, self.actual.enclosing_radius
+        return PhaseMonitor(shape, period=self.scenario.control_period, obstacles=obstacles, radius=radius)
+
+    @property
+    def moving_air(self) -> Air | None:
+        """The resolved air where it moves at some time of the flight, or None where it is still throughout.
+
+        Raises:
+            ParameterError: there is wind, and nothing that it could push.
+        """
+        air = self.effects.air or Air()
+        blown = any(isinstance(event, Gust | WindChange) for event in self.scenario.events)
+        if not (any(air.wind) or air.turbulence is not None or blown):
+            return None
+        if not air.drags:
+            name = self.vehicle.name
+            rule = f"positive, or body_drag given, for the wind to push: the vehicle {name!r} states no drag"
+            raise ParameterError("effects.air", "rotor_drag", air.rotor_drag or 0.0, rule)
+        return air
+
+    def wind(self) -> WindField | None:
+        """The motion of the air, or None where it is still throughout; raises as `moving_air`."""
+        if (air := self.moving_air) is None:
+            return None
+        gusts, changes = self.winds
+        return WindField(
+            mean=air.wind,
+            gusts=gusts,
+            changes=changes,
+            turbulence=air.turbulence,
+            timestep=self.scenario.plant.timestep,
+            rng=self.generator("wind"),
+        )
+
+    @property
+    def winds(self) -> tuple[tuple[Gust, ...], tuple[WindChange, ...]]:
+        """The gusts, and the steps of the mean wind."""
+        events = self.scenario.events
+        gusts = tuple(event for event in events if isinstance(event, Gust))
+        return gusts, tuple(event for event in events if isinstance(event, WindChange))
+
+    def changes(self, events: Sequence[Event] | None = None) -> tuple[Change, ...]:
+        """What these events, or else all, do to rotors, mass and payload, and what pushes, in any order.
+
+        Raises:
+            ParameterError: rotors with inertia are to change their speed at once.
+        """
+        events = self.scenario.events if events is None else events
+        pushes = _in_force([event for event in events if isinstance(event, Push)])
+        rotors = self.effects.rotors or RotorDynamics()
+        for event in events:
+            if isinstance(event, LagChange):
+                rotors.lagging(event)
+        return (
+            *self._losses([event for event in events if isinstance(event, RotorLoss)]),
+            *(PushChange(at=time, pushes=tuple(in_force)) for time, in_force in pushes),
+            *(event for event in events if isinstance(event, (*LOADING, LagChange))),
+        )
+
+    def _losses(self, losses: Sequence[RotorLoss]) -> Iterator[RotorChange]:
+        """Each rotor's share whenever one of its losses begins or ends: the product of what all in force leave."""
+        rotors = self.scenario.effects.rotors or RotorDynamics()
+        for rotor, worn in enumerate(rotors.efficiency, start=1):
+            for time, in_force in _in_force([loss for loss in losses if loss.rotor == rotor]):
+                left = math.prod(1.0 - loss.loss for loss in in_force)
+                yield RotorChange(at=time, rotor=rotor, efficiency=worn * left)
+
+    # --- sensors -----------------------------------------------------------------------------------------------------
+
+    def navigation(self) -> Navigation | None:
+        """The source of the controller's state; None where that is the true one.
+
+        Raises:
+            ParameterError: a fault of a sensor that the estimator does not have.
+        """
+        sensors, faults, estimator = self.sensors, self.faults, self.scenario.estimator
+        if not sensors and not faults and estimator is None:
+            return None
+        step, rng = self.scenario.plant.timestep, self.generator("sensors")
+        return Navigation(self.vehicle, timestep=step, sensors=sensors, rng=rng, faults=faults, estimator=estimator)
+
+    @property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """The sensors that the scenario has, in SI units."""
+        present = {} if self.scenario.sensors is None else self.scenario.sensors.present()
+        return tuple(
+            Sensor(
+                name=name,
+                **vars(spec)
+                | {field: _three(getattr(spec, field), _UNITS[name]) for field in ("noise", "bias", "bias_walk")},
+            )
+            for name, spec in present.items()
+        )
+
+    @property
+    def faults(self) -> tuple[SensorFault, ...]:
+        """The faults of the sensors."""
+        return tuple(make_fault(event) for event in self.scenario.events if isinstance(event, SensorFaultEvent))
+
+    # --- what goes together ------------------------------------------------------------------------------------------
+
+    def check(self) -> Assembly:
+        """Refuse, before anything is flown, parts that do not go together.
+
+        Raises:
+            InputError: there is no such vehicle, it cannot hover, an effect is not possible with it or with the
+                integrator, the course cannot be built or does not state the motion that the flight is to start on, or
+                the flight starts below the floor, or in the air with rotors at rest.
+        """
+        scenario, load = self.scenario, self.effects.load or Load()
+        mass_properties(self.actual, load, load.payloads)
+        _ = self.moving_air
+        changes = self.changes()
+        if scenario.plant.integrator == "rk4":
+            check_free(self.effects, changes, scenario.obstacles)
+        course = self.course
+        if scenario.initial.on_reference and course.derivatives is None:
+            rule = f"false where the course states positions alone, as one of type {scenario.reference.type} does"
+            raise ParameterError("initial", "on_reference", True, rule)
+        ground = scenario.effects.ground
+        if ground is not None and (ground.contact or ground.effect):
+            self._check_floor()
+        if limits := space_limits(self):
+            start = self.initial_state(self.motion)[None, list(POSITION)]
+            for limit in limits:
+                clear = float(limit.shape.clearance(np.zeros(1), start)[0]) - limit.radius
+                if limit.start <= 0.0 and clear < -limit.tolerance:
+                    side = "inside" if isinstance(limit.shape, Region) else "clear of"
+                    ball = f"the radius of {limit.radius:.3g} m of the ball that represents the vehicle"
+                    raise ParameterError("initial", "position", start[0].tolist(), f"{side} {limit.name}, by {ball}")
+        return self
+
+    def _check_floor(self) -> None:
+        """Refuse a start below the floor, or one in the air with rotors at rest."""
+        initial, shape, state = self.scenario.initial, outline(self.actual), self.initial_state()[None, :]
+        feet = float(clearance(state, shape.feet, shape.foot_radius, shape.floor)[0])
+        hull = float(clearance(state, shape.hull, 0.0, shape.floor)[0])
+        lowest, position = min(feet, hull), list(initial.position)
+        if lowest < -TOUCH:
+            tilt = f"roll {initial.euler[0]:g} and pitch {initial.euler[1]:g} deg"
+            rule = f"{-lowest:.3g} m higher, at {tilt}, for feet and hull to clear the floor"
+            raise ParameterError("initial", "position", position, rule)
+        if initial.cold and feet > AIRBORNE:
+            rule = f"on the floor where initial.cold is true, or it would fall: its feet are {feet:.3g} m above it"
+            raise ParameterError("initial", "position", position, rule)
+
+
+def preferring_core(scenario: Scenario) -> Scenario:
+    """The scenario with `core-or-piqp` in place of `piqp`, the default: for where a step's time matters."""
+    controller = scenario.controller
+    if isinstance(controller, BoundedSpec) and controller.solver == "piqp":
+        return scenario.replace({"controller.solver": CORE_OR_PIQP})
+    return scenario
+
+
+def make_fault(event: SensorFaultEvent) -> SensorFault:
+    """A sensor's fault in SI units."""
+    name = SensorName(event.sensor)
+    return SensorFault(
+        sensor=name,
+        kind=FaultKind(event.fault),
+        start=event.at,
+        stop=event.at + event.duration,
+        axes=AXES if event.axes is None else tuple(sorted({"xyz".index(axis) for axis in event.axes})),
+        offset=_three(event.offset or 0.0, _UNITS[name]),
+    )
+
+
+def _three(value: float | Sequence[float], unit: float) -> tuple[float, float, float]:
+    x, y, z = [value] * 3 if isinstance(value, float | int) else value
+    return unit * x, unit * y, unit * z
+
+
+_Lasting = TypeVar("_Lasting", RotorLoss, Push)
+
+
+def _in_force(events: Sequence[_Lasting]) -> Iterator[tuple[float, list[_Lasting]]]:
+    """The instants [s] at which events begin or end, and those in force from then on, in their own order."""
+    turns: dict[float, tuple[set[int], set[int]]] = {}
+    for i, event in enumerate(events):
+        turns.setdefault(event.at, (set(), set()))[0].add(i)
+        if event.duration is not None:
+            turns.setdefault(event.at + event.duration, (set(), set()))[1].add(i)
+    in_force: set[int] = set()
+    for time, (begun, ended) in sorted(turns.items(), key=itemgetter(0)):
+        in_force = (in_force | begun) - ended
+        yield time, [events[i] for i in sorted(in_force)]
