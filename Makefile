@@ -20,7 +20,7 @@ PYTHON ?= $(firstword $(foreach name,$(CANDIDATES),$(shell $(name) -c '$(SUPPORT
 PIP_INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check
 NOT_INSTALLED := The packages could not be installed. With a network at hand: make setup
 RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; rendering_backend()' 2>/dev/null
-FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang cppcheck clang-tidy
+FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang wasm-ld cppcheck clang-tidy
 HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done && \
 	echo 'int LLVMFuzzerTestOneInput(void) { return 0; }' | clang -fsanitize=fuzzer -x c -o /dev/null -) >/dev/null 2>&1
 HAS_COMPILER := command -v $${CC:-cc} >/dev/null
@@ -79,6 +79,7 @@ docs: setup $(VENV)/.docs  ## build the documentation into site/, with a gallery
 	@$(VENV)/bin/zensical build --clean
 	@sed -i 's|https://unpkg.com/iframe-worker/shim|assets/iframe-worker.js|' site/*.html
 	@! grep -lE 'src="https?:|<link[^>]*href="https?:[^"]*\.(css|js)' site/*.html || { echo "These pages need a network." >&2; false; }
+	@OPENBLAS_NUM_THREADS=1 $(PY) docs/fly/build.py
 	@echo "Done. Open site/index.html in a browser."
 
 numbers: setup  ## fill the tables of README.md and docs/ from JSON (OPTIONS="speed mismatch" measures these first)
@@ -144,6 +145,6 @@ $(VENV)/.browser: $(VENV)/.installed
 
 $(VENV)/.firmware: $(VENV)/.installed
 	@if $(HAS_FIRMWARE_TOOLS) || { { $(call apt,gcc libc6-dev gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm \
-		gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user clang libclang-rt-dev cppcheck clang-tidy); } && \
+		gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user clang lld libclang-rt-dev cppcheck clang-tidy); } && \
 		$(HAS_FIRMWARE_TOOLS); }; then touch $@; \
 	else echo "Until then the tests of exported controllers that lack a tool are skipped." >&2; fi
