@@ -27,7 +27,7 @@ from mpc.baselines.attitude import (
     wanted_attitude,
 )
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for
-from mpc.baselines.law import FeedbackLaw, Tuned, require_positive, require_within
+from mpc.baselines.law import FeedbackLaw, Tuned, require_positive
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import within
@@ -67,17 +67,6 @@ class GeometricSettings:
     disturbance: RampSettings | None = None  # of the observer of what the model misses; None for none
     horizon: int = 10  # N, samples of preview; they give the reference's velocity and acceleration
     bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
-
-    def __post_init__(self) -> None:
-        for name in ("period", "k_x", "k_v", "k_R", "k_Omega", "c_1", "c_2", "sigma", "sigma_R"):
-            require_positive(name, getattr(self, name))
-        for name in ("k_i", "k_I"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ParameterError("controller", name, getattr(self, name), "at least 0 and finite")
-        require_within("yaw_share", self.yaw_share, 0.05, 1.0)
-        require_within("tilt_max", self.tilt_max, 0.1, 80.0)
-        if any(self.drag) and not self.feedforward:
-            raise ParameterError("controller", "drag", self.drag, "zero where feedforward is not true")
 
 
 def geometric_settings(

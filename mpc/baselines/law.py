@@ -32,16 +32,6 @@ def require_positive(name: str, value: float) -> None:
         raise ParameterError("controller", name, value, "positive and finite")
 
 
-def require_within(name: str, value: float, lower: float, upper: float) -> None:
-    """A setting that has to be between two numbers.
-
-    Raises:
-        ParameterError: it is not.
-    """
-    if not lower <= value <= upper:
-        raise ParameterError("controller", name, value, f"between {lower:g} and {upper:g}")
-
-
 class FeedbackLaw(ABC):
     """A controller that solves nothing: a subclass defines what it commands in flight, `_command`."""
 

@@ -12,7 +12,7 @@ from annotated_types import Ge, Le, Len, doc
 
 from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
-from mpc.baselines.law import Baseline, FeedbackLaw, require_within
+from mpc.baselines.law import Baseline, FeedbackLaw
 from mpc.baselines.preview import wrapped
 from mpc.bounded import InputWeights, objective_of, require_states
 from mpc.heading import turn_horizontally
@@ -50,10 +50,6 @@ class LQRSettings:
     """Largest tilt that errors of x, y and their rates demand [deg], or None.  The law is linear: without a limit a
     large error demands more tilt than the model, or the vehicle, tolerates."""
     bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
-
-    def __post_init__(self) -> None:
-        if self.tilt_max is not None:
-            require_within("tilt_max", self.tilt_max, 0.1, 80.0)
 
 
 def bryson_objective(vehicle: Vehicle, period: float | None = None) -> Objective:

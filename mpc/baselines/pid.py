@@ -17,7 +17,7 @@ from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
 from mpc.baselines.attitude import LEAST_LIFT, Measured, attitude_for, limit_force, motion_of, prioritised_error
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
-from mpc.baselines.law import FeedbackLaw, Tuned, require_positive, require_within
+from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import Target, target_of
 from mpc.handover import within
 from mpc.obstacles import Shape
@@ -47,18 +47,6 @@ class PIDSettings:
     rate_max: tuple[float, float, float] = (220.0, 220.0, 200.0)  # body rates commanded [deg/s]; PX4's MC_ROLLRATE_MAX
     horizon: int = 10  # N, samples of preview; they give the reference's velocity and acceleration
     bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
-
-    def __post_init__(self) -> None:
-        require_positive("period", self.period)
-        require_positive("velocity_max", self.velocity_max)
-        for name in ("velocity_integral", "rate_integral"):
-            require_within(name, getattr(self, name), 0.0, 1.0 / self.period)
-        for name in ("velocity_derivative", "rate_derivative"):
-            require_within(name, getattr(self, name), 0.0, 0.9)
-        require_within("yaw_weight", self.yaw_weight, 0.05, 1.0)
-        require_within("tilt_max", self.tilt_max, 0.1, 80.0)
-        for rate in self.rate_max:
-            require_positive("rate_max", rate)
 
 
 def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, **others: object) -> PIDSettings:

@@ -118,18 +118,6 @@ class NonlinearSettings:
     ramp: RampSettings | None = None  # of the one that follows changing forces, and fits drag to them; None for none
     solver: str | None = None  # see `mpc.solvers.find_solver`; None for the fastest one for the size
 
-    def __post_init__(self) -> None:
-        for name in ("horizon", "stride", "iterations", "substeps"):
-            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
-                raise ParameterError("controller", name, getattr(self, name), "a whole number >= 1")
-        if not isinstance(self.terminal, str) and not 0.0 <= self.terminal < math.inf:
-            raise ParameterError("controller", "terminal", self.terminal, 'at least 0 and finite, or "lqr"')
-        if self.tilt is not None and not 0.0 < self.tilt < 0.5 * math.pi:
-            raise ParameterError("controller", "tilt", self.tilt, "positive and below pi/2, or None")
-        if self.attitude_error is AttitudeError.DIFFERENCE and np.ndim(self.weights.attitude):
-            rule = 'one number where attitude_error = "difference"'
-            raise ParameterError("controller.weights", "attitude", self.weights.attitude, rule)
-
     def outputs(self) -> tuple[Array, Array]:
         """C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
         weights, difference = self.weights, self.attitude_error is AttitudeError.DIFFERENCE

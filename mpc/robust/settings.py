@@ -62,13 +62,6 @@ class RobustSettings:
     margins: Array | None = None  # (N, n_c) by which the output bounds are tightened; None for none
     terminal: bool = False  # whether the last state has the weight of the hover model's LQR
 
-    def __post_init__(self) -> None:
-        for name in ("rotor_lag", "delay"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ParameterError("controller", name, getattr(self, name), "at least 0 s and finite")
-        if not 0.0 < self.largest_turn < math.inf:
-            raise ParameterError("controller", "largest_turn", self.largest_turn, "positive and finite")
-
 
 @dataclass(frozen=True, kw_only=True)
 class Robust(Bounded):
