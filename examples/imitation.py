@@ -35,7 +35,7 @@ def course(seed: int) -> quadsim.Scenario:
     for axis in ("roll", "pitch"):  # between samples, and beyond the linear model, the teacher is off by some 0.1 deg
         changes |= {f"constraints.{axis}.tolerance": TOLERANCE, f"constraints.{axis}.tolerance_sampled": TOLERANCE}
     every = quadsim.load("paper-constrained").replace(changes)
-    return every.model_copy(update={"constraints": [each for each in every.constraints if "arrival" not in each.name]})
+    return every.altered(constraints=[each for each in every.constraints if "arrival" not in each.name])
 
 
 def features(now: quadsim.Moment, state: Array, preview: Array, hover: float) -> Array:

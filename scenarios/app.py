@@ -1041,7 +1041,7 @@ def scenario(
         raise InputError(f"scenario needs a name or a TOML file, or --schema (there are: {names})")
     whole = loading.assemble(name, changes, seed).resolved.scenario
     if isinstance(whole.reference, Csv):  # another table may take the place of its own
-        whole = whole.model_copy(update={"reference": replace(whole.reference, sha256=None)})
+        whole = whole.altered(reference=replace(whole.reference, sha256=None))
     return results.ScenarioFile(whole.to_toml())
 
 

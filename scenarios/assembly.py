@@ -96,14 +96,14 @@ class Assembly:
     @property
     def resolved(self) -> Assembly:
         """That of the scenario with every number that it leaves to its vehicle: its file alone defines the flight."""
-        return self.of(self.with_vehicle.model_copy(update={"effects": self.effects}))
+        return self.of(self.with_vehicle.altered(effects=self.effects))
 
     @property
     def with_vehicle(self) -> Scenario:
         """The scenario with the numbers of its vehicle's file in it; effects go on taking theirs from the vehicle."""
         numbers = {name: getattr(self.vehicle, name) for name in VEHICLE_UNITS}
-        table = self.scenario.vehicle.model_copy(update=numbers)
-        return self.scenario.model_copy(update={"vehicle": table})
+        table = replace(self.scenario.vehicle, **numbers)
+        return self.scenario.altered(vehicle=table)
 
     # --- vehicle -----------------------------------------------------------------------------------------------------
 

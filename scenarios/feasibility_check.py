@@ -61,7 +61,7 @@ def fitting(assembly: Assembly) -> str:
 
     def smoother(share: float) -> bool:
         changed = replace(scenario.reference, response_time=filtered_by / share)
-        softened = assembly.of(scenario.model_copy(update={"reference": changed}))
+        softened = assembly.of(scenario.altered(reference=changed))
         return not _required(course, softened, duration=duration).problems
 
     if smaller(1.0):

@@ -142,7 +142,7 @@ class Flight(Result):
         from scenarios.infeasibility import diagnose
 
         spec = self.scenario.controller_at(self.unanswered.time)
-        posed = self.scenario.model_copy(update={"controller": spec, "events": []})
+        posed = self.scenario.altered(controller=spec, events=())
         return diagnose(self.unanswered, posed, self.vehicle)
 
     @property

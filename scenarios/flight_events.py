@@ -86,7 +86,7 @@ class FlightEvents:
         self._spec = scenario.controller
         self._plant, self._navigation, self._reference, self._loop = plant, navigation, reference, loop
         self._build = build
-        self._recent: list[Event] = scenario.events  # those that the plant may still have to do with, and others
+        self._recent: list[Event] = [*scenario.events]  # those that the plant may still have to do with, and others
         self.unanswered: InfeasiblePeriod | None = None
         self._due: list[tuple[int, float, SetpointEvent | ControllerEvent, Successor | None]] = []
         for event in scenario.events:
@@ -148,7 +148,7 @@ class FlightEvents:
             substitute = None if event.at < duration else neutral(scenario, event)
             if substitute is not None and substitute not in events:
                 events.insert(0, substitute)
-        return scenario.model_copy(update={"duration": duration, "events": events})
+        return scenario.altered(duration=duration, events=events)
 
     def _stamped(self, event: Event | Mapping[str, Any]) -> Event:
         """An event with the time at which it happens, to act from the first period on that is not observed yet."""
@@ -172,7 +172,7 @@ class FlightEvents:
             changes["duration"] = round(
                 (math.floor(event.at / before.control_period + 1e-6) + 1) * before.control_period, 9
             )
-        scenario = before.model_copy(update=changes)
+        scenario = before.altered(**changes)
         if isinstance(event, _DEPENDENT):
             try:
                 scenario.require_consistent()
@@ -258,7 +258,7 @@ def prepared(assembly: Assembly) -> Scenario:
         *(_fault(scenario, name) for name in get_args(SensorText) if name in names),
     ]
     added = [event for event in possible if event not in scenario.events]
-    return scenario.model_copy(update={"events": [*added, *scenario.events]})  # what the file has at 0 comes after
+    return scenario.altered(events=[*added, *scenario.events])  # what the file has at 0 comes after
 
 
 def neutral(scenario: Scenario, event: Event) -> Event | None:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from pydantic import ValidationError
 
 from mpc.bounded import IN_DEGREES, Bounded, Polytope
 from mpc.constrained import Constrained
@@ -221,8 +220,8 @@ class _Case:
             law = table["controller"]
             table["controller"] = {name: value for name, value in law.items() if name in fields_of(Robust)}
         try:
-            changed = Scenario.read(table).controller
-        except ValidationError:
+            changed = Scenario.parse(table).controller
+        except InputError:
             return None
         assert isinstance(changed, Constrained | Robust)
         return changed

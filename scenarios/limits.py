@@ -39,7 +39,7 @@ def audited(assembly: Assembly) -> tuple[Limit, ...]:
 def with_bounds_stated(assembly: Assembly) -> Scenario:
     """The scenario with its controller's bounds as constraints, for another controller to be held to the same."""
     scenario, bounds = assembly.scenario, assembly.bounds
-    return scenario.model_copy(update={"constraints": [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]})
+    return scenario.altered(constraints=[*_stated(scenario, bounds), *_unnamed(scenario, bounds)])
 
 
 def audit_notes(assembly: Assembly) -> list[str]:

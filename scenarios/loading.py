@@ -96,5 +96,5 @@ def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directo
         locate_files(data, directory)
     scenario = Scenario.parse(data, source=source)
     if directory is not None and isinstance(scenario.reference, Csv):
-        scenario = scenario.model_copy(update={"reference": scenario.reference.located(directory)})
+        scenario = scenario.altered(reference=scenario.reference.located(directory))
     return scenario

@@ -312,4 +312,4 @@ def _allowing(scenario: Scenario, spacing: float) -> Scenario:
         return replace(limit, **tolerances)
 
     limits = [*map(widened, with_bounds_stated(Assembly(scenario)).constraints)]
-    return scenario.model_copy(update={"constraints": limits})
+    return scenario.altered(constraints=limits)

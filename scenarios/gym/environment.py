@@ -283,7 +283,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             if options:
                 raise ParameterError("", "options", options, "absent where nothing varies")
             seed = int(self.np_random.integers(2**31)) if seed is None else seed
-            return self._base.model_copy(update={"seed": seed})
+            return self._base.altered(seed=seed)
         flights = self._plan.spec.flights
         flight = options["flight"] if "flight" in options else int(self.np_random.integers(flights))
         if set(options) - {"flight"} or not (isinstance(flight, int | np.integer) and 0 <= flight < flights):
@@ -371,7 +371,7 @@ def environment_id(name: str) -> str:
 def register_library() -> None:
     """Register the scenarios that ship; they are right, and not checked."""
     for name in scenario_names():
-        scenario = Scenario.read(read_scenario(scenario_path(name), scenario_path))
+        scenario = Scenario.parse(read_scenario(scenario_path(name), scenario_path))
         gymnasium.registry.setdefault(environment_id(name), _specification(scenario, scenario=name))
 
 

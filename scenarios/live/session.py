@@ -123,9 +123,7 @@ class Session:
         self._queue.clear()
         scenarios = [self.scenario]
         if self._against is not None:
-            scenarios.append(
-                with_bounds_stated(Assembly(self.scenario)).model_copy(update={"controller": self._against})
-            )
+            scenarios.append(with_bounds_stated(Assembly(self.scenario)).altered(controller=self._against))
         self.flights = tuple(Rollout(flown, live=True) for flown in scenarios)
         self._held = _Hand()
         self.reason: str | None = None

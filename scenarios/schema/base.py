@@ -1,6 +1,6 @@
 """What all tables of the scenario file share: strictness, kinds of numbers, and how their fields are declared.
 
-A table is a `Spec`, or a settings dataclass of the core, which is then its only declaration; see `quadsim.fields`.
+A table is a frozen dataclass, its only declaration; see `quadsim.fields`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import functools
 from typing import Annotated, Any, Final, TypeGuard, get_type_hints
 
 from annotated_types import DocInfo, Len
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict
 from pydantic.fields import FieldInfo
 
 from quadsim.fields import Number
@@ -25,23 +25,14 @@ _FIRST: Final = {"at": 0, "type": 1}
 """Fields that stand first in a table, which may have been added to those of a dataclass."""
 
 
-class Spec(BaseModel):
-    """A table of the file.
-
-    What a validator raises starts with the name of the field, for `scenarios.schema.problems.describe` to complete.
-    """
-
-    model_config = ConfigDict(frozen=True, **STRICT)
-
-
 def is_table(kind: object) -> TypeGuard[type[Any]]:
     """Whether a type is one of tables."""
-    return isinstance(kind, type) and (issubclass(kind, BaseModel) or dataclasses.is_dataclass(kind))
+    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
 
 
 def fields_of(table: type[Any]) -> dict[str, FieldInfo]:
     """The fields of a table by their names, with types, limits, defaults and descriptions."""
-    return table.model_fields if issubclass(table, BaseModel) else _declared(table)  # type: ignore[arg-type]
+    return _declared(table)  # type: ignore[arg-type]
 
 
 @functools.cache

@@ -12,6 +12,7 @@ from pydantic_core import core_schema
 
 from scenarios.courses.table import DEFAULT, ReferenceTable
 from scenarios.schema.base import fields_of
+from scenarios.schema.problems import adapter
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import headline, is_absent, tables_in
 
@@ -68,7 +69,7 @@ def scenario_schema() -> dict[str, Any]:
         >>> quadsim.scenario_schema()["title"]
         'A quadsim scenario'
     """
-    whole = Scenario.model_json_schema(schema_generator=_SchemaOfToml)
+    whole = adapter(Scenario).json_schema(schema_generator=_SchemaOfToml)
     tables = whole.pop("$defs")
     difference = _loosened(whole)
     ending = {table.__name__ for table in tables_in(ReferenceTable) if hasattr(table, "until")}

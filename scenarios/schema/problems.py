@@ -15,7 +15,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from annotated_types import GroupedMetadata
-from pydantic import BaseModel, Tag, TypeAdapter, ValidationError
+from pydantic import Tag, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, core_schema
 
@@ -202,16 +202,16 @@ def parse_table(kind: type[Table], data: Mapping[str, Any], source: str, *, file
         ScenarioError: naming every field that is wrong; the message starts with `source`.
     """
     try:
-        table: Table = _adapter(cast(Any, kind)).validate_json(json.dumps(data, default=lambda _: math.inf))
+        table: Table = adapter(cast(Any, kind)).validate_json(json.dumps(data, default=lambda _: math.inf))
     except ValidationError as error:
         raise ScenarioError(source, describe_all(error, data, kind, file=file)) from error
     return table
 
 
 @functools.cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    if not issubclass(kind, BaseModel):
-        kind.__pydantic_config__ = STRICT  # of tables within, too
+def adapter(kind: Any) -> TypeAdapter[Any]:
+    """What reads tables of a kind: strictly, and none of their fields unknown."""
+    kind.__pydantic_config__ = STRICT  # of tables within, too
     return TypeAdapter(kind)
 
 

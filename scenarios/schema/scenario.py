@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
+import copy
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
+from dataclasses import dataclass, field, make_dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, get_args, get_type_hints
 
 from annotated_types import Ge, Gt, Le, MaxLen, doc
-from pydantic import BeforeValidator, Field, ValidationError, create_model, model_validator
+from pydantic import BeforeValidator, Field
 
 from mpc.bounded import Polytope
 from mpc.indi import INDISettings
@@ -27,39 +27,47 @@ from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.catalogue import Group
 from scenarios.courses.table import ReferenceTable
 from scenarios.plugin import PluginForce
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, fields_of
+from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES
 from scenarios.schema.controllers import AnyController, changed
 from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
-from scenarios.schema.problems import ScenarioError, describe_all
+from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.settings import set_field
 from scenarios.schema.writing import to_toml
 
 
-class ActualSpec(Spec):
-    """The vehicle as it really is, where that is not as modelled: the plant has it, the controller does not know it."""
+@dataclass(frozen=True, kw_only=True)
+class _Overrides:
+    """Parameters of `quadsim.vehicle.Vehicle`, each of which may be absent; units as in the vehicle's file."""
 
     def overrides(self) -> dict[str, Any]:
         """The parameters that are given."""
-        return self.model_dump(exclude={"file"}, exclude_none=True)
+        values = {name: getattr(self, name) for name in VEHICLE_UNITS}
+        return {name: value for name, value in values.items() if value is not None}
 
 
-class VehicleSpec(ActualSpec):
+_VEHICLE_TYPES: Final = get_type_hints(Vehicle, include_extras=True)
+_PARAMETERS: Final = [(name, _VEHICLE_TYPES[name] | None, field(default=None)) for name in VEHICLE_UNITS]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Modelled(_Overrides):
     """Which vehicle file, and what in it to replace, for the model and the plant alike; units as in the file."""
 
-    file: str = Field(description="a shipped vehicle's name, or a path ending in .toml, relative to the scenario file")
+    file: Annotated[str, doc("a shipped vehicle's name, or a path ending in .toml, relative to the scenario file")]
 
 
-if not TYPE_CHECKING:  # with every parameter of `quadsim.vehicle.Vehicle`, each of which may be absent
-    _PARAMETERS = {
-        name: (field.rebuild_annotation() | None, Field(default=None, description=field.description))
-        for name, field in fields_of(Vehicle).items()
-        if name in VEHICLE_UNITS
-    }
-    ActualSpec, VehicleSpec = (
-        create_model(spec.__name__, __base__=spec, __doc__=spec.__doc__, **_PARAMETERS)
-        for spec in (ActualSpec, VehicleSpec)
+if TYPE_CHECKING:
+    VehicleTable: TypeAlias = _Modelled
+    ActualTable: TypeAlias = _Overrides
+else:
+    VehicleTable = make_dataclass("VehicleTable", _PARAMETERS, bases=(_Modelled,), frozen=True, kw_only=True)
+    ActualTable = make_dataclass("ActualTable", _PARAMETERS, bases=(_Overrides,), frozen=True, kw_only=True)
+    VehicleTable.__doc__ = _Modelled.__doc__
+    ActualTable.__doc__ = (
+        "The vehicle as it really is, where that is not as modelled: the plant has it, the controller does not know it."
     )
+    VehicleTable.__module__ = ActualTable.__module__ = __name__
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,75 +150,99 @@ BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate
 """Signals that controllers may have bounds on."""
 
 
-class Scenario(Spec):
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
     """A flight: what flies, where, by which controller, and what is required of it."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]*$", max_length=80)] = Field(
-        description="letters a-z, digits and . _ -; names the run's directory"
+    name: Annotated[str, MaxLen(80), doc("letters a-z, digits and . _ -; names the run's directory")] = field(
+        metadata={"pattern": r"^[a-z0-9][a-z0-9._-]*$"}
     )
-    description: str = Field(description="one line for `quadsim list`")
-    group: Group = Field(default="other", description="where `quadsim list` shows it: " + ", ".join(get_args(Group)))
-    expect: Verdict = Field(
-        default="satisfied",
-        description="its verdict, if all is right: satisfied (flown to its end, every required constraint holds), "
-        "violated (one does not, the vehicle crashes, or the controller ends in permanent fallback), lost (the flight "
-        "ends early, by a criterion of [lost] or otherwise), incomplete (it ends before the window of one begins)",
-    )
-    duration: Annotated[float, Field(gt=0.0, le=LONGEST_FLIGHT)] = Field(
-        default=math.inf,
-        description="[s] whole control periods; absent: to the end of a course of turns or ramps",
-    )
-    control_period: Annotated[float, Field(gt=0.0, le=10.0)] = Field(
-        description="[s] tau_s, time for which a command is held, a whole number of physics steps"
-    )
-    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = Field(
-        default=0, description="of everything random; recorded with the flight"
-    )
-    log_rate: Annotated[float, Field(ge=0.01, le=1e6)] = Field(
-        default=200.0, description="[Hz] rows of plant.parquet; the audit sees every physics step"
-    )
-    vehicle: VehicleSpec
-    actual: ActualSpec | None = None
+    description: Annotated[str, doc("one line for `quadsim list`")]
+    group: Annotated[Group, doc("where `quadsim list` shows it: " + ", ".join(get_args(Group)))] = "other"
+    expect: Annotated[
+        Verdict,
+        doc(
+            "its verdict, if all is right: satisfied (flown to its end, every required constraint holds), violated "
+            "(one does not, the vehicle crashes, or the controller ends in permanent fallback), lost (the flight ends "
+            "early, by a criterion of [lost] or otherwise), incomplete (it ends before the window of one begins)"
+        ),
+    ] = "satisfied"
+    duration: Annotated[
+        float,
+        Gt(0.0),
+        Le(LONGEST_FLIGHT),
+        doc("[s] whole control periods; absent: to the end of a course of turns or ramps"),
+    ] = math.inf
+    control_period: Annotated[
+        float,
+        Gt(0.0),
+        Le(10.0),
+        doc("[s] tau_s, time for which a command is held, a whole number of physics steps"),
+    ]
+    seed: Annotated[int, Ge(0), Le(LARGEST_SEED), doc("of everything random; recorded with the flight")] = 0
+    log_rate: Annotated[
+        float, Ge(0.01), Le(1e6), doc("[Hz] rows of plant.parquet; the audit sees every physics step")
+    ] = 200.0
+    vehicle: VehicleTable
+    actual: ActualTable | None = None
     initial: Initial = Initial()
     plant: Simulation = Simulation()
     reference: ReferenceTable
     controller: AnyController
-    effects: Effects = Effects()
-    forces: Annotated[list[PluginForce], MaxLen(MOST_ENTRIES)] = Field(
-        default=[], description="forces of one's own on the vehicle, each code that is called once per physics step"
-    )
-    computation: ComputationTime | None = Field(default=None, description="absent: commands take no time")
-    sensors: SensorsSpec | None = Field(default=None, description="absent: the controller receives the true state")
-    estimator: EstimatorSpec | None = Field(
-        default=None, description="absent: the controller receives the sensors' samples as they arrive"
-    )
-    events: Annotated[list[Event], MaxLen(MOST_EVENTS)] = Field(default=[], description="what happens in flight")
+    effects: Effects = field(default_factory=Effects)
+    forces: Annotated[
+        tuple[PluginForce, ...],
+        MaxLen(MOST_ENTRIES),
+        doc("your own forces on the vehicle, each code that is called once per physics step"),
+    ] = ()
+    computation: Annotated[ComputationTime | None, doc("absent: commands take no time")] = None
+    sensors: Annotated[SensorsSpec | None, doc("absent: the controller receives the true state")] = None
+    estimator: Annotated[
+        EstimatorSpec | None, doc("absent: the controller receives the sensors' samples as they arrive")
+    ] = None
+    events: Annotated[tuple[Event, ...], MaxLen(MOST_EVENTS), doc("what happens in flight")] = ()
     lost: Lost = Lost()
-    obstacles: Annotated[list[Annotated[AnyObstacle, Field(discriminator="type")]], MaxLen(MOST_ENTRIES)] = Field(
-        default=[], description="what the vehicle, a ball of its extent, must not touch: a touch is a crash"
-    )
-    corridors: Annotated[list[Corridor], MaxLen(MOST_ENTRIES)] = Field(
-        default=[], description="convex regions to stay in, each for a window of time or of the path"
-    )
-    keep_in: Fence | None = Field(default=None, description="a convex region to stay in throughout; absent: none")
-    constraints: Annotated[list[Limit], MaxLen(MOST_ENTRIES)] = Field(
-        default=[],
-        description="what the flight is audited against beside the controller's own bounds; an entry without bounds "
-        "takes the controller's",
-    )
+    obstacles: Annotated[
+        tuple[Annotated[AnyObstacle, Field(discriminator="type")], ...],
+        MaxLen(MOST_ENTRIES),
+        doc("what the vehicle, a ball of its extent, must not touch: a touch is a crash"),
+    ] = ()
+    corridors: Annotated[
+        tuple[Corridor, ...],
+        MaxLen(MOST_ENTRIES),
+        doc("convex regions to stay in, each for a window of time or of the path"),
+    ] = ()
+    keep_in: Annotated[Fence | None, doc("a convex region to stay in throughout; absent: none")] = None
+    constraints: Annotated[
+        tuple[Limit, ...],
+        MaxLen(MOST_ENTRIES),
+        doc(
+            "what the flight is audited against beside the controller's own bounds; an entry without bounds takes the "
+            "controller's"
+        ),
+    ] = ()
 
-    @model_validator(mode="after")
-    def _check(self) -> Scenario:
-        if math.isinf(self.duration):  # absent, and it stays out of `model_fields_set`
+    def __post_init__(self) -> None:
+        if math.isinf(self.duration):
             until: float | None = getattr(self.reference, "until", None)
             if until is None:
                 raise ValueError("duration is missing")
             periods = math.ceil(until / self.control_period - 1e-6)
-            object.__setattr__(self, "duration", round(periods * self.control_period, 9))
+            vars(self).update(duration=round(periods * self.control_period, 9), ends_with_course=True)
             if self.duration > LONGEST_FLIGHT:
                 raise ValueError(f"duration must be <= {LONGEST_FLIGHT}; the course takes {self.duration}")
         self.require_consistent()
-        return self
+
+    @property
+    def ends_with_course(self) -> bool:
+        """Whether its duration is that of its course, and stated nowhere."""
+        return bool(vars(self).get("ends_with_course", False))
+
+    def altered(self, **fields: Any) -> Scenario:
+        """The same with other values of whole fields, which nothing checks against one another; lists are tuples."""
+        other = copy.copy(self)
+        vars(other).update({name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})
+        return other
 
     def require_consistent(self) -> None:
         """Refuse fields that do not go together, each of which may stand by itself.
@@ -293,24 +325,6 @@ class Scenario(Spec):
                     problems = getattr(error, "problems", (error,))
                     raise ValueError(f"events.{i}.fields: {'; '.join(map(str, problems))}") from error
 
-    @classmethod
-    def read(cls, data: Mapping[str, Any]) -> Scenario:
-        """A scenario of a file's tables.
-
-        They are validated as JSON, where lists are tuples, texts are enumerations' values and tables are dataclasses,
-        and nothing else is converted.  What JSON cannot hold, as dates, is infinite there, which is allowed nowhere.
-
-        Raises:
-            InputError: a number has more digits than can be written.
-        """
-        if isinstance(data.get("controller"), str):
-            data = {**data, "controller": {"type": data["controller"]}}
-        try:
-            text = json.dumps(data, default=lambda _: math.inf)
-        except ValueError as error:
-            raise InputError(f"a scenario must be one that can be written: {error}") from error
-        return cls.model_validate_json(text)
-
     @property
     def controller_changes(self) -> list[tuple[float, AnyController]]:
         """Each controller that takes over from the one before it, and when [s], in order of time."""
@@ -355,10 +369,14 @@ class Scenario(Spec):
         Raises:
             ScenarioError: naming every field that is wrong.
         """
+        if isinstance(data.get("controller"), str):
+            data = {**data, "controller": {"type": data["controller"]}}
         try:
-            return cls.read(data)
-        except ValidationError as error:
-            raise ScenarioError(source, describe_all(error, data, cls)) from error
+            return parse_table(cls, data, source)
+        except ScenarioError:
+            raise
+        except ValueError as error:
+            raise InputError(f"a scenario must be one that can be written: {error}") from error
 
     def replace(self, changes: Mapping[str, Any]) -> Scenario:
         """A scenario that differs in some fields; this one stays as it is.
@@ -378,7 +396,7 @@ class Scenario(Spec):
             (50, 30)
         """
         data = tomllib.loads(self.to_toml())
-        if "duration" not in self.model_fields_set:
+        if self.ends_with_course:
             del data["duration"]
         for path, value in changes.items():
             set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, source="replace")

@@ -6,7 +6,6 @@ A tuning as a page that works offline, and as tables for the terminal.
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,6 +31,7 @@ from scenarios.campaign.store import flown_by
 from scenarios.many import count_workers
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario
+from scenarios.schema.writing import plain
 from scenarios.tuning.search import JOURNAL_FILE, Search, require_optuna
 from scenarios.tuning.tuning_plan import OWN, START, TuningPlan
 
@@ -189,7 +189,7 @@ def _manifest(plan: TuningPlan) -> dict[str, Any]:
     """What is flown, with what."""
     tables = {k: v for k, v in asdict(plan.spec).items() if k not in _MAY_CHANGE}
     campaign = {k: v for k, v in asdict(plan.start.spec).items() if k not in OWN}
-    scenario = json.loads(plan.start.scenario.model_dump_json())  # infinite bounds are null
+    scenario = plain(plan.start.scenario)
     stated = {"format": "quadsim tuning", **tables, "campaign": campaign, "scenario": scenario}
     return {**stated, "optuna": require_optuna().__version__, **flown_by(plan.start)}
 

@@ -199,7 +199,7 @@ def test_what_a_run_records_is_what_its_tables_give(
     Each is flown once: a log holds the plant at the physics rate, whatever the rate of its file.
     """
     flight = fly_once(name)
-    scenario = flight.scenario.model_copy(update={"log_rate": rate})
+    scenario = flight.scenario.altered(log_rate=rate)
     monkeypatch.setattr("scenarios.rollout.Rollout.fly", lambda *_: replace(flight, assembly=Assembly(scenario)))
     out = str(tmp_path / "run")
     status = main(["run", name, "--set", f"log_rate={rate}", *TABLES, "--json", "--out", out])

@@ -24,6 +24,7 @@ from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
+from scenarios.schema.writing import plain
 from scenarios.summary_tables import outcome_line
 
 PILLAR = {"type": "cylinder", "name": "pillar", "position": [1.0, 0.0, 1.0], "radius": 0.1, "height": 3.0}
@@ -71,7 +72,7 @@ def test_tables_become_limits(crashed: Flight) -> None:
     assert [(limit.start, limit.stop) for limit in limits[-2:]] == [(0.0, 1.0), (0.0, np.inf)]
     radius = crashed.vehicle.arm_length + (crashed.vehicle.rotor_radius or 0.0)
     assert all(isinstance(limit, SpaceLimit) and limit.radius == radius and limit.unit == "m" for limit in limits)
-    again = Scenario.parse(scenario({"obstacles": [PILLAR, CRATE], "keep_in": FENCE}).model_dump(mode="json"))
+    again = Scenario.parse(plain(scenario({"obstacles": [PILLAR, CRATE], "keep_in": FENCE})))
     assert again.obstacles[0] == Cylinder(name="pillar", position=(1.0, 0.0, 1.0), radius=0.1, height=3.0)
 
 

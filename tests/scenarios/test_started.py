@@ -60,7 +60,7 @@ INPUTS = st.lists(st.tuples(st.integers(0, PERIODS - 1), st.booleans(), INPUT), 
 def cut(name: str) -> Scenario:
     """A scenario as long as the sessions below, of which the library's events are left."""
     scenario = load_scenario(name, SCENARIOS[name])
-    return scenario.model_copy(update={"duration": round(PERIODS * scenario.control_period, 9)})
+    return scenario.altered(duration=round(PERIODS * scenario.control_period, 9))
 
 
 def assert_same_bits(one: Flight, other: Flight) -> None:

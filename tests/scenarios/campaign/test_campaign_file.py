@@ -132,7 +132,7 @@ def test_campaigns_on_the_same_draws_differ_in_their_controller_alone() -> None:
     paper, robust = load_plan("paper-robustness"), load_plan("paper-robustness-robust")
     assert [paper.identity(k) for k in range(20)] == [robust.identity(k) for k in range(20)]
     other = {name: getattr(paper.of(3), name) for name in ("controller", "name", "description")}
-    assert robust.of(3).model_copy(update=other) == paper.of(3)
+    assert robust.of(3).altered(**other) == paper.of(3)
     assert {field.partition(".")[0] for field, *_ in plan_differences(paper, robust)} == {"controller"}
 
 
