@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from quadsim.assets import models_dir
+from scenarios.assembly import Assembly
 from scenarios.courses.steps import Steps
 from scenarios.export.exporter import c_controller
 from scenarios.loading import load_scenario
-from scenarios.parts.vehicle import build_vehicle
 
 HERE = Path(__file__).resolve().parent
 SITE = HERE.parents[1] / "site"
@@ -67,7 +67,7 @@ def missing() -> str | None:
 def facts() -> dict[str, Any]:
     """The numbers of the paper's flight that the page needs."""
     scenario = load_scenario(CONTROLLERS["constrained"])
-    vehicle, course, controller = build_vehicle(scenario), scenario.reference, scenario.controller
+    vehicle, course, controller = Assembly(scenario).vehicle, scenario.reference, scenario.controller
     assert isinstance(course, Steps)
     assert controller.output_bounds["roll"] == controller.output_bounds["pitch"]
     period = scenario.control_period
