@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 from timing import Record, options, run, step_quantiles, time_in_turns
 
+from mpc.constrained import Constrained
+from mpc.robust.settings import Robust
 from quadsim.controller import ACCEPTED, Command, Controller, Moment
 from quadsim.errors import FlightError, InputError, MissingCoreError, MissingPackageError
 from quadsim.flight.log import ControlLog
@@ -23,8 +25,6 @@ from scenarios.app import load
 from scenarios.assembly import Assembly
 from scenarios.catalogue import read_catalogue
 from scenarios.rollout import Rollout
-from scenarios.schema.controller import ConstrainedSpec
-from scenarios.schema.robust import RobustSpec
 from scenarios.schema.scenario import Scenario
 
 SEGMENT = 20
@@ -79,7 +79,7 @@ def entries(scenario: Scenario) -> dict[str, Scenario]:
 def measure(name: str, quick: bool) -> list[Record]:
     """A record of each solver on a scenario."""
     scenario = load(name)
-    if not isinstance(scenario.controller, ConstrainedSpec | RobustSpec):
+    if not isinstance(scenario.controller, Constrained | Robust):
         raise InputError(f"{name} is flown by no MPC of fixed matrices; choose a constrained or a robust one")
     if quick:
         scenario = scenario.replace({"duration": 2.0, "controller.horizon": 10, "constraints": []})

@@ -6,6 +6,7 @@ draws constraint_cost.png, or the file that is named.
 
 import math
 import sys
+import tomllib
 
 import matplotlib.pyplot as plt
 
@@ -18,7 +19,7 @@ CONSTRAINED = quadsim.load("paper-constrained").replace({"constraints": []})
 
 def without_constraints() -> quadsim.Scenario:
     """The same weights and horizon, a constant gain."""
-    table = CONSTRAINED.model_dump(include={"controller"}, exclude_none=True)["controller"]
+    table = tomllib.loads(CONSTRAINED.to_toml())["controller"]
     kept = {name: table[name] for name in ("horizon", "output_weights", "input_weights")}
     return CONSTRAINED.replace({"controller": {"type": "unconstrained", **kept}})
 

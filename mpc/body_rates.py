@@ -1,7 +1,7 @@
 """Collective thrust and body rates flown by an inner loop: proportional in the rates, on the exact rotor map.
 
 The torque demanded is tau = J k (omega_c - omega) + omega x J omega, so that each rate follows its command as a
-first-order lag of 1/k while rotors have room; thrust is limited before yaw (`mpc.baselines.allocation`).
+first-order lag of 1/k while rotors have room; thrust is limited before yaw (`mpc.allocation`).
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
-from mpc.baselines.allocation import allocate, make_allocation
 from quadsim.controller import Command
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal
 
 import numpy as np
+from annotated_types import doc
 
 from mpc.answer import ActuatorBounds, AnswerCheck, command_of, rejection, shifted
+from mpc.bounded import Bounded, FallbackSettings
 from mpc.handover import resized, within
-from mpc.obstacles import ObstacleQP, Space
+from mpc.obstacles import ObstacleQP, Shape, Space
 from mpc.ocp import InfeasiblePeriod, Problem, Query
 from mpc.paper import rollout
 from mpc.qp import KKT_EVERY
 from mpc.solvers import INVALID_DATA, Answer, Solver
-from quadsim.controller import GROUNDED, Command, Moment, stopped
+from quadsim.controller import GROUNDED, Command, Controller, Moment, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
 
 
 class ConstrainedMPC:
@@ -107,3 +112,22 @@ class ConstrainedMPC:
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
         return rollout(self.problem.model, states, plans)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Constrained(Bounded):
+    """The paper's constrained MPC, the optimum of a QP in every period (Sec. 5)."""
+
+    type: Annotated[Literal["constrained"], doc("the control law, by its name in `quadsim list`")] = "constrained"
+    fallback: Annotated[
+        FallbackSettings | None,
+        doc("absent: the last plan is held, shifted, and then the flight is given up"),
+    ] = None
+
+    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.build`."""
+        law = self.in_c(vehicle, period, shapes)
+        if law is None:
+            problem, space = self.problem(vehicle, period), self.space(shapes, vehicle, period, None)
+            law = ConstrainedMPC(problem, self.make_solver(problem, space), space=space, kkt_every=self.kkt_every)
+        return law if self.fallback is None else self.guarded(law, self.fallback, vehicle, period)

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import numpy as np
 from annotated_types import doc
 
-from mpc.baselines.allocation import allocate, make_allocation
+from mpc.allocation import allocate, make_allocation
 from mpc.handover import hand_over, within
 from quadsim.controller import GROUNDED, Command, Controller, Moment
 from quadsim.fields import Positive

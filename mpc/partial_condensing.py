@@ -117,8 +117,8 @@ class Matrices:
     tail: Array  # (J - 1, M + 1, n, n + M nu) those of the others by [s_j, v_j]
     P: csc_matrix  # cost
     dynamics: csc_matrix  # equality rows
-    rows: csc_matrix  # inequality rows
-    own: QPRows  # what these are
+    G: csc_matrix  # inequality rows
+    rows: QPRows  # what these are
 
 
 def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
@@ -208,8 +208,8 @@ class PartiallyCondensed:
             tail=tail,
             P=self._P.matrix(self._costs(head, tail)),
             dynamics=self._A.matrix(self._dynamics(head, tail)),
-            rows=self._G.matrix(self._inequalities(head, tail, self._rows)),
-            own=self._rows,
+            G=self._G.matrix(self._inequalities(head, tail, self._rows)),
+            rows=self._rows,
         )
 
     def _slopes(self, A: Array, B: Array) -> tuple[Array, Array]:
@@ -241,9 +241,9 @@ class PartiallyCondensed:
 
     def _input_cost(self, steps: int) -> Array:
         """Hessian of the cost of a stage's inputs, of changes both from the stage before and to the one after."""
-        itself, beside = np.eye(steps), np.eye(steps, k=1) + np.eye(steps, k=-1)
-        own = np.kron(itself, self._input_weight + 2.0 * self._move_weight)
-        return np.asarray(own - np.kron(beside, self._move_weight))
+        beside = np.eye(steps, k=1) + np.eye(steps, k=-1)
+        itself = np.kron(np.eye(steps), self._input_weight + 2.0 * self._move_weight)
+        return np.asarray(itself - np.kron(beside, self._move_weight))
 
     def _dynamics(self, head: Array, tail: Array) -> list[Array]:
         """The equality rows' blocks: each stage's end is the next one's start."""
@@ -292,11 +292,11 @@ class PartiallyCondensed:
             A, B, c = query.steps
             matrices = self._built(A, B)
         if problem is not None:
-            own = QPRows(problem)
-            G = self._G.matrix(self._inequalities(matrices.head, matrices.tail, own))
-            matrices = replace(matrices, rows=G, own=own)
+            rows = QPRows(problem)
+            G = self._G.matrix(self._inequalities(matrices.head, matrices.tail, rows))
+            matrices = replace(matrices, G=G, rows=rows)
         state, desired, u_before = query[:3]
-        at, rows, objective = self._at, matrices.own, self._problem.objective
+        at, rows, objective = self._at, matrices.rows, self._problem.objective
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))
         (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
         # Entry i is for x(k+i), i = 0 .. N-1; x(k) itself is past changing, and its slopes are zero.
@@ -323,7 +323,7 @@ class PartiallyCondensed:
             c=gradient,
             A=matrices.dynamics,
             b=np.concatenate([head[:, -1], tail[:, -1]]).ravel(),
-            G=matrices.rows,
+            G=matrices.G,
             h_l=(rows.lower - values).ravel(),
             h_u=(rows.upper - values).ravel(),
             x_l=self._x_l,

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
 import scipy.linalg
+from annotated_types import doc
 
+from mpc.bounded import Weighted
 from mpc.condensing import condensed_cost
+from mpc.obstacles import Shape
 from mpc.ocp import Problem
 from mpc.paper import prediction, rollout
-from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Moment, stopped
+from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Controller, Moment, stopped
+from quadsim.errors import InputError
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,3 +75,20 @@ class UnconstrainedMPC:
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
         return rollout(self.problem.model, states, plans)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unconstrained(Weighted):
+    """The paper's unconstrained MPC, a constant gain (Sec. 4)."""
+
+    type: Annotated[Literal["unconstrained"], doc("the control law, by its name in `quadsim list`")] = "unconstrained"
+
+    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.build`."""
+        try:
+            return self.in_c(vehicle, period) or UnconstrainedMPC(self.problem(vehicle, period))
+        except np.linalg.LinAlgError as error:
+            raise InputError(
+                "the controller's gain cannot be computed: its weights and the vehicle's numbers are too many orders "
+                f"of magnitude apart ({error})"
+            ) from error

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
-from mpc.fallback.settings import FallbackSettings
+from mpc.bounded import Bounded, FallbackSettings, Weighted
 from mpc.flatness import motion_along
 from mpc.solvers import CORE_OR_PIQP
 from quadsim.assets import vehicle_path
@@ -38,18 +38,16 @@ from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicl
 from scenarios.courses.course import Course
 from scenarios.courses.followed import FollowedCourse
 from scenarios.courses.steps import Steps, switches
-from scenarios.limits import audited, controller_bounds, space_limits
-from scenarios.parts.controllers import make_controller, make_problem
-from scenarios.parts.plugin import import_plugin, make_force
+from scenarios.limits import audited, space_limits
+from scenarios.plugin import import_plugin, make_force
 from scenarios.schema.events import Event, SensorFaultEvent, SetpointEvent
-from scenarios.schema.optimisation import BoundedSpec, WeightedSpec
 
 if TYPE_CHECKING:
     from mpc.ocp import Problem
     from quadsim.controller import Controller
     from quadsim.flight.audit import Limit
     from quadsim.motion import Motion
-    from scenarios.schema.controller import ControllerSpec
+    from scenarios.schema.controllers import AnyController
     from scenarios.schema.scenario import Scenario
 
 _SIZES: Final = {
@@ -261,16 +259,14 @@ class Assembly:
 
     # --- controller --------------------------------------------------------------------------------------------------
 
-    def controller(self, spec: ControllerSpec | None = None) -> Controller:
+    def controller(self, spec: AnyController | None = None) -> Controller:
         """The controller, or that of another table, set up and ready to be flown.
 
         Raises:
             InputError: it cannot be made from these numbers, or its code cannot be found or called.
         """
         spec = self.scenario.controller if spec is None else spec
-        return make_controller(
-            spec, self.vehicle, self.scenario.control_period, (*self.scenario.obstacles, *self.regions)
-        )
+        return spec.build(self.vehicle, self.scenario.control_period, (*self.scenario.obstacles, *self.regions))
 
     def problem(self) -> Problem:
         """The controller's optimisation.
@@ -279,21 +275,21 @@ class Assembly:
             InputError: the controller has none.
         """
         spec = self.scenario.controller
-        if not isinstance(spec, WeightedSpec):
+        if not isinstance(spec, Weighted):
             raise ParameterError("controller", "type", spec.type, "one that minimises over a horizon")
-        return make_problem(spec, self.vehicle, self.scenario.control_period)
+        return spec.problem(self.vehicle, self.scenario.control_period)
 
     @cached_property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """See `scenarios.limits.controller_bounds`."""
-        return controller_bounds(self.scenario.controller, self.vehicle)
+        """The bounds that the controller has on signals of the audit, see `mpc.bounded.ControllerTable.audited`."""
+        return self.scenario.controller.audited(self.vehicle)
 
     @cached_property
     def limits(self) -> tuple[Limit, ...]:
         """What the flight is audited against."""
         return audited(self)
 
-    def computation(self, spec: ControllerSpec | None = None) -> Computation | None:
+    def computation(self, spec: AnyController | None = None) -> Computation | None:
         """How long commands of a controller take, of the scenario's by default; None where they take no time."""
         stalls = tuple(event for event in self.scenario.events if isinstance(event, Stall))
         settings = self.scenario.computation
@@ -487,7 +483,7 @@ class Assembly:
 def preferring_core(scenario: Scenario) -> Scenario:
     """The scenario with `core-or-piqp` in place of `piqp`, the default: for where a step's time matters."""
     controller = scenario.controller
-    if isinstance(controller, BoundedSpec) and controller.solver == "piqp":
+    if isinstance(controller, Bounded) and controller.solver == "piqp":
         return scenario.replace({"controller.solver": CORE_OR_PIQP})
     return scenario
 

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mpc.bounded import Bounded
+from mpc.robust.settings import Robust
 from quadsim.errors import ParameterError
 from quadsim.flight.audit import Mask
 from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
@@ -19,8 +21,6 @@ from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course
 from scenarios.courses.smoothing import within_rounding
 from scenarios.schema.events import SetpointEvent
-from scenarios.schema.optimisation import BoundedSpec
-from scenarios.schema.robust import RobustSpec
 
 if TYPE_CHECKING:
     from scenarios.assembly import Assembly
@@ -146,18 +146,16 @@ def _isolated(kinks: Sequence[float], period: float) -> Array:
 
 def _bounds(scenario: Scenario, vehicle: Vehicle) -> tuple[dict[str, Range], dict[str, Range]]:
     """The controller's bounds, and what tightening leaves of those on outputs at the end of the horizon; SI."""
-    from scenarios.parts.controllers import make_bounds, tightening_margins
-
     spec = scenario.controller
-    if not isinstance(spec, BoundedSpec):
+    if not isinstance(spec, Bounded):
         return {}, {}
-    bounds, names = make_bounds(spec), [name for name in STATE_NAMES if name in spec.output_bounds]
+    bounds, names = spec.bounds(), [name for name in STATE_NAMES if name in spec.output_bounds]
     (u_min, u_max), (delta_min, delta_max) = spec.input_bounds.speed, spec.input_bounds.slew
     whole = dict(zip(names, zip(bounds.y_min.tolist(), bounds.y_max.tolist(), strict=True), strict=True))
     inputs = {"speed": (u_min, u_max), "slew": (delta_min, delta_max)}
     margins = None
     with contextlib.suppress(ParameterError):  # which is reported where the controller is made
-        margins = tightening_margins(spec, vehicle, scenario.control_period) if isinstance(spec, RobustSpec) else None
+        margins = spec.margins(vehicle, scenario.control_period) if isinstance(spec, Robust) else None
     if margins is None:
         return whole | inputs, {}
     last = dict(zip(names, margins[-1].tolist(), strict=True))

@@ -26,7 +26,7 @@ from quadsim.sim.loop import ClosedLoop
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing import SensorName
-from scenarios.schema.controller import ControllerSpec, changed
+from scenarios.schema.controllers import AnyController, changed
 from scenarios.schema.events import (
     MOST_EVENTS,
     ControllerEvent,
@@ -52,7 +52,7 @@ _LONGEST: Final = 200
 class Successor:
     """A controller that is ready to take over, and the table of a scenario file that it is made of."""
 
-    spec: ControllerSpec
+    spec: AnyController
     controller: Controller
 
 
@@ -79,7 +79,7 @@ class FlightEvents:
         navigation: Navigation | None,
         reference: FollowedCourse,
         loop: ClosedLoop,
-        build: Callable[[ControllerSpec], Controller] | None,
+        build: Callable[[AnyController], Controller] | None,
     ) -> None:
         """Set up, before the first period; `build` makes a controller, None where the user's own one flies."""
         self.assembly, scenario = assembly, assembly.scenario
@@ -201,7 +201,7 @@ class FlightEvents:
         periods = [period for period in (self.unanswered, unanswered_by(self._loop.controller)) if period is not None]
         return min(periods, key=lambda period: period.converges is not None, default=None)
 
-    def _switch(self, spec: ControllerSpec, ready: Successor | None) -> None:
+    def _switch(self, spec: AnyController, ready: Successor | None) -> None:
         successor = ready if ready is not None and ready.spec == spec else self._built(spec)
         self.unanswered = self.first_unanswered()
         self._loop.switch(successor.controller)
@@ -219,7 +219,7 @@ class FlightEvents:
             self._built(spec)
         self._schedule(event, ready)
 
-    def _built(self, spec: ControllerSpec) -> Successor:
+    def _built(self, spec: AnyController) -> Successor:
         if self._build is None:
             raise ParameterError("event", "type", "controller", "another one where the controller is one's own")
         return Successor(spec=spec, controller=self._build(spec))

@@ -16,18 +16,17 @@ from typing import Any, Final
 import numpy as np
 from pydantic import ValidationError
 
-from mpc.answer import ActuatorBounds
+from mpc.bounded import IN_DEGREES, Bounded, Polytope
+from mpc.constrained import Constrained
 from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
 from mpc.fallback.contract import Guarded
 from mpc.ocp import InfeasiblePeriod
+from mpc.robust.settings import Robust
 from quadsim.errors import InputError
 from quadsim.flight.audit import TERMS, sum_signal
 from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.parts.controllers import make_bounds, make_controller, make_penalty, posed_problem
-from scenarios.schema.controller import ConstrainedSpec
-from scenarios.schema.optimisation import ANGLES, BoundedSpec, PolytopeSpec
-from scenarios.schema.robust import RobustSpec
+from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field, set_field
 
@@ -65,7 +64,7 @@ def diagnose(unanswered: InfeasiblePeriod, scenario: Scenario, vehicle: Vehicle)
     if unanswered.converges is not None:
         return _unconverged(unanswered, unanswered.converges, getattr(scenario.controller, "iterations", 1))
     spec = scenario.controller
-    case = (_Case if isinstance(spec, BoundedSpec) else _OwnCase)(unanswered, scenario, spec, vehicle)
+    case = (_Case if isinstance(spec, Bounded) else _OwnCase)(unanswered, scenario, spec, vehicle)
     conflict = find_conflict(unanswered)
     entries = [] if conflict is None else _merged([*case.entries(conflict)])
     suggestions = [] if conflict is None or conflict.feasible else [*case.suggestions(conflict)]
@@ -114,7 +113,7 @@ class _Case:
             return _Bound(name=name, rotor=rotor, side=which, unit="rad/s", field=field, entry=entry)
         if side.place == 0:
             name = [state for state in STATE_NAMES if state in self._spec.output_bounds][side.row]
-            factor, field = math.degrees(1.0) if name in ANGLES else 1.0, f"controller.output_bounds.{name}"
+            factor, field = math.degrees(1.0) if name in IN_DEGREES else 1.0, f"controller.output_bounds.{name}"
             return _Bound(name=name, side=which, unit=TERMS[name].unit, factor=factor, field=field, entry=entry)
         polytope, name = self._polytope(side), self._unanswered.problem.every_constraint[side.place].name
         if self._is_space(side):
@@ -126,7 +125,7 @@ class _Case:
         name, field = polytope.row_names[side.row], f"controller.polytopes.{polytope.name}.{which}"
         return _Bound(name=name, side=which, unit=unit, field=field, entry=side.row)
 
-    def _polytope(self, side: Side) -> PolytopeSpec | None:
+    def _polytope(self, side: Side) -> Polytope | None:
         name = self._unanswered.problem.every_constraint[side.place].name
         return next((polytope for polytope in self._spec.polytopes if polytope.name == name), None)
 
@@ -180,7 +179,7 @@ class _Case:
         return softened
 
     def _soft(self, tables: Sequence[str]) -> Settings | None:
-        other_law = "controller.soft" in tables and not isinstance(self._spec, RobustSpec)
+        other_law = "controller.soft" in tables and not isinstance(self._spec, Robust)
         law: Settings = {"controller.type": "robust"} if other_law else {}
         return next(filter(self._helps, ({**law, **dict.fromkeys(tables, soft)} for soft in SOFT)), None)
 
@@ -205,27 +204,27 @@ class _Case:
         if spec is None or spec.input_bounds.speed[1] > max(self._vehicle.speed_max, self._spec.input_bounds.speed[1]):
             return False
         try:
-            problem = posed_problem(spec, self._vehicle, self._period)
+            problem = spec.problem(self._vehicle, self._period)
         except InputError:
             return False
         space = tuple(part for part in self._unanswered.problem.constraints if part.C is not None and part.C.ndim == 3)
         if spec.avoidance is not None and (soft := spec.avoidance.soft) is not None:
-            space = tuple(replace(part, penalty=make_penalty(soft, part.lower.shape[1])) for part in space)
+            space = tuple(replace(part, penalty=soft.penalty(part.lower.shape[1])) for part in space)
         return has_answer(replace(problem, constraints=(*problem.constraints, *space)), self._unanswered.query)
 
-    def _changed(self, settings: Settings) -> ConstrainedSpec | RobustSpec | None:
+    def _changed(self, settings: Settings) -> Constrained | Robust | None:
         """The controller with other fields; None where the file would be refused."""
         table = tomllib.loads(self._file)
         for field, value in settings.items():
             set_field(table, field, value, source="diagnosis")
         if "controller.type" in settings:
             law = table["controller"]
-            table["controller"] = {name: value for name, value in law.items() if name in RobustSpec.model_fields}
+            table["controller"] = {name: value for name, value in law.items() if name in fields_of(Robust)}
         try:
             changed = Scenario.read(table).controller
         except ValidationError:
             return None
-        assert isinstance(changed, ConstrainedSpec | RobustSpec)
+        assert isinstance(changed, Constrained | Robust)
         return changed
 
     def _fallback(self) -> Iterator[dict[str, Any]]:
@@ -236,11 +235,11 @@ class _Case:
         settings: Settings = {"controller.fallback": {}}
         changed, query = self._changed(settings), self._unanswered.query
         assert changed is not None
-        law = make_controller(changed, self._vehicle, self._period)
+        law = changed.build(self._vehicle, self._period)
         assert isinstance(law, Guarded)
         target = np.zeros(N_STATES)
         target[[*REFERENCE_STATES]] = query.state[[*REFERENCE_STATES]]
-        bounds = ActuatorBounds.of(make_bounds(changed))
+        bounds = changed.input_bounds.actuators(self._vehicle)
         plan = law.law.plan(query.state[:N_STATES], target, query.u_before, bounds, changed.horizon, law.trim)
         periods = recovery(self._unanswered, plan)
         if periods is not None:

@@ -12,17 +12,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from mpc.bounded import Range
 from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
 from quadsim.report.table import format_number
-from scenarios.schema.controller import NonlinearSpec
 
 if TYPE_CHECKING:
-    from quadsim.vehicle import Vehicle
     from scenarios.assembly import Assembly
-    from scenarios.schema.controller import ControllerSpec
     from scenarios.schema.scenario import Scenario
 
-Range = tuple[float, float]
 COMMANDED: Final = ("speed", "slew")
 SHARE, SHARE_SAMPLED, ROUNDING = 0.01, 0.002, 1e-6
 """Tolerances of bounds that no entry names: shares of half the band, and of commands their rounding [rad/s]."""
@@ -45,21 +42,6 @@ def with_bounds_stated(assembly: Assembly) -> Scenario:
     return scenario.model_copy(update={"constraints": [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]})
 
 
-def controller_bounds(spec: ControllerSpec, vehicle: Vehicle) -> dict[str, Range]:
-    """The bounds that a controller has on signals of the audit, hard or soft, in their units."""
-    bounds: dict[str, Range] = {name: (pair[0], pair[1]) for name, pair in getattr(spec, "output_bounds", {}).items()}
-    if isinstance(spec, NonlinearSpec) and spec.tilt is not None:
-        bounds["tilt"] = (-math.inf, spec.tilt)
-    if isinstance(spec, NonlinearSpec) and spec.body_rate is not None:
-        largest = spec.body_rate if isinstance(spec.body_rate, list) else [spec.body_rate] * 3
-        bounds |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", largest, strict=True)}
-    inputs = getattr(spec, "input_bounds", None)
-    if inputs is not None:
-        pairs = {"speed": inputs.speed or (vehicle.speed_min, vehicle.speed_max), "slew": inputs.slew}
-        bounds |= {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
-    return bounds
-
-
 def audit_notes(assembly: Assembly) -> list[str]:
     """What a reader of the audit has to know: bounds that no constraint names, and others than the controller's."""
     scenario, vehicle, bounds = assembly.scenario, assembly.vehicle, assembly.bounds
@@ -75,7 +57,7 @@ def audit_notes(assembly: Assembly) -> list[str]:
     if absent:
         notes.append(f"{', '.join(absent)}: not audited, the controller has no such bound and the entry states none")
     audited = [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]
-    changes = [(0.0, bounds)] + [(at, controller_bounds(spec, vehicle)) for at, spec in scenario.controller_changes]
+    changes = [(0.0, bounds)] + [(at, spec.audited(vehicle)) for at, spec in scenario.controller_changes]
     for limit in audited:
         for (at, now), (_, before) in zip(changes, [(0.0, {}), *changes], strict=False):
             pair = now.get(limit.signal)

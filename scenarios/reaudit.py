@@ -29,9 +29,10 @@ from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly
 from scenarios.loading import parse_scenario
+from scenarios.plugin import is_plugin
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.bases import read_whole
-from scenarios.schema.plugin import LAWS, is_plugin
+from scenarios.schema.controllers import LAWS
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import leaves
 

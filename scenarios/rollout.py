@@ -16,15 +16,15 @@ from quadsim.controller import Command, Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import audit, smallest_margins
 from quadsim.sim.effects import Force
-from quadsim.sim.loop import ClosedLoop, Observation, Reference, Sample, complete, one_period
+from quadsim.sim.loop import ClosedLoop, Reference, complete
 from quadsim.sim.navigation import Navigation
+from quadsim.sim.physics import FlownPeriod, Observation, one_period
 from quadsim.sim.plant import Plant
 from quadsim.state import Array
 from scenarios.assembly import Assembly
 from scenarios.flight import Flight
 from scenarios.flight_events import FlightEvents, Successor, prepared
 from scenarios.progress import Progress, silent
-from scenarios.schema.controller import NonlinearSpec
 from scenarios.schema.events import ControllerEvent, Event
 from scenarios.schema.scenario import LONGEST_FLIGHT, MOST_STEPS, Scenario
 
@@ -61,7 +61,7 @@ def closed_loop(
 def needs_quaternions(scenario: Scenario) -> bool:
     """Whether one of its controllers flies at any attitude."""
     specs = (scenario.controller, *(spec for _, spec in scenario.controller_changes))
-    return any(isinstance(spec, NonlinearSpec) for spec in specs)
+    return any(spec.any_attitude for spec in specs)
 
 
 @contextlib.contextmanager
@@ -188,7 +188,7 @@ class Rollout:
         """
         return self.loop.observation
 
-    def step(self, command: Command | Array | None = None) -> Sample:
+    def step(self, command: Command | Array | None = None) -> FlownPeriod:
         """Fly one control period.
 
         Args:
@@ -253,7 +253,7 @@ class Rollout:
         """
         return self._events.successor(fields)
 
-    def margins(self, sample: Sample | None = None) -> dict[str, float]:
+    def margins(self, sample: FlownPeriod | None = None) -> dict[str, float]:
         """The signed margin of each constraint at its worst within one period; negative = violated.
 
         At the physics rate, begin and end included, in the constraint's unit; NaN outside its time window.
@@ -266,7 +266,7 @@ class Rollout:
             raise InputError("no period has been flown yet")
         return smallest_margins(one_period(sample, self._plant.timestep), self.limits)
 
-    def violations(self, sample: Sample | None = None) -> dict[str, float]:
+    def violations(self, sample: FlownPeriod | None = None) -> dict[str, float]:
         """How far each constraint is exceeded beyond its tolerance within one period: g <= 0 where it holds.
 
         In its unit, at its worst; minus infinity outside its time window.

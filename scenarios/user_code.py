@@ -8,8 +8,9 @@ from typing import Any
 from quadsim.controller import Controller
 from quadsim.sim.effects import Force
 from scenarios.assembly import Assembly
-from scenarios.parts.plugin import import_plugin, make_force, make_law, refer_to, require_importable
+from scenarios.plugin import import_plugin, make_force, make_law, refer_to, require_importable
 from scenarios.schema.scenario import Scenario
+from scenarios.schema.writing import plain
 
 
 def named(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:
@@ -19,10 +20,10 @@ def named(scenario: Scenario, controller: object, forces: Sequence[object] = ())
     if isinstance(controller, str):
         changes["controller"] = {"type": controller, "horizon": horizon}
     elif controller is not None:
-        changes["controller"] = refer_to(controller, horizon).model_dump(exclude_none=True)
+        changes["controller"] = plain(refer_to(controller, horizon))
     if forces:
         specs = [*scenario.forces, *(refer_to(force) for force in forces)]
-        changes["forces"] = [spec.model_dump(exclude_none=True, exclude={"horizon"}) for spec in specs]
+        changes["forces"] = [{name: part for name, part in plain(spec).items() if name != "horizon"} for spec in specs]
     return scenario.replace(changes) if changes else scenario
 
 

@@ -72,8 +72,9 @@ def test_the_lines_of_the_readme_are_those_of_the_example(
     assert "my-controller" in capsys.readouterr().out
 
 
-def test_the_scenarios_of_the_page_on_controllers_fly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    page = (ROOT / "docs" / "controllers.md").read_text(encoding="utf-8")
+def test_the_scenarios_of_the_pages_on_controllers_fly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("controllers", "linear", "robust")
+    page = "".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8") for name in names)
     monkeypatch.chdir(EXAMPLES)
     blocks = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
     assert len(blocks) == 5

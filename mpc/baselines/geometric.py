@@ -7,13 +7,15 @@ Subject to Rotor Drag for Accurate Tracking of High-Speed Trajectories", 2018.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
+from annotated_types import Len, doc
 
+from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
-from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.attitude import (
     LEAST_LIFT,
     Measured,
@@ -25,13 +27,16 @@ from mpc.baselines.attitude import (
     wanted_attitude,
 )
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for
-from mpc.baselines.law import FeedbackLaw, require_positive, require_within
+from mpc.baselines.law import FeedbackLaw, Tuned, require_positive
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import within
+from mpc.indi import Incremental, INDISettings
 from mpc.nonlinear.model import zero
-from quadsim.controller import Command, Moment, Phase
+from mpc.obstacles import Shape
+from quadsim.controller import Command, Controller, Moment, Phase
 from quadsim.errors import ParameterError
+from quadsim.fields import NonNegative
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -62,17 +67,6 @@ class GeometricSettings:
     disturbance: RampSettings | None = None  # of the observer of what the model misses; None for none
     horizon: int = 10  # N, samples of preview; they give the reference's velocity and acceleration
     bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
-
-    def __post_init__(self) -> None:
-        for name in ("period", "k_x", "k_v", "k_R", "k_Omega", "c_1", "c_2", "sigma", "sigma_R"):
-            require_positive(name, getattr(self, name))
-        for name in ("k_i", "k_I"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ParameterError("controller", name, getattr(self, name), "at least 0 and finite")
-        require_within("yaw_share", self.yaw_share, 0.05, 1.0)
-        require_within("tilt_max", self.tilt_max, 0.1, 80.0)
-        if any(self.drag) and not self.feedforward:
-            raise ParameterError("controller", "drag", self.drag, "zero where feedforward is not true")
 
 
 def geometric_settings(
@@ -277,3 +271,42 @@ def _heading(yaw: float, target: Target) -> Array:
         np.array([-math.sin(heading), math.cos(heading), 0.0]),
     )
     return np.stack([along, rate * across, acceleration * across - rate**2 * along])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Geometric(Tuned):
+    """Geometric tracking on SE(3)."""
+
+    type: Annotated[Literal["geometric"], doc("the control law, by its name in `quadsim list`")] = "geometric"
+    integral: Annotated[bool, doc("whether position and attitude errors are integrated")] = False
+    feedforward: Annotated[
+        bool, doc("whether the reference's jerk and snap are fed forward, and drag, by differential flatness")
+    ] = False
+    drag: Annotated[
+        tuple[NonNegative, ...],
+        Len(3, 3),
+        doc("[1/s] linear drag along body x, y, z that feedforward takes into account"),
+    ] = (0.0, 0.0, 0.0)
+    disturbance: Annotated[RampSettings | None, doc("absent: what the model misses is not observed")] = None
+    indi: Annotated[INDISettings | None, doc("absent: rotors hold the commands for a period")] = None
+
+    def __post_init__(self) -> None:
+        if any(self.drag) and not self.feedforward:
+            raise ParameterError("", "drag", [*self.drag], "zero where feedforward is not true")
+        if self.feedforward and self.horizon <= PREVIEW_DEGREE:
+            rule = f"at least {PREVIEW_DEGREE + 1} where feedforward is true"
+            raise ParameterError("", "horizon", self.horizon, rule)
+
+    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.build`."""
+        settings = geometric_settings(
+            vehicle,
+            lag=self.lag,
+            integral=self.integral,
+            feedforward=self.feedforward,
+            drag=self.drag,
+            disturbance=self.disturbance,
+            **self.shared(vehicle, period),
+        )
+        law = GeometricController(vehicle, settings)
+        return law if self.indi is None else Incremental(law, vehicle, self.indi, law.bounds)

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Final
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
 
 import numpy as np
+from annotated_types import Ge, Le, doc
 
 from mpc.answer import ActuatorBounds
-from mpc.baselines.preview import differentiator
+from mpc.baselines.preview import SMALLEST_PREVIEW, differentiator
+from mpc.bounded import LARGEST_HORIZON, ControllerTable, InputBounds, Range
 from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model
 from quadsim.controller import GROUNDED, Command, Moment, stopped
 from quadsim.errors import CommandError, ParameterError
+from quadsim.fields import NonNegative
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
 
@@ -26,16 +30,6 @@ def require_positive(name: str, value: float) -> None:
     """
     if not 0.0 < value < math.inf:
         raise ParameterError("controller", name, value, "positive and finite")
-
-
-def require_within(name: str, value: float, lower: float, upper: float) -> None:
-    """A setting that has to be between two numbers.
-
-    Raises:
-        ParameterError: it is not.
-    """
-    if not lower <= value <= upper:
-        raise ParameterError("controller", name, value, f"between {lower:g} and {upper:g}")
 
 
 class FeedbackLaw(ABC):
@@ -87,3 +81,39 @@ class FeedbackLaw(ABC):
         plan = np.tile(self.model.u_bar, (self.horizon, 1))
         plan[0] = speeds
         return Command(speeds=speeds.copy(), plan=plan)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Baseline(ControllerTable):
+    """The table of a law to compare an MPC with; every field has a default."""
+
+    horizon: Annotated[
+        int,
+        Ge(SMALLEST_PREVIEW),
+        Le(LARGEST_HORIZON),
+        doc("[periods] N, of the reference ahead, which give its velocity and acceleration"),
+    ] = 10
+    input_bounds: Annotated[
+        InputBounds | None,
+        doc("what commands are held to; absent: the speeds that the vehicle's rotors hold, and any step"),
+    ] = None
+    tilt: Annotated[float, Ge(0.1), Le(80.0), doc("[deg] largest tilt commanded")] = 45.0
+
+    def audited(self, vehicle: Vehicle) -> dict[str, Range]:
+        """See `mpc.bounded.ControllerTable.audited`."""
+        return {} if self.input_bounds is None else self.input_bounds.audited(vehicle)
+
+    def shared(self, vehicle: Vehicle, period: float) -> dict[str, Any]:
+        """What the settings of all these laws have in common."""
+        bounds = None if self.input_bounds is None else self.input_bounds.actuators(vehicle)
+        return {"period": period, "horizon": self.horizon, "tilt_max": self.tilt, "bounds": bounds}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuned(Baseline):
+    """One whose gains follow from the period and a lag."""
+
+    lag: Annotated[
+        NonNegative | None,
+        doc("[s] lag of rotors and computer that gains allow for; absent: the vehicle's, or half a period"),
+    ] = None

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
+from annotated_types import Ge, Le, Len, doc
 
+from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
-from mpc.baselines.allocation import allocate, make_allocation
-from mpc.baselines.law import FeedbackLaw, require_within
+from mpc.baselines.law import Baseline, FeedbackLaw
 from mpc.baselines.preview import wrapped
+from mpc.bounded import InputWeights, objective_of, require_states
 from mpc.heading import turn_horizontally
 from mpc.model import LinearModel, continuous_model, discretise, hover_model, lqr
+from mpc.obstacles import Shape
 from mpc.ocp import Objective
-from quadsim.controller import Command, Moment
+from quadsim.controller import Command, Controller, Moment
 from quadsim.errors import ParameterError
+from quadsim.fields import Weight
 from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, STATE_NAMES, VELOCITY, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -45,10 +50,6 @@ class LQRSettings:
     """Largest tilt that errors of x, y and their rates demand [deg], or None.  The law is linear: without a limit a
     large error demands more tilt than the model, or the vehicle, tolerates."""
     bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
-
-    def __post_init__(self) -> None:
-        if self.tilt_max is not None:
-            require_within("tilt_max", self.tilt_max, 0.1, 80.0)
 
 
 def bryson_objective(vehicle: Vehicle, period: float | None = None) -> Objective:
@@ -170,3 +171,36 @@ class LQR(FeedbackLaw):
             return speeds
         # Thrust goes with the square; a speed below zero demands what no rotor gives, and counts with its sign.
         return allocate(self._allocation, self._allocation.M @ (speeds * np.abs(speeds)), lower, upper)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LQRTable(Baseline):
+    """LQR over an infinite horizon on the hover model."""
+
+    type: Annotated[Literal["lqr"], doc("the control law, by its name in `quadsim list`")] = "lqr"
+    output_weights: Annotated[
+        Annotated[dict[str, Weight], Len(1)] | None,
+        doc(
+            "diagonal of Q_y [1/unit of the state^2, rad for angles], of states by their names; absent: Bryson's rule "
+            "for all twelve and the inputs"
+        ),
+    ] = None
+    input_weights: Annotated[
+        InputWeights | None, doc("[1/(rad/s)^2] diagonal of Q_u; given where output_weights are")
+    ] = None
+    heading: Annotated[bool, doc("whether errors are turned into axes along the present yaw")] = True
+    tilt: Annotated[float, Ge(0.1), Le(80.0), doc("[deg] largest tilt commanded for position errors")] = 30.0
+
+    def __post_init__(self) -> None:
+        if (self.output_weights is None) != (self.input_weights is None):
+            raise ValueError("input_weights must be given where output_weights are, and nowhere else")
+        require_states(self.output_weights or {}, "output_weights")
+
+    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.build`."""
+        if self.output_weights is None or self.input_weights is None:
+            objective = bryson_objective(vehicle, period)
+        else:
+            objective = objective_of(self.output_weights, self.input_weights)
+        settings = LQRSettings(objective=objective, heading_frame=self.heading, **self.shared(vehicle, period))
+        return LQR(vehicle, settings)

@@ -6,19 +6,23 @@ The structure is PX4's (PositionControl, AttitudeControl, RateControl); ArduPilo
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Annotated, Final, Literal
 
 import numpy as np
+from annotated_types import doc
 
+from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
-from mpc.baselines.allocation import allocate, make_allocation
 from mpc.baselines.attitude import LEAST_LIFT, Measured, attitude_for, limit_force, motion_of, prioritised_error
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
-from mpc.baselines.law import FeedbackLaw, require_positive, require_within
+from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import Target, target_of
 from mpc.handover import within
-from quadsim.controller import Command, Moment, Phase
+from mpc.obstacles import Shape
+from quadsim.controller import Command, Controller, Moment, Phase
+from quadsim.fields import Positive
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -43,18 +47,6 @@ class PIDSettings:
     rate_max: tuple[float, float, float] = (220.0, 220.0, 200.0)  # body rates commanded [deg/s]; PX4's MC_ROLLRATE_MAX
     horizon: int = 10  # N, samples of preview; they give the reference's velocity and acceleration
     bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
-
-    def __post_init__(self) -> None:
-        require_positive("period", self.period)
-        require_positive("velocity_max", self.velocity_max)
-        for name in ("velocity_integral", "rate_integral"):
-            require_within(name, getattr(self, name), 0.0, 1.0 / self.period)
-        for name in ("velocity_derivative", "rate_derivative"):
-            require_within(name, getattr(self, name), 0.0, 0.9)
-        require_within("yaw_weight", self.yaw_weight, 0.05, 1.0)
-        require_within("tilt_max", self.tilt_max, 0.1, 80.0)
-        for rate in self.rate_max:
-            require_positive("rate_max", rate)
 
 
 def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, **others: object) -> PIDSettings:
@@ -183,3 +175,16 @@ def force_within(force: Array, *, weight: float, largest: float, tilt: float) ->
     allowed = min(math.sqrt(largest**2 - upward**2), upward * math.tan(tilt))
     share = 1.0 if horizontal <= allowed else allowed / horizontal
     return np.array([share * upright[0], share * upright[1], upward])
+
+
+@dataclass(frozen=True, kw_only=True)
+class PID(Tuned):
+    """Cascaded PID as autopilots fly it."""
+
+    type: Annotated[Literal["pid"], doc("the control law, by its name in `quadsim list`")] = "pid"
+    velocity: Annotated[Positive, doc("[m/s] largest velocity commanded")] = 12.0
+
+    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.build`."""
+        shared = self.shared(vehicle, period)
+        return CascadedPID(vehicle, pid_settings(vehicle, lag=self.lag, velocity_max=self.velocity, **shared))

@@ -22,8 +22,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mpc.bounded import by_group
 from mpc.equilibrium import Trim
-from mpc.fallback.settings import by_group
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
 from quadsim.controller import Moment

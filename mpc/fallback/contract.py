@@ -27,11 +27,10 @@ from typing import Any, Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds, rejection, shifted
+from mpc.bounded import USUAL_TILT, FallbackSettings
 from mpc.equilibrium import Trim
 from mpc.fallback.completion import PLAUSIBLE_REFERENCE, CompletedMoment, StateCompletion, completed_moment
 from mpc.fallback.hover import HoverLaw
-from mpc.fallback.settings import USUAL_TILT
-from mpc.fallback.settings import FallbackSettings as FallbackSettings
 from mpc.handover import hand_over, resized, within
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel

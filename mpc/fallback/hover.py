@@ -21,8 +21,8 @@ from typing import Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds
+from mpc.bounded import by_group
 from mpc.equilibrium import Trim
-from mpc.fallback.settings import by_group
 from mpc.heading import anchored, slope, turn_horizontally
 from mpc.model import LinearModel, lqr
 from quadsim.state import INDEX, POSITION, VELOCITY, Array, read_only

@@ -4,19 +4,54 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
 
 import numpy as np
-from annotated_types import Len, doc
+from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 
+from mpc.bounded import (
+    MOST_ENTRIES,
+    USUAL_FALLBACK,
+    Avoidance,
+    ControllerTable,
+    FallbackSettings,
+    Horizon,
+    KktEvery,
+    Lag,
+    Polytope,
+    Range,
+    RotorBounds,
+    Soft,
+    ranges,
+    require_lag,
+    require_ordered,
+    require_solver,
+    resolved_lag,
+    rows_of,
+    selection,
+)
+from mpc.constraints import Constraint
 from mpc.disturbance import RampSettings
+from mpc.indi import INDISettings
 from mpc.nonlinear.rigidbody import Inputs
 from mpc.observer import ObserverSettings
+from mpc.qp import KKT_EVERY
+from mpc.solvers import CORE_OR_PIQP, SOLVERS
+from quadsim.controller import CORE, Controller
 from quadsim.errors import ParameterError
-from quadsim.fields import NonNegative, Weight
+from quadsim.fields import NonNegative, Pair, Positive, Weight
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from mpc.obstacles import Shape
+
+LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states that are so of the quaternion model too
+VEHICLES_SPEEDS: Final = RotorBounds()
+Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
+Rates = Positive | Annotated[tuple[Positive, ...], Len(3, 3)]
 
 AxisWeights = Weight | Annotated[Sequence[Weight], Len(3, 3)]
 """One weight for three axes, or one each."""
@@ -69,31 +104,19 @@ class NonlinearSettings:
     substeps: int = 1  # Runge-Kutta steps from one node to the next
     inputs: Inputs = Inputs.THRUST  # what the inputs are shares of the largest of
     rotor_lag: float | None = None  # time constant of the rotors' thrusts or speeds [s]; None for none
-    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # linear, that the model knows, body axes [N s/m]
-    quadratic_drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # in each component of the velocity [N s^2/m^2]
+    drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # linear, that the model knows, body axes [N s/m]
+    quadratic_drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # in each component of the velocity [N s^2/m^2]
     attitude_error: AttitudeError = AttitudeError.ERROR_STATE  # what the weight of the attitude is of
     weights: Weights = _USUAL  # what distances from the reference cost
     terminal: float | str = (
         0.0  # the last state's weight over the others', 0 for none; "lqr" for the Riccati equation's
     )
     tilt: float | None = None  # largest angle between thrust axis and vertical [rad], below pi/2; None for no bound
-    largest_rates: tuple[float, float, float] = (math.inf, math.inf, math.inf)  # body rates [rad/s]
+    largest_rates: tuple[float, ...] = (math.inf, math.inf, math.inf)  # body rates [rad/s]
     soft: tuple[float, float] | None = None  # (l1, l2) of exceeding these by 1 rad or 1 rad/s; None for hard bounds
     observer: ObserverSettings | None = None  # of the disturbance observer; None for no offset-free tracking
     ramp: RampSettings | None = None  # of the one that follows changing forces, and fits drag to them; None for none
     solver: str | None = None  # see `mpc.solvers.find_solver`; None for the fastest one for the size
-
-    def __post_init__(self) -> None:
-        for name in ("horizon", "stride", "iterations", "substeps"):
-            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
-                raise ParameterError("controller", name, getattr(self, name), "a whole number >= 1")
-        if not isinstance(self.terminal, str) and not 0.0 <= self.terminal < math.inf:
-            raise ParameterError("controller", "terminal", self.terminal, 'at least 0 and finite, or "lqr"')
-        if self.tilt is not None and not 0.0 < self.tilt < 0.5 * math.pi:
-            raise ParameterError("controller", "tilt", self.tilt, "positive and below pi/2, or None")
-        if self.attitude_error is AttitudeError.DIFFERENCE and np.ndim(self.weights.attitude):
-            rule = 'one number where attitude_error = "difference"'
-            raise ParameterError("controller.weights", "attitude", self.weights.attitude, rule)
 
     def outputs(self) -> tuple[Array, Array]:
         """C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
@@ -106,3 +129,184 @@ class NonlinearSettings:
 
 def _three(weight: AxisWeights) -> Array:
     return np.broadcast_to(np.asarray(weight, float), 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nonlinear(ControllerTable):
+    """Nonlinear MPC at any attitude: steps of sequential quadratic programming in every period."""
+
+    any_attitude: ClassVar = True
+
+    type: Annotated[Literal["nonlinear"], doc("the control law, by its name in `quadsim list`")] = "nonlinear"
+    horizon: Annotated[Horizon, doc("[periods] how far it looks ahead, a whole number of nodes")] = 20
+    node: Annotated[Positive | None, doc("[s] from one node to the next, whole periods; absent: one period")] = None
+    iterations: Annotated[
+        int,
+        Ge(1),
+        Le(100),
+        doc("most steps of sequential quadratic programming in a period; 1: the real-time iteration"),
+    ] = 1
+    shift: Annotated[
+        bool | None, doc("whether the last plan is shifted by a node; absent: where a node is one period")
+    ] = None
+    substeps: Annotated[int, Ge(1), Le(100), doc("Runge-Kutta steps per node")] = 1
+    inputs: Annotated[Literal["thrust", "speed"], doc("what the inputs are, as shares of the rotors' largest")] = (
+        "thrust"
+    )
+    weights: Weights = _USUAL
+    attitude_error: Annotated[
+        Literal["error-state", "difference"],
+        doc(
+            "error-state: twice the vector part of q_r* q, the angle to first order; difference: the four components "
+            "of q - q_r"
+        ),
+    ] = "error-state"
+    terminal: Annotated[
+        NonNegative | Literal["none", "lqr"],
+        doc("weight of the last node: none, lqr, or a factor on that of the others"),
+    ] = "none"
+    rotor_lag: Annotated[
+        Lag,
+        doc('[s] time constant by which rotors follow that is predicted, 0 for none; "vehicle": its rotor_rise'),
+    ] = 0.0
+    drag: Annotated[Drag, doc("[N s/m] linear drag that is predicted, along body x, y, z")] = (0.0, 0.0, 0.0)
+    quadratic_drag: Annotated[Drag, doc("[N s^2/m^2] the same, of each component's square")] = (0.0, 0.0, 0.0)
+    output_bounds: Annotated[
+        dict[str, Pair], doc("[m, m/s] lower and upper bound, of positions and velocities by their states' names")
+    ] = field(default_factory=dict)
+    tilt: Annotated[
+        Annotated[float, Gt(0.0), Lt(90.0)] | None,
+        doc("[deg] largest angle between thrust axis and vertical; absent: no bound"),
+    ] = None
+    body_rate: Annotated[
+        Rates | None, doc("[deg/s] largest magnitude, one or about body x, y, z; absent: no bound")
+    ] = None
+    soft: Annotated[Soft | None, doc("of the three above; absent: hard")] = None
+    avoidance: Annotated[
+        Avoidance | None,
+        doc("absent: it knows of no obstacles, corridors or fence, which are audited all the same"),
+    ] = None
+    polytopes: Annotated[
+        tuple[Polytope, ...],
+        MaxLen(MOST_ENTRIES),
+        doc("bounds on sums of positions, velocities and, as inputs, rotor speeds; audited as well"),
+    ] = ()
+    offset_free: ObserverSettings | None = None
+    disturbance: Annotated[
+        RampSettings | None,
+        doc("absent: no drag is fitted, no changing force followed; not beside offset_free"),
+    ] = None
+    indi: Annotated[INDISettings | None, doc("absent: rotors hold the commands for a period")] = None
+    input_bounds: RotorBounds = VEHICLES_SPEEDS
+    fallback: FallbackSettings = USUAL_FALLBACK
+    kkt_every: KktEvery = KKT_EVERY
+    solver: Annotated[str | None, doc("QP solver, by its name in `quadsim list`; absent: the fastest for the size")] = (
+        field(default=None, metadata={"json_schema_extra": {"examples": [*SOLVERS]}})
+    )
+
+    def __post_init__(self) -> None:
+        if self.solver is not None:
+            require_solver(self.solver)
+            if self.solver in (CORE, CORE_OR_PIQP):
+                rule = "a QP solver: the core takes no models that change"
+                raise ParameterError("", "solver", self.solver, rule)
+        require_lag(self.rotor_lag)
+        if self.attitude_error == "difference" and not isinstance(self.weights.attitude, float):
+            rule = 'one number where attitude_error = "difference"'
+            raise ParameterError("", "weights.attitude", self.weights.attitude, rule)
+        if self.offset_free is not None and self.disturbance is not None:
+            raise ValueError("disturbance must be absent where offset_free is given: both estimate the same force")
+        for name, pair in self.output_bounds.items():
+            if name not in LINEAR:
+                rule = f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
+                raise ValueError(rule)
+            require_ordered(f"output_bounds.{name}", pair)
+        if self.inputs == "thrust" and self.input_bounds.slew is not None:
+            raise ValueError(
+                'input_bounds.slew must be absent where inputs = "thrust", in which steps of speeds are not linear: '
+                f'inputs = "speed"; got {[*self.input_bounds.slew]}'
+            )
+
+    def audited(self, vehicle: Vehicle) -> dict[str, Range]:
+        """See `mpc.bounded.ControllerTable.audited`."""
+        bounds = ranges(self.output_bounds)
+        if self.tilt is not None:
+            bounds["tilt"] = (-math.inf, self.tilt)
+        if self.body_rate is not None:
+            rates = _three(self.body_rate).tolist()
+            bounds |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", rates, strict=True)}
+        return bounds | self.input_bounds.audited(vehicle)
+
+    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.build`."""
+        from mpc.indi import Incremental
+        from mpc.nonlinear.controller import NonlinearMPC
+
+        stride, space = self._stride(period), None
+        if self.avoidance is not None:
+            space = self.avoidance.space(
+                shapes,
+                vehicle,
+                period=stride * period,
+                horizon=self.horizon // stride,
+                positions=(0, 1, 2),
+                largest=True,
+            )
+        bounds = self.input_bounds.actuators(vehicle)
+        mpc = NonlinearMPC(
+            vehicle,
+            period=period,
+            settings=self.settings(vehicle, stride),
+            bounds=bounds,
+            constraints=self._rows(),
+            space=space,
+            kkt_every=self.kkt_every,
+        )
+        law = self.fallback.around(mpc, bounds, vehicle, period)
+        return law if self.indi is None else Incremental(law, vehicle, self.indi, bounds)
+
+    def settings(self, vehicle: Vehicle, stride: int) -> NonlinearSettings:
+        """The same in SI units, of nodes of `stride` periods."""
+        return NonlinearSettings(
+            horizon=self.horizon // stride,
+            stride=stride,
+            iterations=self.iterations,
+            shift=self.shift,
+            substeps=self.substeps,
+            inputs=Inputs(self.inputs),
+            rotor_lag=resolved_lag(self.rotor_lag, vehicle),
+            drag=self.drag,
+            quadratic_drag=self.quadratic_drag,
+            attitude_error=AttitudeError(self.attitude_error),
+            weights=self.weights,
+            terminal=0.0 if self.terminal == "none" else self.terminal,
+            tilt=None if self.tilt is None else math.radians(self.tilt),
+            largest_rates=tuple(np.radians(_three(math.inf if self.body_rate is None else self.body_rate)).tolist()),
+            soft=None if self.soft is None else (self.soft.linear, self.soft.quadratic),
+            observer=self.offset_free,
+            ramp=self.disturbance,
+            solver=self.solver,
+        )
+
+    def _stride(self, period: float) -> int:
+        """Periods from one node to the next."""
+        if self.node is None:
+            return 1
+        stride = round(self.node / period)
+        if stride < 1 or not math.isclose(stride * period, self.node, rel_tol=1e-9):
+            rule = f"a whole multiple of the control period of {period} s"
+            raise ParameterError("controller", "node", self.node, rule)
+        if self.horizon % stride:
+            rule = f"a whole number of nodes, {stride} periods each"
+            raise ParameterError("controller", "horizon", self.horizon, rule)
+        return stride
+
+    def _rows(self) -> tuple[Constraint, ...]:
+        """`output_bounds` and `polytopes` as rows over the 12 states and four rotor speeds."""
+        polytopes = rows_of(self.polytopes)
+        if not self.output_bounds:
+            return polytopes
+        lower, upper = np.array([*self.output_bounds.values()], float).T
+        penalty = None if self.soft is None else self.soft.penalty(lower.size)
+        rows = selection([*self.output_bounds])
+        return Constraint(name="outputs", lower=lower, upper=upper, C=rows, penalty=penalty), *polytopes

@@ -33,6 +33,7 @@ import numpy as np
 import scipy.linalg
 from annotated_types import doc
 
+from mpc.bounded import SHORTEST_LAG
 from mpc.constraints import Bounds
 from mpc.model import continuous_model, discretise, lqr
 from quadsim.errors import ParameterError
@@ -45,7 +46,6 @@ ERROR_SHARE: Final = 0.1  # output error, as a share of that room, to which the 
 SPEED_SHARE: Final = 0.025
 """...with about this share of the hover speed (Bryson's rule; Bryson and Ho, 1975, "Applied Optimal Control")."""
 POSITION_ERROR: Final = 0.05  # [m]
-SHORTEST_LAG: Final = 1e-4  # time constant of rotors [s] below which gains cannot be computed; far below any period
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _ACCELERATED: Final = [INDEX[name] for name in ("vx", "vy", "vz", "roll_rate", "pitch_rate", "yaw_rate")]

@@ -127,18 +127,18 @@ class PhaseMonitor:
             return self._phase or Phase.FLYING
         gap = float(clearance(states[-1:], self._outline.feet, self._outline.foot_radius, self._outline.floor)[0])
         self._touched = self._touched + 1 if gap <= TOUCH else 0
-        wanted = bool(preview[:, REFERENCE_NAMES.index("z")].max() > self._takeoff_height)
+        flight_required = bool(preview[:, REFERENCE_NAMES.index("z")].max() > self._takeoff_height)
         if self._phase is None:
             self._phase = Phase.FLYING if gap > AIRBORNE else Phase.LANDED
         if self._crashed(self._outline, states):
             self._phase = Phase.CRASHED
         elif self._phase is Phase.FLYING:
-            if self._touched >= self._periods_of_rest and not wanted:
+            if self._touched >= self._periods_of_rest and not flight_required:
                 self._phase = Phase.LANDED
         elif self._phase is Phase.ARMED and gap > AIRBORNE:
             self._phase = Phase.FLYING
         elif self._phase is not Phase.CRASHED:
-            self._phase = Phase.ARMED if wanted else Phase.LANDED
+            self._phase = Phase.ARMED if flight_required else Phase.LANDED
         return self._phase
 
     def _crashed(self, outline: Outline, states: Array) -> bool:

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
-from quadsim.controller import FALLBACK, MISSED, Command, Controller, InnerLoop, Moment, Phase
+from quadsim.controller import Command, Controller, InnerLoop, Moment, Phase
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError
-from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.log import FlightLog
 from quadsim.flight.phase import check_loss
 from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
-from quadsim.sim.physics import Segment, inner_steps, physics_to_state
+from quadsim.sim.physics import FlownPeriod, Observation, Segment, flight_log, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
-from quadsim.state import INDEX, N_STATES, REFERENCE_NAMES, Array
+from quadsim.state import INDEX, REFERENCE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
@@ -58,38 +58,6 @@ class Rows:
     def preview(self, k: int, n: int) -> Array:
         """See `Reference`."""
         return np.asarray(self.values[k + 1 : k + 1 + n])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Observation:
-    """What a control period begins with."""
-
-    k: int  # which period
-    state: Array  # (12,) as measured, or estimated
-    truth: Array  # (12,) as it is
-    reference: Array  # (4,) filtered x, y, z [m], yaw [rad] at t_k
-    preview: Array  # (N, 4) the same at t_{k+1} .. t_{k+N}, as far as it is known.
-    moment: Moment  # when it is, and what a controller may know besides; `moment.acting` is u(k-1)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sample:
-    """One control period as it was flown."""
-
-    observation: Observation  # what it began with
-    command: Command  # what the controller answered, or what was given instead
-    speeds: Array  # (4,) the command in force at its end, an earlier one if `command` was missed [rad/s]
-    delay: float  # simulated time from the measurement to the command [s]
-    missed: bool  # whether the command came too late to be used
-    step_s: float  # wall time of the controller's step [s]; 0 where the command was given
-    before: Array  # (14,) MuJoCo's state at its begin; see `quadsim.sim.physics.physics_to_state`
-    segment: Segment  # its physics steps
-    rotors: Array  # (4,) how fast the rotors turned at its end [rad/s]
-
-    @property
-    def phase(self) -> Phase:
-        """Where the flight stood with the ground."""
-        return self.observation.moment.phase
 
 
 class ClosedLoop:
@@ -172,8 +140,8 @@ class ClosedLoop:
         self._acting = self._initial_speeds
         self._plan, self._age = self._acting[None], 0  # the last plan that came in time, and how many periods ago
         self._observed: Observation | None = None
-        self._samples: list[Sample] | None = [] if recorded else None
-        self.last: Sample | None = None
+        self._samples: list[FlownPeriod] | None = [] if recorded else None
+        self.last: FlownPeriod | None = None
         self._predicted: list[Array | None] = []  # of the controllers before this one, and how many periods they flew
         self._switched = 0
 
@@ -220,7 +188,7 @@ class ClosedLoop:
                 self._observed = self._observe()
         return self._observed
 
-    def step(self, command: Command | None = None) -> Sample:
+    def step(self, command: Command | None = None) -> FlownPeriod:
         """Fly one control period, with a command that is held instead of asking the controller, where one is given.
 
         Raises:
@@ -247,20 +215,12 @@ class ClosedLoop:
         """
         if self._samples is None:
             raise InputError("no period of this flight was recorded: it was begun with recorded=False")
-        samples = self._samples
-        control = _control_log(samples, self._initial_speeds, self.period)
-        plant = _plant_log(samples, self._start, self._initial_speeds, self._yaw, self._plant.timestep)
-        if self.quaternions:
-            moments = [sample.observation.moment for sample in samples]
-            attitudes = np.array([moment.attitude for moment in moments], float).reshape(-1, 4)
-            rates = np.array([moment.body_rates for moment in moments], float).reshape(-1, 3)
-            control = replace(control, attitude=attitudes, body_rates=rates)
-            physics = np.concatenate([self._start[None], *(sample.segment.physics for sample in samples)])
-            plant = replace(plant, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
-        return FlightLog(
-            control=control,
-            timing=_timing_log(samples, control.t),
-            plant=plant,
+        timestep, start = self._plant.timestep, self._start
+        log = flight_log(
+            self._samples, start, self._initial_speeds, self._yaw, self.period, timestep, quaternions=self.quaternions
+        )
+        return replace(
+            log,
             predicted=_joined([*self._predicted, *([self._predict()] if self.k > self._switched else [])]),
             reason=self.reason,
             interrupted=self._interrupted,
@@ -323,9 +283,9 @@ class ClosedLoop:
             return None
         return positions
 
-    def _fly(self, observed: Observation, given: Command | None) -> Sample:
+    def _fly(self, observed: Observation, command: Command | None) -> FlownPeriod:
         plant, computation, steps, now = self._plant, self.computation, self._steps, observed.moment
-        step_s, command = 0.0, given
+        step_s = 0.0
         if command is None:
             started = clock.perf_counter()
             with _ending_flight(now.time):
@@ -354,7 +314,7 @@ class ClosedLoop:
                 held = np.broadcast_to(speeds, (len(segment.physics), N_ROTORS))
                 self._navigation.advance(segment.physics, held, standing=now.phase in (Phase.LANDED, Phase.ARMED))
         self._acting = acting
-        return Sample(
+        return FlownPeriod(
             observation=observed,
             command=command,
             speeds=acting,
@@ -402,17 +362,6 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
         gc.unfreeze()
 
 
-def one_period(sample: Sample, timestep: float) -> FlightLog:
-    """One control period as a log of its own: a row, and the plant's rows from its begin to its end, both included."""
-    moment = sample.observation.moment
-    assert moment.acting is not None
-    yaw = float(sample.observation.truth[INDEX["yaw"]])
-    control = replace(_control_log([sample], moment.acting, 0.0), t=_times(2, moment.time)[1:])
-    plant = _plant_log([sample], sample.before, moment.acting, yaw, timestep)
-    plant = replace(plant, t=np.round(moment.time + plant.t, 9))
-    return FlightLog(control=control, timing=_timing_log([sample], control.t), plant=plant)
-
-
 @contextlib.contextmanager
 def _ending_flight(time: float) -> Iterator[None]:
     """Make whatever a controller's code raises the flight's end, not its loss."""
@@ -439,66 +388,6 @@ def _hold(plant: Plant, inner: InnerLoop | None, speeds: Array, steps: int) -> I
         with _ending_flight(plant.time):
             commanded = inner.speeds(plant.time, speeds, plant.physics[_BODY_RATES], plant.speeds)
         yield plant.advance(commanded, min(stride, steps - first)), plant.applied(commanded)
-
-
-def _control_log(samples: list[Sample], initial_speeds: Array, period: float) -> ControlLog:
-    observed = [sample.observation for sample in samples]
-
-    def column(name: str, kind: type) -> np.ndarray[Any, np.dtype[Any]]:
-        return np.array([getattr(sample.command, name) for sample in samples], dtype=kind)
-
-    fallback = column("fallback", np.int64)
-    late = np.array([sample.missed for sample in samples], dtype=bool)
-    residuals = [sample.command.sqp for sample in samples]
-    return ControlLog(
-        t=_times(len(samples), period),
-        state=np.array([observation.state for observation in observed], float).reshape(-1, N_STATES),
-        truth=np.array([observation.truth for observation in observed], float).reshape(-1, N_STATES),
-        reference=np.array([observation.reference for observation in observed], float).reshape(
-            -1, len(REFERENCE_NAMES)
-        ),
-        speeds=np.array([sample.speeds for sample in samples], float).reshape(-1, N_ROTORS),
-        speeds_before=np.array(initial_speeds, float),
-        status=tuple(MISSED if sample.missed else sample.command.status for sample in samples),
-        answered_by=tuple(
-            FALLBACK if sample.missed or sample.command.fallback else sample.command.answered_by for sample in samples
-        ),
-        phase=tuple(str(sample.phase) for sample in samples),
-        iterations=column("iterations", np.int64),
-        active=column("active", np.int64),
-        fallback=np.where(late, np.maximum(fallback, 1), fallback),
-        slack=column("slack", float),
-        **{name: column(name, float) for name in RESIDUALS},
-        delay=np.array([sample.delay for sample in samples], float),
-        sqp=np.array([residual or (math.nan, math.nan) for residual in residuals]) if any(residuals) else None,
-    )
-
-
-def _timing_log(samples: list[Sample], t: Array) -> TimingLog:
-    return TimingLog(
-        t=t,
-        solve_ms=np.array([1e3 * sample.command.solve_s for sample in samples]),
-        step_ms=np.array([1e3 * sample.step_s for sample in samples]),
-    )
-
-
-def _plant_log(samples: list[Sample], start: Array, initial_speeds: Array, yaw: float, timestep: float) -> PlantLog:
-    if not samples:
-        return PlantLog(t=_times(1, timestep), state=physics_to_state(start[None], yaw), speeds=initial_speeds[None])
-    flown = Segment.join([sample.segment for sample in samples])
-    physics = np.concatenate([start[None], flown.physics])
-    return PlantLog(
-        t=_times(len(physics), timestep),
-        state=physics_to_state(physics, yaw),
-        speeds=np.concatenate([flown.speeds, samples[-1].rotors[None]]),
-        wrench=None if flown.wrench is None else np.concatenate([flown.wrench, flown.wrench[-1:]]),
-        wind=None if flown.wind is None else np.concatenate([flown.wind, flown.wind[-1:]]),
-    )
-
-
-def _times(count: int, spacing: float) -> Array:
-    """Instants k * spacing without the rounding that adding up or a binary fraction leaves."""
-    return np.round(np.arange(count) * spacing, 9)
 
 
 def _joined(parts: list[Array | None]) -> np.ndarray[Any, np.dtype[np.float32]] | None:

@@ -1,17 +1,20 @@
-"""The simulator's own state over a number of steps, and how it becomes the paper's."""
+"""The simulator's own state over a number of steps, how it becomes the paper's, and the periods flown as a log."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
+from quadsim.controller import FALLBACK, MISSED, Command, Moment, Phase
+from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.rotation import body_to_euler_rates, quaternion_to_euler
 from quadsim.sim.sensing import whole
-from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array
+from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, VELOCITIES, Array
+from quadsim.vehicle import N_ROTORS
 
 Integrator = Literal["mujoco", "rk4"]  # who takes the physics steps: MuJoCo, or `quadsim.sim.rigid_body`
 
@@ -85,3 +88,128 @@ class Segment:
         columns = {name: [getattr(part, name) for part in parts] for name in vars(parts[0])}
         stacked: dict[str, Any] = {name: None if c[0] is None else np.concatenate(c) for name, c in columns.items()}
         return Segment(**stacked)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observation:
+    """What a control period begins with."""
+
+    k: int  # which period
+    state: Array  # (12,) as measured, or estimated
+    truth: Array  # (12,) as it is
+    reference: Array  # (4,) filtered x, y, z [m], yaw [rad] at t_k
+    preview: Array  # (N, 4) the same at t_{k+1} .. t_{k+N}, as far as it is known.
+    moment: Moment  # when it is, and what a controller may know besides; `moment.acting` is u(k-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlownPeriod:
+    """One control period as it was flown."""
+
+    observation: Observation  # what it began with
+    command: Command  # what the controller answered, or what was given instead
+    speeds: Array  # (4,) the command in force at its end, an earlier one if `command` was missed [rad/s]
+    delay: float  # simulated time from the measurement to the command [s]
+    missed: bool  # whether the command came too late to be used
+    step_s: float  # wall time of the controller's step [s]; 0 where the command was given
+    before: Array  # (14,) MuJoCo's state at its begin; see `quadsim.sim.physics.physics_to_state`
+    segment: Segment  # its physics steps
+    rotors: Array  # (4,) how fast the rotors turned at its end [rad/s]
+
+    @property
+    def phase(self) -> Phase:
+        """Where the flight stood with the ground."""
+        return self.observation.moment.phase
+
+
+def flight_log(
+    samples: Sequence[FlownPeriod], start: Array, speeds: Array, yaw: float, period: float, timestep: float,
+    *, quaternions: bool = False,
+) -> FlightLog:  # fmt: skip
+    """Control periods of a length [s] as a log with plant rows at the physics rate, and attitudes where asked for.
+
+    At the start were MuJoCo's state (14,), rotor speeds (4,) [rad/s] and a yaw [rad], which tells its turns.
+    """
+    control = _control_log(samples, speeds, period)
+    plant = _plant_log(samples, start, speeds, yaw, timestep)
+    if quaternions:
+        moments = [sample.observation.moment for sample in samples]
+        attitudes = np.array([moment.attitude for moment in moments], float).reshape(-1, 4)
+        rates = np.array([moment.body_rates for moment in moments], float).reshape(-1, 3)
+        control = replace(control, attitude=attitudes, body_rates=rates)
+        physics = np.concatenate([start[None], *(sample.segment.physics for sample in samples)])
+        plant = replace(plant, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
+    return FlightLog(control=control, timing=_timing_log(samples, control.t), plant=plant)
+
+
+def one_period(sample: FlownPeriod, timestep: float) -> FlightLog:
+    """One control period as a log of its own: a row, and the plant's rows from its begin to its end, both included."""
+    moment = sample.observation.moment
+    assert moment.acting is not None
+    yaw = float(sample.observation.truth[INDEX["yaw"]])
+    log = flight_log([sample], sample.before, moment.acting, yaw, 0.0, timestep)
+    t = _times(2, moment.time)[1:]
+    control, timing = replace(log.control, t=t), replace(log.timing, t=t)
+    return replace(
+        log, control=control, timing=timing, plant=replace(log.plant, t=np.round(moment.time + log.plant.t, 9))
+    )
+
+
+def _control_log(samples: Sequence[FlownPeriod], initial_speeds: Array, period: float) -> ControlLog:
+    observed = [sample.observation for sample in samples]
+
+    def column(name: str, kind: type) -> np.ndarray[Any, np.dtype[Any]]:
+        return np.array([getattr(sample.command, name) for sample in samples], dtype=kind)
+
+    fallback = column("fallback", np.int64)
+    late = np.array([sample.missed for sample in samples], dtype=bool)
+    residuals = [sample.command.sqp for sample in samples]
+    return ControlLog(
+        t=_times(len(samples), period),
+        state=np.array([observation.state for observation in observed], float).reshape(-1, N_STATES),
+        truth=np.array([observation.truth for observation in observed], float).reshape(-1, N_STATES),
+        reference=np.array([observation.reference for observation in observed], float).reshape(-1, 4),
+        speeds=np.array([sample.speeds for sample in samples], float).reshape(-1, N_ROTORS),
+        speeds_before=np.array(initial_speeds, float),
+        status=tuple(MISSED if sample.missed else sample.command.status for sample in samples),
+        answered_by=tuple(
+            FALLBACK if sample.missed or sample.command.fallback else sample.command.answered_by for sample in samples
+        ),
+        phase=tuple(str(sample.phase) for sample in samples),
+        iterations=column("iterations", np.int64),
+        active=column("active", np.int64),
+        fallback=np.where(late, np.maximum(fallback, 1), fallback),
+        slack=column("slack", float),
+        **{name: column(name, float) for name in RESIDUALS},
+        delay=np.array([sample.delay for sample in samples], float),
+        sqp=np.array([residual or (math.nan, math.nan) for residual in residuals]) if any(residuals) else None,
+    )
+
+
+def _timing_log(samples: Sequence[FlownPeriod], t: Array) -> TimingLog:
+    return TimingLog(
+        t=t,
+        solve_ms=np.array([1e3 * sample.command.solve_s for sample in samples]),
+        step_ms=np.array([1e3 * sample.step_s for sample in samples]),
+    )
+
+
+def _plant_log(
+    samples: Sequence[FlownPeriod], start: Array, initial_speeds: Array, yaw: float, timestep: float
+) -> PlantLog:
+    if not samples:
+        return PlantLog(t=_times(1, timestep), state=physics_to_state(start[None], yaw), speeds=initial_speeds[None])
+    flown = Segment.join([sample.segment for sample in samples])
+    physics = np.concatenate([start[None], flown.physics])
+    return PlantLog(
+        t=_times(len(physics), timestep),
+        state=physics_to_state(physics, yaw),
+        speeds=np.concatenate([flown.speeds, samples[-1].rotors[None]]),
+        wrench=None if flown.wrench is None else np.concatenate([flown.wrench, flown.wrench[-1:]]),
+        wind=None if flown.wind is None else np.concatenate([flown.wind, flown.wind[-1:]]),
+    )
+
+
+def _times(count: int, spacing: float) -> Array:
+    """Instants k * spacing without the rounding that adding up or a binary fraction leaves."""
+    return np.round(np.arange(count) * spacing, 9)

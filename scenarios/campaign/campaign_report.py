@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -35,6 +35,11 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
+_TITLES: Final = {
+    **{"events": "How often", "constraints": "Constraints", "metrics": "All metrics", "worst": "Worst flights"},
+    **{"worst-draws": "Their parameters", "drivers-table": "Which parameters matter"},
+    "groups": "Failures over each varied parameter",
+}
 _MOST_LINES: Final = 8  # of a table on the console; the report has them all
 _MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN}
 _ENDS: Final = ("lower", "upper")
@@ -90,72 +95,60 @@ def driver_sentence(summary: Summary) -> str:
     return f"{noun} depends on {listed or 'no varied parameter beyond chance'}."
 
 
+def _grid(key: str, head: Sequence[str], lines: Iterable[tuple[Cell, ...]], note: str = "") -> Grid:
+    return Grid(key=key, title=_TITLES[key], head=tuple(head), lines=tuple(lines), note=note)
+
+
 def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
     """How often each event that happened did; `failure` names the events that count as failure."""
-    sure = f"{100.0 * summary['confidence']:g} %"
-    counted = f" ({', '.join(failure)})" if failure else ""
-    return Grid(
-        key="events",
-        title="How often",
-        head=("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}"),
-        lines=tuple(
-            line(name, str(share["count"]), *_shares(share), *(percent(share[f"{end}_one_sided"]) for end in _ENDS))
-            for name, share in summary["events"].items()
-            if share["count"] or name in _ALWAYS
-        ),
-        note=f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold, or "
+    sure, counted = f"{100.0 * summary['confidence']:g} %", f" ({', '.join(failure)})" if failure else ""
+    head = ("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}")
+    lines = (
+        line(name, str(share["count"]), *_shares(share), *(percent(share[f"{end}_one_sided"]) for end in _ENDS))
+        for name, share in summary["events"].items()
+        if share["count"] or name in _ALWAYS
+    )
+    note = (
+        f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold, or "
         "the flight was lost, raised an error or met a limit. Shares of both leave out incomplete flights, which ended "
         "before a required constraint was reached. Intervals are Clopper-Pearson's, of independent draws; the last two "
-        "columns are one-sided. Spread draws are more precise than that.",
+        "columns are one-sided. Spread draws are more precise than that."
     )
+    return _grid("events", head, lines, note)
 
 
 def constraint_table(summary: Summary) -> Grid:
     """How often each constraint did not hold, and by how much at worst."""
-    lines = []
+    sure, lines = f"{100.0 * summary['confidence']:g} % interval", []
     for name, constraint in summary["constraints"].items():
         failed, worst = constraint["not_satisfied"], (ABSENT, ABSENT)
         if constraint["worst_margin"] is not None:
             worst = f"{format_number(constraint['worst_margin'])} {constraint['unit']}", str(constraint["worst_flight"])
         count = Cell(text=str(failed["count"]), mark=Mark.BAD if failed["count"] else Mark.NONE)
         lines.append(line(name, count, *_shares(failed), *worst))
-    return Grid(
-        key="constraints",
-        title="Constraints",
-        head=(
-            *("constraint", "flights that did not hold it", "share"),
-            *(f"{100.0 * summary['confidence']:g} % interval", "worst margin", "in flight"),
-        ),
-        lines=tuple(lines),
-        note="Margins are at the physics rate, without the tolerance; negative is beyond the bound. Shares are of the "
-        "flights that reached the constraint or were lost before it.",
+    head = ("constraint", "flights that did not hold it", "share", sure, "worst margin", "in flight")
+    note = (
+        "Margins are at the physics rate, without the tolerance; negative is beyond the bound. Shares are of the "
+        "flights that reached the constraint or were lost before it."
     )
+    return _grid("constraints", head, lines, note)
 
 
 def metric_table(summary: Summary) -> Grid:
     """How every metric is distributed."""
     measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
-    lines = tuple(
-        line(
-            label(name, metric["unit"]),
-            *(format_number(metric[measure]) for measure in measures),
-            str(metric["flights"]),
-        )
+    lines = (
+        line(label(name, metric["unit"]), *(format_number(metric[m]) for m in measures), str(metric["flights"]))
         for name, metric in summary["metrics"].items()
     )
-    return Grid(
-        key="metrics",
-        title="All metrics",
-        head=("metric", *measures, "flights"),
-        lines=lines,
-        note="Over the flights that have the number, lost ones, up to where they were aborted, included.",
-    )
+    note = "Over the flights that have the number, lost ones, up to where they were aborted, included."
+    return _grid("metrics", ("metric", *measures, "flights"), lines, note)
 
 
 def worst_table(summary: Summary, directory: str) -> Grid:
     """The worst flights, and how to fly one again."""
     worst = summary["worst"]
-    lines = tuple(
+    lines = (
         line(
             str(flight["flight"]),
             Cell(text=flight["verdict"], mark=_MARKS.get(flight["verdict"], Mark.BAD)),
@@ -165,30 +158,21 @@ def worst_table(summary: Summary, directory: str) -> Grid:
         )
         for flight in worst
     )
-    again = f" To fly one of them again: {replay_command(directory, worst[0]['flight'])}" if worst else ""
-    return Grid(
-        key="worst",
-        title="Worst flights",
-        head=("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason"),
-        lines=lines,
-        note="Lost flights first, then errors, limits, violations and the rest; among these, failed ones first, then "
-        "the smaller worst margin." + again,
-    )
+    note = "Lost flights first, then errors, limits, violations and the rest; among these, failed ones first, then "
+    note += "the smaller worst margin."
+    if worst:
+        note += f" To fly one of them again: {replay_command(directory, worst[0]['flight'])}"
+    return _grid("worst", ("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason"), lines, note)
 
 
 def worst_draws_table(summary: Summary) -> Grid:
     """Parameters of the worst flights, a column for each."""
     worst = summary["worst"]
-    lines = tuple(
+    lines = (
         line(label(name, parameter["unit"]), *(_drawn(flight["draws"][name]) for flight in worst))
         for name, parameter in summary["parameters"].items()
     )
-    return Grid(
-        key="worst-draws",
-        title="Their parameters",
-        head=("flight", *(str(flight["flight"]) for flight in worst)),
-        lines=lines if worst else (),
-    )
+    return _grid("worst-draws", ("flight", *(str(flight["flight"]) for flight in worst)), lines if worst else ())
 
 
 def replay_command(directory: str, flight: int) -> str:
@@ -211,15 +195,13 @@ def driver_table(summary: Summary) -> Grid:
         for name, related in drivers(summary).items()
     )
     measures = ("rho", "after Holm", "xi", "after Holm")
-    return Grid(
-        key="drivers-table",
-        title="Which parameters matter",
-        head=("varied parameter", *(f"{of}: {measure}" for of in ("worst margin", "failure") for measure in measures)),
-        lines=tuple(lines),
-        note="rho: Spearman's rank correlation. xi: Chatterjee's (2021), of any dependence, also of harm at both ends "
+    head = ("varied parameter", *(f"{of}: {measure}" for of in ("worst margin", "failure") for measure in measures))
+    note = (
+        "rho: Spearman's rank correlation. xi: Chatterjee's (2021), of any dependence, also of harm at both ends "
         "of a range. p-values are corrected by Holm's method for all of this table; bold: beyond chance at "
-        f"{100.0 * ALPHA:g} %.",
+        f"{100.0 * ALPHA:g} %."
     )
+    return _grid("drivers-table", head, lines, note)
 
 
 def group_table(summary: Summary) -> Grid:
@@ -231,14 +213,10 @@ def group_table(summary: Summary) -> Grid:
         if cells := levels + [_group(group) for group in parameter.get("groups", ())]:
             listed[label(name, parameter["unit"])] = cells
     size = max(map(len, listed.values()), default=0)
-    return Grid(
-        key="groups",
-        title="Failures over each varied parameter",
-        head=("varied parameter", *(f"{k + 1}." for k in range(size))),
-        lines=tuple(line(name, *cells, *[ABSENT] * (size - len(cells))) for name, cells in listed.items()),
-        note="Share of failed flights among those with such values; groups are of about equal size, or by value where "
-        f"there are few. Over all flights it is {percent(failure['share'])}.",
-    )
+    lines = (line(name, *cells, *[ABSENT] * (size - len(cells))) for name, cells in listed.items())
+    note = "Share of failed flights among those with such values; groups are of about equal size, or by value where "
+    note += f"there are few. Over all flights it is {percent(failure['share'])}."
+    return _grid("groups", ("varied parameter", *(f"{k + 1}." for k in range(size))), lines, note)
 
 
 def _association(related: Mapping[str, Any] | None) -> tuple[Cell, ...]:

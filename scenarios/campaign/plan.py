@@ -23,9 +23,9 @@ from scenarios.flight import Flight
 from scenarios.loading import parse_scenario
 from scenarios.machine import processor_name
 from scenarios.many import ERROR, MEMORY, fly_many
+from scenarios.plugin import Plugin
 from scenarios.rollout import Rollout
 from scenarios.schema.bases import locate_files, merge, read_scenario
-from scenarios.schema.plugin import PluginSpec
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import NOT_DESCRIBED, apply_setting, differences, get_field, note_changes, set_field
@@ -59,7 +59,7 @@ class Plan:
         """Whether a controller or a force of the user's flies, in some flight at least."""
         drawn = {field for entry in self.spec.vary for field in entry.fields}
         chosen = not drawn.isdisjoint(("controller", "controller.type", "forces"))
-        return chosen or isinstance(self.scenario.controller, PluginSpec) or bool(self.scenario.forces)
+        return chosen or isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
 
     @property
     def columns(self) -> dict[str, pa.DataType]:

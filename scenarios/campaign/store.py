@@ -30,8 +30,7 @@ from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.rows import TIMES, Row, make_table, read_table, split_times
 from scenarios.machine import machine, versions
-from scenarios.parts.plugin import import_plugin
-from scenarios.schema.plugin import ForceSpec, PluginSpec
+from scenarios.plugin import Plugin, PluginForce, import_plugin
 
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
@@ -219,7 +218,7 @@ def flown_by(plan: Plan) -> dict[str, Any]:
     controller = plan.scenario.controller
     return {
         "code": code_digest(),
-        "controller": _user_code(controller) if isinstance(controller, PluginSpec) else None,
+        "controller": _user_code(controller) if isinstance(controller, Plugin) else None,
         "forces": [_user_code(force) for force in plan.scenario.forces] or None,
         "versions": versions(),
         "machine": machine(),
@@ -233,7 +232,7 @@ def code_digest() -> str:
     return code if why_missing() is None else f"{code}, without the core"
 
 
-def _user_code(spec: PluginSpec | ForceSpec) -> str | None:
+def _user_code(spec: Plugin | PluginForce) -> str | None:
     """SHA-256 of a user's module, or of the whole package that it is in; None without a file."""
     file = getattr(sys.modules[import_plugin(spec).__module__.partition(".")[0]], "__file__", None)
     if file is None:

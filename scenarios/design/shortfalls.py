@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from mpc.baselines.law import Baseline
+from mpc.bounded import Bounded, InputBounds
+from mpc.robust.settings import Robust
 from quadsim.vehicle import Vehicle
 from scenarios.assembly import Assembly
 from scenarios.design.authority import Authority, authority
 from scenarios.feasibility_check import fitting, report
-from scenarios.schema.baselines import GeometricSpec, LQRSpec, PIDSpec
-from scenarios.schema.optimisation import BoundedSpec, InputBoundsSpec
-from scenarios.schema.robust import RobustSpec
 from scenarios.schema.scenario import Scenario
 
 SLOWEST_ANSWER: Final = 1.0
@@ -22,15 +22,15 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
     """A line for each bound of a scenario, whatever its own vehicle, that the vehicle cannot meet."""
     spec, can = scenario.controller, authority(vehicle)
     missed: list[str] = []
-    if isinstance(spec, BoundedSpec | LQRSpec | PIDSpec | GeometricSpec) and spec.input_bounds is not None:
+    if isinstance(spec, Bounded | Baseline) and spec.input_bounds is not None:
         missed += _inputs(spec.input_bounds, vehicle, scenario.control_period)
-    if isinstance(spec, BoundedSpec):
+    if isinstance(spec, Bounded):
         for name in ("roll", "pitch"):
             if name in spec.output_bounds:
                 missed += _tilt(f"controller.output_bounds.{name}", max(map(abs, spec.output_bounds[name])), can)
-    elif isinstance(spec, LQRSpec | PIDSpec | GeometricSpec):
+    elif isinstance(spec, Baseline):
         missed += _tilt("controller.tilt", spec.tilt, can)
-    if isinstance(spec, RobustSpec) and spec.rotor_lag == "vehicle" and vehicle.rotor_rise is None:
+    if isinstance(spec, Robust) and spec.rotor_lag == "vehicle" and vehicle.rotor_rise is None:
         missed.append("controller.rotor_lag is the vehicle's, whose file gives no rotor_rise: give a number of seconds")
     for limit in scenario.constraints:
         if limit.signal == "speed" and not limit.lower <= vehicle.hover_speed <= limit.upper:
@@ -47,7 +47,7 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
     return (*missed, fits) if fits else tuple(missed)
 
 
-def _inputs(bounds: InputBoundsSpec, vehicle: Vehicle, period: float) -> list[str]:
+def _inputs(bounds: InputBounds, vehicle: Vehicle, period: float) -> list[str]:
     lower, upper = bounds.speed
     speed, hover, missed = "controller.input_bounds.speed", vehicle.hover_speed, []
     if hover > upper:

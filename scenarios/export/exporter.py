@@ -11,6 +11,7 @@ from typing import Any, Final, get_args
 
 import numpy as np
 
+from mpc.bounded import Weighted
 from mpc.core.library import MIRRORS
 from mpc.core.numbers import Exportable
 from mpc.core.solver import WAYS, CoreProblem, core_library
@@ -18,13 +19,12 @@ from mpc.export.ctext import CText, Precision
 from mpc.export.source import CHANGES, DATA, CController, part
 from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
-from quadsim.errors import ParameterError
+from quadsim.errors import ExportError, ParameterError
 from quadsim.outputs import absolute, reserving, writing
 from quadsim.state import N_STATES, POSITION, VELOCITY, Array
 from scenarios.assembly import Assembly
 from scenarios.export.record import Recording, record
 from scenarios.loading import load_scenario
-from scenarios.parts.controllers import exportable
 from scenarios.schema.scenario import Scenario
 
 DISTANCES: Final = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
@@ -180,8 +180,10 @@ def exported_law(scenario: Scenario) -> Exportable:
     Raises:
         ExportError: it cannot be exported.
     """
-    shapes = (*scenario.obstacles, *scenario.regions)
-    return exportable(scenario.controller, Assembly(scenario).vehicle, scenario.control_period, shapes)
+    controller, shapes = scenario.controller, (*scenario.obstacles, *scenario.regions)
+    if not isinstance(controller, Weighted):
+        raise ExportError(f"it is {controller.type!r}; exported are unconstrained, constrained and robust")
+    return controller.exportable(Assembly(scenario).vehicle, scenario.control_period, shapes)
 
 
 def _facts(controller: CController) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from mpc.bounded import Bounded
 from mpc.constrained import ConstrainedMPC
 from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
@@ -23,7 +24,6 @@ from quadsim.errors import ExportError, PlanExhaustedError
 from quadsim.state import Array
 from scenarios.assembly import Assembly
 from scenarios.rollout import Rollout
-from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.scenario import Scenario
 
 MPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
@@ -76,7 +76,7 @@ class Recorder:
 def record(scenario: Scenario) -> Recording:
     """Fly a scenario, record each period, and compute the answers of a controller that starts with the first."""
     scenario = scenario.replace({"controller.compiled": False})
-    if isinstance(scenario.controller, BoundedSpec):
+    if isinstance(scenario.controller, Bounded):
         scenario = scenario.replace({"controller.solver": CORE})
     law = Assembly(scenario).controller()
     inner = law.inner if isinstance(law, Guarded) else law

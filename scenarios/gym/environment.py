@@ -20,7 +20,7 @@ from quadsim.errors import FlightError, ParameterError
 from quadsim.flight.audit import Limit
 from quadsim.flight.log import FlightLog
 from quadsim.report.film.camera import Camera
-from quadsim.sim.loop import Observation, one_period
+from quadsim.sim.physics import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.campaign.plan import Plan, make_plan, read_campaign

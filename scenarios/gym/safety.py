@@ -9,13 +9,12 @@ import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
+from mpc.robust.settings import Robust
 from quadsim.controller import UNCONSTRAINED
 from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle
 from scenarios.gym.environment import QuadrotorEnv
 from scenarios.gym.spaces import Action
-from scenarios.parts.controllers import make_filter
-from scenarios.schema.robust import RobustSpec
 
 
 class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
@@ -61,7 +60,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         scenario = base.scenario
         if controller is not None:
             scenario = scenario.replace({"controller": dict(controller)})
-        if not isinstance(scenario.controller, RobustSpec):
+        if not isinstance(scenario.controller, Robust):
             raise ParameterError("controller", "type", scenario.controller.type, "robust, for a safety filter")
         self._base, self._spec = base, scenario.controller
         self._vehicle: Vehicle | None = None
@@ -71,7 +70,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         observed = self.env.reset(seed=seed, options=options)
         started = self._base.started
         if started.vehicle != self._vehicle:
-            self._filter, self._law = make_filter(self._spec, started.vehicle, started.scenario.control_period)
+            self._filter, self._law = self._spec.safety_filter(started.vehicle, started.scenario.control_period)
             self._vehicle = started.vehicle
         acting = started.observation.moment.acting
         assert acting is not None

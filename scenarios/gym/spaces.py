@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from mpc.answer import ActuatorBounds
 from mpc.body_rates import STATUS, BodyRateLoop
+from mpc.bounded import Bounded
 from quadsim.controller import Command
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, STATE_NAMES, STATE_UNITS, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.parts.controllers import make_bounds
-from scenarios.schema.optimisation import BoundedSpec
 from scenarios.schema.scenario import Scenario
 
 Action = NDArray[np.floating]
@@ -48,8 +47,8 @@ class Actions:
         if kind not in ACTIONS:
             raise UnknownNameError("action", str(kind), ACTIONS)
         spec = scenario.controller
-        if isinstance(spec, BoundedSpec):
-            bounds, owner = ActuatorBounds.of(make_bounds(spec)), "controller.input_bounds"
+        if isinstance(spec, Bounded):
+            bounds, owner = spec.input_bounds.actuators(vehicle), "controller.input_bounds"
         else:
             bounds, owner = ActuatorBounds.of_vehicle(vehicle), f"vehicle {vehicle.name}"
         low, high, hover = bounds.u_min, bounds.u_max, vehicle.hover_speed

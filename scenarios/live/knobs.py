@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from scenarios.schema.base import fields_of, is_table
-from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.controllers import AnyController
 from scenarios.schema.problems import Kind, kinds_of
 
 Value = float | int | bool | str | tuple[float, ...]
@@ -25,7 +25,7 @@ class Knob:
     choices: tuple[str, ...] = ()  # of a text
 
 
-def knobs(spec: ControllerSpec) -> tuple[Knob, ...]:
+def knobs(spec: AnyController) -> tuple[Knob, ...]:
     """Every field of a controller that has a value, but its type, longer lists and what a user's controller reads."""
     return tuple(knob for knob in _walk("", spec, (Kind(type=type(spec)),), "") if knob.path != "type")
 

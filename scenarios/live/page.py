@@ -32,7 +32,8 @@ from scenarios.live.knobs import Knob, Value, knobs
 from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
 from scenarios.live.stage import Stage
-from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.controllers import AnyController
+from scenarios.schema.writing import plain
 
 SECONDS: Final = 20.0  # of the plots
 _EVERY: Final = 4
@@ -89,7 +90,7 @@ class Page:
         save: Callable[[Session], str],
         host: str = "127.0.0.1",
         port: int = 0,
-        others: Mapping[str, ControllerSpec],
+        others: Mapping[str, AnyController],
     ) -> None:
         import viser
         from viser import _messages
@@ -289,7 +290,7 @@ class Page:
         self._steer = velocity
         self._steered.value = ", ".join(f"{speed:g}" for speed in velocity)
 
-    def _show_knobs(self, spec: ControllerSpec) -> None:
+    def _show_knobs(self, spec: AnyController) -> None:
         for _, handles in self._fields.values():
             for handle in handles:
                 handle.remove()
@@ -329,7 +330,7 @@ class Page:
 
     async def _take(self, name: str) -> None:
         spec = self._session.scenario.controller if name == "as started" else self._others[name]
-        if await self._replace(spec.model_dump(mode="json", exclude_none=True), name):
+        if await self._replace(plain(spec), name):
             self._show_knobs(spec)
 
     async def _replace(self, fields: Mapping[str, Any], what: str) -> bool:

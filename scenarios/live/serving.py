@@ -31,7 +31,7 @@ from scenarios.catalogue import scenario_names
 from scenarios.live.session import Frame, Session, read_script
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Document
-from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.controllers import AnyController
 from scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -172,7 +172,7 @@ class Guard:
 
 def fly_live(
     scenario: Scenario,
-    against: ControllerSpec | None,
+    against: AnyController | None,
     script: str | Path | None,
     *,
     onward: bool,
@@ -241,7 +241,7 @@ def _serve(session: Session, save: Callable[[Session], str], *, host: str, port:
             f"listening on {host}: anyone on that network with the address below can fly this session; "
             "the connection is not encrypted"
         )
-    scenario, others = session.scenario, dict[str, ControllerSpec]()
+    scenario, others = session.scenario, dict[str, AnyController]()
     for name in scenario_names():
         other = load_scenario(name)
         same = (other.vehicle, other.control_period) == (scenario.vehicle, scenario.control_period)

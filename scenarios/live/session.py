@@ -20,14 +20,14 @@ from quadsim.assets import read_toml
 from quadsim.errors import FlightError, InputError, ParameterError
 from quadsim.fields import Fraction, Vector
 from quadsim.flight.audit import Limit
-from quadsim.sim.loop import Sample
+from quadsim.sim.physics import FlownPeriod
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
 from scenarios.flight_events import Successor
 from scenarios.limits import with_bounds_stated
 from scenarios.rollout import Rollout
-from scenarios.schema.controller import ControllerSpec
+from scenarios.schema.controllers import AnyController
 from scenarios.schema.problems import parse_table
 from scenarios.schema.scenario import Scenario
 
@@ -86,7 +86,7 @@ class Frame:
 
     k: int  # which period
     time: float  # when it began [s]
-    samples: tuple[Sample | None, ...]
+    samples: tuple[FlownPeriod | None, ...]
     margins: tuple[Mapping[str, float], ...]  # see `Rollout.margins`
     horizons: tuple[Array | None, ...]  # (N + 1, 3) predicted positions [m], from the present one on
     pull: Array  # (3,) the force of the person's hand [N]; zero without one
@@ -111,7 +111,7 @@ class Session:
         reason: why the first has ended; None while it has not.
     """
 
-    def __init__(self, scenario: Scenario, against: ControllerSpec | None = None) -> None:
+    def __init__(self, scenario: Scenario, against: AnyController | None = None) -> None:
         self.scenario, self._against = preferring_core(scenario), against
         self._queue: deque[tuple[Mapping[str, Any], str | None, Successor | None]] = deque()
         self.flights: tuple[Rollout, ...] = ()
@@ -279,7 +279,7 @@ def read_script(path: str | Path) -> Script:
     return parse_table(Script, read_toml(Path(path)), str(path), file="script")
 
 
-def _horizon(flight: Rollout, sample: Sample) -> Array | None:
+def _horizon(flight: Rollout, sample: FlownPeriod) -> Array | None:
     predict = getattr(flight.loop.controller, "predict", None)
     if predict is None or len(sample.command.plan) < 1:
         return None

@@ -7,23 +7,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
-from typing import Annotated, Any, Final, Literal, TypeGuard, get_type_hints
+from typing import Annotated, Any, Final, TypeGuard, get_type_hints
 
 from annotated_types import DocInfo, Len
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
 
 from quadsim.fields import Number
 
 MOST_ENTRIES: Final = 1000  # of a list of tables
-Triple = Annotated[list[Number], Len(3, 3)]
 Pair = Annotated[list[Number], Len(2, 2)]
-LARGEST_HORIZON: Final = 1000
-Horizon = Annotated[int, Field(ge=1, le=LARGEST_HORIZON)]
 LARGEST_SEED: Final = 2**63 - 1  # the largest whole number that every reader of TOML takes
-Seconds = Annotated[float, Field(ge=0.0, le=10.0)]
-Lag = Seconds | Literal["vehicle"]  # A time constant, or that of the vehicle file
 
 STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -59,9 +53,3 @@ def _declared(table: Any) -> dict[str, FieldInfo]:
         found[field.name] = info = FieldInfo.from_annotated_attribute(hints[field.name], field)
         info.description = next((note.documentation for note in info.metadata if isinstance(note, DocInfo)), None)
     return found
-
-
-def require_ordered(name: str, pair: Sequence[float]) -> None:
-    """Refuse a pair of bounds whose lower is not below its upper."""
-    if not pair[0] < pair[1]:
-        raise ValueError(f"{name} must have its lower bound below its upper; got {list(pair)}")

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from quadsim.assets import DEEPEST, read_toml
 from quadsim.errors import FileError, ParameterError
-from scenarios.schema.plugin import located
+from scenarios.plugin import located
 from scenarios.schema.settings import note_changes, state_bounds
 
 LARGEST_FILE: Final = 8_000_000

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 from annotated_types import Ge, Gt, Le, MaxLen, doc
 from pydantic import BeforeValidator, Field, ValidationError, create_model, model_validator
 
+from mpc.bounded import Polytope
 from mpc.indi import INDISettings
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Positive, Vector
@@ -25,11 +26,10 @@ from quadsim.state import STATE_NAMES
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.catalogue import Group
 from scenarios.courses.table import ReferenceTable
+from scenarios.plugin import PluginForce
 from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES, Spec, fields_of
-from scenarios.schema.controller import ControllerSpec, NonlinearSpec, changed
+from scenarios.schema.controllers import AnyController, changed
 from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
-from scenarios.schema.optimisation import BoundedSpec, PolytopeSpec
-from scenarios.schema.plugin import ForceSpec
 from scenarios.schema.problems import ScenarioError, describe_all
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.settings import set_field
@@ -174,9 +174,9 @@ class Scenario(Spec):
     initial: Initial = Initial()
     plant: Simulation = Simulation()
     reference: ReferenceTable
-    controller: ControllerSpec
+    controller: AnyController
     effects: Effects = Effects()
-    forces: Annotated[list[ForceSpec], MaxLen(MOST_ENTRIES)] = Field(
+    forces: Annotated[list[PluginForce], MaxLen(MOST_ENTRIES)] = Field(
         default=[], description="forces of one's own on the vehicle, each code that is called once per physics step"
     )
     computation: ComputationTime | None = Field(default=None, description="absent: commands take no time")
@@ -259,9 +259,9 @@ class Scenario(Spec):
             raise ValueError(f"constraints must have distinct names; got {names}")
 
     @property
-    def polytopes(self) -> list[PolytopeSpec]:
+    def polytopes(self) -> tuple[Polytope, ...]:
         """Those of its controller."""
-        return self.controller.polytopes if isinstance(self.controller, BoundedSpec | NonlinearSpec) else []
+        return self.controller.polytopes
 
     @property
     def audited_names(self) -> list[str]:
@@ -303,6 +303,8 @@ class Scenario(Spec):
         Raises:
             InputError: a number has more digits than can be written.
         """
+        if isinstance(data.get("controller"), str):
+            data = {**data, "controller": {"type": data["controller"]}}
         try:
             text = json.dumps(data, default=lambda _: math.inf)
         except ValueError as error:
@@ -310,15 +312,15 @@ class Scenario(Spec):
         return cls.model_validate_json(text)
 
     @property
-    def controller_changes(self) -> list[tuple[float, ControllerSpec]]:
+    def controller_changes(self) -> list[tuple[float, AnyController]]:
         """Each controller that takes over from the one before it, and when [s], in order of time."""
-        found: list[tuple[float, ControllerSpec]] = []
+        found: list[tuple[float, AnyController]] = []
         events = (event for event in self.events if isinstance(event, ControllerEvent))
         for event in sorted(events, key=lambda event: event.at):
             found.append((event.at, changed(found[-1][1] if found else self.controller, event.fields)))
         return found
 
-    def controller_at(self, time: float) -> ControllerSpec:
+    def controller_at(self, time: float) -> AnyController:
         """The controller that flies at a time [s]."""
         found = self.controller
         for at, spec in self.controller_changes:

@@ -38,6 +38,15 @@ def is_absent(value: object) -> bool:
     return value is None or (isinstance(value, float) and math.isinf(value))
 
 
+def plain(value: Any) -> Any:
+    """Tables and lists as JSON and TOML hold them, without what is absent."""
+    if is_table(type(value)):
+        value = {name: getattr(value, name) for name in fields_of(type(value))}
+    if isinstance(value, Mapping):
+        return {name: plain(entry) for name, entry in value.items() if not is_absent(entry)}
+    return [plain(entry) for entry in value] if isinstance(value, list | tuple) else value
+
+
 def to_toml(model: Any) -> str:
     """A model as a TOML document."""
     return "\n".join(_lines(model, "", set())) + "\n"

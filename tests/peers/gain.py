@@ -17,21 +17,13 @@ import scipy.linalg
 from peers.checks import Check
 
 from mpc.ocp import Problem
-from mpc.paper import cost, prediction
 from mpc.unconstrained import sequence_gains
 from quadsim.state import Array
 
-HEAD: Final = (
-    "N",
-    "from do-mpc, N steps",
-    "cond(H) times roundoff",
-    "from do-mpc, N + 1 steps",
-    "from scipy, infinite",
-)
 SCENARIO: Final = "paper-unconstrained"
 HORIZONS: Final = (10, 20, 50, 100)
 ALLOWED: Final = {10: 1e-12, 20: 1e-12, 50: 1e-10, 100: 1e-8}
-"""Relative differences that pass; they grow as the condensed cost's rounding does, see `Comparison.rounding`."""
+"""Relative differences that pass; they grow as the condensed cost's rounding does."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +34,6 @@ class Comparison:
     difference: float  # of K_N from do-mpc's gain for N, relative to it in the Frobenius norm
     one_step_more: float  # the same from do-mpc's gain for N + 1, which a wrong index would compare with
     infinite: float  # the same from the gain of scipy's discrete algebraic Riccati equation
-    rounding: float  # cond(H) times the unit roundoff: how well Eq. (21) determines K_N in double precision
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -94,7 +85,6 @@ def _state_weight(problem: Problem) -> Array:
 
 def _compare(problem: Problem) -> Comparison:
     K_N = sequence_gains(problem).K[: problem.model.nu]
-    H = cost(prediction(problem.model, problem.horizon), problem.objective).H
 
     def relative(other: Array) -> float:
         return float(np.linalg.norm(K_N - other) / np.linalg.norm(other))
@@ -104,5 +94,4 @@ def _compare(problem: Problem) -> Comparison:
         difference=relative(riccati_gain(problem)),
         one_step_more=relative(riccati_gain(replace(problem, horizon=problem.horizon + 1))),
         infinite=relative(infinite_gain(problem)),
-        rounding=float(np.linalg.cond(H) * np.finfo(float).eps / 2.0),
     )

@@ -6,16 +6,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from peers.checks import Check
 from peers.constrained_qp import OURS, ConstrainedQP, QpmpcController
 from peers.recorded import Query
-from support import paper_problem
 
 from mpc.ocp import Problem
 from mpc.solvers import QPSolver
 from quadsim.controller import UNCONSTRAINED
-from quadsim.errors import ParameterError
 
 
 def test_first_inputs_are_the_same(against_qpmpc: ConstrainedQP, hold: Callable[[Check], None]) -> None:
@@ -41,11 +38,3 @@ def test_a_reference_one_sample_late_is_seen(problem: Problem, queries: tuple[Qu
         for wrong, query in zip(late, queries[::100], strict=True)
     ]
     assert max(differences) > 0.1
-
-
-def test_weights_that_qpmpc_cannot_take_are_refused() -> None:
-    problem = paper_problem()
-    weights = problem.objective.Q_u + 1e-3
-    coupled = replace(problem, objective=replace(problem.objective, Q_u=weights))
-    with pytest.raises(ParameterError, match="Q_u must be diagonal, to be rebuilt in qpmpc"):
-        QpmpcController(coupled)

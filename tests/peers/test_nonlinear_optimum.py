@@ -44,11 +44,6 @@ def test_do_mpc_is_given_the_same_problem() -> None:
         assert np.abs(found.states - other.states).max() < ALLOWED
 
 
-def test_do_mpc_takes_no_bounds_on_steps_or_tilt() -> None:
-    with pytest.raises(ValueError, match="more than bounds on inputs"):
-        DoMPC(LAGGED)
-
-
 def test_a_weight_that_is_another_is_seen() -> None:
     """A hundredth more on the velocity: two thousand times what is allowed."""
     course, other = Course(PAPER), Peer(replace(PAPER, velocity=1.01 * PAPER.velocity))

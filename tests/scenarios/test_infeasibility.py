@@ -31,7 +31,6 @@ from scenarios.catalogue import scenario_path
 from scenarios.flight import Flight
 from scenarios.infeasibility import diagnose
 from scenarios.loading import load_scenario
-from scenarios.parts.controllers import make_controller
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
 
@@ -317,7 +316,7 @@ class Keeping:
     """A controller of one's own that keeps the problem that it could not solve."""
 
     def __init__(self, vehicle: Vehicle, period: float, horizon: int, largest: float = 2.0) -> None:
-        law = make_controller(load_scenario("paper-constrained").controller, vehicle, period)
+        law = load_scenario("paper-constrained").controller.build(vehicle, period)
         assert isinstance(law, ConstrainedMPC)
         roll = mpc.Bounds(
             C_c=np.eye(12)[[INDEX["roll"]]],

@@ -128,10 +128,10 @@ class Overlay:
         for j, (name, state) in enumerate(zip(REFERENCE_NAMES, REFERENCE_STATES, strict=True)):
             angle = state == INDEX["yaw"]
             factor, digits = (math.degrees(1.0), 1) if angle else (1.0, 2)
-            now, wanted, row = factor * values[j], factor * reference[j], y + 24 + 27 * j
+            now, target, row = factor * values[j], factor * reference[j], y + 24 + 27 * j
             painter.text(x, row, f"{name} [{'deg' if angle else 'm'}]", colour=ink.GREY)
             unknown = angle and self._footage.tilt is not None and self._footage.tilt[i] > 0.5 * math.pi
-            columns = (118, now, ink.WHITE), (192, wanted, ink.AMBER), (262, now - wanted, ink.GREY)
+            columns = (118, now, ink.WHITE), (192, target, ink.AMBER), (262, now - target, ink.GREY)
             for right, value, colour in columns:
                 shown = f"{round(value, digits) + 0.0:+.{digits}f}"  # no "-0.00"
                 text = ABSENT if unknown and colour is not ink.AMBER else shown  # upside down none is to be held

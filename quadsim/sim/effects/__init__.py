@@ -78,8 +78,8 @@ class ThrustNoise:
         """The thrusts (M, 4) [N] over M steps that result where these are commanded, of `largest` [N] at most."""
         share = thrusts / largest
         lost = self.loss * np.square(share) + self.deviation * np.sqrt(share) * rng.standard_normal(share.shape)
-        given: Array = largest * np.clip(share - lost, 0.0, 1.0)
-        return given
+        remaining: Array = largest * np.clip(share - lost, 0.0, 1.0)
+        return remaining
 
 
 @dataclass(frozen=True, kw_only=True)

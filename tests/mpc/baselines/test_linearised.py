@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from mpc.baselines.allocation import allocate
+from mpc.allocation import allocate
 from mpc.baselines.attitude import motion_of
 from mpc.baselines.geometric import GeometricController, Integrals
 from mpc.baselines.lqr import lqr_gain

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scripted_controller import Scripted, bounds, guard, model
 
-from mpc.fallback.settings import FallbackSettings
+from mpc.bounded import FallbackSettings
 from quadsim.controller import Command, Moment, Phase
 from quadsim.errors import CommandError
 from quadsim.state import Array

@@ -10,9 +10,9 @@ import pytest
 from scripted_controller import PERIOD, bounds, model, problem
 from support import paper_reference
 
+from mpc.bounded import FallbackSettings
 from mpc.constrained import ConstrainedMPC
 from mpc.fallback.contract import Guarded
-from mpc.fallback.settings import FallbackSettings
 from mpc.ocp import Query
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers.piqp import STATUS

@@ -13,6 +13,7 @@ import pytest
 import scipy.linalg
 from support import derivative, fly_once, paper_problem, paper_reference
 
+from mpc.bounded import SHORTEST_LAG
 from mpc.constraints import Bounds, Penalty
 from mpc.model import discretise
 from mpc.nonlinear.model import advance, nonlinear_model
@@ -20,7 +21,6 @@ from mpc.observer import ObserverSettings
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.robust.tightening import (
     ERROR_SHARE,
-    SHORTEST_LAG,
     SPEED_SHARE,
     TighteningSettings,
     between_samples,

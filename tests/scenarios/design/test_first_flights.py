@@ -13,11 +13,11 @@ from first_flights import FirstFlight, fly_first, vehicles
 
 import quadsim
 from mpc.baselines.lqr import bryson_objective
+from mpc.robust.settings import Robust
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import Vehicle, load_vehicle
 from scenarios.design.first_scenario import BASELINE_SHARE, CLEARANCE, COURSES, LAWS, ROOM, first_scenario
 from scenarios.loading import parse_scenario
-from scenarios.schema.robust import RobustSpec
 
 ALL = {vehicle.name: vehicle for vehicle in vehicles()}
 HARDEST = ("random-08", "random-17")
@@ -97,7 +97,7 @@ def test_the_file_states_what_is_flown(course: str, law: str) -> None:
     scenario = parse_scenario(made.to_data())
     assert scenario.controller.type == law
     bounds = {limit.signal: (limit.lower, limit.upper) for limit in scenario.constraints}
-    if isinstance(scenario.controller, RobustSpec):
+    if isinstance(scenario.controller, Robust):
         assert bounds["roll"] == tuple(scenario.controller.output_bounds["roll"])
         assert bounds["slew"] == tuple(scenario.controller.input_bounds.slew)
     else:

@@ -21,7 +21,6 @@ from scenarios.design.authority import authority
 from scenarios.design.first_scenario import SHARE, first_scenario, largest_eight
 from scenarios.design.rules import FASTEST, PERIOD_SHARE, delay_margin, design_for, gain, is_stable
 from scenarios.loading import parse_scenario
-from scenarios.parts.controllers import make_controller
 
 ALL = vehicles()
 EVERY = pytest.mark.parametrize("vehicle", ALL, ids=lambda vehicle: vehicle.name)
@@ -47,7 +46,7 @@ def test_a_baselines_loop_tolerates_a_quarter_to_three_quarters_of_that_delay(ve
     for i in range(N_STATES):
         state, answers = np.zeros(N_STATES), []
         for state[i] in (step, -step):
-            controller = make_controller(scenario.controller, vehicle, tuning.period)
+            controller = scenario.controller.build(vehicle, tuning.period)
             answers.append(controller.step(Moment(), state, np.zeros((controller.horizon, 4))).speeds)
         K[:, i] = (answers[1] - answers[0]) / (2.0 * step)
     margin = delay_margin(vehicle, tuning)

@@ -23,10 +23,11 @@ from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
+from scenarios.schema.writing import plain
 
 WINDY = load_scenario("steady-wind", ["controller.horizon=10"])
 ROBUST = load_scenario("robust", ["controller.horizon=10"]).controller
-FIELDS = [{"output_weights.x": 20.0}, {"horizon": 8}, load_scenario("robust").controller.model_dump(exclude_none=True)]
+FIELDS = [{"output_weights.x": 20.0}, {"horizon": 8}, plain(load_scenario("robust").controller)]
 INPUTS = st.one_of(
     HAPPENING,
     kind("pull", to=vector(2.0)),

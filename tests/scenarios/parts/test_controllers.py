@@ -15,7 +15,7 @@ from jsonschema import Draft202012Validator
 from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import GeometricController
 from mpc.baselines.lqr import LQR, bryson_objective
-from mpc.baselines.pid import CascadedPID
+from mpc.baselines.pid import PID, CascadedPID
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Bounds
 from mpc.fallback.contract import Guarded
@@ -327,4 +327,4 @@ def test_a_name_alone_takes_fields_from_settings_and_from_files_over_it(tmp_path
     (tmp_path / "one.toml").write_text('base = "hover"\nname = "one"\ncontroller = "pid"\n')
     (tmp_path / "two.toml").write_text('base = "one.toml"\nname = "two"\n[controller]\ntilt = 20.0\n')
     found = load_scenario(str(tmp_path / "two.toml"), ["controller.horizon=4"]).controller
-    assert found.model_dump(include={"type", "tilt", "horizon"}) == {"type": "pid", "tilt": 20.0, "horizon": 4}
+    assert found == PID(tilt=20.0, horizon=4)

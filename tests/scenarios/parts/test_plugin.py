@@ -19,7 +19,7 @@ from quadsim.errors import CommandError, InputError
 from quadsim.state import Array
 from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
-from scenarios.parts.plugin import PluginController
+from scenarios.plugin import PluginController
 from scenarios.rollout import Rollout
 
 HOVER = """

@@ -101,7 +101,7 @@ def test_settings_replace_add_and_reach_into_constraints() -> None:
     assert scenario.vehicle.arm_length == 0.25
     assert scenario.constraints[0].upper == 4.5
     assert scenario.description == "no quotes needed"
-    assert scenario.controller.input_weights.speed == [1.0, 2.0, 3.0, 4.0]
+    assert scenario.controller.input_weights.speed == (1.0, 2.0, 3.0, 4.0)
 
 
 # --- any file ------------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mpc.baselines.allocation import Allocation, allocate, make_allocation
+from mpc.allocation import Allocation, allocate, make_allocation
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import load_vehicle
 

@@ -1,4 +1,7 @@
-"""Controllers and forces of the user's own: imported by the place of their code, called, fitted to the protocol."""
+"""Controllers and forces of the user's own: named by the place of their code, imported, called, fitted to the protocol.
+
+`controller = "my_package.my_module:MyController"`
+"""
 
 from __future__ import annotations
 
@@ -7,32 +10,124 @@ import importlib
 import inspect
 import logging
 import operator
+import re
 import sys
 import sysconfig
 import traceback
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
+from annotated_types import doc
 
+from mpc.bounded import ControllerTable, Horizon
 from mpc.handover import hand_over
-from quadsim.controller import SQP, Command, Moment
+from mpc.obstacles import Shape
+from quadsim.controller import SQP, Command, Controller, Moment
 from quadsim.errors import CommandError, InputError, ParameterError, UnknownNameError, printable
+from quadsim.fields import is_plain
 from quadsim.flight.log import RESIDUALS
 from quadsim.sim.effects import Force
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.schema.plugin import ENTRY_POINTS, ForceSpec, PluginSpec
 
+FORM: Final = "package.module:Class"  # what the text that names a controller looks like
+ENTRY_POINTS: Final = "quadsim.controllers"
+"""The group under which installed packages announce controllers by short names."""
+_NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _STEP: Final = (
     "a class or an object with a method step(now, state, reference), or a function law(now, state, reference)"
 )
 _WHOLE: Final = ("iterations", "active", "fallback")  # parts of a Command
 _REAL: Final = ("slack", *RESIDUALS, "solve_s")
 _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Code:
+    folder: Annotated[
+        str | None,
+        doc("where its module is looked for first, from the scenario file; absent: beside that"),
+    ] = None
+    settings: Annotated[dict[str, Any], doc("what else it is called with, by the arguments' names")] = field(
+        default_factory=dict
+    )
+
+
+def _name_no_law(schema: dict[str, Any]) -> None:
+    from scenarios.schema.controllers import LAWS
+
+    schema["not"] = {"enum": [*LAWS]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plugin(ControllerTable, _Code):
+    """A controller of one's own, called as MyController(vehicle, period=..., horizon=..., **settings)."""
+
+    type: Annotated[
+        str, doc("its code, as package.module:Class, or its name among the entry points quadsim.controllers")
+    ] = field(metadata={"json_schema_extra": _name_no_law})
+    horizon: Annotated[Horizon, doc("[periods] N, samples of the reference that a step is given")] = 50
+
+    def __post_init__(self) -> None:
+        _check_code(self.type, self.settings, ("vehicle", "period", "horizon"))
+
+    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.build`."""
+        return make_law(import_plugin(self), self, vehicle, period)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PluginForce(_Code):
+    """A force of one's own, called once per physics step; see `quadsim.sim.effects.Force`.
+
+    A function force(time, state, **settings), or a class called as MyForce(vehicle, rng=..., **settings).
+    """
+
+    type: Annotated[str, doc("its code, as package.module:name")]
+
+    def __post_init__(self) -> None:
+        if ":" not in self.type:
+            raise ParameterError("", "type", self.type, f"of the form {FORM}")
+        _check_code(self.type, self.settings, ("vehicle", "rng", "time", "state"))
+
+
+def _check_code(place: str, settings: Mapping[str, Any], arguments: tuple[str, ...]) -> None:
+    """Refuse a place that is none, and settings that are no arguments or cannot be written."""
+    if ":" in place and not re.fullmatch(f"{_NAME}:{_NAME}", place):
+        raise ParameterError("", "type", place, f"of the form {FORM}")
+    for name, value in settings.items():
+        if not name.isidentifier() or name in arguments:
+            raise ValueError(f"settings.{name} must be named as an argument is, other than {', '.join(arguments)}")
+        if not is_plain(value):
+            rule = "a finite number, a text, true or false, or a list or table of them"
+            raise ValueError(f"settings.{name} must be {rule}; got {value}")
+
+
+def is_plugin(name: str) -> bool:
+    """Whether a text names code, or an entry point that there is."""
+    return ":" in name or name in metadata.entry_points(group=ENTRY_POINTS).names
+
+
+def located(controller: Any, beside: Path) -> Any:
+    """A `[controller]` as a file gives it, its folder made independent of the file's, `beside`.
+
+    That is its folder too, where none is given and the module is there.
+    """
+    table = {"type": controller} if isinstance(controller, str) else controller
+    name = table.get("type") if isinstance(table, Mapping) else None
+    if not isinstance(name, str) or ":" not in name:
+        return controller
+    given = table.get("folder")
+    if isinstance(given, str) and (beside / given).is_dir():
+        return {**table, "folder": str((beside / given).resolve())}
+    first = beside / name.partition(":")[0].partition(".")[0]
+    found = "folder" not in table and (first.is_dir() or first.with_suffix(".py").is_file())
+    return {**table, "folder": str(beside.resolve())} if found else controller
 
 
 class PluginController:
@@ -98,7 +193,7 @@ def _numbers(given: Any, shape: tuple[int, ...], name: str) -> Array:
     return array
 
 
-def make_law(law: Any, spec: PluginSpec, vehicle: Vehicle, period: float) -> PluginController:
+def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginController:
     """The controller of a function law(now, state, reference), a class, an object, or what makes one of a vehicle."""
     if (code := _code_of(law)) is not type(law):
         if isinstance(code, type) or "vehicle" in inspect.signature(code).parameters:
@@ -116,7 +211,7 @@ def make_law(law: Any, spec: PluginSpec, vehicle: Vehicle, period: float) -> Plu
     return PluginController(law, spec.horizon)
 
 
-def make_force(force: Any, spec: ForceSpec, vehicle: Vehicle, rng: np.random.Generator) -> Force:
+def make_force(force: Any, spec: PluginForce, vehicle: Vehicle, rng: np.random.Generator) -> Force:
     """The force of a function force(time, state), an object called so, or a class of such; see `make_law`."""
     if isinstance(code := _code_of(force), type):
         force = force if code is type(force) else _call(code, spec, {"vehicle": vehicle}, rng=rng)
@@ -128,7 +223,7 @@ def make_force(force: Any, spec: ForceSpec, vehicle: Vehicle, rng: np.random.Gen
     return force
 
 
-def _call(call: Any, spec: PluginSpec | ForceSpec, arguments: dict[str, Any], **given: Any) -> Any:
+def _call(call: Any, spec: Plugin | PluginForce, arguments: dict[str, Any], **given: Any) -> Any:
     """What a call gives with these arguments and the settings; what it raises is a message about them."""
     try:
         return call(*arguments.values(), **given, **spec.settings)
@@ -139,7 +234,7 @@ def _call(call: Any, spec: PluginSpec | ForceSpec, arguments: dict[str, Any], **
         raise InputError(f"{_table(spec)}: {spec.type} cannot be called with {called}: {_reason(error)}") from error
 
 
-def import_plugin(spec: PluginSpec | ForceSpec) -> Any:
+def import_plugin(spec: Plugin | PluginForce) -> Any:
     """Import what a scenario names, from what is installed, the spec's folder or the working directory; log from where.
 
     Raises:
@@ -172,14 +267,14 @@ def import_plugin(spec: PluginSpec | ForceSpec) -> Any:
     return found
 
 
-def refer_to(law: object, horizon: int = 1) -> PluginSpec:
+def refer_to(law: object, horizon: int = 1) -> Plugin:
     """How a scenario file names a controller or force that was passed in: by the place of its code."""
     code: Any = _code_of(law)
     file, folder = getattr(sys.modules.get(code.__module__), "__file__", None), None
     if file is not None and not file.startswith(_INSTALLED):
         folder = str(Path(file).resolve().parents[code.__module__.count(".") + file.endswith("__init__.py")])
     place = f"{code.__module__}:{code.__qualname__.replace('<locals>.', '').replace('<lambda>', 'law')}"
-    return PluginSpec(type=place, horizon=horizon, folder=folder, settings=getattr(law, "keywords", {}))
+    return Plugin(type=place, horizon=horizon, folder=folder, settings=getattr(law, "keywords", {}))
 
 
 def require_importable(law: object, what: str = "controller") -> None:
@@ -201,8 +296,8 @@ def _code_of(law: Any) -> Any:
     return code if isinstance(code, type) or inspect.isroutine(code) else type(code)
 
 
-def _table(spec: PluginSpec | ForceSpec) -> str:
-    return "forces" if isinstance(spec, ForceSpec) else "controller"
+def _table(spec: Plugin | PluginForce) -> str:
+    return "forces" if isinstance(spec, PluginForce) else "controller"
 
 
 def _reason(error: BaseException) -> str:

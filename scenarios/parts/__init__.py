@@ -1,1 +1,0 @@
-"""From the tables of a scenario file to the parts that fly: vehicle, effects, sensors, controllers."""

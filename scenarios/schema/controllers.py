@@ -1,0 +1,81 @@
+"""`[controller]`: the table of a controller, of the law that it names; a new one is a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, get_args
+
+from pydantic import Discriminator, Tag
+
+from mpc.baselines.geometric import Geometric
+from mpc.baselines.lqr import LQRTable
+from mpc.baselines.pid import PID
+from mpc.constrained import Constrained
+from mpc.nonlinear.settings import Nonlinear
+from mpc.robust.settings import Robust
+from mpc.unconstrained import Unconstrained
+from scenarios.plugin import FORM, Plugin, is_plugin
+from scenarios.schema.problems import parse_table
+from scenarios.schema.settings import set_field
+from scenarios.schema.writing import plain
+
+
+def _law(controller: object) -> str | None:
+    """Which of the laws below a table is of; anything else is left for the message."""
+    given = controller.get("type") if isinstance(controller, Mapping) else getattr(controller, "type", None)
+    if not isinstance(given, str):
+        return None
+    return given if given in LAWS or not is_plugin(given) else FORM
+
+
+class _OrName:
+    """In the schema a law's name alone stands for a table of defaults, see `Scenario.read`."""
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return {"anyOf": [handler(schema), {"type": "string"}]}
+
+
+_Table = Annotated[
+    Annotated[Unconstrained, Tag("unconstrained")]
+    | Annotated[Constrained, Tag("constrained")]
+    | Annotated[Robust, Tag("robust")]
+    | Annotated[Nonlinear, Tag("nonlinear")]
+    | Annotated[LQRTable, Tag("lqr")]
+    | Annotated[PID, Tag("pid")]
+    | Annotated[Geometric, Tag("geometric")]
+    | Annotated[Plugin, Tag(FORM)],
+    Discriminator(_law),
+]
+_TABLES: Final = {tag.tag: table for table, tag in map(get_args, get_args(get_args(_Table)[0]))}
+LAWS: Final = tuple(name for name in _TABLES if name != FORM)
+"""The names of built-in controllers."""
+AnyController = Annotated[_Table, _OrName()]
+"""Any of the laws, distinguished by its type; one whose fields all have defaults may be given by its name alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Holder:
+    """A table that has a controller, for messages to name it."""
+
+    controller: AnyController
+
+
+def changed(controller: AnyController, fields: Mapping[str, Any]) -> AnyController:
+    """A controller of which some fields, by dotted path, have other values; with a `type` it is replaced whole.
+
+    Raises:
+        ScenarioError: a field is not there, or its value is not allowed.
+    """
+    data: dict[str, Any] = {} if "type" in fields else plain(controller)
+    for path, value in _leaves(fields):
+        set_field(data, path, value, source="fields")
+    return parse_table(_Holder, {"controller": data}, "controller").controller
+
+
+def _leaves(fields: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in fields.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{above}{name}.")
+        else:
+            yield above + name, value
