@@ -225,6 +225,10 @@ def describe_all(
     lines: dict[tuple[str, ...], str] = {}
     whole: set[tuple[str, ...]] = set()  # lists of a wrong length, whose entries do not matter
     for details in sorted(error.errors(include_url=False), key=lambda details: details["type"] == "missing"):
+        for i, part in enumerate(details["loc"]):  # entries of a list that is too long are wrong beside the point
+            if isinstance(part, int) and find(details["loc"][:i], data, root).is_of_wrong_length:
+                details = {**details, "loc": details["loc"][:i], "type": "too_long"}
+                break
         place = find(details["loc"], data, root)
         lines.setdefault(place.names, describe(details, data, root, file=file))
         if details["type"] in ("too_short", "too_long") and place.is_of_wrong_length:

@@ -7,9 +7,13 @@ import tomllib
 import pytest
 from support import scenario_table
 
-from scenarios.loading import parse_scenario
+from scenarios.assembly import Assembly
+from scenarios.catalogue import scenario_names
+from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import plain
+
+SHIPPED = [Assembly(scenario).resolved.scenario for scenario in map(load_scenario, scenario_names())]
 
 
 @pytest.mark.parametrize("scenario", SHIPPED, ids=lambda scenario: scenario.name)
