@@ -6,12 +6,21 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from mpc.baselines.law import require_positive
 from quadsim.errors import ParameterError
 from quadsim.vehicle import Vehicle
 
 SEPARATION: Final = 2.0  # bandwidth of each loop over that of the loop around it
 YAW_SHARE: Final = 0.4  # bandwidth of heading over that of roll and pitch: about PX4's MC_YAW_P / MC_ROLL_P = 2.8 / 6.5
+
+
+def require_positive(name: str, value: float) -> None:
+    """A setting that has to be a positive, finite number.
+
+    Raises:
+        ParameterError: it is not.
+    """
+    if not 0.0 < value < math.inf:
+        raise ParameterError("controller", name, value, "positive and finite")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,8 +26,8 @@ from mpc.baselines.attitude import (
     rate_error,
     wanted_attitude,
 )
-from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for
-from mpc.baselines.law import FeedbackLaw, Tuned, require_positive
+from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
+from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import within

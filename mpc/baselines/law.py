@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
@@ -16,20 +15,10 @@ from mpc.bounded import LARGEST_HORIZON, ControllerTable, InputBounds, Range
 from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model
 from quadsim.controller import GROUNDED, Command, Moment, stopped
-from quadsim.errors import CommandError, ParameterError
+from quadsim.errors import CommandError
 from quadsim.fields import NonNegative
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
-
-
-def require_positive(name: str, value: float) -> None:
-    """A setting that has to be a positive, finite number.
-
-    Raises:
-        ParameterError: it is not.
-    """
-    if not 0.0 < value < math.inf:
-        raise ParameterError("controller", name, value, "positive and finite")
 
 
 class FeedbackLaw(ABC):

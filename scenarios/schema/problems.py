@@ -29,6 +29,11 @@ _LISTS: Final = (list, tuple, Sequence)  # types that are lists in a file
 _TAGS: Final = ("type", "distribution")  # fields that distinguish tables
 _NAMES: Final = {float: "number", int: "whole number", str: "text"}
 _LIMITS: Final = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+_REASONS: Final = {
+    "controller.compiled": " with this controller: only MPC with fixed matrices (unconstrained, constrained, robust) "
+    "can be compiled"
+}
+"""Why some fields are not there where a reader may expect them."""
 _KNOWN: Final = frozenset(get_args(core_schema.ErrorType))  # pydantic's kinds of error; a custom one states its rule
 
 
@@ -251,8 +256,8 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *,
         allowed = find(details["loc"][:-1], data, root).fields
         if len(place.names) == 1 and field != "base":
             allowed += ("base",)  # which is gone once a file has been merged over its base
-        guess = _guess(place.names[-1], allowed)
-        return f"{field} is not a field of the {file} file{guess} (there are: {', '.join(allowed)})"
+        hint = _REASONS.get(field) or _guess(place.names[-1], allowed)
+        return f"{field} is not a field of the {file} file{hint} (there are: {', '.join(allowed)})"
     if kind == "value_error":
         cause = details["ctx"]["error"]
         if isinstance(cause, ParameterError):  # of a dataclass, which does not know where it stands

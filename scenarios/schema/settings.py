@@ -149,6 +149,8 @@ def _holder(data: dict[str, Any], through: list[str], *, source: str, given: str
         if isinstance(held, list):
             held = held[_index(held, ".".join(through[:depth]), key)]
         else:
+            if key == "controller" and isinstance(held.get(key), str):  # its name alone
+                held[key] = {"type": held[key]}
             held = held.setdefault(key, {})
         if not isinstance(held, dict | list) or held == []:
             raise ParameterError("", source, given, f"a path to a field; {key} has none")
