@@ -413,10 +413,14 @@ class Bounded(Weighted):
         C_c = selection(names)
         return Bounds(C_c=C_c, y_min=lower, y_max=upper, delta_min=down, delta_max=up, u_min=u_min, u_max=u_max)
 
+    def constraints(self) -> tuple[Constraint, ...]:
+        """The rows beside `bounds`, of every law that has them."""
+        return rows_of(self.polytopes)
+
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
         """See `Weighted.problem`."""
         posed = super().problem(vehicle, period)
-        return replace(posed, bounds=self.bounds(), constraints=rows_of(self.polytopes))
+        return replace(posed, bounds=self.bounds(), constraints=self.constraints())
 
     def exportable(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
         """See `Weighted.exportable`."""

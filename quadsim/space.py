@@ -101,7 +101,9 @@ class Solid(NamedTuple):
             return np.array([w * w, y[2] - z[1], z[0] - x[2], x[1] - y[0]]) / (2.0 * w)
         axis = np.sqrt(np.maximum(0.0, 1.0 + np.array([x[0], y[1], z[2]])) / 2.0)  # a half turn
         first = int(axis.argmax())
-        return np.array([0.0, *np.where(self.turn[first] < 0.0, -axis, axis)])
+        signs = np.where(self.turn[first] < 0.0, -1.0, 1.0)
+        signs[first] = 1.0
+        return np.array([0.0, *(signs * axis)])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,7 +23,7 @@ from quadsim.flight.metrics import CourseStep
 from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance
 from quadsim.sim.airframe import outline
 from quadsim.sim.computation import Computation, ComputationTime, Stall
-from quadsim.sim.effects import LOADING, Change, Effects, Force, Push, PushChange
+from quadsim.sim.effects import Change, Effects, Force, Push, PushChange
 from quadsim.sim.effects.load import Load, mass_properties
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics, RotorLoss
 from quadsim.sim.effects.wind import Air, Gust, WindChange, WindField
@@ -389,7 +389,7 @@ class Assembly:
         return (
             *self._losses([event for event in events if isinstance(event, RotorLoss)]),
             *(PushChange(at=time, pushes=tuple(in_force)) for time, in_force in pushes),
-            *(event for event in events if isinstance(event, (*LOADING, LagChange))),
+            *(event for event in events if isinstance(event, Change)),
         )
 
     def _losses(self, losses: Sequence[RotorLoss]) -> Iterator[RotorChange]:

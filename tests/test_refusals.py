@@ -90,7 +90,8 @@ def test_the_table_has_every_field_of_a_scenario() -> None:
     declared = {name for table in (schema, *schema["$defs"].values()) for name in table.get("properties", {})}
     text = " ".join(" ".join(settings) for entry in ENTRIES for settings, _ in refused_settings(entry))
     text += " ".join(TABLE["scenario_files"])
-    assert not declared - set(re.findall(r"\w+", text))
+    missing = declared - set(re.findall(r"\w+", text))
+    assert not missing, missing
 
 
 @pytest.mark.parametrize("field", ["name", "duration", "control_period", "vehicle.file", "controller.horizon"])

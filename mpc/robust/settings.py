@@ -20,7 +20,6 @@ from mpc.bounded import (
     objective_of,
     require_lag,
     resolved_lag,
-    rows_of,
 )
 from mpc.constraints import Penalty
 from mpc.observer import ObserverSettings
@@ -65,7 +64,7 @@ class RobustSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Robust(Bounded):
-    """The robust MPC: `constrained`, and beside it whatever of the parts below is given."""
+    """The robust MPC: soft bounds, lag, delay, disturbances, heading and more, each switched on alone."""
 
     type: Annotated[Literal["robust"], doc("the control law, by its name in `quadsim list`")] = "robust"
     soft: Soft | None = None
@@ -167,7 +166,7 @@ class Robust(Bounded):
             objective=objective_of(self.output_weights, self.input_weights),
             bounds=self.bounds(),
             settings=settings,
-            constraints=rows_of(self.polytopes),
+            constraints=self.constraints(),
         )
 
     def _tightened(self, vehicle: Vehicle, period: float) -> dict[str, Any]:

@@ -136,6 +136,8 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
         from mpc.solvers.daqp import DaqpDense
 
         return DaqpDense()
+    if name in SOLVERS:
+        raise UnknownNameError("QP solver", name, SOLVERS, "make_backend makes none of it")
     from mpc.solvers.qpsolvers import AnyOfQpsolvers
 
     return AnyOfQpsolvers(name)

@@ -124,7 +124,7 @@ def sum_signal(terms: tuple[tuple[str, float], ...]) -> Signal:
 
 @dataclass(frozen=True, kw_only=True)
 class Limit:
-    """Bounds on a signal of the flight; see `quadsim.flight.audit.Limit`.
+    """Bounds on a signal of the flight.
 
     `slew` is the command's step per period, `speed` and `slew` hold for every rotor.  A bound that is infinite is none.
     An entry without bounds stands for the controller's; `scenarios.limits` puts these in.

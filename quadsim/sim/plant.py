@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from operator import add
-from typing import Final
+from typing import Final, assert_never
 
 import mujoco
 import numpy as np
@@ -20,7 +20,7 @@ from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
 from quadsim.sim.airframe import BODY, compile_model, obstacle_body, outline
 from quadsim.sim.effects import LOADING, Change, Effects, Force, PushChange
 from quadsim.sim.effects.forces import StepForces
-from quadsim.sim.effects.load import Load, MassChange, Payload, apply_mass, mass_properties
+from quadsim.sim.effects.load import Load, MassChange, Payload, PayloadDrop, apply_mass, mass_properties
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air, WindField
 from quadsim.sim.physics import Integrator, Segment, physics_to_state
@@ -250,8 +250,12 @@ class Plant:
                 self._rotors = self._rotors.lagging(change)
             elif isinstance(change, PushChange):
                 self._forces.push(change.pushes)
+            elif isinstance(change, Payload):
+                self._carry((*self._payloads, change), self._mass_factor)
+            elif isinstance(change, PayloadDrop):
+                self._carry((), self._mass_factor)
             else:
-                self._carry((*self._payloads, change) if isinstance(change, Payload) else (), self._mass_factor)
+                assert_never(change)
 
     def _carry(self, payloads: tuple[Payload, ...], mass_factor: float) -> None:
         self._payloads, self._mass_factor = payloads, mass_factor

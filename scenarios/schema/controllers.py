@@ -47,8 +47,9 @@ _Table = Annotated[
     | Annotated[Plugin, Tag(FORM)],
     Discriminator(_law),
 ]
-_TABLES: Final = {tag.tag: table for table, tag in map(get_args, get_args(get_args(_Table)[0]))}
-LAWS: Final = tuple(name for name in _TABLES if name != FORM)
+TABLES: Final = {tag.tag: table for table, tag in map(get_args, get_args(get_args(_Table)[0]))}
+"""Their tables, by name."""
+LAWS: Final = tuple(name for name in TABLES if name != FORM)
 """The names of built-in controllers."""
 AnyController = Annotated[_Table, _OrName()]
 """Any of the laws, distinguished by its type; one whose fields all have defaults may be given by its name alone."""

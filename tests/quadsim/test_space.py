@@ -21,6 +21,7 @@ from quadsim.space import (
     Cylinder,
     Fence,
     Place,
+    Solid,
     Solids,
     Sphere,
     Wall,
@@ -210,3 +211,11 @@ def test_footprints_are_as_wide_as_the_solid(obstacle: AnyObstacle) -> None:
         gap, _ = solid.clearance(1e6 * way[None] + solid.centre)  # from so far away, to the plane that touches it
         reach = ((outline - solid.centre[:2]) @ way[:2]).max()
         assert 1e6 - gap[0] == pytest.approx(reach, abs=2e-2 * max(reach, 0.1))
+
+
+@given(axis=st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda axis: np.linalg.norm(axis) > 0.1))
+def test_half_turns_about_any_axis_are_those_of_mujoco(axis: tuple[float, float, float]) -> None:
+    unit = np.array(axis) / np.linalg.norm(axis)
+    turn, again = 2.0 * np.outer(unit, unit) - np.eye(3), np.empty(9)
+    mujoco.mju_quat2Mat(again, Solid(kind="box", size=(1.0, 1.0, 1.0), centre=np.zeros(3), turn=turn).quaternion)
+    np.testing.assert_allclose(again.reshape(3, 3), turn, atol=1e-6)

@@ -24,7 +24,7 @@ from scenarios.design.vehicle_report import make_sheet
 from scenarios.results import EXIT_DONE
 
 VEHICLES = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]
-CRAZYFLIE, HUMMINGBIRD, LOPES, _ = VEHICLES
+CRAZYFLIE, HUMMINGBIRD, LOPES = (load_vehicle(vehicle_path(n)) for n in ("crazyflie2", "hummingbird", "lopes2011"))
 SKEWED = replace(HUMMINGBIRD, rotor_azimuths=(10.0, 100.0, -170.0, -80.0), speed_min=250.0)
 EVERY = pytest.mark.parametrize("vehicle", VEHICLES, ids=lambda vehicle: vehicle.name)
 

@@ -83,7 +83,7 @@ def test_the_first_seconds_at_8_m_s_are_those_of_the_specification() -> None:
 
 
 def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
-    assert paper_names() == ["quadrotor-uav", "torrente2021"]
+    assert {"quadrotor-uav", "torrente2021"} <= {*paper_names()}
     for name in paper_names():
         paper = load_paper(name)
         for number in paper.numbers:
