@@ -17,6 +17,16 @@ LIBRARY, CAMPAIGNS, TUNINGS, PAPERS = (_HERE / name for name in ("library", "cam
 
 Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
 
+CONTROLLERS: Final = {
+    "unconstrained": "the paper's Sec. 4: a constant gain from the unconstrained optimum",
+    "constrained": "the paper's Sec. 5: a QP's optimum in every period, tilt, rotor speeds and their steps bounded",
+    "robust": "constrained, with soft bounds, rotor lag, delay, disturbances, heading and more, each switched on alone",
+    "nonlinear": "nonlinear MPC at any attitude: a quaternion model, sequential quadratic programming",
+    "lqr": "infinite-horizon LQR on the hover model, following the reference's velocity",
+    "pid": "cascaded PID, as autopilots fly it",
+    "geometric": "geometric tracking control on SE(3)",
+}
+"""Named here too, so that `quadsim list` need not load them."""
 _MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
 """The mark of a scenario that is to defeat its controller."""
 
@@ -93,8 +103,6 @@ def read_catalogue() -> Catalogue:
     """Everything that ships; files are right, and not checked."""
     from mpc.solvers import solver_entries
     from quadsim.vehicle import load_vehicle
-    from scenarios.schema.controllers import LAWS, TABLES
-    from scenarios.schema.writing import headline
 
     scenarios = {}
     for name in scenario_names():
@@ -105,7 +113,7 @@ def read_catalogue() -> Catalogue:
         campaigns={name: read_toml(campaign_path(name))["description"] for name in campaign_names()},
         tunings={name: read_toml(tuning_path(name))["description"] for name in tuning_names()},
         vehicles={name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
-        controllers={law: headline(TABLES[law]) for law in LAWS},
+        controllers=CONTROLLERS,
         papers={name: read_toml(paper_path(name))["title"] for name in paper_names()},
         solvers={name: entry.line for name, entry in solver_entries().items()},
     )

@@ -169,7 +169,7 @@ def test_help_loads_little_and_list_no_simulator() -> None:
     assert "scenarios" in loaded
     assert loaded & declared() == {"cyclopts", "rich"}
     loaded = loaded_by("import scenarios.cli\nscenarios.cli.main(['list'])")
-    assert not loaded & {"mujoco", "pyarrow", "pandas"}
+    assert not loaded & {"mujoco", "pydantic", "pyarrow", "pandas"}
 
 
 REMOVING = {"unlink", "rmdir", "rmtree", "rename", "renames", "remove", "removedirs", "move"}

@@ -16,11 +16,12 @@ from golden_numbers import library_entry, read
 from mpc.answer import INFEASIBLE
 from quadsim.controller import FALLBACK, LAW, MISSED, STOPPED
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
-from scenarios.catalogue import LIBRARY, scenario_names
+from scenarios.catalogue import CONTROLLERS, LIBRARY, scenario_names
 from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.rollout import Rollout
 from scenarios.schema.base import fields_of
+from scenarios.schema.controllers import LAWS
 from scenarios.schema.scenario import Lost, Scenario
 
 SHARED = (
@@ -214,3 +215,7 @@ def test_the_page_states_every_loss_criterion_and_its_default() -> None:
     text = (ROOT / "docs" / "scenarios.md").read_text(encoding="utf-8")
     for name, info in fields_of(Lost).items():
         assert f"- `lost.{name} = {info.default:g}`: {info.description}\n" in text
+
+
+def test_the_list_has_every_controller() -> None:
+    assert {*CONTROLLERS} == {*LAWS}
