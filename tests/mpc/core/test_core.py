@@ -77,7 +77,7 @@ def test_drawn_states_are_answered_cold_and_warm_as_by_daqp(name: str, draws: in
             else:
                 assert answer.answered_by == PIQP
     assert count[CORE] > draws // 2
-    assert min(count[GAIN], count[PIQP]) > 0
+    assert name != "paper-constrained" or min(count[GAIN], count[PIQP]) > 0  # soft bounds are never infeasible
 
 
 SCENARIOS = {  # periods by who answered them; what these would be, were they the prototype's, is in no other place
