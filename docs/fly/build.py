@@ -55,7 +55,7 @@ def missing() -> str | None:
     if stamp.is_file() and stamp.read_text(encoding="utf-8") == wanted:
         return None
     CACHE.mkdir(exist_ok=True)
-    command = ["npm", "install", "--no-save", "--no-package-lock", "--no-audit", "--no-fund", "--fetch-retries=0"]
+    command = ["npm", "install", "--no-save", "--no-package-lock", "--no-audit", "--no-fund", "--fetch-retries=3"]
     names = [f"{name}@{pin}" for name, pin in PACKAGES.items()]
     done = subprocess.run([*command, f"--prefix={CACHE}", *names], capture_output=True, text=True)
     if done.returncode != 0:
