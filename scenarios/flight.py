@@ -48,7 +48,7 @@ _LONGEST: Final = 500  # characters of why a product failed
 _log: Final = logging.getLogger("quadsim")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Flight(Result):
     """A flown scenario.
 
@@ -110,6 +110,16 @@ class Flight(Result):
         What permanent fallback is: `quadsim.flight.metrics.unrecovered`.
         """
         return self.outcome == "satisfied"
+
+    def __repr__(self) -> str:
+        flown = self.log.control.t.size * self.scenario.control_period
+        line = f"<Flight {self.scenario.name}: {self.outcome}, {flown:.2f} s by {self.controller}"
+        reached = [finding for finding in self.findings if finding.verdict != "incomplete" and finding.limit.required]
+        if not reached:
+            return f"{line}>"
+        worst = min(reached, key=lambda finding: sum(finding.deciding) / finding.limit.half_band)
+        margin, tolerance = worst.deciding
+        return f"{line}\n worst margin: {worst.limit.name} {margin:.4g} {worst.limit.unit}, tolerance {tolerance:g}>"
 
     @property
     def outcome(self) -> Verdict:

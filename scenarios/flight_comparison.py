@@ -35,7 +35,7 @@ Target = Flight | Scenario | str | Path
 """What can be compared: a flight, a run directory, or a scenario to fly, by itself or by its name."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class FlightComparison(Result):
     """Flights side by side."""
 

@@ -49,7 +49,7 @@ _COMMANDED: Final = tuple(f"u{i}" for i in range(1, N_ROTORS + 1))
 _TURNING: Final = tuple(f"w{i}" for i in range(1, N_ROTORS + 1))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Reaudit(Result):
     """The audit from a run's tables, or of a flight as it was flown."""
 

@@ -46,6 +46,11 @@ class Result:
 
         return console.to_text(self.shown())
 
+    def __repr__(self) -> str:
+        """The first lines of its text."""
+        lines = self.text().splitlines()
+        return "\n".join([*lines[:9], *(["..."] if len(lines) > 9 else [])])
+
     def _repr_html_(self) -> str:
         """For notebooks."""
         from scenarios import console

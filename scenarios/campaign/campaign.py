@@ -60,7 +60,7 @@ class Standing:
 Watch = Callable[[Standing], None]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class CampaignResult(Result):
     """What came of a campaign."""
 
@@ -309,7 +309,7 @@ def recorded_flight(directory: Path, number: int | None) -> Recorded:
     return Recorded(number=number, row=row, plan=plan, scenario=plan.of(number), notes=notes)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Replay(Result):
     """A flight of a campaign, flown again."""
 

@@ -92,7 +92,7 @@ class MetricComparison:
     difference: PairedDifference  # of the second less the first
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class PairedComparison(Result):
     """What two campaigns on the same draws show of each other."""
 

@@ -150,7 +150,7 @@ BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate
 """Signals that controllers may have bounds on."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Scenario:
     """A flight: what flies, where, by which controller, and what is required of it."""
 
@@ -232,6 +232,10 @@ class Scenario:
             if self.duration > LONGEST_FLIGHT:
                 raise ValueError(f"duration must be <= {LONGEST_FLIGHT}; the course takes {self.duration}")
         self.require_consistent()
+
+    def __repr__(self) -> str:
+        parts = f"{self.duration:g} s of {self.vehicle.file}, {self.reference.type} by {self.controller.type}"
+        return f"<Scenario {self.name}: {parts}\n {self.description}>"
 
     @property
     def ends_with_course(self) -> bool:

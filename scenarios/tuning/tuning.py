@@ -44,7 +44,7 @@ MANIFEST_FILE: Final = "manifest.json"
 _MAY_CHANGE: Final = {"trials", "fresh", "description"}  # where a tuning is resumed
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class TuningResult(Result):
     """What came of a tuning.
 

@@ -300,3 +300,14 @@ def test_flights_are_compared(hover: Scenario, flight: Flight, tmp_path: Path) -
     page = quadsim.compare(saved, out=tmp_path / "page", progress=False).page
     assert page == tmp_path / "page" / "index.html"
     assert "hover" in page.read_text()
+
+
+def test_what_is_handed_out_names_itself_in_a_few_lines() -> None:
+    scenario = quadsim.load("hover").replace({"duration": 1.0})
+    flight = quadsim.fly(scenario)
+    assert repr(scenario).splitlines()[0] == "<Scenario hover: 1 s of lopes2011, steps by constrained"
+    first, worst = repr(flight).splitlines()
+    assert first == f"<Flight hover: {flight.outcome}, 1.00 s by constrained"
+    name, margin = re.fullmatch(r" worst margin: (\S+) (\S+) .*>", worst).groups()
+    assert float(margin) == pytest.approx(min(flight.margins[name]), abs=0.1)
+    assert len(repr(quadsim.compare(flight, flight)).splitlines()) <= 10
