@@ -52,14 +52,14 @@ def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) ->
 
 
 def outcome_line(summary: Mapping[str, Any]) -> Text:
-    """Completed or aborted with its reason, the verdict on the required constraints, and whether that was expected."""
+    """Completed, lost or aborted, with the reason or the verdict on the required constraints, and what was expected."""
     expected, as_expected = summary.get("expected", "satisfied"), summary.get("as_expected", True)
     remark = ""
     if expected != "satisfied":
         remark = ", as the scenario expects" if as_expected else f", where the scenario expects it {expected}"
     colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
     if summary["status"] != "completed":
-        return console.styled((f"aborted{remark}", colour), f": {summary['reason']}")
+        return console.styled((f"{verdict(summary)}{remark}", colour), f": {summary['reason']}")
     phrase = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
     if verdict(summary) == "incomplete":
         colour = "green" if remark and as_expected else "yellow"

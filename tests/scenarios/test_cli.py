@@ -173,8 +173,8 @@ LOST = ["--set", "initial.euler=[60.0, 0.0, 0.0]"]
         (VIOLATED, "satisfied", False, "completed, a required constraint does not hold  0.50 s"),
         (VIOLATED, "violated", True, "completed, a required constraint does not hold, as the scenario expects"),
         (VIOLATED, "lost", False, "completed, a required constraint does not hold, where the scenario expects it lost"),
-        (LOST, "satisfied", False, "aborted: at t = 0.000 s"),
-        (LOST, "lost", True, "aborted, as the scenario expects: at t = 0.000 s"),
+        (LOST, "satisfied", False, "lost: at t = 0.000 s"),
+        (LOST, "lost", True, "lost, as the scenario expects: at t = 0.000 s"),
     ],
 )
 def test_the_outcome_is_held_against_what_the_scenario_expects(
