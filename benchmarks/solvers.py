@@ -17,7 +17,7 @@ from timing import Record, options, run, step_quantiles, time_in_turns
 
 from mpc.constrained import Constrained
 from mpc.robust.settings import Robust
-from quadsim.controller import ACCEPTED, Command, Controller, Moment
+from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import FlightError, InputError, MissingCoreError, MissingPackageError
 from quadsim.flight.log import ControlLog
 from quadsim.state import Array, make_state
@@ -49,7 +49,7 @@ class Replayed:
         if period != self._period + 1:
             self._controller.reset(before)
         self._period = period
-        moment = Moment(time=float(self._log.t[period]), acting=before)
+        moment = StepInputs(time=float(self._log.t[period]), acting=before)
         reference = self._reference[period + 1 : period + 1 + self._controller.horizon]
         self._query = (moment, self._log.state[period], reference)
 

@@ -57,7 +57,7 @@ def main() -> None:
         terminal = Terminal(directory / "serial.elf")
         computer = SerialMPC(terminal, "double", scenario.controller.horizon)
 
-        def law(now: quadsim.Moment, state: Array, reference: Array) -> Array:
+        def law(now: quadsim.StepInputs, state: Array, reference: Array) -> Array:
             assert now.acting is not None
             if now.time <= 0.0:
                 computer.reset(now.acting)

@@ -38,7 +38,7 @@ def course(seed: int) -> quadsim.Scenario:
     return every.altered(constraints=[each for each in every.constraints if "arrival" not in each.name])
 
 
-def features(now: quadsim.Moment, state: Array, preview: Array, hover: float) -> Array:
+def features(now: quadsim.StepInputs, state: Array, preview: Array, hover: float) -> Array:
     """(213,) what the student knows: a state (12,), a reference (50, 4), the command in force, and a one."""
     assert now.acting is not None
     ahead = (preview - state[[0, 2, 4, 10]]).ravel()
@@ -53,7 +53,7 @@ class Student:
     def __init__(self, gain: Array, hover: float) -> None:
         self.gain, self.hover = gain, hover
 
-    def step(self, now: quadsim.Moment, state: Array, reference: Array) -> Array:
+    def step(self, now: quadsim.StepInputs, state: Array, reference: Array) -> Array:
         """See `quadsim.controller.Controller.step`."""
         return np.clip(self.hover + features(now, state, reference, self.hover) @ self.gain, 0.0, 250.0)
 
@@ -72,7 +72,7 @@ class Lesson:
         """See `quadsim.controller.Controller.reset`."""
         self.teacher.reset(speeds)
 
-    def step(self, now: quadsim.Moment, state: Array, reference: Array) -> quadsim.Command | Array:
+    def step(self, now: quadsim.StepInputs, state: Array, reference: Array) -> quadsim.Command | Array:
         """See `quadsim.controller.Controller.step`."""
         command = self.teacher.step(now, state, reference)
         if command.status in ("solved", "unconstrained"):

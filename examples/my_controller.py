@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from quadsim.controller import Moment
+from quadsim.controller import StepInputs
 from quadsim.state import POSITION, VELOCITY
 from quadsim.vehicle import Vehicle
 
@@ -18,7 +18,7 @@ class MyController:
         self.inertia = np.array([vehicle.mass, *vehicle.inertia])
         self.to_squares = np.linalg.inv(vehicle.allocation)  # from thrust and torques to squared rotor speeds
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Array:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Array:
         """Four rotor speeds [rad/s] for a state (12,) and the next N samples of the course (N, 4)."""
         (roll, pitch, yaw), rates, g = state[[6, 8, 10]], state[[7, 9, 11]], self.vehicle.gravity
         velocity = np.diff(reference[:, :3], axis=0) / self.period

@@ -17,7 +17,7 @@ from mpc.ocp import InfeasiblePeriod, Problem, Query
 from mpc.paper import rollout
 from mpc.qp import KKT_EVERY
 from mpc.solvers import INVALID_DATA, Answer, Solver
-from quadsim.controller import GROUNDED, Command, Controller, Moment, stopped
+from quadsim.controller import GROUNDED, Command, Controller, StepInputs, stopped
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -73,7 +73,7 @@ class ConstrainedMPC:
         if law is not None and law._plan is not None:
             self._plan, self._held = resized(law._plan, self.horizon), law._held
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.
 
         While landed the rotors are taken to their lowest speed as fast as their bounds allow.

@@ -27,7 +27,7 @@ from annotated_types import doc
 
 from mpc.allocation import allocate, make_allocation
 from mpc.handover import hand_over, within
-from quadsim.controller import GROUNDED, Command, Controller, Moment
+from quadsim.controller import GROUNDED, Command, Controller, StepInputs
 from quadsim.fields import Positive
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -109,7 +109,7 @@ class Incremental:
         if law is not None:
             self._loop.adopt(law._loop)
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """The law's command, with the inner loop that is to carry it out; on the ground without."""
         command = self.inner.step(now, state, reference)
         if now.phase in GROUNDED:

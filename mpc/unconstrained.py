@@ -16,7 +16,7 @@ from mpc.condensing import condensed_cost
 from mpc.obstacles import Shape
 from mpc.ocp import Problem
 from mpc.paper import prediction, rollout
-from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Controller, Moment, stopped
+from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Controller, StepInputs, stopped
 from quadsim.errors import InputError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -61,7 +61,7 @@ class UnconstrainedMPC:
     def reset(self, speeds: Array) -> None:
         """Nothing to forget: the law has no memory."""
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Evaluate Eq. (22), rotors off while landed; see `quadsim.controller.Controller.step`."""
         if now.phase in GROUNDED:
             return stopped(np.zeros(self.problem.model.nu), self.horizon, now.phase)

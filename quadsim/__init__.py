@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from quadsim.controller import Command as Command
-    from quadsim.controller import Moment as Moment
+    from quadsim.controller import StepInputs as StepInputs
     from quadsim.errors import QuadsimError as QuadsimError
     from quadsim.vehicle import Vehicle as Vehicle
     from scenarios.app import campaign as campaign
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
-    "quadsim.controller": "Command Moment",
+    "quadsim.controller": "Command StepInputs",
     "quadsim.errors": "QuadsimError",
     "quadsim.vehicle": "Vehicle",
     "scenarios.app": "campaign catalogue check compare doctor feasibility film fly live load load_vehicle "

@@ -54,7 +54,7 @@ class Phase(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Moment:
+class StepInputs:
     """When a controller is called, and what it may use besides the measured state.
 
     Attributes:
@@ -68,7 +68,7 @@ class Moment:
 
     Examples:
         >>> import quadsim
-        >>> quadsim.Moment(time=0.05).phase.value
+        >>> quadsim.StepInputs(time=0.05).phase.value
         'flying'
     """
 
@@ -191,7 +191,7 @@ class Controller(Protocol):
         """Forget the past: the next step is the first, after `speeds` u(-1) (4,) [rad/s]."""
         ...
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """The command for the period that starts now, of a measured state xi(k) (12,).
 
         The reference (N, 4) is filtered x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.

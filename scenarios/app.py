@@ -154,7 +154,7 @@ def make_controller(scenario: ScenarioName) -> Controller:
         >>> import quadsim
         >>> law = quadsim.make_controller("paper-constrained")
         >>> law.reset(np.full(4, 200.0))
-        >>> command = law.step(quadsim.Moment(), np.zeros(12), np.zeros((law.horizon, 4)))
+        >>> command = law.step(quadsim.StepInputs(), np.zeros(12), np.zeros((law.horizon, 4)))
         >>> command.speeds.shape, command.plan.shape
         ((4,), (50, 4))
     """

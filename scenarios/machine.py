@@ -80,7 +80,7 @@ def _rendering() -> str:
 
 def _try_solver(name: str) -> str:
     """Solve the first step of the paper's constrained flight."""
-    from quadsim.controller import SOLVED, Moment
+    from quadsim.controller import SOLVED, StepInputs
     from scenarios.loading import assemble
 
     assembly = assemble("paper-constrained", [f"controller.solver={name}"])
@@ -90,7 +90,7 @@ def _try_solver(name: str) -> str:
     controller.reset(assembly.initial_speeds)
     reference = assembly.reference(controller.horizon + 1)[1:]
     try:
-        command = controller.step(Moment(), assembly.initial_state(), reference)
+        command = controller.step(StepInputs(), assembly.initial_state(), reference)
     except FlightError as error:
         return f"fails: {error}"
     verdict = "works" if command.status == SOLVED else f"answers {command.status}"

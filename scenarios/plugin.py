@@ -27,7 +27,7 @@ from annotated_types import doc
 from mpc.bounded import ControllerTable, Horizon
 from mpc.handover import hand_over
 from mpc.obstacles import Shape
-from quadsim.controller import SQP, Command, Controller, Moment
+from quadsim.controller import SQP, Command, Controller, StepInputs
 from quadsim.errors import CommandError, InputError, ParameterError, UnknownNameError, printable
 from quadsim.fields import is_plain
 from quadsim.flight.log import RESIDUALS
@@ -165,7 +165,7 @@ class PluginController:
         """See `quadsim.controller.Controller`."""
         hand_over(self._law, previous._law if isinstance(previous, PluginController) else previous)
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError where the answer is no command."""
         acting = None if now.acting is None else now.acting.copy()
         answer: Any = self._law.step(replace(now, acting=acting), state.copy(), reference.copy())

@@ -17,7 +17,7 @@ from mpc.heading import advance as advance_from
 from mpc.heading import turn
 from mpc.model import LinearModel
 from mpc.ocp import Problem
-from quadsim.controller import SOLVED, Command, Moment
+from quadsim.controller import SOLVED, Command, StepInputs
 from quadsim.state import INDEX, Array
 
 PERIOD = 0.05
@@ -72,13 +72,13 @@ class Scripted:
     horizon: int = 30
     name: str = "scripted"
     solver: str = "none"
-    calls: list[tuple[Moment, Array]] = field(default_factory=list)
+    calls: list[tuple[StepInputs, Array]] = field(default_factory=list)
     resets: list[Array] = field(default_factory=list)
 
     def reset(self, speeds: Array) -> None:
         self.resets.append(speeds)
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         entry = self.script.get(len(self.calls), {})
         self.calls.append((now, state.copy()))
         if isinstance(entry, Exception):
@@ -103,7 +103,7 @@ def guard(inner: Any, **options: Any) -> Guarded:
 
 
 def call(guarded: Guarded, state: Array | None = None, **now: Any) -> Command:
-    return guarded.step(Moment(**now), np.zeros(12) if state is None else state, np.zeros((guarded.horizon, 4)))
+    return guarded.step(StepInputs(**now), np.zeros(12) if state is None else state, np.zeros((guarded.horizon, 4)))
 
 
 def failing(periods: Sequence[int], **answer: Any) -> dict[int, dict[str, Any] | Exception]:
@@ -124,7 +124,7 @@ class Pressed(Scripted):
 
     trim = pressed()
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         plan = np.tile(self.trim.speeds, (self.horizon, 1))
         answer = super().step(now, state, reference)
         return replace(answer, speeds=plan[0], plan=plan)

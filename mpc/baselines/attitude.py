@@ -75,15 +75,15 @@ def attitude_for(force: Array, yaw: float) -> Array:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def prioritised_error(attitude: Array, wanted: Array, yaw_weight: float) -> Array:
+def prioritised_error(attitude: Array, desired: Array, yaw_weight: float) -> Array:
     """Attitude error (3,) about the body axes [rad for small errors], heading last; attitudes (3, 3) body to world.
 
     2 sgn(q_0) times the vector part of the error quaternion q = q_tilt q_yaw: the shortest rotation that brings body z
-    where it is wanted, then the rest, a turn about it of which only the share `yaw_weight`, in (0, 1], is demanded.
+    where it is desired, then the rest, a turn about it of which only the share `yaw_weight`, in (0, 1], is demanded.
     Brescianini, Hehn, D'Andrea, "Nonlinear quadrocopter attitude control", ETH Zurich, 2013; PX4's
     AttitudeControl.  The yaw part is divided by the weight, so that small errors of all three axes count alike.
     """
-    thrust = attitude.T @ wanted[:, 2]  # where body z is to go, seen from the body
+    thrust = attitude.T @ desired[:, 2]  # where body z is to go, seen from the body
     cosine = float(np.clip(thrust[2], -1.0, 1.0))
     if cosine > -1.0 + 1e-9:
         w = math.sqrt(0.5 * (1.0 + cosine))
@@ -94,20 +94,20 @@ def prioritised_error(attitude: Array, wanted: Array, yaw_weight: float) -> Arra
         w, x, y = 0.0, 1.0, 0.0
         tilting = np.diag([1.0, -1.0, -1.0])
     tilted = attitude @ tilting
-    turn = math.atan2(wanted[:, 0] @ tilted[:, 1], wanted[:, 0] @ tilted[:, 0])
+    turn = math.atan2(desired[:, 0] @ tilted[:, 1], desired[:, 0] @ tilted[:, 0])
     half = 0.5 * yaw_weight * turn
     c, s = math.cos(half), math.sin(half)
     return 2.0 * np.array([x * c + y * s, y * c - x * s, w * s / yaw_weight])
 
 
-def attitude_error(attitude: Array, wanted: Array) -> Array:
+def attitude_error(attitude: Array, desired: Array) -> Array:
     """e_R = (R_d' R - R' R_d)^vee / 2 (3,).  Lee, Leok, McClamroch (2010)."""
-    return vee(wanted.T @ attitude)
+    return vee(desired.T @ attitude)
 
 
-def rate_error(attitude: Array, rates: Array, wanted: Array, wanted_rates: Array) -> Array:
+def rate_error(attitude: Array, rates: Array, desired: Array, desired_rates: Array) -> Array:
     """e_Omega = Omega - R' R_d Omega_d (3,) [rad/s].  Lee, Leok, McClamroch (2010)."""
-    return np.asarray(rates - attitude.T @ wanted @ wanted_rates)
+    return np.asarray(rates - attitude.T @ desired @ desired_rates)
 
 
 def unit_derivatives(v: Array, v1: Array, v2: Array) -> tuple[Array, Array, Array]:
@@ -121,7 +121,7 @@ def unit_derivatives(v: Array, v1: Array, v2: Array) -> tuple[Array, Array, Arra
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted:
+class DesiredAttitude:
     """The computed attitude R_c (3, 3), Omega_c (3,) [rad/s] and its derivative (3,) [rad/s^2], in its own axes."""
 
     attitude: Array
@@ -129,7 +129,7 @@ class Wanted:
     acceleration: Array
 
 
-def wanted_attitude(force: Sequence[Array], momentum: Sequence[Array], drag: Array, heading: Array) -> Wanted:
+def desired_attitude(force: Sequence[Array], momentum: Sequence[Array], drag: Array, heading: Array) -> DesiredAttitude:
     """R_c = [b_1c, b_2c, b_3c] with b_1c as near to the heading as the force leaves.
 
     What the rotors and drag give together is to be `force`, f b_3c - R_c diag(d) R_c' p = A: across the body
@@ -155,7 +155,7 @@ def wanted_attitude(force: Sequence[Array], momentum: Sequence[Array], drag: Arr
     R_c = np.stack([b1, b2, b3], axis=1)
     Omega_c = vee(R_c.T @ np.stack([b11, b21, b31], axis=1))
     acceleration_c = vee(R_c.T @ np.stack([b12, b22, b32], axis=1))  # of hat(Omega_c)^2 + hat(Omega_c'), skew
-    return Wanted(attitude=R_c, rates=Omega_c, acceleration=acceleration_c)
+    return DesiredAttitude(attitude=R_c, rates=Omega_c, acceleration=acceleration_c)
 
 
 def _with_drag(force: Sequence[Array], momentum: Sequence[Array], drag: float) -> Sequence[Array]:

@@ -18,13 +18,13 @@ from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
 from mpc.baselines.attitude import (
     LEAST_LIFT,
+    DesiredAttitude,
     Measured,
-    Wanted,
     attitude_error,
+    desired_attitude,
     limit_force,
     motion_of,
     rate_error,
-    wanted_attitude,
 )
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
 from mpc.baselines.law import FeedbackLaw, Tuned
@@ -34,7 +34,7 @@ from mpc.handover import within
 from mpc.indi import Incremental, INDISettings
 from mpc.nonlinear.model import zero
 from mpc.obstacles import Shape
-from quadsim.controller import Command, Controller, Moment, Phase
+from quadsim.controller import Command, Controller, Phase, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.state import Array
@@ -59,7 +59,7 @@ class GeometricSettings:
     c_2: float = 1.0  # weight of the attitude error in the second [1/s]
     sigma: float = 5.0  # largest acceleration of the first integral, each axis [m/s^2]
     sigma_R: float = 5.0  # largest angular acceleration of the second, each axis [rad/s^2]
-    tilt_max: float = 45.0  # largest tilt of the wanted force [deg]; Lee et al. (2010) know none
+    tilt_max: float = 45.0  # largest tilt of the desired force [deg]; Lee et al. (2010) know none
     feedforward: bool = False
     """Whether the reference's jerk and snap are fed forward too, drag with them, and commands aimed at the middle of
     the period that they are held for."""
@@ -74,7 +74,7 @@ def geometric_settings(
 ) -> GeometricSettings:
     """Settings whose gains follow from the period and the lag to allow for [s]; `others` are fields of theirs.
 
-    Since the law feeds forward how the wanted attitude turns, its linearisation has the polynomial
+    Since the law feeds forward how the desired attitude turns, its linearisation has the polynomial
     (s^2 + k_Omega s + k_R)(s^2 + k_v s + k_x), and about k_Omega + k_v for the gain from a rate error to angular
     acceleration: that sum is 1 / (2 (period / 2 + lag)), as in `bandwidths`.  The outer pair is four times slower than
     the inner one (the cascade's separation of 2, twice), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2.
@@ -150,7 +150,7 @@ class GeometricController(FeedbackLaw):
             if self._observer is not None and law._observer is not None:
                 self._observer.adopt(law._observer)
 
-    def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
+    def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """The law's wrench as rotor speeds; the integrals rest while bounds keep it from being given."""
         exact = self.settings.feedforward or self._observer is not None
         motion = motion_of(state, now.attitude, now.body_rates) if exact else motion_of(state)
@@ -158,15 +158,15 @@ class GeometricController(FeedbackLaw):
         if self.settings.feedforward and now.motion is not None:
             yaw = np.array([target.yaw, target.yaw_rate, target.yaw_acceleration])
             target = target_of_motion(now.motion, yaw, self.settings.period)
-        wrench, wanted = self.wrench(motion, target, self._integrals, self._observed(now, motion, before))
+        wrench, desired = self.wrench(motion, target, self._integrals, self._observed(now, motion, before))
         lower, upper = self.bounds.reach(before)
         speeds = allocate(self._allocation, wrench, lower, upper)
         given = np.allclose(self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max())
         if given and now.phase is Phase.FLYING:
-            self._integrals = self.integrate(self._integrals, motion, target, wanted)
+            self._integrals = self.integrate(self._integrals, motion, target, desired)
         return self._held_for_a_period(speeds)
 
-    def _observed(self, now: Moment, motion: Measured, before: Array) -> Disturbance:
+    def _observed(self, now: StepInputs, motion: Measured, before: Array) -> Disturbance:
         """What the observer expects of the middle of the period that starts now; at rest until the vehicle flies."""
         if self._observer is None:
             return UNDISTURBED
@@ -178,7 +178,7 @@ class GeometricController(FeedbackLaw):
 
     def wrench(
         self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
-    ) -> tuple[Array, Wanted]:
+    ) -> tuple[Array, DesiredAttitude]:
         """[f, M_x, M_y, M_z] (4,) [N, N m], and the attitude that the moment turns to.
 
         f = A . R e_3 with A = m (-k_x e_x - k_v e_v + g e_3 + x_d'' - d) less the integral, and
@@ -186,7 +186,7 @@ class GeometricController(FeedbackLaw):
             - J (hat(Omega) R' R_c Omega_c - R' R_c Omega_c'),
 
         with the observed disturbance d, d_Omega.  With feed-forward the drag at the reference's velocity counts too:
-        `wanted_attitude`, and f is that of half a period on.
+        `desired_attitude`, and f is that of half a period on.
 
         Where the limits of tilt or of lift hold A, the attitude that it demands counts as one at rest.
         """
@@ -201,29 +201,29 @@ class GeometricController(FeedbackLaw):
         if np.array_equal(A, demanded):
             A1, A2 = self._force_derivatives(motion, target, A, e_v, disturbance)
             p1, p2 = m * target.acceleration, m * target.jerk
-        wanted = wanted_attitude(
+        desired = desired_attitude(
             (A, A1, A2),
             (m * target.velocity, p1, p2),
             self._drag,
             _heading(motion.yaw, target) if target.heading is None else target.heading,
         )
-        R_rel = R.T @ wanted.attitude
-        e_R, e_Omega = attitude_error(R, wanted.attitude), rate_error(R, Omega, wanted.attitude, wanted.rates)
-        ahead = np.cross(Omega, R_rel @ wanted.rates) - R_rel @ wanted.acceleration + disturbance[2]
+        R_rel = R.T @ desired.attitude
+        e_R, e_Omega = attitude_error(R, desired.attitude), rate_error(R, Omega, desired.attitude, desired.rates)
+        ahead = np.cross(Omega, R_rel @ desired.rates) - R_rel @ desired.acceleration + disturbance[2]
         moment = np.cross(Omega, J * Omega) - J * (self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
         if not settings.feedforward:
-            return np.concatenate([[A @ R[:, 2]], moment]), wanted
+            return np.concatenate([[A @ R[:, 2]], moment]), desired
         half = 0.5 * settings.period
         up = R[:, 2] + half * R @ np.array([Omega[1], -Omega[0], 0.0])
         along, along1 = A + m * self._drag[2] * target.velocity, A1 + self._drag[2] * p1
-        return np.concatenate([[(along + half * along1) @ up], moment]), wanted
+        return np.concatenate([[(along + half * along1) @ up], moment]), desired
 
-    def integrate(self, integrals: Integrals, motion: Measured, target: Target, wanted: Wanted) -> Integrals:
+    def integrate(self, integrals: Integrals, motion: Measured, target: Target, desired: DesiredAttitude) -> Integrals:
         """The integrals one period on: of e_v + c_1 e_x and of e_Omega + c_2 e_R, saturated."""
         settings = self.settings
         e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
-        e_R = attitude_error(motion.attitude, wanted.attitude)
-        e_Omega = rate_error(motion.attitude, motion.rates, wanted.attitude, wanted.rates)
+        e_R = attitude_error(motion.attitude, desired.attitude)
+        e_Omega = rate_error(motion.attitude, motion.rates, desired.attitude, desired.rates)
         translation = integrals.translation + settings.period * settings.k_i * (e_v + settings.c_1 * e_x)
         rotation = integrals.rotation + settings.period * settings.k_I * (e_Omega + settings.c_2 * e_R)
         return Integrals(
@@ -257,10 +257,10 @@ class GeometricController(FeedbackLaw):
 
 
 def _heading(yaw: float, target: Target) -> Array:
-    """(3, 3) rows: the horizontal direction wanted for body x, its rate of change and that of this.
+    """(3, 3) rows: the horizontal direction desired for body x, its rate of change and that of this.
 
-    e_R vanishes at half a turn, where it should be largest: a heading more than a quarter turn away is wanted a quarter
-    turn away, and at rest.
+    e_R vanishes at half a turn, where it should be largest: of a heading more than a quarter turn away, a quarter turn
+    is desired, at rest.
     """
     turn = wrapped(target.yaw - yaw)
     near = abs(turn) <= 0.5 * math.pi

@@ -14,7 +14,7 @@ from mpc.baselines.preview import SMALLEST_PREVIEW, differentiator
 from mpc.bounded import LARGEST_HORIZON, ControllerTable, InputBounds, Range
 from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model
-from quadsim.controller import GROUNDED, Command, Moment, stopped
+from quadsim.controller import GROUNDED, Command, StepInputs, stopped
 from quadsim.errors import CommandError
 from quadsim.fields import NonNegative
 from quadsim.state import STATE_NAMES, Array
@@ -37,7 +37,7 @@ class FeedbackLaw(ABC):
         """Restart after the command u(-1) (4,) [rad/s]."""
         self._before = np.array(speeds, float)
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """The law's command; on the ground the lowest speed, as fast as bounds allow; see `quadsim.controller`.
 
         Raises:
@@ -62,7 +62,7 @@ class FeedbackLaw(ABC):
         return predict_in_heading_frame(self.model, states, plans)
 
     @abstractmethod
-    def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
+    def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """The command in the air after `before` (4,) [rad/s], from finite numbers; see `Controller.step`."""
 
     def _held_for_a_period(self, speeds: Array) -> Command:

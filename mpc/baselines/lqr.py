@@ -19,7 +19,7 @@ from mpc.heading import turn_horizontally
 from mpc.model import LinearModel, continuous_model, discretise, hover_model, lqr
 from mpc.obstacles import Shape
 from mpc.ocp import Objective
-from quadsim.controller import Command, Controller, Moment
+from quadsim.controller import Command, Controller, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
 from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, STATE_NAMES, VELOCITY, Array, read_only
@@ -118,7 +118,7 @@ class LQR(FeedbackLaw):
         self._allocation = make_allocation(vehicle)
         self._tilt_demand = np.linalg.pinv(self.gain[:, TILT]) @ self.gain[:, HORIZONTAL]
 
-    def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
+    def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """The law's command now, held to the bounds, and then those of the closed loop of the model."""
         targets = self._targets(state, reference)
         xi = state

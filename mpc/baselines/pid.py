@@ -21,7 +21,7 @@ from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import Target, target_of
 from mpc.handover import within
 from mpc.obstacles import Shape
-from quadsim.controller import Command, Controller, Moment, Phase
+from quadsim.controller import Command, Controller, Phase, StepInputs
 from quadsim.fields import Positive
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -94,7 +94,7 @@ class CascadedPID(FeedbackLaw):
         if law is not None:
             self._memory = law._memory
 
-    def _command(self, now: Moment, state: Array, reference: Array, before: Array) -> Command:
+    def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """One period of all loops, integrals at rest until the vehicle flies."""
         target, reach = target_of(reference, self._operator), self.bounds.reach(before)
         speeds, after = self.fly(self._memory, state, target, *reach)

@@ -15,13 +15,24 @@ from mpc.core.library import check_mirrors
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
 from mpc.core.solver import PROBLEMS, Key, Work, core_library, core_problem
 from mpc.equilibrium import Trim
-from mpc.fallback.completion import CompletedMoment
+from mpc.fallback.completion import CompletedInputs
 from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model
 from mpc.nonlinear.model import SUBSTEPS
 from mpc.paper import rollout
 from mpc.robust.settings import LONGEST_SPAN
-from quadsim.controller import CORE, FALLBACK, GAIN, GROUNDED, SOLVED, UNCONSTRAINED, Command, Moment, Phase, stopped
+from quadsim.controller import (
+    CORE,
+    FALLBACK,
+    GAIN,
+    GROUNDED,
+    SOLVED,
+    UNCONSTRAINED,
+    Command,
+    Phase,
+    StepInputs,
+    stopped,
+)
 from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -164,7 +175,7 @@ class CompiledMPC:
             return Trim(speeds=self._trim.copy(), lift=self._lift.copy(), twist=self._twist.copy())
         return Trim(speeds=self._shared.nominal.u_bar, lift=np.array([0.0, 0.0, 1.0]))
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`."""
         acting = self._before if now.acting is None else now.acting
         if now.phase in GROUNDED:
@@ -212,12 +223,12 @@ class CompiledMPC:
         self.reset(speeds)
         return stopped(speeds.copy(), self.horizon, phase)
 
-    def _may_learn(self, now: Moment) -> bool:
+    def _may_learn(self, now: StepInputs) -> bool:
         """Whether what was expected for now may be held against the state; see `RobustMPC.pose`."""
         if abs(now.time - self._called_at - self._shared.nominal.period) > _SAME_TIME:
             self._measured = -math.inf
         self._called_at = now.time
-        if isinstance(now, CompletedMoment) and now.unseen[_MOVING].any():
+        if isinstance(now, CompletedInputs) and now.unseen[_MOVING].any():
             return False
         span, self._measured = now.time - self._measured, now.time
         return span - _SAME_TIME <= LONGEST_SPAN and now.phase is Phase.FLYING

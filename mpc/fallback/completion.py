@@ -26,7 +26,7 @@ from mpc.bounded import by_group
 from mpc.equilibrium import Trim
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
-from quadsim.controller import Moment
+from quadsim.controller import StepInputs
 from quadsim.rotation import body_rates_of
 from quadsim.state import (
     ANGLE_RATES,
@@ -66,13 +66,13 @@ UNKNOWN: Final = by_group(100.0, 10.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompletedMoment(Moment):
+class CompletedInputs(StepInputs):
     """A moment whose state may in part be predicted rather than measured."""
 
     unseen: Array  # (12,) periods since each channel was measured; 0 for one that is
 
 
-def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) -> CompletedMoment:
+def completed_inputs(now: StepInputs, acting: Array, unseen: Array, known: Array) -> CompletedInputs:
     """A moment with the command in force (4,) and which channels (12,) of the state `known` (12,) are not measured.
 
     Its attitude and body rates are left out where the state's are predicted.  Next to a pitch of 90 deg the rates of
@@ -83,7 +83,7 @@ def completed_moment(now: Moment, acting: Array, unseen: Array, known: Array) ->
         values["attitude"] = None
     if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
         values["body_rates"] = None
-    return CompletedMoment(**values)
+    return CompletedInputs(**values)
 
 
 class StateCompletion:

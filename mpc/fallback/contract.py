@@ -10,7 +10,7 @@ Each period, the first of these that can be had:
 
 The inner controller is called in every period in which the state is known, so that recovery is automatic.  It receives
 the command in force, so that its bounds on steps refer to what acts, whatever commanded it, and which channels of the
-state are predicted rather than measured (`mpc.fallback.completion.CompletedMoment`).
+state are predicted rather than measured (`mpc.fallback.completion.CompletedInputs`).
 
 One that estimates disturbances gives the equilibrium under them as an attribute `trim` (`mpc.equilibrium.Trim`).
 Levels 1 to 3, and predictions of channels that are not measured, start from it; it is held while nothing is measured.
@@ -29,13 +29,23 @@ import numpy as np
 from mpc.answer import ActuatorBounds, rejection, shifted
 from mpc.bounded import USUAL_TILT, FallbackSettings
 from mpc.equilibrium import Trim
-from mpc.fallback.completion import PLAUSIBLE_REFERENCE, CompletedMoment, StateCompletion, completed_moment
+from mpc.fallback.completion import PLAUSIBLE_REFERENCE, CompletedInputs, StateCompletion, completed_inputs
 from mpc.fallback.hover import HoverLaw
 from mpc.handover import hand_over, resized, within
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
 from mpc.ocp import InfeasiblePeriod
-from quadsim.controller import ACCEPTED, FALLBACK, GROUNDED, Command, Controller, Moment, Phase, check_command, stopped
+from quadsim.controller import (
+    ACCEPTED,
+    FALLBACK,
+    GROUNDED,
+    Command,
+    Controller,
+    Phase,
+    StepInputs,
+    check_command,
+    stopped,
+)
 from quadsim.errors import FlightError
 from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
@@ -91,7 +101,7 @@ class Guarded:
             state, plan = law._good
             self._good = state, resized(plan, self.horizon)
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """The first level's command that can be had; see `quadsim.controller.Controller.step`.
 
         However the inner controller fails, this raises none of its `FAILURES`, whose names become the status.
@@ -99,7 +109,7 @@ class Guarded:
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
         known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
-        completed = completed_moment(now, acting.copy(), self._completion.unseen.copy(), known)
+        completed = completed_inputs(now, acting.copy(), self._completion.unseen.copy(), known)
         status, answer = self._call(completed, known, reference)
         if now.phase in GROUNDED:
             self._forget()
@@ -135,7 +145,7 @@ class Guarded:
             return predicted
         return predict_in_heading_frame(anchored(self._model, self.trim), states, plans, self.trim)
 
-    def _call(self, now: CompletedMoment, known: Array, reference: Array) -> tuple[str, Command | None]:
+    def _call(self, now: CompletedInputs, known: Array, reference: Array) -> tuple[str, Command | None]:
         """The inner controller's answer where one was given, and its status: an accepted one is good to fly."""
         assert now.acting is not None
         if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:

@@ -47,7 +47,7 @@ from mpc.obstacles import ObstacleQP, Space
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
 from mpc.solvers import INVALID_DATA, Answer, QPSolver
-from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, SQP, Command, Moment, Phase, stopped
+from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, SQP, Command, Phase, StepInputs, stopped
 from quadsim.errors import ParameterError
 from quadsim.rotation import (
     body_to_euler_rates,
@@ -296,7 +296,7 @@ class NonlinearMPC:
             self._observer.adopt(estimate)
             self._update_disturbance(self._observer.estimate)
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; numbers out of hand are answered with the status `invalid_data`."""
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
@@ -369,7 +369,7 @@ class NonlinearMPC:
         """(6,) estimated acceleration now, world [m/s^2], and angular acceleration, body [rad/s^2]."""
         return np.concatenate([self._model.acceleration, self._model.angular_acceleration])
 
-    def _measured(self, now: Moment, state: Array) -> Array:
+    def _measured(self, now: StepInputs, state: Array) -> Array:
         """(n,) the model's state."""
         x = np.concatenate([_body(state), self._rotors])[: self._model.n]
         for part, measured in ((Q, now.attitude), (W, now.body_rates)):

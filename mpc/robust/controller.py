@@ -21,7 +21,7 @@ import numpy as np
 from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
-from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE, CompletedMoment
+from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE, CompletedInputs
 from mpc.handover import observed, within
 from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, with_nearest_yaw
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
@@ -34,7 +34,7 @@ from mpc.qp import KKT_EVERY
 from mpc.robust.settings import LONGEST_SPAN
 from mpc.robust.settings import RobustSettings as RobustSettings
 from mpc.solvers import INVALID_DATA, Answer, Solver
-from quadsim.controller import GROUNDED, Command, Moment, Phase, stopped
+from quadsim.controller import GROUNDED, Command, Phase, StepInputs, stopped
 from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -141,7 +141,7 @@ class RobustMPC:
             self._update_trim()
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; what is answered without a QP: `pose`."""
         query = self.pose(now, state, reference)
         if isinstance(query, Command):
@@ -165,12 +165,12 @@ class RobustMPC:
         return command_of(plan[0], plan, answer.status, answer)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
-    def pose(self, now: Moment, state: Array, reference: Array) -> Query | Command:
+    def pose(self, now: StepInputs, state: Array, reference: Array) -> Query | Command:
         """What this period's problem is solved for, once per period; or the answer, where nothing is to be solved.
 
         Numbers that are not finite, not `mpc.fallback.completion.PLAUSIBLE`, or lead to such are answered with the
         status `invalid_data`, and do not update the observer.  Neither does a state that is in part predicted
-        (`mpc.fallback.completion.CompletedMoment`), the first measured one after more than `LONGEST_SPAN` of such, or
+        (`mpc.fallback.completion.CompletedInputs`), the first measured one after more than `LONGEST_SPAN` of such, or
         one after a pause: `now.time` has to be a period later than last time.
         """
         if now.acting is not None:
@@ -245,9 +245,9 @@ class RobustMPC:
         x, y, along = self._estimate[:3].tolist()
         return along * axis[0] + x, along * axis[1] + y, along * axis[2]
 
-    def _span(self, now: Moment) -> float:
+    def _span(self, now: StepInputs) -> float:
         """Time since the last measured state [s]; infinite after a pause, or where the present one is not measured."""
-        if isinstance(now, CompletedMoment) and now.unseen[_MOVING].any():
+        if isinstance(now, CompletedInputs) and now.unseen[_MOVING].any():
             return math.inf
         span, self._measured = now.time - self._measured, now.time
         return span - _SAME_TIME

@@ -32,7 +32,7 @@ from mpc.robust.controller import RobustMPC
 from mpc.robust.tightening import observed
 from mpc.solvers import Answer
 from mpc.solvers.piqp import Piqp
-from quadsim.controller import ACCEPTED, UNCONSTRAINED, Command, Moment
+from quadsim.controller import ACCEPTED, UNCONSTRAINED, Command, StepInputs
 from quadsim.state import Array
 
 LATER: Final = 1e-6
@@ -84,7 +84,7 @@ class SafetyFilter:
         self._mpc.reset(speeds)
         self.wanted = np.array(speeds, float)
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """The nearest command to `wanted` after which the constraints can hold; `unconstrained` where that is it."""
         query = self._mpc.pose(now, state, reference)
         if isinstance(query, Command):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
-from quadsim.controller import Command, Controller, InnerLoop, Moment, Phase
+from quadsim.controller import Command, Controller, InnerLoop, Phase, StepInputs
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError
 from quadsim.flight.log import FlightLog
 from quadsim.flight.phase import check_loss
@@ -259,7 +259,7 @@ class ClosedLoop:
         self._lowest = min(self._lowest, float(row[_HEIGHT]))
         if self._loss is not None and phase is not Phase.CRASHED:
             check_loss(self._loss, self.time, truth, row, self._lowest)
-        now = Moment(
+        now = StepInputs(
             time=self.time,
             phase=phase,
             acting=self._acting,

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from quadsim.controller import FALLBACK, MISSED, Command, Moment, Phase
+from quadsim.controller import FALLBACK, MISSED, Command, Phase, StepInputs
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.rotation import body_to_euler_rates, quaternion_to_euler
 from quadsim.sim.sensing import whole
@@ -99,7 +99,7 @@ class Observation:
     truth: Array  # (12,) as it is
     reference: Array  # (4,) filtered x, y, z [m], yaw [rad] at t_k
     preview: Array  # (N, 4) the same at t_{k+1} .. t_{k+N}, as far as it is known.
-    moment: Moment  # when it is, and what a controller may know besides; `moment.acting` is u(k-1)
+    moment: StepInputs  # when it is, and what a controller may know besides; `moment.acting` is u(k-1)
 
 
 @dataclass(frozen=True, kw_only=True)

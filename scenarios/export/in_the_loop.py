@@ -28,7 +28,7 @@ from mpc.core.law import ANSWERERS, LEVELS, STATUSES
 from mpc.export.ctext import Precision
 from mpc.export.targets import EMULATOR, TARGETS, Target
 from mpc.ocp import Problem
-from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Moment, stopped
+from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, StepInputs, stopped
 from quadsim.errors import FlightError, MissingProgramError, QuadsimError
 from quadsim.flight.audit import Limit
 from quadsim.outputs import reserving
@@ -227,7 +227,7 @@ class MPCInTheLoop:
         self._before, self.ways = np.array(speeds, float), [0] * len(STATUSES)
         self._serial.reset(speeds)
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.
 
         Raises:

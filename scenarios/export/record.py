@@ -13,13 +13,13 @@ from mpc.bounded import Bounded
 from mpc.constrained import ConstrainedMPC
 from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
-from mpc.fallback.completion import CompletedMoment
+from mpc.fallback.completion import CompletedInputs
 from mpc.fallback.contract import Guarded
 from mpc.ocp import Query
 from mpc.robust.controller import RobustMPC
 from mpc.solvers import Method
 from mpc.unconstrained import UnconstrainedMPC
-from quadsim.controller import ACCEPTED, CORE, GAIN, Command, Moment, Phase
+from quadsim.controller import ACCEPTED, CORE, GAIN, Command, Phase, StepInputs
 from quadsim.errors import ExportError, PlanExhaustedError
 from quadsim.state import Array
 from scenarios.assembly import Assembly
@@ -57,9 +57,9 @@ class Recorder:
         self.queries, self._before, self._ended = [], np.array(speeds, float), False
         self.inner.reset(speeds)
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`."""
-        flying = now.phase is Phase.FLYING and not (isinstance(now, CompletedMoment) and now.unseen.any())
+        flying = now.phase is Phase.FLYING and not (isinstance(now, CompletedInputs) and now.unseen.any())
         self._ended |= bool(self.queries) and not flying
         if flying and not self._ended:
             acting = self._before if now.acting is None else now.acting
@@ -115,7 +115,7 @@ def _answers(
     for k, (state, acting, reference) in enumerate(queries):
         answer = REFUSED, acting
         with contextlib.suppress(PlanExhaustedError):
-            command = law.step(Moment(time=k * period, acting=acting), state, reference)
+            command = law.step(StepInputs(time=k * period, acting=acting), state, reference)
             if command.status in ACCEPTED:
                 assert law.answer is not None
                 answer = WAYS[law.answer.method], command.speeds

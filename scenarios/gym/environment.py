@@ -15,7 +15,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import VectorEnv
 
-from quadsim.controller import Command, Moment, Phase
+from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import FlightError, ParameterError
 from quadsim.flight.audit import Limit
 from quadsim.flight.log import FlightLog
@@ -329,7 +329,7 @@ class Agent:
         """See `quadsim.controller.Controller.reset`."""
         self.speeds = speeds.copy()
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Never called: each step has a command."""
         raise NotImplementedError
 

@@ -9,7 +9,7 @@ from support import paper_problem, paper_reference
 from mpc.constrained import ConstrainedMPC
 from mpc.ocp import Query
 from mpc.solvers import Answer, QPSolver
-from quadsim.controller import Command, Moment
+from quadsim.controller import Command, StepInputs
 from quadsim.errors import PlanExhaustedError
 
 STATE = np.zeros(12)
@@ -44,7 +44,9 @@ def fly(faults: dict[int, str], periods: int, horizon: int = 50) -> list[Command
     controller = ConstrainedMPC(solver.problem, solver)
     controller.reset(solver.problem.model.u_bar)
     reference = paper_reference(periods + horizon + 1)
-    return [controller.step(Moment(time=0.05 * k), STATE, reference[k + 1 : k + 1 + horizon]) for k in range(periods)]
+    return [
+        controller.step(StepInputs(time=0.05 * k), STATE, reference[k + 1 : k + 1 + horizon]) for k in range(periods)
+    ]
 
 
 def test_commands_respect_their_hard_bounds_exactly() -> None:
@@ -92,10 +94,10 @@ def test_reset_forgets_the_plan() -> None:
     controller = ConstrainedMPC(solver.problem, solver)
     reference = paper_reference(60)[1:51]
     controller.reset(solver.problem.model.u_bar)
-    controller.step(Moment(), STATE, reference)
+    controller.step(StepInputs(), STATE, reference)
     controller.reset(solver.problem.model.u_bar)
     with pytest.raises(PlanExhaustedError):
-        controller.step(Moment(), STATE, reference)
+        controller.step(StepInputs(), STATE, reference)
 
 
 def test_slews_count_from_the_command_that_acts() -> None:
@@ -104,8 +106,8 @@ def test_slews_count_from_the_command_that_acts() -> None:
     controller = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem))
     reference = paper_reference(51)[1:]
     controller.reset(problem.model.u_bar)
-    commanded = controller.step(Moment(), STATE, reference).speeds
+    commanded = controller.step(StepInputs(), STATE, reference).speeds
     acting = commanded - 7.0
-    after = controller.step(Moment(time=0.05, acting=acting), STATE, reference).speeds
+    after = controller.step(StepInputs(time=0.05, acting=acting), STATE, reference).speeds
     assert problem.bounds is not None
     np.testing.assert_allclose(after, acting + problem.bounds.delta_max, atol=1e-6)  # it climbs as fast as it may

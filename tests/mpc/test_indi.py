@@ -10,7 +10,7 @@ import pytest
 from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import GeometricController, geometric_settings
 from mpc.indi import Incremental, INDISettings, TorqueIncrement
-from quadsim.controller import Moment, Phase
+from quadsim.controller import Phase, StepInputs
 from quadsim.flight.log import FlightLog
 from quadsim.sim.effects import Disturbance, Effects
 from quadsim.sim.effects.rotors import RotorDynamics
@@ -99,8 +99,8 @@ def test_on_the_ground_there_is_no_inner_loop(vehicle: Vehicle) -> None:
     law = GeometricController(vehicle, geometric_settings(vehicle, period=0.05))
     controller = Incremental(law, vehicle, INDISettings(), law.bounds)
     preview = np.zeros((law.horizon, 4))
-    assert controller.step(Moment(phase=Phase.LANDED), make_state(), preview).inner is None
-    assert controller.step(Moment(), make_state(), preview).inner is not None
+    assert controller.step(StepInputs(phase=Phase.LANDED), make_state(), preview).inner is None
+    assert controller.step(StepInputs(), make_state(), preview).inner is not None
     assert (controller.name, controller.horizon, controller.unanswered) == ("geometric", 10, None)
 
 

@@ -21,7 +21,7 @@ from mpc.model import LinearModel, continuous_model, discretise
 from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.solvers import SOLVERS, Method, QPSolver, find_solver, make_solver, solver_entries
-from quadsim.controller import ACCEPTED, CORE, SOLVED, UNCONSTRAINED, Moment
+from quadsim.controller import ACCEPTED, CORE, SOLVED, UNCONSTRAINED, StepInputs
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle
 
@@ -281,7 +281,7 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
     )
     controller = RobustMPC(vehicle, posed, settings, make_solver(CORE, posed))
     controller.reset(hover)
-    command = controller.step(Moment(acting=hover), state, reference)
+    command = controller.step(StepInputs(acting=hover), state, reference)
     assert command.status == SOLVED
     np.testing.assert_allclose(command.plan, peer.plan, rtol=0.0, atol=1e-5)
     held = problem.constraints[0]

@@ -19,7 +19,7 @@ from mpc.qp import kkt_residuals
 from mpc.solvers import CORE_OR_PIQP, SOLVERS, Answer, QPSolver, find_solver, make_backend, make_solver, solver_entries
 from mpc.solvers.daqp import DaqpDense
 from mpc.solvers.piqp import Piqp
-from quadsim.controller import CORE, GAIN, SOLVED, Moment
+from quadsim.controller import CORE, GAIN, SOLVED, StepInputs
 from quadsim.errors import MissingPackageError, PlanExhaustedError, UnknownNameError
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
@@ -68,7 +68,7 @@ def test_data_that_is_not_finite_reaches_no_back_end(place: int, corrupted: floa
     controller = ConstrainedMPC(problem, solver)
     controller.reset(problem.model.u_bar)
     with pytest.raises(PlanExhaustedError, match="invalid_data"):
-        controller.step(Moment(), np.full(12, np.nan), paper_reference(51)[1:])
+        controller.step(StepInputs(), np.full(12, np.nan), paper_reference(51)[1:])
 
 
 @pytest.mark.parametrize(

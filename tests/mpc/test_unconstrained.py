@@ -9,7 +9,7 @@ import scipy.linalg
 from support import paper_problem, paper_reference
 
 from mpc.unconstrained import UnconstrainedMPC, sequence_gains
-from quadsim.controller import Moment
+from quadsim.controller import StepInputs
 from quadsim.state import Array
 
 
@@ -57,7 +57,7 @@ def test_step_is_the_first_action_of_the_sequence() -> None:
     controller = UnconstrainedMPC(problem)
     reference = paper_reference(300)[150:250]
     state = np.random.default_rng(0).normal(size=12) * 0.1
-    command = controller.step(Moment(), state, reference)
+    command = controller.step(StepInputs(), state, reference)
     gains = controller.gains
     desired = np.zeros((100, 12))
     desired[:, [0, 2, 4, 10]] = reference

@@ -16,7 +16,7 @@ from mpc.answer import ActuatorBounds
 from mpc.nonlinear.controller import NonlinearMPC
 from mpc.nonlinear.rigidbody import Inputs
 from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
-from quadsim.controller import ACCEPTED, Moment
+from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.motion import Motion
 from quadsim.state import N_STATES, POSITIONS, VELOCITIES, Array
 from scenarios.assembly import Assembly
@@ -120,7 +120,7 @@ class Course:
         """(N, 4) inputs that our controller answers."""
         state = np.zeros(N_STATES)
         state[POSITIONS], state[VELOCITIES] = question.state[:3], question.state[7:10]
-        moment = Moment(
+        moment = StepInputs(
             time=time,
             acting=self.speeds(question.before),
             attitude=question.state[3:7],

@@ -12,7 +12,7 @@ import pytest
 from support import NO_PRODUCTS
 
 import quadsim
-from quadsim.controller import Moment
+from quadsim.controller import StepInputs
 from quadsim.flight import rundir
 from quadsim.report.comparison import comparison_rows
 from quadsim.state import STATE_NAMES, Array
@@ -76,7 +76,7 @@ def test_each_parameter_moves_the_plant_and_not_the_controller(name: str) -> Non
         laws = one.loop.controller, other.loop.controller
         for law in laws:
             law.reset(speeds)
-        commands = [law.step(Moment(acting=speeds), state, target).plan for law in laws]
+        commands = [law.step(StepInputs(acting=speeds), state, target).plan for law in laws]
     np.testing.assert_array_equal(*commands)
 
 

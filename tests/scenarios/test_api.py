@@ -18,7 +18,7 @@ import pytest
 import mpc
 import quadsim
 import quadsim.gym
-from quadsim.controller import Moment
+from quadsim.controller import StepInputs
 from quadsim.errors import InputError, OutputError, ParameterError, RenderingUnavailableError, UnknownNameError
 from quadsim.flight import rundir
 from quadsim.report.film.video import rendering_backend
@@ -31,7 +31,7 @@ Fly = Callable[..., Flight]
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
-def hover_law(now: Moment, state: Array, reference: Array) -> Array:
+def hover_law(now: StepInputs, state: Array, reference: Array) -> Array:
     """A law that other processes can import."""
     return np.full(4, 180.0 if now.time < 0.2 else 210.0)
 
@@ -42,7 +42,7 @@ class Gentle:
     def __init__(self, vehicle: Vehicle, period: float, horizon: int, share: float = 1.0) -> None:
         self.speeds = np.full(4, share * vehicle.hover_speed)
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Array:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Array:
         return self.speeds
 
 
@@ -163,7 +163,7 @@ def test_a_custom_law_flies(hover: Scenario) -> None:
     ready = Gentle(by_class.vehicle, 0.05, 50, share=0.5)
     assert np.array_equal(by_class.command, quadsim.fly(hover, controller=ready, progress=False).command)
 
-    def local(now: Moment, state: Array, reference: Array) -> Array:
+    def local(now: StepInputs, state: Array, reference: Array) -> Array:
         return ready.speeds
 
     assert np.array_equal(by_class.command, quadsim.fly(hover, controller=local, progress=False).command)
@@ -281,7 +281,7 @@ def test_a_custom_law_is_sent_to_other_processes_by_its_place(
     assert swept(steady) == [210.0, 210.0]
     assert swept(functools.partial(steady, speed=190.0)) == [190.0, 190.0]
 
-    def local(now: Moment, state: Array, reference: Array) -> Array:
+    def local(now: StepInputs, state: Array, reference: Array) -> Array:
         return np.zeros(4)
 
     for law, message in ((local, "at the top of a module"), (object(), "at the top of a module")):

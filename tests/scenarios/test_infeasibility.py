@@ -22,7 +22,7 @@ from mpc.constrained import ConstrainedMPC
 from mpc.fallback.contract import Guarded
 from mpc.nonlinear.controller import CONVERGED
 from mpc.ocp import InfeasiblePeriod
-from quadsim.controller import ACCEPTED, Command, Controller, Moment
+from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
@@ -147,7 +147,7 @@ def query_case(file: str, case: Case, *more: str) -> Queried:
     controller.reset(acting)
     status = "plan_exhausted_error"
     with contextlib.suppress(PlanExhaustedError):
-        status = controller.step(Moment(acting=acting), case.state, np.zeros((controller.horizon, 4))).status
+        status = controller.step(StepInputs(acting=acting), case.state, np.zeros((controller.horizon, 4))).status
     return Queried(
         scenario=scenario,
         vehicle=vehicle,
@@ -253,7 +253,7 @@ def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str)
     state, acting = case.state, np.full(4, queried.vehicle.hover_speed)
     guarded.reset(acting)
     for k in range(50):
-        command = guarded.step(Moment(time=0.05 * k, acting=acting), state, np.zeros((HORIZON, 4)))
+        command = guarded.step(StepInputs(time=0.05 * k, acting=acting), state, np.zeros((HORIZON, 4)))
         if command.status in ACCEPTED:
             break
         state, acting = model.A @ state + model.B @ (command.speeds - model.u_bar), command.speeds
@@ -331,7 +331,7 @@ class Keeping:
         self.inner = ConstrainedMPC(self.problem, mpc.QPSolver("piqp-multistage", self.problem))
         self.unanswered: InfeasiblePeriod | None = None
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         try:
             return self.inner.step(now, state, reference)
         finally:

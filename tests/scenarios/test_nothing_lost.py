@@ -81,7 +81,7 @@ def test_an_inner_loop_that_raises_ends_the_flight_there() -> None:
         def speeds(self, *_: object) -> list[float]:
             raise RuntimeError("inner")
 
-    def law(now: quadsim.Moment, state: object, reference: np.ndarray[Any, Any]) -> quadsim.Command:
+    def law(now: quadsim.StepInputs, state: object, reference: np.ndarray[Any, Any]) -> quadsim.Command:
         speeds = np.full(4, 192.8)
         inner = Inner() if now.time > 0.38 else None
         return quadsim.Command(speeds=speeds, plan=speeds[None].repeat(len(reference), 0), inner=inner)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpc.fallback.completion import completed_moment
+from mpc.fallback.completion import completed_inputs
 from mpc.nonlinear.rigidbody import thrust_axis
-from quadsim.controller import Command, Moment
+from quadsim.controller import Command, StepInputs
 from quadsim.flight.parquet import read_log, write_log
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion, quaternion_to_euler
 from quadsim.sim.physics import physics_to_state
@@ -34,9 +34,9 @@ class Listener:
     name, solver, horizon = "listener", "", 1
 
     def reset(self, speeds: Array) -> None:
-        self.speeds, self.heard = speeds, list[tuple[Moment, Array]]()
+        self.speeds, self.heard = speeds, list[tuple[StepInputs, Array]]()
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         self.heard.append((now, state))
         return Command(speeds=self.speeds, plan=self.speeds[None])
 
@@ -109,17 +109,17 @@ def test_controllers_receive_the_attitude_that_belongs_to_their_state(name: str)
 
 
 def test_predicted_channels_are_not_passed_on_as_measured() -> None:
-    now = Moment(attitude=np.array([1.0, 0.0, 0.0, 0.0]), body_rates=np.ones(3))
+    now = StepInputs(attitude=np.array([1.0, 0.0, 0.0, 0.0]), body_rates=np.ones(3))
     known, seen = np.zeros(N_STATES), np.zeros(N_STATES)
-    whole = completed_moment(now, np.ones(4), seen, known)
+    whole = completed_inputs(now, np.ones(4), seen, known)
     assert whole.attitude is now.attitude
     assert whole.body_rates is now.body_rates
     for channels, attitude, rates in ((ANGLES, None, now.body_rates), (ANGLE_RATES, now.attitude, None)):
         unseen = seen.copy()
         unseen[channels] = 1.0
-        partly = completed_moment(now, np.ones(4), unseen, known)
+        partly = completed_inputs(now, np.ones(4), unseen, known)
         assert partly.attitude is attitude
         assert partly.body_rates is rates
     steep = known.copy()
     steep[8] = 1.55  # where rates of Euler angles are beyond belief, those of the body are not
-    assert completed_moment(now, np.ones(4), unseen, steep).body_rates is now.body_rates
+    assert completed_inputs(now, np.ones(4), unseen, steep).body_rates is now.body_rates

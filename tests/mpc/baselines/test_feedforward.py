@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import Measured, Wanted, hat, wanted_attitude
+from mpc.baselines.attitude import DesiredAttitude, Measured, desired_attitude, hat
 from mpc.baselines.geometric import GeometricController, Integrals, geometric_settings
 from mpc.baselines.preview import Target, target_of_motion
 from mpc.flatness import motion_along
@@ -43,14 +43,14 @@ def target_at(t: float) -> Target:
     )
 
 
-def flat(vehicle: Vehicle, drag: Array, t: float) -> tuple[float, Wanted]:
+def flat(vehicle: Vehicle, drag: Array, t: float) -> tuple[float, DesiredAttitude]:
     """Thrust [N] and attitude along the three sines."""
     m, target = vehicle.mass, target_at(t)
     force = m * (target.acceleration + np.array([0.0, 0.0, vehicle.gravity])), m * target.jerk, m * target.snap
     momentum = m * target.velocity, m * target.acceleration, m * target.jerk
     c, s = np.cos(target.yaw), np.sin(target.yaw)
     heading = np.array([[c, s, 0.0], [-0.4 * s, 0.4 * c, 0.0], [-0.16 * c, -0.16 * s, 0.0]])
-    wanted = wanted_attitude(force, momentum, drag, heading)
+    wanted = desired_attitude(force, momentum, drag, heading)
     return float(wanted.attitude[:, 2] @ (force[0] + drag[2] * momentum[0])), wanted
 
 

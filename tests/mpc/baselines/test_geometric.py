@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mpc.baselines.attitude import Measured, Wanted, motion_of, vee
+from mpc.baselines.attitude import DesiredAttitude, Measured, motion_of, vee
 from mpc.baselines.geometric import GeometricController, Integrals
 from mpc.baselines.preview import Target
 from quadsim.assets import vehicle_path
-from quadsim.controller import Moment
+from quadsim.controller import StepInputs
 from quadsim.flight.log import FlightLog
 from quadsim.state import make_state, tilt
 from quadsim.vehicle import Vehicle, load_vehicle
@@ -38,7 +38,7 @@ TARGET = Target(
 )
 
 
-def wanted_after(law: GeometricController, vehicle: Vehicle, h: float) -> tuple[np.ndarray, Wanted]:
+def wanted_after(law: GeometricController, vehicle: Vehicle, h: float) -> tuple[np.ndarray, DesiredAttitude]:
     """R_c and the law's rates of it, `h` [s] on, the vehicle having moved under the law's thrust."""
     wrench, _ = law.wrench(MOTION, TARGET, NONE)
     acceleration = wrench[0] / vehicle.mass * MOTION.attitude[:, 2] - np.array([0.0, 0.0, vehicle.gravity])
@@ -59,7 +59,7 @@ def wanted_after(law: GeometricController, vehicle: Vehicle, h: float) -> tuple[
     return wanted.attitude, wanted
 
 
-def test_the_wanted_rates_and_their_change_are_those_of_the_wanted_attitude(
+def test_the_desired_rates_and_their_change_are_those_of_the_wanted_attitude(
     craft: Vehicle, build: Callable[..., Any]
 ) -> None:
     law, h = build("geometric", craft), 1e-5
@@ -169,8 +169,10 @@ def test_integrals_rest_while_the_rotors_have_no_more(vehicle: Vehicle, build: C
     controller, place = build("geometric", vehicle, integral=True), np.zeros((10, 4))
     below = make_state(position=(0.0, 0.0, -30.0))
     for _ in range(20):
-        assert controller.step(Moment(), below, place).speeds.max() == pytest.approx(vehicle.speed_max)
-    np.testing.assert_allclose(controller.step(Moment(), make_state(), place).speeds, vehicle.hover_speed, rtol=1e-9)
+        assert controller.step(StepInputs(), below, place).speeds.max() == pytest.approx(vehicle.speed_max)
+    np.testing.assert_allclose(
+        controller.step(StepInputs(), make_state(), place).speeds, vehicle.hover_speed, rtol=1e-9
+    )
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mpc.answer import ActuatorBounds
-from quadsim.controller import Moment, Phase
+from quadsim.controller import Phase, StepInputs
 from quadsim.errors import CommandError
 from quadsim.state import INDEX, make_state
 from quadsim.vehicle import Vehicle
@@ -28,7 +28,7 @@ def held(controller: Any, pose: Any) -> np.ndarray:
 def first_wrench(controller: Any, vehicle: Vehicle, state: np.ndarray, pose: Any) -> np.ndarray:
     """[U, tau_x, tau_y, tau_z] that a fresh controller commands at once."""
     controller.reset(np.full(4, vehicle.hover_speed))
-    return vehicle.allocation @ controller.step(Moment(), state, held(controller, pose)).speeds ** 2
+    return vehicle.allocation @ controller.step(StepInputs(), state, held(controller, pose)).speeds ** 2
 
 
 @pytest.mark.parametrize("yaw", HEADINGS)
@@ -37,7 +37,7 @@ def test_at_rest_on_the_reference_the_command_is_hover(law: str, craft: Vehicle,
     state = make_state(position=(1.0, -2.0, 3.0), euler=(0.0, 0.0, psi))
     controller = build(law, craft)
     for turns in (-1, 0, 2):  # the plant unwraps yaw, the reference may not
-        command = controller.step(Moment(), state, held(controller, [1.0, -2.0, 3.0, psi + 2.0 * math.pi * turns]))
+        command = controller.step(StepInputs(), state, held(controller, [1.0, -2.0, 3.0, psi + 2.0 * math.pi * turns]))
         np.testing.assert_allclose(command.speeds, craft.hover_speed, rtol=1e-9)
         assert command.plan.shape == (controller.horizon, 4)
         np.testing.assert_array_equal(command.plan[0], command.speeds)
@@ -76,7 +76,7 @@ def test_a_target_that_moves_is_followed_with_its_velocity(law: str, craft: Vehi
     state[[INDEX["vx"], INDEX["vy"], INDEX["vz"]]] = 0.4, -0.3, 0.2
     t = 0.05 * np.arange(1, controller.horizon + 1)
     reference = np.stack([0.4 * t, -0.3 * t, 0.2 * t, np.full_like(t, 0.5)], axis=1)
-    command = controller.step(Moment(), state, reference)
+    command = controller.step(StepInputs(), state, reference)
     np.testing.assert_allclose(command.speeds, craft.hover_speed, rtol=1e-6)
 
 
@@ -89,10 +89,10 @@ def test_a_state_or_reference_that_is_not_finite_is_refused_and_forgotten(
     broken = state.copy()
     broken[INDEX["vx"]] = value
     with pytest.raises(CommandError, match="no command from a measured state whose vx is not finite"):
-        controller.step(Moment(time=1.0), broken, held(controller, pose))
+        controller.step(StepInputs(time=1.0), broken, held(controller, pose))
     with pytest.raises(CommandError, match="no command from a reference that is not finite"):
-        controller.step(Moment(time=1.0), state, held(controller, [value, 0.0, 0.0, 0.0]))
-    answers = [one.step(Moment(), state, held(one, pose)).speeds for one in (controller, other)]
+        controller.step(StepInputs(time=1.0), state, held(controller, [value, 0.0, 0.0, 0.0]))
+    answers = [one.step(StepInputs(), state, held(one, pose)).speeds for one in (controller, other)]
     np.testing.assert_array_equal(*answers)
 
 
@@ -103,13 +103,13 @@ def test_on_the_ground_rotors_are_stopped_as_fast_as_slews_allow(
     bounds = ActuatorBounds.alike((20.0, 250.0), (-10.0, 5.0))
     controller = build(law, vehicle, bounds=bounds)
     controller.reset(np.array([100.0, 25.0, 20.0, 200.0]))
-    command = controller.step(Moment(phase=phase), np.full(12, math.nan), held(controller, np.zeros(4)))
+    command = controller.step(StepInputs(phase=phase), np.full(12, math.nan), held(controller, np.zeros(4)))
     np.testing.assert_array_equal(command.speeds, [90.0, 20.0, 20.0, 190.0])
     assert command.status == str(phase)
-    command = controller.step(Moment(phase=phase), np.zeros(12), held(controller, np.zeros(4)))
+    command = controller.step(StepInputs(phase=phase), np.zeros(12), held(controller, np.zeros(4)))
     np.testing.assert_array_equal(command.speeds, [80.0, 20.0, 20.0, 180.0])
     free = build(law, vehicle)
-    command = free.step(Moment(phase=phase), np.zeros(12), held(free, np.zeros(4)))
+    command = free.step(StepInputs(phase=phase), np.zeros(12), held(free, np.zeros(4)))
     np.testing.assert_array_equal(command.speeds, 0.0)
 
 
@@ -121,7 +121,9 @@ def test_integrals_wait_for_the_flight(law: str, vehicle: Vehicle, build: Build)
     answers = {}
     for phase in (Phase.ARMED, Phase.FLYING):
         controller = build(law, vehicle, **others)
-        answers[phase] = [controller.step(Moment(phase=phase), state, held(controller, pose)).speeds for _ in range(20)]
+        answers[phase] = [
+            controller.step(StepInputs(phase=phase), state, held(controller, pose)).speeds for _ in range(20)
+        ]
     np.testing.assert_allclose(answers[Phase.ARMED][-1], answers[Phase.ARMED][0], rtol=1e-12)
     assert answers[Phase.FLYING][-1].sum() > answers[Phase.FLYING][0].sum() + 0.5
 
@@ -137,7 +139,7 @@ def test_any_state_gets_a_command_within_speeds_and_slews(
     controller.reset(before)
     for _ in range(3):
         state, pose = size * rng.normal(size=12), size * rng.normal(size=4)
-        speeds = controller.step(Moment(), state, held(controller, pose)).speeds
+        speeds = controller.step(StepInputs(), state, held(controller, pose)).speeds
         assert np.isfinite(speeds).all()
         assert speeds.min() >= 0.0
         assert speeds.max() <= 250.0
@@ -154,7 +156,7 @@ def test_without_bounds_of_its_own_it_commands_what_the_rotors_hold(
     extremes = []
     for _ in range(30):
         state, pose = size * rng.normal(size=12), size * rng.normal(size=4)
-        extremes.append(controller.step(Moment(), state, held(controller, pose)).speeds)
+        extremes.append(controller.step(StepInputs(), state, held(controller, pose)).speeds)
     assert np.min(extremes) >= craft.speed_min
     assert np.max(extremes) <= craft.speed_max
     assert np.max(extremes) > 1.1 * craft.hover_speed
@@ -162,6 +164,6 @@ def test_without_bounds_of_its_own_it_commands_what_the_rotors_hold(
 
 def test_the_command_in_force_is_what_slews_count_from(law: str, vehicle: Vehicle, build: Build) -> None:
     controller = build(law, vehicle, bounds=ActuatorBounds.alike((0.0, 250.0), (-10.0, 5.0)))
-    late = Moment(acting=np.full(4, 100.0))
+    late = StepInputs(acting=np.full(4, 100.0))
     speeds = controller.step(late, make_state(), held(controller, [0.0, 0.0, 5.0, 0.0])).speeds
     np.testing.assert_allclose(speeds, 105.0)

@@ -12,7 +12,7 @@ import pytest
 
 from mpc.baselines.pid import Memory, force_within, velocity_wanted
 from mpc.baselines.preview import Target
-from quadsim.controller import Moment
+from quadsim.controller import StepInputs
 from quadsim.flight.log import FlightLog
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
@@ -120,10 +120,10 @@ def test_the_lqr_plans_what_its_model_goes_on_to_do(vehicle: Vehicle, build: Cal
     controller = build("lqr", vehicle)
     state = make_state(position=(-0.1, 0.05, 0.02), euler=(0.0, 0.0, 0.3))
     pose = np.tile([0.0, 0.0, 0.0, 0.3], (controller.horizon, 1))
-    command = controller.step(Moment(), state, pose)
+    command = controller.step(StepInputs(), state, pose)
     predicted = controller.predict(state[None], command.plan[None])[0]
     for i in range(controller.horizon - 1):
-        again = controller.step(Moment(), predicted[i], pose)
+        again = controller.step(StepInputs(), predicted[i], pose)
         if i == 0:
             assert abs(predicted[i][INDEX["yaw"]] - 0.3) < 1e-9  # so that both see the same frame
         np.testing.assert_allclose(again.speeds, command.plan[i + 1], rtol=1e-6)

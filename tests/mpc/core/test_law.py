@@ -12,7 +12,7 @@ import quadsim
 from mpc.core import library
 from mpc.core.law import CompiledMPC
 from mpc.core.numbers import robust_numbers
-from quadsim.controller import CORE, FALLBACK, GAIN, Command, Moment, Phase
+from quadsim.controller import CORE, FALLBACK, GAIN, Command, Phase, StepInputs
 from quadsim.errors import ExportError, MissingCoreError
 from quadsim.state import INDEX, N_STATES, Array
 from scenarios.export.exporter import exported_law
@@ -55,7 +55,7 @@ def mpc(request: pytest.FixtureRequest) -> CompiledMPC:
 def ask(mpc: CompiledMPC, k: int, state: Array, speeds: Array | None = None) -> Command:
     """Its answer in period k with a reference 1 m to the side."""
     reference = np.tile([1.0, 0.0, 0.0, 0.0], (mpc.horizon, 1))
-    return mpc.step(Moment(time=k * mpc.problem.model.period, phase=Phase.FLYING, acting=speeds), state, reference)
+    return mpc.step(StepInputs(time=k * mpc.problem.model.period, phase=Phase.FLYING, acting=speeds), state, reference)
 
 
 def states(count: int, seed: int) -> Array:
@@ -84,7 +84,7 @@ def test_controllers_share_nothing_that_changes(mpc: CompiledMPC) -> None:
 def test_it_says_who_answered(mpc: CompiledMPC) -> None:
     hover = mpc.problem.model.u_bar
     at_rest, target = np.zeros(N_STATES), np.zeros((mpc.horizon, 4))
-    free = mpc.step(Moment(time=0.0, phase=Phase.FLYING), at_rest, target)
+    free = mpc.step(StepInputs(time=0.0, phase=Phase.FLYING), at_rest, target)
     assert (free.status, free.answered_by, free.active) == ("unconstrained", GAIN, 0)
     assert free.speeds == pytest.approx(hover)
     far = ask(mpc, 1, at_rest)
@@ -138,7 +138,7 @@ def test_a_disturbance_is_learned_in_flight_alone() -> None:
         for k in range(3):
             falling = np.zeros(N_STATES)
             falling[INDEX["vz"]] = -0.1 * k
-            mpc.step(Moment(time=k * law.problem.model.period, phase=phase), falling, np.zeros((mpc.horizon, 4)))
+            mpc.step(StepInputs(time=k * law.problem.model.period, phase=phase), falling, np.zeros((mpc.horizon, 4)))
         assert (mpc.trim.speeds.mean() > mpc.problem.model.u_bar.mean() + 1.0) == learned
 
 

@@ -10,9 +10,9 @@ import pytest
 from scripted_controller import PERIOD, Scripted, advance, call, failing, following, guard, model, random_state
 
 from mpc.bounded import FallbackSettings
-from mpc.fallback.completion import CompletedMoment
+from mpc.fallback.completion import CompletedInputs
 from mpc.solvers.piqp import STATUS
-from quadsim.controller import ACCEPTED, Moment, Phase
+from quadsim.controller import ACCEPTED, Phase, StepInputs
 from quadsim.errors import CommandError
 from quadsim.state import INDEX, VELOCITY, Array
 
@@ -20,7 +20,7 @@ from quadsim.state import INDEX, VELOCITY, Array
 def test_a_good_answer_passes_unchanged() -> None:
     inner = Scripted()
     command = call(guard(inner))
-    answer = inner.step(Moment(), np.zeros(12), np.zeros((30, 4)))
+    answer = inner.step(StepInputs(), np.zeros(12), np.zeros((30, 4)))
     np.testing.assert_array_equal(command.speeds, answer.speeds)
     np.testing.assert_array_equal(command.plan, answer.plan)
     assert (command.status, command.fallback, command.iterations) == ("solved", 0, 7)
@@ -93,7 +93,7 @@ def test_rounding_beyond_the_bounds_is_taken_away() -> None:
 @pytest.mark.parametrize("reference", [np.full((30, 4), math.nan), np.full((30, 4), 1e9), np.zeros((29, 4))])
 def test_a_reference_that_is_none_is_not_passed_on(reference: Array) -> None:
     inner = Scripted()
-    command = guard(inner).step(Moment(), np.zeros(12), reference)
+    command = guard(inner).step(StepInputs(), np.zeros(12), reference)
     assert (command.status, command.fallback) == ("invalid_reference", 2)
     assert not inner.calls
 
@@ -220,9 +220,9 @@ def test_the_controller_receives_what_is_predicted() -> None:
     for time, state in enumerate((np.zeros(12), partly, partly, np.zeros(12))):
         call(guarded, state, time=float(time))
     moments = [now for now, _ in inner.calls]
-    assert all(isinstance(now, CompletedMoment) for now in moments)
+    assert all(isinstance(now, CompletedInputs) for now in moments)
     assert [now.time for now in moments] == [0.0, 1.0, 2.0, 3.0]
-    unseen = np.array([now.unseen for now in moments if isinstance(now, CompletedMoment)])
+    unseen = np.array([now.unseen for now in moments if isinstance(now, CompletedInputs)])
     assert unseen[:, INDEX["vz"]].tolist() == [0.0, 1.0, 2.0, 0.0]
     assert not np.delete(unseen, INDEX["vz"], axis=1).any()
 
@@ -233,4 +233,4 @@ def test_a_yaw_counts_its_turns(turns: int) -> None:
     state[INDEX["yaw"]] = math.tau * turns
     reference = np.zeros((30, 4))
     reference[:, 3] = math.tau * turns
-    assert guard(Scripted()).step(Moment(), state, reference).status == "solved"
+    assert guard(Scripted()).step(StepInputs(), state, reference).status == "solved"

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scripted_controller import Scripted, bounds, guard, model
 
 from mpc.bounded import FallbackSettings
-from quadsim.controller import Command, Moment, Phase
+from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import CommandError
 from quadsim.state import Array
 
@@ -46,7 +46,7 @@ def test_nothing_bad_ever_leaves(steps: list[Any], hover: float) -> None:
         answer: Any = None
         foreseen: float = 0.0
 
-        def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
             assert np.isfinite(state).all()
             assert now.acting is not None
             assert np.isfinite(now.acting).all()
@@ -61,7 +61,7 @@ def test_nothing_bad_ever_leaves(steps: list[Any], hover: float) -> None:
     before = model().u_bar
     for inner.answer, state, acting, phase, wanted in steps:
         inner.foreseen = wanted
-        command = guarded.step(Moment(phase=phase, acting=acting), state, np.full((5, 4), wanted))
+        command = guarded.step(StepInputs(phase=phase, acting=acting), state, np.full((5, 4), wanted))
         usable = acting is not None and np.isfinite(acting).all() and np.abs(acting).max() <= 1e5
         lower, upper = bounds().reach(acting if usable else before)
         assert command.speeds.shape == (4,)

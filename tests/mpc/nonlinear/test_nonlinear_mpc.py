@@ -19,7 +19,7 @@ from mpc.nonlinear.rigidbody import N_BODY, Inputs, P, Q, V, W, advance_nodes, r
 from mpc.nonlinear.settings import AttitudeError, NonlinearSettings, Weights
 from mpc.observer import ObserverSettings
 from quadsim.assets import vehicle_path
-from quadsim.controller import ACCEPTED, NOT_CONVERGED, OPTIMAL, Command, Moment, Phase
+from quadsim.controller import ACCEPTED, NOT_CONVERGED, OPTIMAL, Command, Phase, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.motion import Motion
 from quadsim.rotation import multiply, quaternion_to_euler
@@ -46,7 +46,7 @@ def call(
     state = np.zeros(N_STATES)
     state[POSITIONS], state[VELOCITIES] = x[P], x[V]
     preview = np.zeros((controller.horizon, 4)) if reference is None else reference
-    return controller.step(Moment(time=time, attitude=x[Q], body_rates=x[W], **moment), state, preview)
+    return controller.step(StepInputs(time=time, attitude=x[Q], body_rates=x[W], **moment), state, preview)
 
 
 def at_rest(q: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)) -> Array:
@@ -370,7 +370,7 @@ def test_without_attitude_in_the_moment_it_is_taken_from_the_state() -> None:
     x = at_rest((math.cos(0.15), math.sin(0.15), 0.0, 0.0))
     # d(pitch)/dt = q cos(roll) - r sin(roll) alone, and no yaw rate
     x[W] = 0.0, 0.4 * math.cos(0.3), -0.4 * math.sin(0.3)
-    np.testing.assert_allclose(law().step(Moment(), state, reference).speeds, call(law(), x).speeds, rtol=1e-9)
+    np.testing.assert_allclose(law().step(StepInputs(), state, reference).speeds, call(law(), x).speeds, rtol=1e-9)
 
 
 def test_an_infeasible_problem_is_reported_with_its_query() -> None:

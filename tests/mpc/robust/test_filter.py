@@ -15,7 +15,7 @@ from mpc.ocp import Objective, Query
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.robust.filter import STANDING, SafetyFilter
 from mpc.solvers import make_backend, make_solver
-from quadsim.controller import UNCONSTRAINED, Command, Moment
+from quadsim.controller import UNCONSTRAINED, Command, StepInputs
 from quadsim.state import INDEX, Array
 from scenarios.assembly import Assembly
 from scenarios.loading import load_scenario
@@ -46,7 +46,7 @@ def make_filter() -> SafetyFilter:
 def filtered(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER) -> Command:
     filter_.reset(acting)
     filter_.wanted = wanted
-    return filter_.step(Moment(acting=acting), state, np.zeros((HORIZON, 4)))
+    return filter_.step(StepInputs(acting=acting), state, np.zeros((HORIZON, 4)))
 
 
 def tilted(roll: float, rate: float, yaw: float = 0.0) -> Array:
@@ -103,7 +103,7 @@ def test_the_plan_of_one_period_is_one_of_the_next() -> None:
     filter_.reset(acting)
     for k in range(60):
         filter_.wanted = HOVER + rng.uniform(-40.0, 40.0, 4)
-        command = filter_.step(Moment(time=k * PERIOD, acting=acting), state, np.zeros((HORIZON, 4)))
+        command = filter_.step(StepInputs(time=k * PERIOD, acting=acting), state, np.zeros((HORIZON, 4)))
         assert command.status in ("solved", UNCONSTRAINED)
         assert command.slack < 1e-6
         acting, yaw = command.speeds, state[INDEX["yaw"]]

@@ -13,13 +13,13 @@ from support import derivative, paper_problem, paper_reference
 
 from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Penalty
-from mpc.fallback.completion import CompletedMoment
+from mpc.fallback.completion import CompletedInputs
 from mpc.heading import turn_horizontally
 from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model
 from mpc.observer import ObserverSettings
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.solvers import QPSolver, make_solver
-from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Moment, Phase
+from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Phase, StepInputs
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
 from quadsim.vehicle import Vehicle
@@ -64,7 +64,7 @@ def flown(
     x = np.concatenate([state, acting])[: plant.n]
     for k in range(periods):
         command = controller.step(
-            Moment(time=k * PERIOD, acting=acting), x[:12], reference[k + 1 : k + 1 + controller.horizon]
+            StepInputs(time=k * PERIOD, acting=acting), x[:12], reference[k + 1 : k + 1 + controller.horizon]
         )
         assert command.status in ACCEPTED
         yield x[:12].copy(), command.speeds
@@ -81,12 +81,12 @@ def believing(controller: RobustMPC, estimate: Array) -> None:
     controller._update_trim()
 
 
-def moments(flight: Flight, first: int, periods: int) -> Iterator[tuple[Moment, Array, Array]]:
+def moments(flight: Flight, first: int, periods: int) -> Iterator[tuple[StepInputs, Array, Array]]:
     """What a controller received in successive periods of a flight."""
     log = flight.log.control
     reference, before = paper_reference(log.t.size + 50), np.vstack([log.speeds_before, log.speeds[:-1]])
     for k in range(first, first + periods):
-        yield Moment(time=log.t[k], acting=before[k]), log.state[k], reference[k + 1 : k + 51]
+        yield StepInputs(time=log.t[k], acting=before[k]), log.state[k], reference[k + 1 : k + 51]
 
 
 def test_without_parts_it_is_the_papers_controller(constrained_flight: Flight, vehicle: Vehicle) -> None:
@@ -104,7 +104,7 @@ def test_without_parts_it_is_the_papers_controller(constrained_flight: Flight, v
 @pytest.mark.parametrize("parts", [{}, {"penalty": SOFT}, EVERYTHING])
 def test_a_period_without_an_active_constraint_has_its_status(vehicle: Vehicle, parts: dict[str, Any]) -> None:
     """And one with some is solved."""
-    now, shifted = Moment(acting=np.full(4, vehicle.hover_speed)), np.tile([5.0, 0.0, 0.0, 0.0], (50, 1))
+    now, shifted = StepInputs(acting=np.full(4, vehicle.hover_speed)), np.tile([5.0, 0.0, 0.0, 0.0], (50, 1))
     controller = robust(vehicle, **parts)
     for reference, status in ((HOLD, UNCONSTRAINED), (shifted, SOLVED), (HOLD, UNCONSTRAINED)):
         controller.reset(np.full(4, vehicle.hover_speed))
@@ -128,7 +128,7 @@ def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle) -> None:
         state = np.full(12, math.nan) if k == 3 else np.zeros(12)
         phase = Phase.LANDED if k == 5 else Phase.FLYING
         # Since the last call's end, `before` has acted to the end of its period, as has `acting` since its beginning.
-        controller.step(Moment(acting=acting, phase=phase), state, HOLD)
+        controller.step(StepInputs(acting=acting, phase=phase), state, HOLD)
         speeds = rotors.respond(speeds, acting, np.array([PERIOD]))[0][0]
         np.testing.assert_allclose(controller._rotors, speeds, atol=1e-9)
         before = acting
@@ -152,7 +152,7 @@ def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float
     controller.reset(u)
     believing(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
     reference = np.tile([0.0, 0.0, 0.0, yaw], (50, 1))
-    np.testing.assert_allclose(controller.step(Moment(acting=u), world[:12], reference).speeds, u, atol=1e-4)
+    np.testing.assert_allclose(controller.step(StepInputs(acting=u), world[:12], reference).speeds, u, atol=1e-4)
 
 
 def test_constant_forces_torques_and_mass_leave_no_steady_error(vehicle: Vehicle) -> None:
@@ -231,11 +231,11 @@ def test_nothing_is_learned_on_the_ground_or_from_what_is_no_number(vehicle: Veh
             (pushed, Phase.FLYING),
         )
     ):
-        controller.step(Moment(time=k * PERIOD, acting=acting, phase=phase), state, HOLD)
+        controller.step(StepInputs(time=k * PERIOD, acting=acting, phase=phase), state, HOLD)
         np.testing.assert_array_equal(controller.disturbance, 0.0)
-    controller.step(Moment(time=4 * PERIOD, acting=acting), np.zeros(12), HOLD)
+    controller.step(StepInputs(time=4 * PERIOD, acting=acting), np.zeros(12), HOLD)
     assert controller.disturbance[2] < -0.1
-    controller.step(Moment(time=5 * PERIOD, acting=acting, phase=Phase.LANDED), pushed, HOLD)
+    controller.step(StepInputs(time=5 * PERIOD, acting=acting, phase=Phase.LANDED), pushed, HOLD)
     np.testing.assert_array_equal(controller.disturbance, 0.0)
 
 
@@ -243,8 +243,8 @@ def test_nothing_is_learned_on_the_ground_or_from_what_is_no_number(vehicle: Veh
 def test_nothing_is_learned_over_a_pause(vehicle: Vehicle, gap: int) -> None:
     """What was expected a period later applies to no other instant."""
     controller, acting = robust(vehicle, **EVERYTHING), np.full(4, vehicle.hover_speed)
-    controller.step(Moment(time=1.0, acting=acting), np.zeros(12), HOLD)
-    controller.step(Moment(time=1.0 + gap * PERIOD, acting=acting), moving((0.0, 0.0, 0.2)), HOLD)
+    controller.step(StepInputs(time=1.0, acting=acting), np.zeros(12), HOLD)
+    controller.step(StepInputs(time=1.0 + gap * PERIOD, acting=acting), moving((0.0, 0.0, 0.2)), HOLD)
     np.testing.assert_array_equal(controller.disturbance, 0.0)
 
 
@@ -257,14 +257,14 @@ def test_predicted_states_teach_nothing_and_long_spans_of_them_neither(
     measured, guessed = np.zeros(12), np.zeros(12)
     guessed[INDEX["vx"]] = 1.0
     times = PERIOD * np.arange(predicted + 3)
-    controller.step(CompletedMoment(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    controller.step(CompletedInputs(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
     for time in times[1 : predicted + 1]:
-        controller.step(CompletedMoment(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
+        controller.step(CompletedInputs(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
         np.testing.assert_array_equal(controller.disturbance, 0.0)
-    controller.step(CompletedMoment(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
+    controller.step(CompletedInputs(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
     assert controller.disturbance.any() == learned
     before = controller.disturbance
-    controller.step(CompletedMoment(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    controller.step(CompletedInputs(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
     assert np.abs(controller.disturbance - before).max() > 0.0
 
 
@@ -273,7 +273,7 @@ def test_a_position_that_is_predicted_hides_no_disturbance(vehicle: Vehicle) -> 
     unseen = np.zeros(12)
     unseen[list(POSITION)] = 7.0
     for k, speed in enumerate((0.0, 0.2)):
-        controller.step(CompletedMoment(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
+        controller.step(CompletedInputs(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
     assert controller.disturbance[2] > 0.1
 
 
@@ -332,7 +332,7 @@ def test_far_from_its_yaw_the_vehicle_is_commanded_a_part_of_the_turn_at_once(ve
 
     def commanded(reference: Array) -> Array:
         controller.reset(np.full(4, vehicle.hover_speed))
-        return controller.step(Moment(), np.zeros(12), reference).plan
+        return controller.step(StepInputs(), np.zeros(12), reference).plan
 
     np.testing.assert_allclose(commanded(far), commanded(near), atol=1e-9)
     np.testing.assert_allclose(commanded(jumping), commanded(twice), atol=1e-9)
@@ -353,7 +353,7 @@ def test_a_delay_is_answered_from_where_the_vehicle_will_be(vehicle: Vehicle, de
     late.reset(before)
     # A ramp, so that the instants of the reference count as well.
     ramp = 0.05 * np.arange(51.0)[:, None] * np.array([1.0, 0.5, 0.2, 0.1])
-    command = late.step(Moment(acting=acting), state, ramp[:50])
+    command = late.step(StepInputs(acting=acting), state, ramp[:50])
     rotors = acting + (before - acting) * math.exp(-(PERIOD - delay) / rotor_lag) if rotor_lag else acting
     there = advance(replace(model, period=delay), np.concatenate([state, rotors])[: model.n], acting)
     prompt = robust(vehicle, rotor_lag=rotor_lag, heading=True)
@@ -361,7 +361,7 @@ def test_a_delay_is_answered_from_where_the_vehicle_will_be(vehicle: Vehicle, de
     shifted = ramp[:50] + delay / PERIOD * np.diff(ramp, axis=0)
     shifted[-1] = ramp[49]
     np.testing.assert_allclose(
-        command.speeds, prompt.step(Moment(acting=acting), there[:12], shifted).speeds, atol=1e-3
+        command.speeds, prompt.step(StepInputs(acting=acting), there[:12], shifted).speeds, atol=1e-3
     )
 
 
@@ -374,18 +374,18 @@ def test_numbers_out_of_hand_are_refused_and_forgotten(vehicle: Vehicle, value: 
     controller = robust(vehicle, **EVERYTHING)
     for channel in (1, 4, 7, 8, 11):
         controller.reset(acting)
-        controller.step(Moment(acting=acting), np.zeros(12), HOLD)
+        controller.step(StepInputs(acting=acting), np.zeros(12), HOLD)
         corrupted = np.zeros(12)
         corrupted[channel] = value
-        command = controller.step(Moment(acting=acting), corrupted, HOLD)
+        command = controller.step(StepInputs(acting=acting), corrupted, HOLD)
         assert command.status not in ACCEPTED
         np.testing.assert_array_equal(command.plan, np.tile(acting, (50, 1)))
-        after = controller.step(Moment(acting=acting), np.zeros(12), HOLD)
+        after = controller.step(StepInputs(acting=acting), np.zeros(12), HOLD)
         assert after.status in ACCEPTED
         assert np.isfinite(controller.disturbance).all()
     wrong = HOLD.copy()
     wrong[7, 2] = value
-    assert controller.step(Moment(acting=acting), np.zeros(12), wrong).status == "invalid_data"
+    assert controller.step(StepInputs(acting=acting), np.zeros(12), wrong).status == "invalid_data"
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.02])
@@ -397,7 +397,7 @@ def test_numbers_that_get_out_of_hand_on_the_way_spoil_nothing(vehicle: Vehicle,
         spun = np.zeros(12)
         spun[[channel, 8]] = 1e3, 1.5
         for state in (np.zeros(12), spun, np.zeros(12)):
-            last = controller.step(Moment(acting=acting), state, HOLD)
+            last = controller.step(StepInputs(acting=acting), state, HOLD)
         assert last.status in ACCEPTED
         assert np.isfinite(controller.disturbance).all()
 
@@ -406,18 +406,18 @@ def test_what_is_not_solved_holds_the_command_in_force_with_its_status(vehicle: 
     controller = robust(vehicle)
     acting = np.full(4, 120.0)
     tilted = make_state(euler=(math.radians(30.0), 0.0, 0.0))
-    command = controller.step(Moment(acting=acting), tilted, HOLD)
+    command = controller.step(StepInputs(acting=acting), tilted, HOLD)
     assert command.status in {"primal_infeasible", "max_iterations", "numerics"}
     assert command.active == 0
     np.testing.assert_array_equal(command.plan, np.tile(acting, (50, 1)))
-    assert controller.step(Moment(acting=acting), np.zeros(12), HOLD).status in ACCEPTED
+    assert controller.step(StepInputs(acting=acting), np.zeros(12), HOLD).status in ACCEPTED
 
 
 @pytest.mark.parametrize("phase", [Phase.LANDED, Phase.CRASHED])
 def test_on_the_ground_rotors_are_stopped_as_fast_as_allowed(vehicle: Vehicle, phase: Phase) -> None:
     controller = robust(vehicle, **EVERYTHING)
     controller.reset(np.full(4, 15.0))
-    stops = [controller.step(Moment(phase=phase), np.zeros(12), HOLD) for _ in range(3)]
+    stops = [controller.step(StepInputs(phase=phase), np.zeros(12), HOLD) for _ in range(3)]
     assert {command.status for command in stops} == {str(phase)}
     assert [command.speeds.tolist() for command in stops] == [[5.0] * 4, [0.0] * 4, [0.0] * 4]
 
@@ -429,8 +429,8 @@ def test_its_own_last_command_acts_where_none_is_given(vehicle: Vehicle) -> None
     for controller in (given, without):
         controller.reset(acting)
     for _ in range(4):
-        expected = given.step(Moment(acting=acting), state, HOLD)
-        np.testing.assert_array_equal(without.step(Moment(), state, HOLD).speeds, expected.speeds)
+        expected = given.step(StepInputs(acting=acting), state, HOLD)
+        np.testing.assert_array_equal(without.step(StepInputs(), state, HOLD).speeds, expected.speeds)
         assert np.all(expected.speeds <= acting + 5.0)
         acting = expected.speeds
     assert acting.min() > vehicle.hover_speed + 10.0

@@ -31,7 +31,7 @@ from mpc.robust.tightening import (
     observed,
 )
 from mpc.solvers import make_solver
-from quadsim.controller import ACCEPTED, Moment
+from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
@@ -372,7 +372,9 @@ def pushed_tilt(vehicle: Vehicle, course: Course, *, rotor_lag: float, delay: fl
     controller.reset(acting)
     x, peak = np.concatenate([np.zeros(12), acting])[: plant.n], 0.0
     for k in range(120):
-        command = controller.step(Moment(time=k * PERIOD, acting=acting), x[:12], reference[k + 1 : k + 1 + HORIZON])
+        command = controller.step(
+            StepInputs(time=k * PERIOD, acting=acting), x[:12], reference[k + 1 : k + 1 + HORIZON]
+        )
         assert command.status in ACCEPTED
         for i in range(substeps):
             w = course((k + i / substeps) * PERIOD, x[TILTS])

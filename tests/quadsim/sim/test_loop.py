@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from quadsim.controller import Command, Controller, Moment, Phase
+from quadsim.controller import Command, Controller, Phase, StepInputs
 from quadsim.errors import PlanExhaustedError
 from quadsim.flight.log import FlightLog
 from quadsim.flight.phase import PhaseMonitor
@@ -34,7 +34,7 @@ class Scripted:
     def reset(self, speeds: Array) -> None:
         self.seen = []
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         k = len(self.seen)
         self.seen.append((now.time, state, reference))
         if k in self.raises:

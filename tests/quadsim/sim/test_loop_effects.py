@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadsim.controller import GROUNDED, MISSED, Command, Moment, Phase, stopped
+from quadsim.controller import GROUNDED, MISSED, Command, Phase, StepInputs, stopped
 from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import computation, estimation, ground
 from quadsim.flight.phase import PhaseMonitor
@@ -34,13 +34,13 @@ class Scripted:
     name: str = "scripted"
     solver: str = ""
     horizon: int = 2
-    moments: list[Moment] = field(default_factory=list)
+    moments: list[StepInputs] = field(default_factory=list)
     states: list[Array] = field(default_factory=list)
 
     def reset(self, speeds: Array) -> None:
         self.moments, self.states = [], []
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         k = len(self.moments)
         self.moments.append(now)
         self.states.append(state.copy())
@@ -104,7 +104,7 @@ def test_a_late_command_leaves_the_plan_going_on(vehicle: Vehicle, speeds: Array
     """Due after 10 ms, stalled over periods 2 to 4: the plan of period 1 goes on from when each command was due."""
 
     class Planner(Scripted):
-        def step(self, now: Moment, state: Array, reference: Array) -> Command:
+        def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
             command = super().step(now, state, reference)
             plan = command.speeds + np.arange(4.0)[:, None]
             return Command(speeds=command.speeds, plan=plan)

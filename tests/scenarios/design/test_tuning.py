@@ -10,7 +10,7 @@ import pytest
 from first_flights import vehicles
 
 from mpc.model import continuous_model, discretise
-from quadsim.controller import Moment
+from quadsim.controller import StepInputs
 from quadsim.errors import ParameterError
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.wind import Air
@@ -47,7 +47,7 @@ def test_a_baselines_loop_tolerates_a_quarter_to_three_quarters_of_that_delay(ve
         state, answers = np.zeros(N_STATES), []
         for state[i] in (step, -step):
             controller = scenario.controller.build(vehicle, tuning.period)
-            answers.append(controller.step(Moment(), state, np.zeros((controller.horizon, 4))).speeds)
+            answers.append(controller.step(StepInputs(), state, np.zeros((controller.horizon, 4))).speeds)
         K[:, i] = (answers[1] - answers[0]) / (2.0 * step)
     margin = delay_margin(vehicle, tuning)
     assert is_stable(vehicle, tuning, K, 0.25 * margin)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from support import NO_PRODUCTS
 
-from quadsim.controller import Command, Moment
+from quadsim.controller import Command, StepInputs
 from quadsim.errors import CommandError, InputError
 from quadsim.state import Array
 from scenarios.assembly import Assembly
@@ -75,7 +75,7 @@ def message(path: str) -> str:
 
 def test_it_is_found_beside_the_scenario_and_called_with_what_is_documented(written: Write) -> None:
     law = build(written(HOVER), "controller.horizon=7", "controller.settings.offset=2.0")
-    command = law.step(Moment(), np.zeros(12), np.zeros((7, 4)))
+    command = law.step(StepInputs(), np.zeros(12), np.zeros((7, 4)))
     vehicle = Assembly(load_scenario("hover")).vehicle
     np.testing.assert_array_equal(command.speeds, np.full(4, vehicle.hover_speed + 2.0))
     np.testing.assert_array_equal(command.plan, np.tile(command.speeds, (7, 1)))
@@ -172,7 +172,7 @@ class Answers:
     def __init__(self, **changes: Any) -> None:
         self._speeds, self._plan, self._changes = np.full(4, 190.0), np.full((3, 4), 190.0), changes
 
-    def step(self, now: Moment, state: Array, reference: Array) -> Command:
+    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         assert now.acting is not None
         for received in (now.acting, state, reference):
             received[:] = 7.0
@@ -198,7 +198,7 @@ class Answers:
 def test_a_command_with_a_wrong_part_is_refused(part: str, given: Any, rule: str) -> None:
     law = PluginController(Answers(**{part: given}), 3)
     with pytest.raises(CommandError, match=rf"Answers answered .*, neither 4 speeds nor a Command: {rule}"):
-        law.step(Moment(acting=np.ones(4)), np.zeros(12), np.zeros((3, 4)))
+        law.step(StepInputs(acting=np.ones(4)), np.zeros(12), np.zeros((3, 4)))
 
 
 @pytest.mark.parametrize("given", [None, np.zeros((1, 3, 12)), np.zeros((2, 12))])
