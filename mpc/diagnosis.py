@@ -72,9 +72,13 @@ class Conflict:
         return not self.violated
 
 
-def find_conflict(unanswered: InfeasiblePeriod) -> Conflict | None:
+def find_conflict(infeasible_period: InfeasiblePeriod) -> Conflict | None:
     """Which constraints cannot hold together; None where the elastic problem cannot be solved either."""
-    problem, query, parts = unanswered.problem, unanswered.query, unanswered.problem.every_constraint
+    problem, query, parts = (
+        infeasible_period.problem,
+        infeasible_period.query,
+        infeasible_period.problem.every_constraint,
+    )
     sides, scales = _sides(problem), _scales(problem)
     of_inputs = {side for side in sides if (C := parts[side.place].C) is None or not C.any()}
     total, violated, held = 0.0, dict[Side, Violation](), set[Side]()
@@ -103,12 +107,12 @@ def find_conflict(unanswered: InfeasiblePeriod) -> Conflict | None:
     return Conflict(total=total, violated=violated, blocking=tuple(sorted(held - violated.keys())))
 
 
-def smallest_widening(unanswered: InfeasiblePeriod, sides: Collection[Side]) -> float | None:
+def smallest_widening(infeasible_period: InfeasiblePeriod, sides: Collection[Side]) -> float | None:
     """By how much these bounds have to be moved outwards, all by the same amount at all steps, for an answer.
 
     None where that does not help, however far they are moved.
     """
-    problem, query = unanswered.problem, unanswered.query
+    problem, query = infeasible_period.problem, infeasible_period.query
     scales = {side: _scales(problem)[side.place][side.row] for side in sides}
     relaxed = _relaxed(problem, query, _sides(problem), sides, together=scales)
     return None if relaxed is None else relaxed.total
@@ -119,9 +123,9 @@ def has_answer(problem: Problem, query: Query) -> bool:
     return _set_up(problem, query)(query)
 
 
-def recovery(unanswered: InfeasiblePeriod, plan: Array) -> int | None:
+def recovery(infeasible_period: InfeasiblePeriod, plan: Array) -> int | None:
     """After how many periods of a plan (N, nu) the problem has an answer, by the model; None for not within it."""
-    problem, query = unanswered.problem, unanswered.query
+    problem, query = infeasible_period.problem, infeasible_period.query
     is_solved, state = _set_up(problem, query), query.state
     for i, (u, A, B, c) in enumerate(zip(plan, *_steps(problem, query), strict=True)):
         state = A @ state + B @ u + c
@@ -214,7 +218,7 @@ def _relaxed(
     slack = Penalty(l1=np.ones(1), l2=np.zeros(1))
     rows = tuple(replace(one, penalty=slack if side in elastic else None) for side, one in sides.items())
     form = PartiallyCondensed(replace(problem, bounds=None, constraints=rows), changing=True)
-    qp = form.pose(query._replace(steps=_steps(problem, query))).qp
+    qp = form.assemble(query._replace(steps=_steps(problem, query))).qp
     named, columns = (
         [side for side in sides if side in elastic],
         form.slacks(np.arange(qp.c.size, dtype=float)).astype(int),

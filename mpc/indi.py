@@ -118,9 +118,9 @@ class Incremental:
         return replace(command, inner=self._loop)
 
     @property
-    def unanswered(self) -> object:
+    def infeasible_period(self) -> object:
         """That of the law, where it has one: the first period since `reset` whose QP had no answer."""
-        return getattr(self.inner, "unanswered", None)
+        return getattr(self.inner, "infeasible_period", None)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""

@@ -190,7 +190,7 @@ class ObstacleQP:
             room = _room(normals, bounds, planned)
             if (room >= -ROUNDING).all() and not (among and i == 0):
                 break
-            answer, problem, planned = self._whole(query, normals, bounds, room, turn)
+            answer, problem, planned = self._solve_with_half_spaces(query, normals, bounds, room, turn)
             if answer.status not in ACCEPTED:
                 named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
                 constraints = (*self.problem.constraints, *named)
@@ -206,21 +206,21 @@ class ObstacleQP:
         states = predicted(self.problem, query, answer.plan)
         return answer._replace(states=states), states[:, self._space.positions] @ turn
 
-    def _posed(self, normals: Array, bounds: Array) -> Problem:
+    def _with_half_spaces(self, normals: Array, bounds: Array) -> Problem:
         """The problem with chosen half-spaces (m, N, 3), (m, N) in the states' axes."""
         added = self._space.constraint(normals, bounds, self.problem.model.n)
         return replace(self.problem, constraints=(*self.problem.constraints, added))
 
-    def _whole(
+    def _solve_with_half_spaces(
         self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array
     ) -> tuple[Answer, Problem, Array]:
         """The optimum with half-spaces of the world, and its positions; `room` (S, N) gives the tightest."""
         count = self._space.settings.rows
         while True:
             at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
-            problem = self._posed(normals[at] @ turn.T, bounds[at])
+            problem = self._with_half_spaces(normals[at] @ turn.T, bounds[at])
             form, backend = self._form(len(at[0]))
-            qp = form.pose(query, problem).qp
+            qp = form.assemble(query, problem).qp
             answer = Answer.of(form, qp, backend.solve(qp), SOLVER)
             if answer.status not in ACCEPTED:
                 return answer, problem, np.empty(0)
@@ -237,7 +237,9 @@ class ObstacleQP:
         """The QP with so many half-spaces at each instant, and what solves it."""
         if count not in self._forms:
             normals = np.full((count, self.problem.horizon, 3), 3.0**-0.5)  # in general position
-            form = PartiallyCondensed(self._posed(normals, np.zeros(normals.shape[:2])), changing=self._changing)
+            form = PartiallyCondensed(
+                self._with_half_spaces(normals, np.zeros(normals.shape[:2])), changing=self._changing
+            )
             backend = Piqp(changing=True)
             backend.setup(form.qp)
             self._forms[count] = form, backend

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem, Query
-from mpc.qp import QP, Posed, QPRows, Solution
+from mpc.qp import QP, PeriodQP, QPRows, Solution
 from quadsim.state import Array, Indices
 
 ROUNDING: Final = 1e-14
@@ -196,7 +196,7 @@ class PartiallyCondensed:
         self._x_l[at.inputs], self._x_u[at.inputs] = self._rows.u_min, self._rows.u_max
         self._x_l[at.slacks] = 0.0
         nothing = np.zeros((N, len(problem.objective.C_r)))
-        self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp
+        self.qp = self.assemble(Query(np.zeros(model.n), nothing, model.u_bar)).qp
 
     def _built(self, A: Array, B: Array) -> Matrices:
         """The matrices of A (N, n, n), B (N, n, nu)."""
@@ -281,7 +281,7 @@ class PartiallyCondensed:
         of_states[..., of_states.shape[-1] - steps * nu :] = by_step.reshape(*of_states.shape[:3], steps * nu)
         return of_states
 
-    def pose(self, query: Query, problem: Problem | None = None) -> Posed:
+    def assemble(self, query: Query, problem: Problem | None = None) -> PeriodQP:
         """The QP of a period; `problem` differs in numbers of its constraints' rows alone."""
         rest = query.equilibrium or self._problem.equilibrium
         if query.steps is None:
@@ -300,9 +300,9 @@ class PartiallyCondensed:
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))
         (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
         # Entry i is for x(k+i), i = 0 .. N-1; x(k) itself is past changing, and its slopes are zero.
-        wanted = np.concatenate([np.zeros((1, at.n)), desired[:-1] @ W.T])
+        desired_linear = np.concatenate([np.zeros((1, at.n)), desired[:-1] @ W.T])
         known = np.concatenate([head[0, :-1], tail[:, :-1].reshape(-1, at.n)])
-        pull = 2.0 * (known @ Q - wanted)
+        pull = 2.0 * (known @ Q - desired_linear)
         gradient = self._linear.copy()
         gradient[at.head] = np.tensordot(matrices.head[0, :-1], pull[: at.L], ([0, 1], [0, 1]))
         later = pull[at.L :].reshape(len(at.tail), at.M, at.n)
@@ -329,7 +329,7 @@ class PartiallyCondensed:
             x_l=self._x_l,
             x_u=self._x_u,
         )
-        return Posed(qp, partial(self._states, matrices, c, state))
+        return PeriodQP(qp, partial(self._states, matrices, c, state))
 
     def inputs(self, x: Array) -> Array:
         """(N, nu) the planned inputs [rad/s] in a primal point."""

@@ -83,9 +83,9 @@ class QPRows:
         for row in self._boxed:  # of several at the same bound, the first has it all
             j = self._whole.input[row]
             upper, lower = self._whole.upper[:, row] == self.u_max[:, j], self._whole.lower[:, row] == self.u_min[:, j]
-            held = np.where(left[:, j] > 0.0, upper, lower)
-            multipliers[held, row] = left[held, j]
-            left[held, j] = 0.0
+            active_side = np.where(left[:, j] > 0.0, upper, lower)
+            multipliers[active_side, row] = left[active_side, j]
+            left[active_side, j] = 0.0
         return multipliers
 
     def split(self, multipliers: Array) -> tuple[Array, Array]:
@@ -109,7 +109,7 @@ class Solution(NamedTuple):
     solve_s: float = 0.0  # wall time inside the solver, updates included [s]
 
 
-class Posed(NamedTuple):
+class PeriodQP(NamedTuple):
     """The QP of one period."""
 
     qp: QP

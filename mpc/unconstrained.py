@@ -39,11 +39,11 @@ def sequence_gains(problem: Problem) -> SequenceGains:
     terms = condensed_cost(problem, prediction(problem.model, problem.horizon))
     factor = scipy.linalg.cho_factor(terms.H)
     # Of the paper's problem -(F3 + F4): what an input held at u_bar throughout costs.
-    held = terms.H @ np.tile(np.eye(problem.model.nu), (problem.horizon, 1))
+    cost_of_u_bar = terms.H @ np.tile(np.eye(problem.model.nu), (problem.horizon, 1))
     return SequenceGains(
         K=-scipy.linalg.cho_solve(factor, terms.F_x),
         G=-scipy.linalg.cho_solve(factor, terms.F_y),
-        L=scipy.linalg.cho_solve(factor, held),
+        L=scipy.linalg.cho_solve(factor, cost_of_u_bar),
     )
 
 

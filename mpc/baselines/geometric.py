@@ -161,8 +161,10 @@ class GeometricController(FeedbackLaw):
         wrench, desired = self.wrench(motion, target, self._integrals, self._observed(now, motion, before))
         lower, upper = self.bounds.reach(before)
         speeds = allocate(self._allocation, wrench, lower, upper)
-        given = np.allclose(self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max())
-        if given and now.phase is Phase.FLYING:
+        attained = np.allclose(
+            self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max()
+        )
+        if attained and now.phase is Phase.FLYING:
             self._integrals = self.integrate(self._integrals, motion, target, desired)
         return self._held_for_a_period(speeds)
 

@@ -64,13 +64,13 @@ def bryson_objective(vehicle: Vehicle, period: float | None = None) -> Objective
     for _ in range(_HALVINGS):
         speed = share * vehicle.hover_speed
         objective = Objective(C_r=np.eye(N_STATES), Q_y=np.diag(deviations**-2.0), Q_u=np.eye(N_ROTORS) / speed**2)
-        if period is None or _stands_lag(vehicle, period, objective):
+        if period is None or _tolerates_lag(vehicle, period, objective):
             break
         share *= 0.5
     return objective
 
 
-def _stands_lag(vehicle: Vehicle, period: float, objective: Objective) -> bool:
+def _tolerates_lag(vehicle: Vehicle, period: float, objective: Objective) -> bool:
     """Whether an LQR's loop is stable with `LAG_MARGIN` times the lag of the vehicle's rotors."""
     lag = LAG_MARGIN * max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0)
     if lag < _SHORTEST_LAG:

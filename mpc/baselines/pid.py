@@ -99,8 +99,8 @@ class CascadedPID(FeedbackLaw):
         target, reach = target_of(reference, self._operator), self.bounds.reach(before)
         speeds, after = self.fly(self._memory, state, target, *reach)
         if now.phase is not Phase.FLYING:
-            held = self._memory
-            after = replace(after, velocity_integral=held.velocity_integral, rate_integral=held.rate_integral)
+            memory = self._memory
+            after = replace(after, velocity_integral=memory.velocity_integral, rate_integral=memory.rate_integral)
         self._memory = after
         return self._held_for_a_period(speeds)
 
@@ -113,7 +113,7 @@ class CascadedPID(FeedbackLaw):
         motion, k, inertia, period = motion_of(state), self.settings.bandwidths, self._inertia, self.settings.period
         force, velocity_integral = self._velocity_loop(memory, motion, target)
         turning = np.zeros(3) if memory.rates is None else (motion.rates - memory.rates) / period
-        error = self._rates_wanted(motion, force, target) - motion.rates
+        error = self._desired_rates(motion, force, target) - motion.rates
         proportional = np.array([k.rate, k.rate, k.yaw_rate])
         acceleration = proportional * error + memory.rate_integral - self.settings.rate_derivative * turning
         wrench = np.concatenate([[np.linalg.norm(force)], inertia * acceleration])
@@ -133,9 +133,9 @@ class CascadedPID(FeedbackLaw):
         """The force (3,) to command [N], world, and the velocity integral (3,) [m/s^2] of the next period."""
         settings, mass, gravity = self.settings, self._vehicle.mass, self._vehicle.gravity
         period, proportional = settings.period, settings.bandwidths.velocity
-        error = velocity_wanted(settings, motion.position, target) - motion.velocity
+        error = desired_velocity(settings, motion.position, target) - motion.velocity
         measured = np.zeros(3) if memory.velocity is None else (motion.velocity - memory.velocity) / period
-        wanted = (
+        demanded_acceleration = (
             target.acceleration
             + proportional * error
             + memory.velocity_integral
@@ -143,13 +143,13 @@ class CascadedPID(FeedbackLaw):
             + np.array([0.0, 0.0, gravity])
         )
         tilt = math.radians(settings.tilt_max)
-        force = force_within(mass * wanted, weight=mass * gravity, largest=self._largest, tilt=tilt)
+        force = force_within(mass * demanded_acceleration, weight=mass * gravity, largest=self._largest, tilt=tilt)
         # Tracking anti-windup: the integral is drawn to where it just saturates; PX4's gain, after Rundqwist (1990).
-        error = error - 2.0 / proportional * (wanted - force / mass)
+        error = error - 2.0 / proportional * (demanded_acceleration - force / mass)
         integral = memory.velocity_integral + period * settings.velocity_integral * proportional * error
         return force, np.clip(integral, -gravity, gravity)
 
-    def _rates_wanted(self, motion: Measured, force: Array, target: Target) -> Array:
+    def _desired_rates(self, motion: Measured, force: Array, target: Target) -> Array:
         """(3,) body rates to turn at [rad/s], by the attitude loop."""
         k, limit = self.settings.bandwidths, np.radians(self.settings.rate_max)
         error = prioritised_error(motion.attitude, attitude_for(force, target.yaw), self.settings.yaw_weight)
@@ -157,13 +157,13 @@ class CascadedPID(FeedbackLaw):
         return np.clip(np.array([k.attitude, k.attitude, k.yaw]) * error + heading, -limit, limit)
 
 
-def velocity_wanted(settings: PIDSettings, position: Array, target: Target) -> Array:
+def desired_velocity(settings: PIDSettings, position: Array, target: Target) -> Array:
     """(3,) velocity to fly at [m/s]: the target's, and a share of the position error per second, within limits."""
-    wanted = target.velocity + settings.bandwidths.position * (target.position - position)
-    horizontal = math.hypot(wanted[0], wanted[1])
-    wanted[:2] *= min(1.0, settings.velocity_max / max(horizontal, 1e-9))
-    wanted[2] = np.clip(wanted[2], -settings.velocity_max, settings.velocity_max)
-    return wanted
+    velocity = target.velocity + settings.bandwidths.position * (target.position - position)
+    horizontal = math.hypot(velocity[0], velocity[1])
+    velocity[:2] *= min(1.0, settings.velocity_max / max(horizontal, 1e-9))
+    velocity[2] = np.clip(velocity[2], -settings.velocity_max, settings.velocity_max)
+    return velocity
 
 
 def force_within(force: Array, *, weight: float, largest: float, tilt: float) -> Array:

@@ -82,12 +82,12 @@ def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
     samples = min(len(motion), MOTION_SAMPLES)
     degree = min(MOTION_DEGREE, samples - 1)
     operator = differentiator(samples, period, degree=degree, first=0)
-    found = np.zeros((MOTION_DEGREE, 3))  # position to snap
+    derivatives = np.zeros((MOTION_DEGREE, 3))  # position to snap
     orders = min(degree + 1, MOTION_DEGREE)
-    found[:orders] = operator[:orders] @ motion.position[:samples]
+    derivatives[:orders] = operator[:orders] @ motion.position[:samples]
     heading = np.zeros((3, 3))
     heading[: min(degree + 1, 3)] = operator[:3] @ rotation(motion.attitude[:samples])[:, :, 0]
-    position, velocity, acceleration, jerk, snap = found
+    position, velocity, acceleration, jerk, snap = derivatives
     return Target(
         position=position,
         velocity=velocity,

@@ -224,7 +224,7 @@ class CompiledMPC:
         return stopped(speeds.copy(), self.horizon, phase)
 
     def _may_learn(self, now: StepInputs) -> bool:
-        """Whether what was expected for now may be held against the state; see `RobustMPC.pose`."""
+        """Whether what was expected for now may be held against the state; see `RobustMPC.query`."""
         if abs(now.time - self._called_at - self._shared.nominal.period) > _SAME_TIME:
             self._measured = -math.inf
         self._called_at = now.time

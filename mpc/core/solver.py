@@ -190,8 +190,8 @@ class Core:
         sizes = p.states, p.horizon * p.regulated, p.states, N_ROTORS, N_ROTORS
         self._query = np.zeros(sum(sizes))
         parts = np.split(self._query, np.cumsum(sizes[:-1]))
-        self._state, wanted, self._x_s, self._u_s, self._before = parts
-        self._wanted = wanted.reshape(p.horizon, -1)
+        self._state, desired, self._x_s, self._u_s, self._before = parts
+        self._desired = desired.reshape(p.horizon, -1)
         self._arguments = self._at, *(part.ctypes.data for part in parts)
 
     def _view(self, address: int, kind: type[ctypes.c_double | ctypes.c_int8], columns: int) -> Array:
@@ -213,7 +213,7 @@ class Core:
         started, (state, desired, u_before, rest, _) = clock.perf_counter(), query
         x_s, u_s = self._equilibrium if rest is None else rest
         self._state[:], self._x_s[:], self._u_s[:], self._before[:] = state, x_s, u_s, u_before
-        np.subtract(desired, 0.0 if rest is None else self._C_r @ x_s, out=self._wanted)
+        np.subtract(desired, 0.0 if rest is None else self._C_r @ x_s, out=self._desired)
         if self._modes is not None:
             for speeds in (self._state[N_STATES:], self._x_s[N_STATES:]):
                 speeds[:] = self._modes @ speeds
@@ -241,7 +241,7 @@ class Core:
 
     def _certificate(self, query: Query, plan: Array, slacks: Array, multipliers: Array) -> tuple[QP, Solution]:
         """The condensed QP of a query, and the solution that a plan is of it."""
-        return self.formulation.pose(query).qp, self.formulation.solution(plan, slacks, multipliers)
+        return self.formulation.assemble(query).qp, self.formulation.solution(plan, slacks, multipliers)
 
     def _by_piqp(self, query: Query, started: float) -> Answer:
         if self._piqp is None:

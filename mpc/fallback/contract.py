@@ -133,9 +133,9 @@ class Guarded:
         return trim if isinstance(trim, Trim) else self._level
 
     @property
-    def unanswered(self) -> InfeasiblePeriod | None:
+    def infeasible_period(self) -> InfeasiblePeriod | None:
         """The first period since `reset` whose QP had no answer; None where all had, or there is no QP."""
-        period = getattr(self.inner, "unanswered", None)
+        period = getattr(self.inner, "infeasible_period", None)
         return period if isinstance(period, InfeasiblePeriod) else None
 
     def predict(self, states: Array, plans: Array) -> Array:

@@ -79,8 +79,8 @@ class HoverLaw:
         state, target = turn_horizontally(np.array([state, target]), np.array(-yaw))
         plan = np.empty((horizon, N_ROTORS))
         for i in range(horizon):
-            wanted = trim.speeds + self._inverse @ self._acceleration(state - target, rest[_TILTS])
-            plan[i] = before = bounds.clip(wanted, before)
+            speeds = trim.speeds + self._inverse @ self._acceleration(state - target, rest[_TILTS])
+            plan[i] = before = bounds.clip(speeds, before)
             state = A @ state + B @ before + drift
             target[_POSITION] += self.model.period * target[_VELOCITY]
         return plan

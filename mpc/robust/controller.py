@@ -84,7 +84,7 @@ class RobustMPC:
 
     Attributes:
         trim: what holds the vehicle at rest against the disturbance that is estimated.
-        unanswered: the first period since `reset` whose QP had no answer; None where all had.
+        infeasible_period: the first period since `reset` whose QP had no answer; None where all had.
         answer: of the last period that had one to solve; None before the first.
     """
 
@@ -119,7 +119,7 @@ class RobustMPC:
         self._rotors = self._acting.copy()
         self._ahead: Array | None = None
         self._called_at = self._measured = -math.inf
-        self.unanswered: InfeasiblePeriod | None = None
+        self.infeasible_period: InfeasiblePeriod | None = None
         self._check.reset()
         self._solver.reset()
         if self._obstacles is not None:
@@ -142,8 +142,8 @@ class RobustMPC:
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """See `quadsim.controller.Controller.step`; what is answered without a QP: `pose`."""
-        query = self.pose(now, state, reference)
+        """See `quadsim.controller.Controller.step`; what is answered without a QP: `query`."""
+        query = self.query(now, state, reference)
         if isinstance(query, Command):
             return query
         problem = self.problem
@@ -155,8 +155,8 @@ class RobustMPC:
         answer, reason = self._check(problem, query, answer, reason)
         self.answer = answer
         if reason is not None:
-            if reason != INVALID_DATA and self.unanswered is None:
-                self.unanswered = InfeasiblePeriod(
+            if reason != INVALID_DATA and self.infeasible_period is None:
+                self.infeasible_period = InfeasiblePeriod(
                     problem=problem, query=query, status=reason, time=now.time, delay=self.settings.delay
                 )
             return refused(self._acting, self.horizon, reason, answer)
@@ -165,7 +165,7 @@ class RobustMPC:
         return command_of(plan[0], plan, answer.status, answer)
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
-    def pose(self, now: StepInputs, state: Array, reference: Array) -> Query | Command:
+    def query(self, now: StepInputs, state: Array, reference: Array) -> Query | Command:
         """What this period's problem is solved for, once per period; or the answer, where nothing is to be solved.
 
         Numbers that are not finite, not `mpc.fallback.completion.PLAUSIBLE`, or lead to such are answered with the

@@ -39,13 +39,13 @@ LATER: Final = 1e-6
 """epsilon: how far later inputs' distance from rest counts, against the first input's from what was wanted."""
 PENALTY: Final = 1e4
 """l1 of violating a soft row by as much as it has room on one side, where the weight of the first input is 1."""
-STANDING: Final = 1e-4
+TERMINAL_TOLERANCE: Final = 1e-4
 """How fast what stands still at the plan's end may still change, per period [unit of the state]."""
 LOOSE: Final = 1e2
 """A bound that is none, per period: PIQP is to see no infinite one that changes, or that is on both sides of a row."""
 END: Final = "standing"
 """The name of the constraint on the plan's end."""
-PASSED: Final = 1e-2
+PASS_TOLERANCE: Final = 1e-2
 """Difference from the wanted command [rad/s] that is rounding of the QP: the wanted one is then passed as it is."""
 
 
@@ -57,7 +57,7 @@ class SafetyFilter:
     `mpc.fallback.contract.Guarded` to fly the last good plan.
 
     The robust MPC, one without half-spaces, lends its model, observer and constraints; it solves nothing itself.
-    `wanted` (4,) is the command to let pass in the next period [rad/s].
+    `requested` (4,) is the command to let pass in the next period [rad/s].
     """
 
     name: Final = "safety-filter"
@@ -65,14 +65,14 @@ class SafetyFilter:
 
     def __init__(self, mpc: RobustMPC) -> None:
         self._mpc, self.horizon = mpc, mpc.horizon
-        standing = _standing(mpc.problem)
-        self.problem = _feasibility(mpc.problem, standing)
+        steady_rows = _steady_rows(mpc.problem)
+        self.problem = _feasibility(mpc.problem, steady_rows)
         self._actuators = ActuatorBounds.of_problem(self.problem)
         # The same with all constraints on states soft, but for that on the plan's end.
         parts = self.problem.constraints
         soft = replace(self.problem, constraints=tuple(p if p.C is None or p.name == END else _soft(p) for p in parts))
-        self._nearest, self._softened = _Nearest(self.problem, standing), _Nearest(soft, standing)
-        self.wanted = self.problem.model.u_bar.copy()
+        self._nearest, self._softened = _Nearest(self.problem, steady_rows), _Nearest(soft, steady_rows)
+        self.requested = self.problem.model.u_bar.copy()
 
     @property
     def trim(self) -> Trim:
@@ -82,23 +82,23 @@ class SafetyFilter:
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
         self._mpc.reset(speeds)
-        self.wanted = np.array(speeds, float)
+        self.requested = np.array(speeds, float)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """The nearest command to `wanted` after which the constraints can hold; `unconstrained` where that is it."""
-        query = self._mpc.pose(now, state, reference)
+        """The nearest command to `requested` after which the constraints can hold; `unconstrained` where that is it."""
+        query = self._mpc.query(now, state, reference)
         if isinstance(query, Command):
             return query
-        answer = self._nearest.solve(query, self.wanted)
+        answer = self._nearest.solve(query, self.requested)
         if answer.status not in ACCEPTED:
-            answer = self._softened.solve(query, self.wanted)
+            answer = self._softened.solve(query, self.requested)
         plan, status = answer.plan, answer.status
         problem = rejection(status, plan[0], plan, self._actuators, query.u_before)
         if problem is not None:
             return refused(query.u_before, self.horizon, problem, answer)
         plan = plan.copy()
-        passed = np.abs(plan[0] - self.wanted).max() <= PASSED
-        plan[0] = self._actuators.clip(self.wanted if passed else plan[0], query.u_before)
+        passed = np.abs(plan[0] - self.requested).max() <= PASS_TOLERANCE
+        plan[0] = self._actuators.clip(self.requested if passed else plan[0], query.u_before)
         return command_of(plan[0], plan, UNCONSTRAINED if passed else status, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
@@ -109,9 +109,9 @@ class SafetyFilter:
 class _Nearest:
     """The QP of a problem whose first input is to be near a wanted one."""
 
-    def __init__(self, problem: Problem, standing: Array) -> None:
+    def __init__(self, problem: Problem, steady_rows: Array) -> None:
         self._form = form = PartiallyCondensed(problem)
-        self._horizon, self._at_rest = problem.horizon, standing
+        self._horizon, self._steady_rows = problem.horizon, steady_rows
         self._first = form.inputs(np.arange(form.qp.c.size, dtype=np.float64))[0].astype(np.intp)
         self._P = form.qp.P.copy()
         self._P[self._first, self._first] += 2.0
@@ -120,25 +120,25 @@ class _Nearest:
         earlier, last = (form.qp.h_u.reshape(self._horizon, -1)[i] for i in (0, -1))
         self._ends = (earlier == LOOSE) & (last < LOOSE)  # rows that hold at the last state alone
 
-    def solve(self, query: Query, wanted: Array) -> Answer:
-        """The plan whose first input is nearest to `wanted` (4,) [rad/s]."""
-        qp = replace(self._form.pose(query).qp, P=self._P)
-        qp.c[self._first] -= 2.0 * wanted
+    def solve(self, query: Query, requested: Array) -> Answer:
+        """The plan whose first input is nearest to `requested` (4,) [rad/s]."""
+        qp = replace(self._form.assemble(query).qp, P=self._P)
+        qp.c[self._first] -= 2.0 * requested
         if query.equilibrium is not None:
             for side in (qp.h_l, qp.h_u):
-                side.reshape(self._horizon, -1)[-1, self._ends] += self._at_rest @ query.equilibrium.x
+                side.reshape(self._horizon, -1)[-1, self._ends] += self._steady_rows @ query.equilibrium.x
         return Answer.of(self._form, qp, self._backend.solve(qp), SafetyFilter.solver)
 
 
-def _feasibility(problem: Problem, standing: Array) -> Problem:
+def _feasibility(problem: Problem, steady_rows: Array) -> Problem:
     """The constraints of a problem, all hard, the condition (m, n) on the plan's end, and a cost of inputs alone."""
     C_r, nu = problem.objective.C_r, problem.model.nu
     objective = Objective(C_r=C_r, Q_y=LATER**2 * np.eye(len(C_r)), Q_u=LATER * np.eye(nu))
     constraints = [replace(part, penalty=None) for part in problem.every_constraint]
-    if len(standing):
-        bound = np.full((problem.horizon, len(standing)), LOOSE)
-        bound[-1] = STANDING
-        constraints.append(Constraint(name=END, lower=-bound, upper=bound, C=standing))
+    if len(steady_rows):
+        bound = np.full((problem.horizon, len(steady_rows)), LOOSE)
+        bound[-1] = TERMINAL_TOLERANCE
+        constraints.append(Constraint(name=END, lower=-bound, upper=bound, C=steady_rows))
     return replace(problem, objective=objective, bounds=None, constraints=tuple(constraints))
 
 
@@ -150,7 +150,7 @@ def _soft(part: Constraint) -> Constraint:
     return replace(part, penalty=Penalty(l1=PENALTY / room, l2=np.zeros(room.size)))
 
 
-def _standing(problem: Problem) -> Array:
+def _steady_rows(problem: Problem) -> Array:
     """(m, n) orthonormal rows, zero times x - x_s where what the bounds see of the state stands still."""
     rows, A = problem.rows, problem.model.A
     bounded = rows.C[rows.on_states]

@@ -96,7 +96,10 @@ class Robust(Bounded):
         if self.tightening is not None and not self.output_bounds:
             raise ValueError("tightening must be absent where there are no output_bounds to tighten")
         if self.heading:
-            bounded = {"output_bounds": [*self.output_bounds], **{each.name: each.of for each in self.polytopes}}
+            bounded = {
+                "output_bounds": [*self.output_bounds],
+                **{polytope.name: polytope.of for polytope in self.polytopes},
+            }
             for name, states in bounded.items():
                 turned = [state for state in states if state in TURNED]
                 if turned:
@@ -126,7 +129,7 @@ class Robust(Bounded):
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
         """See `mpc.bounded.Weighted.problem`."""
-        return self._posed(vehicle, period, self.settings(vehicle, period))
+        return self._robust_problem(vehicle, period, self.settings(vehicle, period))
 
     def exportable(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
         """See `mpc.bounded.Weighted.exportable`."""
@@ -156,7 +159,7 @@ class Robust(Bounded):
             return None
         return margins(bounds=self.bounds(), **self._tightened(vehicle, period))
 
-    def _posed(self, vehicle: Vehicle, period: float, settings: RobustSettings) -> Problem:
+    def _robust_problem(self, vehicle: Vehicle, period: float, settings: RobustSettings) -> Problem:
         from mpc.robust.controller import robust_problem
 
         return robust_problem(
@@ -188,6 +191,6 @@ class Robust(Bounded):
         if self.tightening is not None and self.avoidance is not None:
             margins = position_margins(**self._tightened(vehicle, period))
         space, settings = self.space(shapes, vehicle, period, margins), self.settings(vehicle, period)
-        problem = self._posed(vehicle, period, settings)
+        problem = self._robust_problem(vehicle, period, settings)
         solver = self.make_solver(problem, space)
         return RobustMPC(vehicle, problem, settings, solver, space=space, kkt_every=self.kkt_every)

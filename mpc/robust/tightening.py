@@ -179,14 +179,14 @@ def growth(
     """
     A_d, B_d = discretise(A, B, period)
     closed = A_d - B_d @ K
-    unanswered = _absolute_integral(C, _transitions(A, 0.0, delay), E, delay)
+    growth_in_delay = _absolute_integral(C, _transitions(A, 0.0, delay), E, delay)
     transitions = _transitions(A, delay, delay + period)
     terms = np.empty((horizon, len(C)))
     seen = C
     for j in range(horizon):
         terms[j] = _absolute_integral(seen, transitions, E, period)
         seen = seen @ closed
-    return np.asarray(unanswered + np.cumsum(terms, axis=0))
+    return np.asarray(growth_in_delay + np.cumsum(terms, axis=0))
 
 
 def disturbed_model(vehicle: Vehicle, rotor_lag: float) -> tuple[Array, Array, Array]:
