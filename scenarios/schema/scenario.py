@@ -32,7 +32,7 @@ from scenarios.schema.controllers import AnyController, changed
 from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
-from scenarios.schema.settings import set_field
+from scenarios.schema.settings import separate, set_field
 from scenarios.schema.writing import to_toml
 
 
@@ -382,12 +382,13 @@ class Scenario:
         except ValueError as error:
             raise InputError(f"a scenario must be one that can be written: {error}") from error
 
-    def replace(self, changes: Mapping[str, Any]) -> Scenario:
+    def replace(self, changes: Mapping[Any, Any]) -> Scenario:
         """A scenario that differs in some fields; this one stays as it is.
 
         Args:
             changes: new values by dotted path, as for `--set`: an entry of a list of tables by its name, or else its
-                index.  Units as in the file; None for a field that is to be absent.
+                index.  Units as in the file; None for a field that is to be absent.  A tuple of paths gets one value
+                for all, or a tuple with a value for each.
 
         Raises:
             InputError: there is no such field, or a value is not allowed.
@@ -398,11 +399,14 @@ class Scenario:
             >>> longer = scenario.replace({"controller.horizon": 30, "vehicle.mass": 4.2})
             >>> scenario.controller.horizon, longer.controller.horizon
             (50, 30)
+            >>> both = ("controller.output_bounds.roll", "controller.output_bounds.pitch")
+            >>> scenario.replace({both: [-2.0, 2.0]}).controller.output_bounds
+            {'roll': (-2.0, 2.0), 'pitch': (-2.0, 2.0)}
         """
         data = tomllib.loads(self.to_toml())
         if self.ends_with_course:
             del data["duration"]
-        for path, value in changes.items():
+        for path, value in separate(changes, source="replace").items():
             set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, source="replace")
         return Scenario.parse(data, source=self.name)
 

@@ -265,6 +265,32 @@ def test_a_sweep_flies_every_combination(hover: Scenario) -> None:
         quadsim.sweep(hover, {"controller.horizon": [0]}, workers=1)
 
 
+def test_fields_are_swept_together(hover: Scenario) -> None:
+    roll, pitch = (f"controller.output_bounds.{name}" for name in ("roll", "pitch"))
+    tried = [[-2.0, 2.0], ([-3.0, 3.0], [-4.0, 4.0])]  # one for both, and one for each
+    found = quadsim.sweep(hover, {(roll, pitch): tried, "vehicle.mass": [4.0, 4.2]}, workers=1, progress=False)
+    swept = [f"{name}.{i}" for name in (roll, pitch) for i in (0, 1)]
+    assert found.table.column_names[:6] == [*swept, "vehicle.mass", "verdict"]
+    assert found[f"{roll}.1"].tolist() == [2.0, 2.0, 3.0, 3.0]
+    assert found[f"{pitch}.0"].tolist() == [-2.0, -2.0, -4.0, -4.0]
+    alone = quadsim.fly(hover.replace({(roll, pitch): tried[1]}), progress=False)
+    for finding in alone.audit:
+        assert found[f"margin.{finding.limit.name}"][2] == finding.worst_margin
+    frame = found.to_pandas()
+    assert frame.shape == (4, len(found.table.column_names))
+    assert frame.groupby("vehicle.mass")["margin.roll"].max().tolist() == pytest.approx([3.0, 3.0], abs=0.01)
+    lines = repr(found).splitlines()
+    assert lines[0].startswith("sweep of hover: 4 flights, 4 satisfied")
+    assert len(lines) <= 10
+    with pytest.raises(ParameterError, match="a tuple of 2; a pair for all is a list; got \\(1, 2, 3\\)"):
+        hover.replace({(roll, pitch): (1, 2, 3)})
+
+
+def test_whole_tables_are_swept(hover: Scenario) -> None:
+    found = quadsim.sweep(hover, {"controller": [{"type": "pid"}, {"type": "lqr"}]}, workers=1, progress=False)
+    assert found["controller.type"].tolist() == ["pid", "lqr"]
+
+
 def test_a_custom_law_is_sent_to_other_processes_by_its_place(
     hover: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
