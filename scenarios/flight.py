@@ -35,7 +35,7 @@ from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.schema.scenario import Scenario, Verdict
+from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import leaves
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     from mpc.ocp import InfeasiblePeriod
     from scenarios.assembly import Assembly
+    from scenarios.schema.scenario import Verdict  # only here: Jedi completes no object with a property of a Literal
 
 _LONGEST: Final = 500  # characters of why a product failed
 _log: Final = logging.getLogger("quadsim")

@@ -58,6 +58,8 @@ class _Modelled(_Overrides):
 
 
 if TYPE_CHECKING:
+    from scenarios.flight import Flight
+
     VehicleTable: TypeAlias = _Modelled
     ActualTable: TypeAlias = _Overrides
 else:
@@ -237,6 +239,10 @@ class Scenario:
         parts = f"{self.duration:g} s of {self.vehicle.file}, {self.reference.type} by {self.controller.type}"
         return f"<Scenario {self.name}: {parts}\n {self.description}>"
 
+    def __dir__(self) -> list[str]:
+        """What a user sets and calls, which is what an interactive session completes to."""
+        return [name for name in super().__dir__() if name in _FOR_USERS or name.startswith("__")]
+
     @property
     def ends_with_course(self) -> bool:
         """Whether its duration is that of its course, and stated nowhere."""
@@ -410,6 +416,15 @@ class Scenario:
             set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, source="replace")
         return Scenario.parse(data, source=self.name)
 
+    def fly(self, **options: Any) -> Flight:
+        """Fly it; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
+        from scenarios.app import fly
+
+        return fly(self, **options)
+
     def to_toml(self) -> str:
         """The resolved file: every field, defaults included, with comments; parsing it gives this scenario again."""
         return to_toml(self)
+
+
+_FOR_USERS: Final = {*Scenario.__dataclass_fields__, "replace", "fly", "to_toml"}

@@ -337,3 +337,29 @@ def test_what_is_handed_out_names_itself_in_a_few_lines() -> None:
     name, margin = re.fullmatch(r" worst margin: (\S+) (\S+) .*>", worst).groups()
     assert float(margin) == pytest.approx(min(flight.margins[name]), abs=0.1)
     assert len(repr(quadsim.compare(flight, flight)).splitlines()) <= 10
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered", "withheld"),
+    [
+        ('flight.state["', ["x", "yaw_rate"], []),
+        ('flight.margins["', ["hold_x", "roll"], []),
+        ("flight.", ["outcome", "state", "margins", "to_pandas", "plot"], []),
+        ("scenario.", ["controller", "duration", "replace", "fly", "to_toml"], ["altered", "require_consistent"]),
+        ("quadsim.", ["fly", "sweep", "Scenario"], ["importlib", "TYPE_CHECKING", "annotations"]),
+    ],
+)
+def test_ipython_with_jedi_completes(hover: Scenario, typed: str, offered: list[str], withheld: list[str]) -> None:
+    from IPython.core.completer import IPCompleter, provisionalcompleter
+
+    names = {"flight": quadsim.fly(hover, progress=False), "scenario": hover, "quadsim": quadsim}
+    completer = IPCompleter(namespace=names, use_jedi=True)
+    completer.jedi_compute_type_timeout = 0
+    with provisionalcompleter():
+        found = {completion.text for completion in completer.completions(typed, len(typed))}
+    assert {*offered} <= found
+    assert not found & {*withheld}
+
+
+def test_a_scenario_flies(hover: Scenario) -> None:
+    assert hover.fly(progress=False).outcome == "satisfied"
