@@ -128,6 +128,7 @@ def test_it_is_drawn(flight: Flight) -> None:
     assert [each.get_ylabel() for each in axes] == ["x [m]", "roll [deg]", "speed [rad/s]"]
     assert len(axes[2].get_lines()) == 4
     assert len(flight.plot()) == 6
+    assert flight.plot("xy")[0].get_xlabel() == "x [m]"
     with pytest.raises(UnknownNameError, match="no signal named 'rol'; did you mean 'roll'"):
         flight.plot("rol")
     page = flight._repr_html_()
