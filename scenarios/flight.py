@@ -181,6 +181,11 @@ class Flight(Result):
         """(K,) of the filtered reference x, y, z [m], yaw [rad]."""
         return dict(zip(REFERENCE_NAMES, self.log.control.reference.T, strict=True))
 
+    @cached_property
+    def logged(self) -> dict[str, Array]:
+        """(K,) of each signal that the controller logged (`StepInputs.log`), NaN in periods without a value."""
+        return {name: values for name, (_, values) in self.log.control.logged.items()}
+
     @property
     def command(self) -> Array:
         """(K, 4) commanded rotor speeds [rad/s]."""
