@@ -35,7 +35,7 @@ from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.schema.scenario import Scenario, Verdict
+from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import leaves
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     from mpc.ocp import InfeasiblePeriod
     from scenarios.assembly import Assembly
+    from scenarios.schema.scenario import Verdict  # only here: Jedi completes no object with a property of a Literal
 
 _LONGEST: Final = 500  # characters of why a product failed
 _log: Final = logging.getLogger("quadsim")
@@ -260,8 +261,8 @@ class Flight(Result):
         """Draw signals over time with their references and bounds, one panel each.
 
         Args:
-            signals: names that constraints can have, as `x`, `tilt`, `speed`; position and attitude where none is
-                given.
+            signals: names that constraints can have, as `x`, `tilt`, `speed`, and `xy` for the path from above;
+                position and attitude where none is given.
 
         Returns:
             The matplotlib axes, top to bottom; `axes[0].figure` is the figure, which is pyplot's.
@@ -273,8 +274,8 @@ class Flight(Result):
         from quadsim.report.to_matplotlib import draw
 
         for name in signals:
-            if name not in SIGNALS:
-                raise UnknownNameError("signal", name, SIGNALS)
+            if name not in (*SIGNALS, "xy"):
+                raise UnknownNameError("signal", name, (*SIGNALS, "xy"))
         figure = draw_signals(self.run, signals or ("x", "y", "z", "roll", "pitch", "yaw"))
         return draw(figure, interactive=True).axes
 
