@@ -67,7 +67,7 @@ class Flight(Result):
         tallies: what became of each sensor's samples in the estimator; empty without one.
         directory: where it was read from or written to; None where it is in memory alone.
         recorded: `summary.json` of one that was read; None for one that was flown.
-        unanswered: the first period whose QP had no answer; None where all had, there is no QP, or it was read.
+        infeasible_period: the first period whose QP had no answer; None where all had, there is no QP, or it was read.
 
     Examples:
         >>> import quadsim
@@ -87,7 +87,7 @@ class Flight(Result):
     tallies: Mapping[SensorName, Tally] = field(repr=False)
     directory: Path | None = None
     recorded: Mapping[str, Any] | None = field(default=None, repr=False)
-    unanswered: InfeasiblePeriod | None = field(default=None, repr=False)
+    infeasible_period: InfeasiblePeriod | None = field(default=None, repr=False)
 
     @property
     def scenario(self) -> Scenario:
@@ -148,13 +148,13 @@ class Flight(Result):
         """
         if self.recorded is not None:
             return self.recorded.get("diagnosis")
-        if self.unanswered is None or (self.unanswered.status == NOT_CONVERGED and self.satisfied):
+        if self.infeasible_period is None or (self.infeasible_period.status == NOT_CONVERGED and self.satisfied):
             return None
         from scenarios.infeasibility import diagnose
 
-        spec = self.scenario.controller_at(self.unanswered.time)
+        spec = self.scenario.controller_at(self.infeasible_period.time)
         posed = self.scenario.altered(controller=spec, events=())
-        return diagnose(self.unanswered, posed, self.vehicle)
+        return diagnose(self.infeasible_period, posed, self.vehicle)
 
     @property
     def audit(self) -> tuple[Finding, ...]:
@@ -180,6 +180,11 @@ class Flight(Result):
     def reference(self) -> dict[str, Array]:
         """(K,) of the filtered reference x, y, z [m], yaw [rad]."""
         return dict(zip(REFERENCE_NAMES, self.log.control.reference.T, strict=True))
+
+    @cached_property
+    def logged(self) -> dict[str, Array]:
+        """(K,) of each signal that the controller logged (`StepInputs.log`), NaN in periods without a value."""
+        return {name: values for name, (_, values) in self.log.control.logged.items()}
 
     @property
     def command(self) -> Array:

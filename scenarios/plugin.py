@@ -32,7 +32,7 @@ from quadsim.errors import CommandError, InputError, ParameterError, UnknownName
 from quadsim.fields import is_plain
 from quadsim.flight.log import RESIDUALS
 from quadsim.sim.effects import Force
-from quadsim.state import Array
+from quadsim.state import Array, State
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 FORM: Final = "package.module:Class"  # what the text that names a controller looks like
@@ -146,12 +146,12 @@ class PluginController:
             )
 
     @property
-    def unanswered(self) -> object:
+    def infeasible_period(self) -> object:
         """The first problem without an answer, an `mpc.InfeasiblePeriod`, where the law keeps one."""
         try:
-            return getattr(self._law, "unanswered", None)
+            return getattr(self._law, "infeasible_period", None)
         except Exception as error:  # after the flight, which is not to be lost by it
-            logging.getLogger("quadsim").warning("no diagnosis: unanswered raised %s", _reason(error))
+            logging.getLogger("quadsim").warning("no diagnosis: infeasible_period raised %s", _reason(error))
             return None
 
     def reset(self, speeds: Array) -> None:
@@ -168,7 +168,8 @@ class PluginController:
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError where the answer is no command."""
         acting = None if now.acting is None else now.acting.copy()
-        answer: Any = self._law.step(replace(now, acting=acting), state.copy(), reference.copy())
+        named = state.copy().view(State)
+        answer: Any = self._law.step(replace(now, acting=acting), named, reference.copy())
         try:
             if not isinstance(answer, Command):
                 answer = Command(speeds=answer, plan=np.tile(_numbers(answer, (N_ROTORS,), "it"), (self.horizon, 1)))
