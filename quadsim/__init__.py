@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from quadsim.controller import Command as Command
     from quadsim.controller import StepInputs as StepInputs
     from quadsim.errors import QuadsimError as QuadsimError
+    from quadsim.state import STATE_NAMES as STATE_NAMES
+    from quadsim.state import State as State
     from quadsim.vehicle import Vehicle as Vehicle
     from scenarios.app import campaign as campaign
     from scenarios.app import catalogue as catalogue
@@ -52,6 +54,7 @@ __version__ = "0.1.0"
 _MODULES = {
     "quadsim.controller": "Command StepInputs",
     "quadsim.errors": "QuadsimError",
+    "quadsim.state": "STATE_NAMES State",
     "quadsim.vehicle": "Vehicle",
     "scenarios.app": "campaign catalogue check compare doctor feasibility film fly live load load_vehicle "
     "make_controller read replay reproduce run scenario start sweep tune vehicle_report view",
@@ -74,5 +77,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The public names, imported or not."""
-    return sorted({*globals(), *_PUBLIC})
+    """The public names, imported or not, and the module's own."""
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]

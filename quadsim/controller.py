@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final, NamedTuple, Protocol
 
@@ -44,6 +44,14 @@ LARGEST_SPEED: Final = 1e5
 """Largest magnitude of a rotor speed command [rad/s] that is taken for a command rather than for a fault."""
 
 
+class Signals(Protocol):
+    """Records what a controller logs; see `quadsim.flight.log.LoggedSignals`."""
+
+    def log(self, name: str, value: float, unit: str) -> None:
+        """See `StepInputs.log`."""
+        ...
+
+
 class Phase(StrEnum):
     """Where a flight stands with the ground; without a ground it is `flying` throughout."""
 
@@ -65,11 +73,18 @@ class StepInputs:
             to be derived from the state.
         body_rates: (3,) measured body rates [rad/s]; None as before.
         motion: the reference from t_k on, where the course knows more than x, y, z, yaw.
+        signals: where `log` writes; None where nothing records.
 
     Examples:
         >>> import quadsim
         >>> quadsim.StepInputs(time=0.05).phase.value
         'flying'
+        >>> def logs_height(now, state, reference):
+        ...     now.log("height_error", reference[0, 2] - state.z, "m")
+        ...     return [205.0] * 4
+        >>> short = quadsim.load("hover").replace({"duration": 0.15})
+        >>> quadsim.fly(short, controller=logs_height).logged["height_error"].shape
+        (3,)
     """
 
     time: float = 0.0
@@ -78,6 +93,21 @@ class StepInputs:
     attitude: Array | None = None
     body_rates: Array | None = None
     motion: Motion | None = None
+    signals: Signals | None = field(default=None, repr=False, compare=False)
+
+    def log(self, name: str, value: float, unit: str = "-") -> None:
+        """Record a number of this period: a column of flight.parquet, and `flight.logged[name]`.
+
+        Args:
+            name: an identifier that is no column of flight.parquet; logged twice in a period, the last value counts.
+            value: finite, or NaN, which periods without a value have.
+            unit: stored with the column.
+
+        Raises:
+            ParameterError: the name or the value is not allowed; it ends the flight.
+        """
+        if self.signals is not None:
+            self.signals.log(name, value, unit)
 
 
 class InnerLoop(Protocol):

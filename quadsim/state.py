@@ -7,8 +7,9 @@ and **Euler-angle rates**, not body rates; `quadsim.rotation` converts between t
 
 from __future__ import annotations
 
+import difflib
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ STATE_NAMES: Final = (
     "x", "vx", "y", "vy", "z", "vz",
     "roll", "roll_rate", "pitch", "pitch_rate", "yaw", "yaw_rate",
 )  # fmt: skip
+"""The states in their order; units: `quadsim.state.STATE_UNITS`."""
 STATE_UNITS: Final = ("m", "m/s") * 3 + ("rad", "rad/s") * 3
 INDEX: Final = {name: i for i, name in enumerate(STATE_NAMES)}
 N_STATES: Final = len(STATE_NAMES)
@@ -52,6 +54,38 @@ def tilt(states: Array) -> Array:
     cosine = np.cos(states[:, INDEX["roll"]]) * np.cos(states[:, INDEX["pitch"]])
     angle: Array = np.arccos(np.clip(cosine, -1.0, 1.0))
     return angle
+
+
+class State(np.ndarray[tuple[int], np.dtype[np.float64]]):
+    """A state (12,) whose entries also have the names of `STATE_NAMES`: floats in m, m/s, rad and rad/s.
+
+    Your controller receives one.  Parts of it, and what is computed from it, are plain arrays.
+
+    Examples:
+        >>> import numpy as np
+        >>> import quadsim
+        >>> state = np.arange(12.0).view(quadsim.State)
+        >>> state.x, state.roll_rate, state[4], state[:3] + 1.0
+        (0.0, 7.0, np.float64(4.0), array([1., 2., 3.]))
+    """
+
+    def __getattr__(self, name: str) -> float:
+        if name in INDEX:
+            return self.item(INDEX[name])
+        near = difflib.get_close_matches(name, STATE_NAMES, n=1)
+        guess = f"; did you mean {near[0]!r}?" if near else ""
+        raise AttributeError(f"a state has no {name!r}{guess} (there are: {', '.join(STATE_NAMES)})")
+
+    def __dir__(self) -> list[str]:
+        return [*STATE_NAMES, *super().__dir__()]
+
+    def __getitem__(self, key: Any) -> Any:
+        part = super().__getitem__(key)
+        return part.view(np.ndarray) if isinstance(part, State) else part
+
+    def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
+        """What NumPy makes of a result: as of any array."""
+        return array[()] if return_scalar else array.view(np.ndarray)
 
 
 class YawTurns:

@@ -29,13 +29,14 @@ from quadsim.sim.estimator import Tally
 from quadsim.sim.sensing import SensorName
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
+from scenarios.courses.csv_course import Csv
 from scenarios.feasibility_check import report
 from scenarios.flight_events import story
 from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.schema.scenario import Scenario, Verdict
+from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import leaves
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
     from mpc.ocp import InfeasiblePeriod
     from scenarios.assembly import Assembly
+    from scenarios.schema.scenario import Verdict  # only here: Jedi completes no object with a property of a Literal
 
 _LONGEST: Final = 500  # characters of why a product failed
 _log: Final = logging.getLogger("quadsim")
@@ -180,6 +182,11 @@ class Flight(Result):
         """(K,) of the filtered reference x, y, z [m], yaw [rad]."""
         return dict(zip(REFERENCE_NAMES, self.log.control.reference.T, strict=True))
 
+    @cached_property
+    def logged(self) -> dict[str, Array]:
+        """(K,) of each signal that the controller logged (`StepInputs.log`), NaN in periods without a value."""
+        return {name: values for name, (_, values) in self.log.control.logged.items()}
+
     @property
     def command(self) -> Array:
         """(K, 4) commanded rotor speeds [rad/s]."""
@@ -260,8 +267,8 @@ class Flight(Result):
         """Draw signals over time with their references and bounds, one panel each.
 
         Args:
-            signals: names that constraints can have, as `x`, `tilt`, `speed`; position and attitude where none is
-                given.
+            signals: names that constraints can have, as `x`, `tilt`, `speed`, and `xy` for the path from above;
+                position and attitude where none is given.
 
         Returns:
             The matplotlib axes, top to bottom; `axes[0].figure` is the figure, which is pyplot's.
@@ -273,8 +280,8 @@ class Flight(Result):
         from quadsim.report.to_matplotlib import draw
 
         for name in signals:
-            if name not in SIGNALS:
-                raise UnknownNameError("signal", name, SIGNALS)
+            if name not in (*SIGNALS, "xy"):
+                raise UnknownNameError("signal", name, (*SIGNALS, "xy"))
         figure = draw_signals(self.run, signals or ("x", "y", "z", "roll", "pitch", "yaw"))
         return draw(figure, interactive=True).axes
 
@@ -318,6 +325,9 @@ class Flight(Result):
         def write_tables(*, overwrite: bool) -> None:
             with writing(target, overwrite=overwrite) as partial:
                 (partial / rundir.SCENARIO_FILE).write_text(self.scenario.to_toml(), encoding="utf-8")
+                course = self.scenario.reference
+                if isinstance(course, Csv) and course.content is not None:
+                    (partial / course.file).write_bytes(course.content)
                 write_log(partial, self.log, plant_stride=self.scenario.plant_stride, metadata=self.metadata)
                 summary = to_json({**self.summary, "wall_s": wall_s()})
                 (partial / rundir.SUMMARY_FILE).write_text(summary, encoding="utf-8")

@@ -5,14 +5,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 
 from quadsim.controller import Phase
+from quadsim.errors import ParameterError
 from quadsim.rotation import conjugate, euler_to_body_rates, euler_to_quaternion, multiply
-from quadsim.state import ANGLE_RATES, ANGLES, Array
+from quadsim.state import ANGLE_RATES, ANGLES, REFERENCE_NAMES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
+from quadsim.vehicle import N_ROTORS
 
 RESIDUALS: Final = (
     *("reported_primal", "reported_dual", "infeasibility"),
@@ -30,6 +34,50 @@ BODY_RATES: Final = {f"body_rate_{axis}": "rad/s" for axis in "xyz"}
 """Columns of the body rates, with units; same condition."""
 SQP_RESIDUAL: Final = {"sqp_defect": "-", "sqp_step": "-"}
 """Columns of `quadsim.controller.SQP`, with units; only for flights with sequential quadratic programming."""
+
+Fields = dict[str, dict[str, str]]
+"""The fields of a log, each with its columns and their units."""
+STATE: Final = dict(zip(STATE_NAMES, STATE_UNITS, strict=True))
+TEXTS: Final = ("status", "answered_by", "phase")
+COUNTS: Final = ("iterations", "active", "fallback")
+CONTROL: Final[Fields] = {
+    "t": {"t": "s"},
+    "state": STATE,
+    "reference": {f"ref_{name}": unit for name, unit in zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)},
+    "speeds": {f"u{i}": "rad/s" for i in range(1, N_ROTORS + 1)},
+    **{name: {name: "-"} for name in (*TEXTS, *COUNTS)},
+    "slack": {"slack": "rad"},
+    **{name: {name: "-"} for name in RESIDUALS},
+    "delay": {"delay": "s"},
+    "truth": {f"true_{name}": unit for name, unit in STATE.items()},  # where the measured state differs
+    "attitude": QUATERNION,
+    "body_rates": BODY_RATES,
+    "sqp": SQP_RESIDUAL,
+}
+COLUMNS: Final = frozenset(name for units in CONTROL.values() for name in units)
+"""The columns of flight.parquet, but for those that a controller logs."""
+
+
+class LoggedSignals(dict[str, tuple[str, float]]):
+    """What a controller logs in one period: unit and value by name."""
+
+    def log(self, name: str, value: float, unit: str = "-") -> None:
+        """See `quadsim.controller.StepInputs.log`."""
+        if not isinstance(name, str) or not name.isidentifier() or name in COLUMNS:
+            raise ParameterError("log", "name", name, "an identifier that is no column of flight.parquet")
+        number = np.asarray(value)
+        if number.shape or number.dtype.kind not in "biuf" or np.isinf(number):
+            raise ParameterError("log", name, value, "one number, finite or NaN")
+        self[name] = unit, float(number)
+
+
+def stacked(periods: Sequence[LoggedSignals]) -> dict[str, tuple[str, Array]]:
+    """Unit and values (K,) of each signal that K periods logged, NaN in periods without."""
+    units = {name: unit for signals in reversed(periods) for name, (unit, _) in signals.items()}
+    return {
+        name: (units[name], np.array([signals.get(name, ("", math.nan))[1] for signals in periods]))
+        for name in dict.fromkeys(name for signals in periods for name in signals)
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +101,7 @@ class ControlLog:
     slack: Array  # (K,) largest softening of an output bound [rad]
     reported_primal: Array  # (K,) as reported by the QP solver; here and below NaN if not available
     reported_dual: Array  # (K,) same
-    infeasibility: (
-        Array  # (K,) largest violation of a row of the problem by the plan, less the row's slack [row's unit]
-    )
+    infeasibility: Array  # (K,) largest violation of a row by the plan, less the row's slack [row's unit]
     kkt_stationarity: Array  # (K,) residuals computed from the QP; see `quadsim.controller.Command`
     kkt_complementarity: Array  # (K,) same
     kkt_dual: Array  # (K,) same
@@ -63,6 +109,8 @@ class ControlLog:
     attitude: Array | None = None  # (K, 4) measured quaternion wxyz, sign continuous; None if Euler angles suffice
     body_rates: Array | None = None  # (K, 3) measured body rates [rad/s]; None if Euler angles suffice
     sqp: Array | None = None  # (K, 2) of `quadsim.controller.SQP`, NaN in periods without; None if all are
+    logged: Mapping[str, tuple[str, Array]] = field(default_factory=dict)
+    """What the controller logged, by name: unit and values (K,), NaN in periods without."""
 
     @property
     def measured_perfectly(self) -> bool:

@@ -18,45 +18,32 @@ import pyarrow.parquet as pq
 from quadsim.errors import FileError
 from quadsim.flight.log import (
     BODY_RATES,
+    COLUMNS,
+    CONTROL,
+    COUNTS,
     QUATERNION,
     RESIDUALS,
     SQP_RESIDUAL,
+    STATE,
+    TEXTS,
     WIND,
     WRENCH,
     ControlLog,
+    Fields,
     FlightLog,
     PlantLog,
     TimingLog,
 )
-from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS
 from quadsim.vehicle import N_ROTORS
 
 FLIGHT_FILE: Final = "flight.parquet"
 TIMING_FILE: Final = "timing.parquet"
 PLANT_FILE: Final = "plant.parquet"
 HORIZON_FILE: Final = "horizon.parquet"
-_Fields = dict[str, dict[str, str]]  # the fields of a log, each with its columns and their units
-_STATE: Final = dict(zip(STATE_NAMES, STATE_UNITS, strict=True))
-_TEXTS: Final = ("status", "answered_by", "phase")
-_COUNTS: Final = ("iterations", "active", "fallback")
-_CONTROL: Final[_Fields] = {
+_TIMING: Final[Fields] = {"t": {"t": "s"}, "solve_ms": {"solve_ms": "ms"}, "step_ms": {"step_ms": "ms"}}
+_PLANT: Final[Fields] = {
     "t": {"t": "s"},
-    "state": _STATE,
-    "reference": {f"ref_{name}": unit for name, unit in zip(REFERENCE_NAMES, REFERENCE_UNITS, strict=True)},
-    "speeds": {f"u{i}": "rad/s" for i in range(1, N_ROTORS + 1)},
-    **{name: {name: "-"} for name in (*_TEXTS, *_COUNTS)},
-    "slack": {"slack": "rad"},
-    **{name: {name: "-"} for name in RESIDUALS},
-    "delay": {"delay": "s"},
-    "truth": {f"true_{name}": unit for name, unit in _STATE.items()},  # if the measured state differs
-    "attitude": QUATERNION,
-    "body_rates": BODY_RATES,
-    "sqp": SQP_RESIDUAL,
-}
-_TIMING: Final[_Fields] = {"t": {"t": "s"}, "solve_ms": {"solve_ms": "ms"}, "step_ms": {"step_ms": "ms"}}
-_PLANT: Final[_Fields] = {
-    "t": {"t": "s"},
-    "state": _STATE,
+    "state": STATE,
     "speeds": {f"w{i}": "rad/s" for i in range(1, N_ROTORS + 1)},
     "wrench": WRENCH,
     "wind": WIND,
@@ -69,30 +56,37 @@ _GAPS: Final = frozenset({*RESIDUALS, *SQP_RESIDUAL})  # columns that are null i
 _Column = tuple[str, str, pa.Array]
 
 
-def _columns(log: ControlLog | TimingLog | PlantLog, fields: _Fields) -> Iterator[_Column]:
-    """Return the columns of the available fields, with names and units."""
+def _columns(log: ControlLog | TimingLog | PlantLog, fields: Fields) -> Iterator[_Column]:
+    """The columns of the fields that are there, each with its name and unit."""
     for field, units in fields.items():
         rows = getattr(log, field)
         if rows is not None:
             for (name, unit), values in zip(units.items(), [rows] if len(units) == 1 else rows.T, strict=True):
-                yield name, unit, pa.array(values, pa.string() if name in _TEXTS else None, from_pandas=name in _GAPS)
+                yield name, unit, pa.array(values, pa.string() if name in TEXTS else None, from_pandas=name in _GAPS)
+
+
+def _logged(log: ControlLog) -> Iterator[_Column]:
+    """The columns that the controller logged."""
+    for name, (unit, values) in log.logged.items():
+        yield name, unit, pa.array(values, from_pandas=True)
 
 
 def _table(columns: Iterable[_Column], metadata: Mapping[str, str]) -> pa.Table:
     arrays, schema = [], []
     for name, unit, array in columns:
         arrays.append(array)
-        schema.append(pa.field(name, array.type, nullable=name in _GAPS, metadata={"unit": unit}))
+        gaps = name in _GAPS or (array.null_count > 0)
+        schema.append(pa.field(name, array.type, nullable=gaps, metadata={"unit": unit}))
     return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata=dict(metadata)))
 
 
 def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, str]) -> dict[str, pa.Table]:
     """A flight's tables `flight`, `timing`, `plant`, and `horizon` if positions were predicted; see `write_log`."""
     control = log.control
-    fields = {name: units for name, units in _CONTROL.items() if name != "truth" or not control.measured_perfectly}
+    fields = {name: units for name, units in CONTROL.items() if name != "truth" or not control.measured_perfectly}
     before = ",".join(repr(float(speed)) for speed in control.speeds_before)
     tables = {
-        "flight": _table(_columns(control, fields), {**metadata, "speeds_before": before}),
+        "flight": _table([*_columns(control, fields), *_logged(control)], {**metadata, "speeds_before": before}),
         "timing": _table(_columns(log.timing, _TIMING), metadata),
         "plant": _table(_columns(log.plant.every(plant_stride), _PLANT), metadata),
     }
@@ -134,8 +128,8 @@ def read_parquet(path: Path) -> pa.Table:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
 
 
-def _fields(table: pa.Table, fields: _Fields) -> dict[str, Any]:
-    """Return the fields of a log by name; None for optional ones that its table lacks."""
+def _fields(table: pa.Table, fields: Fields) -> dict[str, Any]:
+    """The fields of a log by name; None for those that its table may lack and does."""
     values: dict[str, Any] = {}
     for field, units in fields.items():
         there = field not in _OPTIONAL or set(units) <= set(table.column_names)
@@ -146,14 +140,14 @@ def _fields(table: pa.Table, fields: _Fields) -> dict[str, Any]:
 
 def _values(table: pa.Table, name: str) -> Any:
     column = table.column(name)
-    if name in _TEXTS:
+    if name in TEXTS:
         texts = tuple(column.to_pylist())
         if not all(isinstance(text, str) for text in texts):
             raise ValueError(f"{name} is not text throughout")
         return texts
     if column.null_count and name not in _GAPS:
         raise ValueError(f"{name} has gaps")
-    return np.asarray(column.to_numpy(), dtype=np.int64 if name in _COUNTS else np.float64)
+    return np.asarray(column.to_numpy(), dtype=np.int64 if name in COUNTS else np.float64)
 
 
 def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
@@ -165,10 +159,15 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
     flight, timing, plant = (read_parquet(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE))
     try:
         before = np.array([float(text) for text in (flight.schema.metadata or {})[b"speeds_before"].split(b",")])
-        values = _fields(flight, _CONTROL)
+        values = _fields(flight, CONTROL)
         if values["truth"] is None:
             values["truth"] = values["state"]
-        control = ControlLog(**values, speeds_before=before)
+        logged = {
+            field.name: (field.metadata[b"unit"].decode(), np.asarray(flight.column(field.name), np.float64))
+            for field in flight.schema
+            if field.name not in COLUMNS
+        }
+        control = ControlLog(**values, logged=logged, speeds_before=before)
         plant_log, timing_log = PlantLog(**_fields(plant, _PLANT)), TimingLog(**_fields(timing, _TIMING))
         predicted = _read_predicted(directory / HORIZON_FILE)
         rows = {control.t.size, timing_log.t.size, *(() if predicted is None else (len(predicted),))}

@@ -15,7 +15,7 @@ import numpy as np
 
 from quadsim.controller import Command, Controller, InnerLoop, Phase, StepInputs
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError
-from quadsim.flight.log import FlightLog
+from quadsim.flight.log import FlightLog, LoggedSignals
 from quadsim.flight.phase import check_loss
 from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
@@ -267,6 +267,7 @@ class ClosedLoop:
             attitude=attitude,
             body_rates=body_rates,
             motion=None if self.motion is None else self.motion.after(k),
+            signals=LoggedSignals(),
         )
         return Observation(k=k, state=state, truth=truth, reference=row, preview=preview, moment=now)
 

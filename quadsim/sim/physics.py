@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from quadsim.controller import FALLBACK, MISSED, Command, Phase, StepInputs
-from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
+from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, LoggedSignals, PlantLog, TimingLog, stacked
 from quadsim.rotation import body_to_euler_rates, quaternion_to_euler
 from quadsim.sim.sensing import whole
 from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, VELOCITIES, Array
@@ -183,6 +183,7 @@ def _control_log(samples: Sequence[FlownPeriod], initial_speeds: Array, period: 
         **{name: column(name, float) for name in RESIDUALS},
         delay=np.array([sample.delay for sample in samples], float),
         sqp=np.array([residual or (math.nan, math.nan) for residual in residuals]) if any(residuals) else None,
+        logged=stacked([s for o in observed if isinstance(s := o.moment.signals, LoggedSignals)]),
     )
 
 
