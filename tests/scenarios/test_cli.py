@@ -320,5 +320,5 @@ def test_a_file_that_is_nested_too_deep_is_refused_before_it_takes_memory(
         finally:
             tracemalloc.stop()
         assert peak < 50e6
-        message = "quadsim: deep.toml: must have at most 20 tables and lists within one another\n"
+        message = "quadsim: deep.toml: must nest tables and lists at most 20 deep\n"
         assert capsys.readouterr().err == message

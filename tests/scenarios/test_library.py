@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import cache
 from pathlib import Path
@@ -79,7 +79,9 @@ def numbers(log: FlightLog, periods: int, steps: int) -> tuple[list[bytes], list
 
     def columns(rows: ControlLog | PlantLog, count: int) -> list[bytes]:
         values = [getattr(rows, field.name) for field in fields(rows)]
-        return [np.asarray(each[:count]).tobytes() for each in values if each is not None]
+        arrays = [value for value in values if value is not None and not isinstance(value, Mapping)]
+        logged = [signal for value in values if isinstance(value, Mapping) for _, signal in value.values()]
+        return [np.asarray(array[:count]).tobytes() for array in (*arrays, *logged)]
 
     return columns(log.control, periods), columns(log.plant, periods * steps)
 
