@@ -51,13 +51,15 @@ Row = Sequence[object]
 
 
 def commands(name: str) -> list[list[str]]:
-    """What makes the files of a name: a benchmark, `papers`, `first-flights`, `campaigns` or `tunings`."""
+    """What makes the files of a name: a benchmark, `papers`, `first-flights`, `campaigns`, `tunings` or `pictures`."""
     python, quadsim = sys.executable, str(Path(sys.executable).with_name("quadsim"))
     match name:
         case "papers":
             return [[quadsim, "reproduce", "--json"]]
         case "first-flights":
             return [[python, "tests/first_flights.py"]]
+        case "pictures":
+            return [[python, f"docs/{script}.py"] for script in ("drawings", "figures", "film")]
         case "campaigns":
             return [[quadsim, "campaign", each, "--out", f"runs/campaigns/{each}", "--resume"] for each in CAMPAIGNS]
         case "tunings":
@@ -293,7 +295,7 @@ def filled(text: str) -> tuple[str, list[str]]:
 def main() -> None:
     """Make what was named, then fill every page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = [*BENCHMARKS, "papers", "first-flights", "campaigns", "tunings"]
+    names = [*BENCHMARKS, "papers", "first-flights", "campaigns", "tunings", "pictures"]
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(names))
     chosen = parser.parse_args().names
     if unknown := sorted({*chosen} - {*names}):

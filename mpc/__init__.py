@@ -1,6 +1,7 @@
 """The controllers: model predictive control in numpy, scipy and PIQP, usable without a simulator.
 
-What a user of the controllers names is imported when it is first used: `mpc.ConstrainedMPC`, `mpc.paper`, ...
+Public names are imported on first use: `mpc.ConstrainedMPC`, `mpc.paper`, ...  `docs/conventions.md` defines states,
+units, frames and margins.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ __all__ = [*_PUBLIC, *_SUBPACKAGES]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name, or a subpackage, when it is first used."""
+    """Import a public name or a subpackage on first use."""
     if name in _SUBPACKAGES:
         return importlib.import_module(f"mpc.{name}")
     if name not in _PUBLIC:

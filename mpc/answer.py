@@ -1,4 +1,4 @@
-"""The one contract for answers: solved, finite and within what actuators can take; else why not."""
+"""The one test of every solver answer: solved, finite and within the actuators' limits; otherwise the reason."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from quadsim.state import Array, Indices, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 BOUND_TOLERANCE: Final = 1e-6
-"""How far outside its bounds [rad/s] an answer may be and still count as in bounds; it is then moved onto them."""
+"""Tolerance of the bounds [rad/s]: an answer outside by no more is moved onto its bounds and accepted."""
 INFEASIBLE: Final = 1e-3
-"""Largest violation of a row [its unit] by a plan that is accepted."""
+"""Largest violation of a row [its unit] that an accepted plan may have."""
 INFEASIBLE_ANSWER: Final = "infeasible_answer"
-"""Status of an answer whose plan violates a row by more."""
+"""Status of an answer whose plan violates a row by more than `INFEASIBLE`."""
 LARGEST_MAP: Final = 2**20
-"""Entries of the map from inputs to rows of states up to which states are predicted by it, else step by step."""
+"""Largest map from inputs to rows [entries] that predicts states; for a larger one they are predicted step by step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,9 +34,9 @@ class ActuatorBounds:
     """Hard bounds on rotor speeds, Eq. (20), and on their steps from one period to the next, Eq. (15)."""
 
     u_min: Array  # (4,) speeds [rad/s], finite and not negative: rotors turn one way
-    u_max: Array  # likewise
-    delta_min: Array  # (4,) steps u(k) - u(k-1) [rad/s]; infinite where there is no bound
-    delta_max: Array  # likewise
+    u_max: Array  # same
+    delta_min: Array  # (4,) steps u(k) - u(k-1) [rad/s]; infinite for no bound
+    delta_max: Array  # same
 
     def __post_init__(self) -> None:
         for name in ("u_min", "u_max", "delta_min", "delta_max"):
@@ -54,18 +54,18 @@ class ActuatorBounds:
 
     @classmethod
     def alike(cls, speed: tuple[float, float], slew: tuple[float, float] = (-math.inf, math.inf)) -> ActuatorBounds:
-        """The same (lower, upper) bounds of speed and of its step for every rotor [rad/s]."""
+        """Return the same (lower, upper) bounds on speed and slew for every rotor [rad/s]."""
         (u_min, u_max), (down, up) = (np.full((2, N_ROTORS), np.reshape(pair, (2, 1))) for pair in (speed, slew))
         return cls(u_min=u_min, u_max=u_max, delta_min=down, delta_max=up)
 
     @classmethod
     def of(cls, bounds: Bounds) -> ActuatorBounds:
-        """Those of an optimisation."""
+        """Return the bounds of an optimisation."""
         return cls(u_min=bounds.u_min, u_max=bounds.u_max, delta_min=bounds.delta_min, delta_max=bounds.delta_max)
 
     @classmethod
     def of_problem(cls, problem: Problem) -> ActuatorBounds:
-        """What an optimisation's hard rows on single inputs, or on single steps, leave in every period."""
+        """Return the hard rows on single inputs and single steps, as bounds that hold in every period."""
         rows, nu = problem.rows, problem.model.nu
         hard = np.isinf(rows.l1) & ~rows.on_states
         sides = []
@@ -80,26 +80,26 @@ class ActuatorBounds:
 
     @classmethod
     def of_vehicle(cls, vehicle: Vehicle) -> ActuatorBounds:
-        """The speeds that its rotors hold, and no bounds on steps."""
+        """Return the vehicle's range of rotor speeds, with unbounded steps."""
         return cls.alike((vehicle.speed_min, vehicle.speed_max))
 
     def reach(self, before: Array) -> tuple[Array, Array]:
-        """The lowest and highest speeds (4,) [rad/s] after a command `before` (4,).
+        """Return the lowest and highest speeds (4,) [rad/s] after a command `before` (4,).
 
-        A command outside the speed bounds, as of rotors that stand still, leaves no speed within both; then those on
-        the speeds hold, and those on the steps do not.
+        No speed satisfies both bounds if `before` is outside the speed bounds, for example when rotors start from rest.
+        The speed bounds then take precedence.
         """
         lower = np.minimum(np.maximum(before + self.delta_min, self.u_min), self.u_max)
         upper = np.minimum(np.maximum(before + self.delta_max, self.u_min), self.u_max)
         return lower, upper
 
     def clip(self, speeds: Array, before: Array) -> Array:
-        """The speeds (4,) in reach of `before` that are nearest to `speeds` [rad/s]."""
+        """Return the speeds (4,) [rad/s] in reach of `before` that are closest to `speeds`."""
         lower, upper = self.reach(before)
         return np.minimum(np.maximum(speeds, lower), upper)
 
     def clip_plan(self, plan: Array, before: Array) -> Array:
-        """A plan (N, 4) with each row in reach of the one before it; steps that are so but for rounding stay."""
+        """The plan (N, 4) with each row moved into reach of the row before, unless it is within rounding of it."""
         steps = plan - np.concatenate((before[None], plan[:-1]))
         beyond = np.maximum(self.delta_min - steps, steps - self.delta_max)
         if beyond.flat[beyond.argmax()] <= BOUND_TOLERANCE:
@@ -111,10 +111,10 @@ class ActuatorBounds:
 
 
 class AnswerCheck:
-    """What each answer is worth by the problem as it was posed, believing neither a solver nor the QP's form.
+    """Checks each answer against the original problem, independent of the solver and of the form of the QP.
 
-    The plan's states are predicted anew, from the model and the period's state; another problem's too, not as quickly.
-    In every `kkt_every`-th period, and for every refused answer, the KKT residuals are computed.
+    It predicts the plan's states anew from the model and the measured state, more slowly for another problem.
+    It computes KKT residuals in every `kkt_every`-th period and for every rejected answer.
     """
 
     def __init__(self, problem: Problem, kkt_every: int) -> None:
@@ -127,16 +127,16 @@ class AnswerCheck:
             self._map = at, rows.C[at], np.concatenate(maps.of_inputs), np.concatenate(maps.of_state)
 
     def reset(self) -> None:
-        """The next period is the first."""
+        """Make the next period the first."""
         self._periods = 0
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a failed solver's numbers may be any
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # a failed solver may return any number
     def __call__(
         self, problem: Problem, query: Query, answer: Answer, refused: str | None
     ) -> tuple[Answer, str | None]:
-        """The answer with its `infeasibility`, and its KKT residuals where they are due; and why it is refused.
+        """Return the answer with its `infeasibility` and, when due, its KKT residuals; and the reason to reject it.
 
-        `refused` is the reason found so far, which stays.
+        A reason in `refused` takes precedence.
         """
         due, self._periods = self._periods % self._every == 0, self._periods + 1
         if answer.certificate is None:
@@ -149,7 +149,7 @@ class AnswerCheck:
         return answer._replace(infeasibility=violation), refused
 
     def _infeasibility(self, problem: Problem, query: Query, answer: Answer) -> float:
-        """Largest violation of a row by the plan, a soft one's less its slack; 0 where there is none."""
+        """Return the largest violation of a row by the plan, less the slack of soft rows; 0 if no row is violated."""
         rows, plan = problem.rows, answer.plan
         steps = plan - np.concatenate((query.u_before[None], plan[:-1]))
         values = plan @ rows.D.T + steps @ rows.E.T
@@ -168,9 +168,9 @@ class AnswerCheck:
 
 
 def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, before: Array) -> str | None:
-    """Why an answer must not reach the plant, or None; `AnswerCheck` has the rest.
+    """Return why an answer must not reach the plant, or None; `AnswerCheck` makes the remaining checks.
 
-    `speeds` (4,) is the command, `plan` (N, 4) the inputs planned, `before` (4,) the command in force [rad/s].
+    `speeds` (4,) is the command, `plan` (N, 4) the planned inputs, `before` (4,) the command in force [rad/s].
     """
     if status not in ACCEPTED:
         return status
@@ -181,7 +181,7 @@ def rejection(status: str, speeds: Array, plan: Array, bounds: ActuatorBounds, b
 
 
 def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallback: int = 0) -> Command:
-    """Speeds (4,) and a plan (N, 4) as a command under a status, with what is known of the answer."""
+    """Return speeds (4,) and a plan (N, 4) as a command, with its status and the statistics of the answer."""
     accepted, kkt = status in ACCEPTED, answer.kkt
     return Command(
         speeds=speeds.copy(),
@@ -203,7 +203,7 @@ def command_of(speeds: Array, plan: Array, status: str, answer: Answer, *, fallb
 
 
 def refused(acting: Array, horizon: int, status: str, answer: Answer | None = None) -> Command:
-    """The command in force (4,) held over the horizon, with the reason for refusing another."""
+    """Return the command in force (4,), held over the horizon, with the reason for rejecting another."""
     plan = np.tile(acting, (horizon, 1))
     if answer is None:
         return Command(speeds=plan[0].copy(), plan=plan, status=status, answered_by=FALLBACK)
@@ -211,5 +211,5 @@ def refused(acting: Array, horizon: int, status: str, answer: Answer | None = No
 
 
 def shifted(plan: Array, steps: int) -> Array:
-    """The rest of a plan (N, nu) after some steps, its last input held."""
+    """Return a plan (N, nu) without its first `steps` rows, its last row repeated."""
     return np.concatenate([plan[steps:], np.repeat(plan[-1:], steps, axis=0)])

@@ -1,7 +1,7 @@
-"""Collective thrust and body rates flown by an inner loop: proportional in the rates, on the exact rotor map.
+"""Inner loop for collective thrust and body rates: proportional control with the exact rotor map.
 
-The torque demanded is tau = J k (omega_c - omega) + omega x J omega, so that each rate follows its command as a
-first-order lag of 1/k while rotors have room; thrust is limited before yaw (`mpc.allocation`).
+The torque tau = J k (omega_c - omega) + omega x J omega makes each rate follow its command with a first-order lag of
+1/k while the rotors are not saturated.  Allocation limits yaw before thrust (`mpc.allocation`).
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 STATUS: Final = "given"
-"""Of a command from no controller."""
+"""Status of a command that no controller computed."""
 
 
 class BodyRateLoop:
-    """The inner loop, see `quadsim.controller.InnerLoop`: its target is its own, not the commanded rotor speeds.
+    """The inner loop (`quadsim.controller.InnerLoop`) with its own set-point in place of the commanded rotor speeds.
 
-    To be held are the collective `thrust` [N] and the body `rates` (3,) [rad/s].
+    Set `thrust` [N], collective, and the body `rates` (3,) [rad/s].
     """
 
     def __init__(self, vehicle: Vehicle, *, rate: float, bandwidth: float, bounds: ActuatorBounds) -> None:
@@ -36,12 +36,12 @@ class BodyRateLoop:
         return self.commanded(rates)
 
     def commanded(self, rates: Array) -> Array:
-        """Rotor speeds (4,) [rad/s] at body rates (3,) [rad/s]."""
+        """Return the rotor speeds (4,) [rad/s] for measured body rates (3,) [rad/s]."""
         J = self._inertia
         torque = J * self._bandwidth * (self.rates - rates) + np.cross(rates, J * rates)
         return allocate(self._allocation, np.append(self.thrust, torque), self._bounds.u_min, self._bounds.u_max)
 
     def command(self, rates: Array, horizon: int) -> Command:
-        """A period's command, from the body rates (3,) at its begin; `speeds` are those commanded first."""
+        """Return the command of a period that starts with body rates (3,) [rad/s]; `speeds` holds the first speeds."""
         speeds = self.commanded(rates)
         return Command(speeds=speeds, plan=np.broadcast_to(speeds, (horizon, N_ROTORS)), status=STATUS, inner=self)

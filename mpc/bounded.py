@@ -1,6 +1,6 @@
-"""What the tables `[controller]` of MPCs have in common: weights, bounds, polytopes, avoidance and the fallback.
+"""The fields that all MPC tables `[controller]` share: weights, bounds, polytopes, avoidance and fallback.
 
-They are in the units of scenario files, angles in degrees; `build`, `bounds` and the like convert them.
+Fields are in file units, angles in degrees; `build`, `bounds` and other methods convert them to SI units.
 """
 
 from __future__ import annotations
@@ -45,51 +45,53 @@ IN_DEGREES: Final = frozenset(
 )
 """States that scenario files give in degrees (per second)."""
 TERMS: Final = (*STATE_NAMES, *(f"speed_{i + 1}" for i in range(N_ROTORS)))
-"""What the rows of a polytope are over."""
-SHORTEST_LAG: Final = 1e-4  # time constant of rotors [s] below which gains cannot be computed; far below any period
+"""The quantities that the rows of a polytope may combine."""
+SHORTEST_LAG: Final = 1e-4  # shortest rotor lag [s] for which gains can be computed; far below any period
 LARGEST_HORIZON: Final = 1000
-MOST_ENTRIES: Final = 1000  # of a list of tables
+MOST_ENTRIES: Final = 1000  # most entries in a list of tables
 USUAL_TILT: Final = 10.0
-"""Largest tilt [deg] of the fallback where none is given."""
+"""Default limit of the fallback's tilt [deg], for a controller without a bound on tilt."""
 _FALLBACK_SHARE: Final = 0.8
-"""Tilt of the fallback over the tightest bound on it: the controller finds a vehicle that it can take over."""
-_SMALLEST_TILT: Final = 0.5  # with less the fallback cannot hold against anything, whatever the bounds are [deg]
+"""Fallback tilt as a share of the tightest bound on it, so that the controller resumes within its bounds."""
+_SMALLEST_TILT: Final = (
+    0.5  # smallest fallback tilt [deg], whatever the bounds; below it the fallback has no lateral authority
+)
 
 Range = tuple[float, float]
 Horizon = Annotated[int, Ge(1), Le(LARGEST_HORIZON)]
 KktEvery = Annotated[
-    int, Ge(1), doc("[periods] from one whose KKT residuals are computed and logged to the next; 1: all")
+    int, Ge(1), doc("[periods] interval at which KKT residuals are computed and logged; 1: every period")
 ]
 Seconds = Annotated[float, Ge(0.0), Le(10.0)]
-Lag = Seconds | Literal["vehicle"]  # a time constant, or that of the vehicle file
+Lag = Seconds | Literal["vehicle"]  # a time constant, or the one in the vehicle file
 RotorWeights = Weight | Annotated[tuple[Weight, ...], Len(N_ROTORS, N_ROTORS)]
-"""One weight for all rotors, or one each."""
+"""One weight for all rotors, or one per rotor."""
 Price = Annotated[float, Ge(0.0), Le(1e12)]
 Law = Annotated[str, doc("the control law, by its name in `quadsim list`")]
 
 
 class ControllerTable:
-    """A table `[controller]`, which builds the controller that it describes."""
+    """A table `[controller]`, which builds the controller it describes."""
 
-    any_attitude: ClassVar = False  # whether it takes attitudes as quaternions
+    any_attitude: ClassVar = False  # whether the controller reads attitudes as quaternions
     polytopes: tuple[Polytope, ...] = ()
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
-        """The bounds that it has on signals of the audit, hard or soft, in the units of the file."""
+        """Return its hard and soft bounds on audited signals, in file units."""
         return {}
 
     def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """The controller, ready to be flown every `period` [s] among obstacles and regions.
+        """Return the controller for a control `period` [s], with obstacles and regions `shapes`.
 
         Raises:
-            InputError: it cannot be made from these numbers.
+            InputError: no controller can be built from these numbers.
         """
         raise NotImplementedError
 
 
 @dataclass(frozen=True, kw_only=True)
 class InputWeights:
-    """What it costs to move the rotor speeds away from hover."""
+    """Weights on deviations of the rotor speeds from hover."""
 
     speed: Annotated[RotorWeights, doc("[1/(rad/s)^2] diagonal of Q_u: one weight for all rotors, or a list of four")]
 
@@ -98,7 +100,7 @@ class InputWeights:
 class RotorBounds:
     """Hard bounds on the rotor speeds and their steps, for every rotor."""
 
-    speed: Annotated[Pair | None, doc("[rad/s] absent: what the vehicle's rotors hold")] = None
+    speed: Annotated[Pair | None, doc("[rad/s] absent: the vehicle's range")] = None
     slew: Annotated[Pair | None, doc('[rad/s per period] only where inputs = "speed"; absent: no bound')] = None
 
     def __post_init__(self) -> None:
@@ -112,12 +114,12 @@ class RotorBounds:
                 raise ValueError(f"slew must allow a speed to be held, so contain 0; got {[*self.slew]}")
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
-        """The bounds on each rotor's speed [rad/s] and its step [rad/s per period], as far as there are any."""
+        """Return the bounds on each rotor's speed [rad/s] and step [rad/s per period], where it has any."""
         pairs = {"speed": self.speed or (vehicle.speed_min, vehicle.speed_max), "slew": self.slew}
         return {name: (pair[0], pair[1]) for name, pair in pairs.items() if pair is not None}
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
-        """The same for every rotor."""
+        """Return the same bounds for the actuators."""
         from mpc.answer import ActuatorBounds
 
         return ActuatorBounds.alike(**self.audited(vehicle))
@@ -133,7 +135,7 @@ class InputBounds(RotorBounds):
 
 @dataclass(frozen=True, kw_only=True)
 class Soft:
-    """What violating a soft bound by e costs: l1 e + l2 e^2."""
+    """The cost of violating a soft bound by e: l1 e + l2 e^2."""
 
     linear: Annotated[
         Price,
@@ -146,16 +148,16 @@ class Soft:
     quadratic: Annotated[Price, doc("[1/unit^2] l2")] = 1e4
 
     def penalty(self, rows: int) -> Penalty:
-        """The price of violating each of this many rows."""
+        """Return the penalty for `rows` rows."""
         return Penalty(l1=np.full(rows, self.linear), l2=np.full(rows, self.quadratic))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Polytope:
-    """Rows lower <= A v <= upper.
+    """Linear constraints lower <= A v <= upper on states and rotor speeds.
 
-    Over states and rotor speeds: a geofence, a polytope of velocities, total thrust.  The flight is audited against the
-    same rows, at the physics rate.
+    Examples: a geofence, a velocity polytope, a bound on total thrust.  The flight is audited against the same rows, at
+    the physics rate.
     """
 
     name: Annotated[str, doc("what reports call it; of several rows name_1, name_2, ...")] = field(
@@ -197,11 +199,11 @@ class Polytope:
 
     @property
     def row_names(self) -> list[str]:
-        """What the rows are called."""
+        """One name per row."""
         return [self.name] if len(self.rows) == 1 else [f"{self.name}_{i + 1}" for i in range(len(self.rows))]
 
     def constraint(self) -> Constraint:
-        """The rows over the 12 states and four rotor speeds, each in its own unit."""
+        """Return the rows over the 12 states and four rotor speeds, in SI units."""
         rows, count = np.array(self.rows, float), len(self.rows)
         C, D = np.zeros((count, N_STATES)), np.zeros((count, N_ROTORS))
         for name, column in zip(self.of, rows.T, strict=True):
@@ -221,7 +223,7 @@ class Polytope:
 
 @dataclass(frozen=True, kw_only=True)
 class Avoidance(AvoidanceSettings):
-    """Half-spaces that keep clear of obstacles, and within corridors and the fence."""
+    """Half-spaces that keep the vehicle clear of obstacles and inside corridors and the fence."""
 
     soft: Annotated[Soft | None, doc("[1/m, 1/m^2] what violating one costs; absent: hard")] = None
 
@@ -236,7 +238,7 @@ class Avoidance(AvoidanceSettings):
         positions: Sequence[int] = POSITION,
         largest: bool = False,
     ) -> Space | None:
-        """The half-spaces of obstacles and regions, see `mpc.obstacles.Space`; None where there are neither."""
+        """Return the half-spaces of obstacles and regions (`mpc.obstacles.Space`); None without any."""
         if not shapes:
             return None
         return Space(
@@ -256,12 +258,12 @@ class Avoidance(AvoidanceSettings):
 class FallbackSettings:
     """The fallback contract: the shifted plan with an LQR correction, then level hover, then descent.
 
-    A plan is held no longer than its horizon; the tilt of the plan comes on top of `tilt`.
+    A plan lasts at most its horizon; its own tilt adds to `tilt`.
     """
 
-    enabled: Annotated[bool, doc("false: what the controller does without an answer is its own")] = True
-    unseen: Annotated[Positive, doc("[s] longest time that predictions replace a missing measurement")] = 1.5
-    plan_age: Annotated[Positive, doc("[s] longest time on one shifted plan")] = 1.0
+    enabled: Annotated[bool, doc("false: the controller handles missing answers itself")] = True
+    unseen: Annotated[Positive, doc("[s] longest time that predictions may replace a missing measurement")] = 1.5
+    plan_age: Annotated[Positive, doc("[s] longest time that one shifted plan is flown")] = 1.0
     position: Annotated[Positive, doc("[m] largest distance from that plan")] = 0.5
     velocity: Annotated[Positive, doc("[m/s] the same of a velocity")] = 1.0
     angle: Annotated[Positive, doc("[deg] the same of roll, pitch and yaw")] = 11.5
@@ -279,7 +281,7 @@ class FallbackSettings:
 
     @property
     def distance(self) -> Array:
-        """(12,) largest distance from a plan's states [m], [m/s], [rad], [rad/s]."""
+        """Return (12,) the largest deviations from a plan's states [m], [m/s], [rad], [rad/s]."""
         return by_group(self.position, self.velocity, math.radians(self.angle), math.radians(self.rate))
 
     def around(
@@ -290,7 +292,7 @@ class FallbackSettings:
         period: float,
         output_bounds: Mapping[str, Sequence[float]] | None = None,
     ) -> Controller:
-        """The law within the fallback contract, its tilt that of the `output_bounds`; the law itself where disabled."""
+        """Return the law inside the fallback contract, with the tilt of `output_bounds`; the law itself if disabled."""
         from mpc.fallback.contract import Guarded
         from mpc.model import hover_model
 
@@ -309,10 +311,10 @@ USUAL_FALLBACK: Final = FallbackSettings()
 
 @dataclass(frozen=True, kw_only=True)
 class Weighted(ControllerTable):
-    """An MPC with fixed matrices: it minimises a weighted sum over a horizon."""
+    """An MPC with constant matrices, which minimises a weighted sum over a horizon."""
 
     type: Law
-    horizon: Annotated[Horizon, doc("[periods] N, how far it looks ahead")]
+    horizon: Annotated[Horizon, doc("[periods] N, the prediction horizon")]
     output_weights: Annotated[
         dict[str, Weight],
         Len(1),
@@ -323,16 +325,16 @@ class Weighted(ControllerTable):
         Literal["lqr"] | None,
         doc("weight of the last predicted state: lqr, of the Riccati equation; absent: as of all others"),
     ] = None
-    compiled: Annotated[bool, doc("fly the whole law in C, by the compiled core, in place of Python's steps")] = False
+    compiled: Annotated[bool, doc("run the whole law in the compiled C core instead of Python")] = False
 
     def __post_init__(self) -> None:
         require_states(self.output_weights, "output_weights")
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
-        """The optimisation that it solves in each period.
+        """Return the optimal control problem of each period.
 
         Raises:
-            InputError: it cannot be made from these numbers.
+            InputError: no problem can be built from these numbers.
         """
         from mpc.model import hover_model
 
@@ -342,22 +344,22 @@ class Weighted(ControllerTable):
         return Problem(model=model, horizon=self.horizon, objective=objective)
 
     def exportable(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
-        """What it is made from in C.
+        """Return the data of its C implementation.
 
         Raises:
-            ExportError: it cannot be exported.
-            InputError: it cannot be made from these numbers.
+            ExportError: the controller cannot be exported.
+            InputError: no controller can be built from these numbers.
         """
         from mpc.core.numbers import Exportable
 
         return Exportable(name=self.type, problem=self.problem(vehicle, period), vehicle=vehicle, settings=None)
 
     def in_c(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller | None:
-        """The law in C; None where it is to be flown in Python.
+        """Return the law in C; None if it runs in Python.
 
         Raises:
-            MissingCoreError: there is no library.
-            ExportError: this law is not there in C.
+            MissingCoreError: the library is missing.
+            ExportError: C does not implement this law.
         """
         if not self.compiled:
             return None
@@ -372,7 +374,7 @@ class Weighted(ControllerTable):
 
 @dataclass(frozen=True, kw_only=True)
 class Bounded(Weighted):
-    """One that also keeps bounds."""
+    """An MPC with bounds."""
 
     output_bounds: Annotated[
         dict[str, Pair], doc("[deg, deg/s, m, m/s] y_c_min, y_c_max; the states named here are C_c")
@@ -381,15 +383,15 @@ class Bounded(Weighted):
     polytopes: Annotated[
         tuple[Polytope, ...],
         MaxLen(MOST_ENTRIES),
-        doc("further bounds on sums of states and rotor speeds; audited as well"),
+        doc("further linear constraints on states and rotor speeds; audited as well"),
     ] = ()
     avoidance: Annotated[
         Avoidance | None,
-        doc("absent: it knows of no obstacles, corridors or fence, which are audited all the same"),
+        doc("absent: the controller ignores obstacles, corridors and fence; the audit does not"),
     ] = None
-    solver: Annotated[str, doc("who solves what the unconstrained optimum does not, by its name in `quadsim list`")] = (
-        field(default="piqp", metadata={"json_schema_extra": {"examples": [*ALIASES, *SOLVERS, CORE, CORE_OR_PIQP]}})
-    )
+    solver: Annotated[
+        str, doc("QP solver used where the unconstrained optimum violates a constraint, by its name in `quadsim list`")
+    ] = field(default="piqp", metadata={"json_schema_extra": {"examples": [*ALIASES, *SOLVERS, CORE, CORE_OR_PIQP]}})
     kkt_every: KktEvery = KKT_EVERY
 
     def __post_init__(self) -> None:
@@ -404,7 +406,7 @@ class Bounded(Weighted):
         return ranges(self.output_bounds) | self.input_bounds.audited(vehicle)
 
     def bounds(self) -> Bounds:
-        """The bounds in SI units."""
+        """Return the bounds in SI units."""
         names = [name for name in STATE_NAMES if name in self.output_bounds]
         scale = np.array([math.radians(1.0) if name in IN_DEGREES else 1.0 for name in names])
         lower, upper = scale * np.array([self.output_bounds[name] for name in names], float).reshape(-1, 2).T
@@ -414,13 +416,13 @@ class Bounded(Weighted):
         return Bounds(C_c=C_c, y_min=lower, y_max=upper, delta_min=down, delta_max=up, u_min=u_min, u_max=u_max)
 
     def constraints(self) -> tuple[Constraint, ...]:
-        """The rows beside `bounds`, of every law that has them."""
+        """Return the rows in addition to `bounds`."""
         return rows_of(self.polytopes)
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
         """See `Weighted.problem`."""
-        posed = super().problem(vehicle, period)
-        return replace(posed, bounds=self.bounds(), constraints=self.constraints())
+        problem = super().problem(vehicle, period)
+        return replace(problem, bounds=self.bounds(), constraints=self.constraints())
 
     def exportable(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
         """See `Weighted.exportable`."""
@@ -430,35 +432,35 @@ class Bounded(Weighted):
         return super().exportable(vehicle, period)
 
     def space(self, shapes: Sequence[Shape], vehicle: Vehicle, period: float, margins: Array | None) -> Space | None:
-        """The half-spaces of obstacles and regions, with further margins (N, 3) [m]; None where it has none."""
+        """Return the half-spaces of obstacles and regions, tightened by margins (N, 3) [m]; None without any."""
         if self.avoidance is None:
             return None
         return self.avoidance.space(shapes, vehicle, period=period, horizon=self.horizon, margins=margins)
 
     def make_solver(self, problem: Problem, space: Space | None) -> Solver:
-        """The problem's solver."""
+        """Return the problem's solver."""
         if space is not None and self.solver == CORE:
-            rule = "a QP solver such as 'piqp' with controller.avoidance: half-spaces differ from step to step"
+            rule = "a QP solver such as 'piqp' with controller.avoidance, whose half-spaces differ from step to step"
             raise ParameterError("controller", "solver", CORE, rule)
         return make_solver("piqp" if space is not None and self.solver == CORE_OR_PIQP else self.solver, problem)
 
     def guarded(self, law: Controller, fallback: FallbackSettings, vehicle: Vehicle, period: float) -> Controller:
-        """The law within the fallback contract."""
+        """Return the law inside the fallback contract."""
         return fallback.around(law, self.input_bounds.actuators(vehicle), vehicle, period, self.output_bounds)
 
 
 def rows_of(polytopes: Sequence[Polytope]) -> tuple[Constraint, ...]:
-    """Further bounds on sums of states and rotor speeds."""
+    """Return the polytopes as constraints."""
     return tuple(polytope.constraint() for polytope in polytopes)
 
 
 def ranges(bounds: Mapping[str, Sequence[float]]) -> dict[str, Range]:
-    """Bounds by name as pairs."""
+    """Return bounds by name, as pairs."""
     return {name: (pair[0], pair[1]) for name, pair in bounds.items()}
 
 
 def objective_of(output_weights: Mapping[str, float], input_weights: InputWeights) -> Objective:
-    """C_r, Q_y and Q_u of weights by the states' names."""
+    """Return C_r, Q_y and Q_u for weights by state name."""
     regulated = [name for name in STATE_NAMES if name in output_weights]
     return Objective(
         C_r=selection(regulated),
@@ -468,12 +470,12 @@ def objective_of(output_weights: Mapping[str, float], input_weights: InputWeight
 
 
 def selection(names: Sequence[str]) -> Array:
-    """Rows of the identity that pick states by name."""
+    """Return the rows of the identity that select states by name."""
     return np.eye(N_STATES)[[INDEX[name] for name in names]]
 
 
 def by_group(position: float, velocity: float, angle: float, rate: float) -> Array:
-    """(12,) one value for positions, velocities, Euler angles and their rates each."""
+    """Return (12,) one value each for positions, velocities, Euler angles and their rates."""
     channels = np.empty(N_STATES)
     for group, value in ((POSITION, position), (VELOCITY, velocity), (EULER, angle), (EULER_RATE, rate)):
         channels[list(group)] = value
@@ -481,10 +483,10 @@ def by_group(position: float, velocity: float, angle: float, rate: float) -> Arr
 
 
 def resolved_lag(lag: float | str, vehicle: Vehicle) -> float:
-    """The time constant of the rotors that is predicted [s].
+    """Return the rotor time constant that the controller predicts [s].
 
     Raises:
-        ParameterError: it is to be the vehicle's, which has none, or too short a one.
+        ParameterError: the vehicle's is asked for, and is missing or too short.
     """
     if not isinstance(lag, str):
         return lag
@@ -498,19 +500,19 @@ def resolved_lag(lag: float | str, vehicle: Vehicle) -> float:
 
 
 def require_lag(lag: float | str) -> None:
-    """Refuse a time constant with which gains cannot be computed."""
+    """Reject a time constant for which gains cannot be computed."""
     if not isinstance(lag, str) and 0.0 < lag < SHORTEST_LAG:
         raise ValueError(f"rotor_lag must be 0, or at least {SHORTEST_LAG:g} s; got {lag:g}")
 
 
 def require_ordered(name: str, pair: Sequence[float]) -> None:
-    """Refuse a pair of bounds whose lower is not below its upper."""
+    """Reject a pair of bounds unless the lower is below the upper."""
     if not pair[0] < pair[1]:
         raise ValueError(f"{name} must have its lower bound below its upper; got {[*pair]}")
 
 
 def require_solver(name: str) -> None:
-    """Refuse a solver that is not there."""
+    """Reject an unknown solver."""
     try:
         find_solver(name)
     except UnknownNameError as error:
@@ -518,7 +520,7 @@ def require_solver(name: str) -> None:
 
 
 def require_states(values: Mapping[str, object], name: str) -> None:
-    """Refuse a table with an entry that is no state."""
+    """Reject a table with an entry that is not a state."""
     for key in values:
         if key not in STATE_NAMES:
             near = difflib.get_close_matches(key, STATE_NAMES, n=1)

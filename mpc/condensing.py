@@ -1,7 +1,7 @@
 """The paper's condensed QP in the inputs alone, for any optimal control problem.  Eqs. (27)-(29).
 
-Of the paper's problem the matrices are those of Eqs. (7)-(20) as printed, with row pairs as two-sided rows; other terms
-of the cost add to them, other constraints add rows, and soft rows add slacks after the inputs.
+For the paper's problem the matrices are those of Eqs. (7)-(20) as printed, with pairs of rows as two-sided rows.
+Further cost terms add to them, further constraints add rows, and soft rows add slacks after the inputs.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from scipy.linalg import lapack
 
 from mpc.ocp import Problem, Query, predicted
 from mpc.paper import Prediction, cost, prediction, slew_matrix
-from mpc.qp import QP, Posed, QPRows, Solution
+from mpc.qp import QP, PeriodQP, QPRows, Solution
 from quadsim.controller import UNCONSTRAINED
 from quadsim.state import Array
 
 Flags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 LARGEST: Final = 2**20
-"""Entries of the QP's matrices beyond which its unconstrained optimum costs more than it saves."""
+"""Largest size of the QP's matrices [entries] for which trying the unconstrained optimum first saves time."""
 ILL_CONDITIONED: Final = 1e-4
-"""Error of an input held throughout, found again from its gradient, above which a Hessian is too ill-conditioned."""
+"""A Hessian is too ill-conditioned if a constant input, recovered from its gradient, has a larger error than this."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CondensedCost:
-    """J = 1/2 v' H v + [F_x dx + F_y dy + F_d du]' v + const, for deviations from a rest state (x_s, u_s).
+    """J = 1/2 v' H v + [F_x dx + F_y dy + F_d du]' v + const, for deviations from an equilibrium (x_s, u_s).
 
     With v = u - u_s the sequence of inputs, dx = x(k) - x_s, dy = y_d - C_r x_s and du = u(k-1) - u_s.
     """
@@ -38,11 +38,11 @@ class CondensedCost:
     H: Array  # (N nu, N nu) symmetric positive definite. Eq. (7)
     F_x: Array  # (N nu, n). Eq. (8)
     F_y: Array  # (N nu, N n_r). Eq. (9)
-    F_d: Array  # (N nu, nu), zero without a weight of changes
+    F_d: Array  # (N nu, nu), zero without a weight on input changes
 
 
 def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
-    """The cost of a problem, from its prediction map."""
+    """Return the cost of a problem from its prediction map."""
     objective, N, n, nu = problem.objective, problem.horizon, problem.model.n, problem.model.nu
     terms = cost(maps, objective)
     H, F_x, F_y, F_d = terms.H, terms.F1, terms.F2, np.zeros((N * nu, nu))
@@ -60,14 +60,14 @@ def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
 
 @dataclass(frozen=True, kw_only=True)
 class RowMaps:
-    """Values (N, m) of rows: of_inputs v + of_state dx + of_rest, the first of them less E du."""
+    """Values (N, m) of rows: of_inputs v + of_state dx + of_rest, before E du is subtracted from the first."""
 
     of_inputs: Array  # (N, m, N nu) slopes in v = u - u_s
     of_state: Array  # (N, m, n) in dx = x(k) - x_s
 
 
 def states_rows(C: Array, of_states: Flags, maps: Prediction, N: int) -> RowMaps:
-    """Values of rows C (m, n) on states, for x(k+1) .. x(k+N) where of the state alone, else for x(k) .. x(k+N-1)."""
+    """Return rows C (m, n) at x(k+1) .. x(k+N) if they depend on states alone, otherwise at x(k) .. x(k+N-1)."""
     n, columns = C.shape[1], maps.Psi.shape[1]
     Psi = np.concatenate([np.zeros((1, n, columns)), maps.Psi.reshape(N, n, columns)])
     Phi = np.concatenate([np.eye(n)[None], maps.Phi.reshape(N, n, n)])
@@ -75,20 +75,20 @@ def states_rows(C: Array, of_states: Flags, maps: Prediction, N: int) -> RowMaps
 
 
 def row_maps(rows: QPRows, maps: Prediction) -> RowMaps:
-    """The rows' values as functions of inputs and state.  Eqs. (14), (16)-(19) for any rows."""
+    """Return the rows' values as functions of inputs and state.  Eqs. (14), (16)-(19), for any rows."""
     if rows.C.ndim == 3:
-        raise ValueError("a condensed QP takes rows that are the same at all steps; partial condensing takes any")
+        raise ValueError("a condensed QP needs rows that are the same at all steps; partial condensing takes any")
     values = states_rows(rows.C, rows.of_states, maps, len(rows.lower))
     return replace(values, of_inputs=_with_inputs(values.of_inputs, rows))
 
 
 def _on_states(C: Array, of_states: Flags, S: Array) -> Array:
-    """(N, m, columns) of rows C on states x(k) .. x(k+N), of which S (N + 1, n, columns) are the slopes."""
+    """Return (N, m, columns): rows C applied to the slopes S (N + 1, n, columns) of x(k) .. x(k+N)."""
     return np.asarray((C * of_states[:, None]) @ S[1:] + (C * ~of_states[:, None]) @ S[:-1])
 
 
 def _with_inputs(values: Array, rows: QPRows) -> Array:
-    """Rows' slopes (N, m, N nu) by the inputs through the states, with those of D u + E du added."""
+    """Return the rows' slopes (N, m, N nu) with the direct terms D u + E du added."""
     N, nu = len(values), rows.D.shape[1]
     by_step = values.reshape(N, len(rows.D), N, nu)
     by_step[range(N), :, range(N)] += rows.D + rows.E
@@ -97,9 +97,9 @@ def _with_inputs(values: Array, rows: QPRows) -> Array:
 
 
 class Condensed:
-    """min 1/2 x' P x + c' x over x = [u(k); ...; u(k+N-1); e], e (N, m_s) the slacks of soft rows.
+    """min 1/2 x' P x + c' x over x = [u(k); ...; u(k+N-1); e], with e (N, m_s) the slacks of soft rows.
 
-    `qp` is that for xi(k) and y_d zero and u(k-1) = u_bar, rows time by time; `cost` that of the inputs alone.
+    `qp` is the QP for xi(k) = 0, y_d = 0 and u(k-1) = u_bar, its rows ordered by time; `cost` covers the inputs alone.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -116,8 +116,8 @@ class Condensed:
         G[:, :, : self._inputs] = self._values.of_inputs
         for i in range(N if m_s else 0):
             G[i, :, self._inputs + i * m_s : self._inputs + (i + 1) * m_s] = rows.slack
-        self._of_rest = self._values.of_inputs.reshape(N, len(rows.C), N, nu).sum(axis=2)  # of u_s throughout
-        self._pull = self.cost.H.reshape(N * nu, N, nu).sum(axis=1)  # by u_s throughout
+        self._of_rest = self._values.of_inputs.reshape(N, len(rows.C), N, nu).sum(axis=2)  # constant input u_s
+        self._pull = self.cost.H.reshape(N * nu, N, nu).sum(axis=1)  # constant input u_s
         size = self._inputs + N * m_s
         self._blank = QP(
             P=np.asfortranarray(scipy.linalg.block_diag(self.cost.H, 2.0 * np.diag(l2)) if m_s else self.cost.H),
@@ -131,16 +131,16 @@ class Condensed:
             x_u=np.concatenate([rows.u_max.ravel(), np.full(N * m_s, np.inf)]),
         )
         nothing = np.zeros((N, problem.objective.C_r.shape[0]))
-        self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp
+        self.qp = self.assemble(Query(np.zeros(model.n), nothing, model.u_bar)).qp
 
     @cached_property
     def _changing(self) -> tuple[Array, Array | None, Array, Array]:
-        """What does not change where the model does.
+        """The parts that do not depend on the model.
 
         Returns:
-            (n_r, n_r) L' of Q_y = L L'; (r, n) the same of the last state's weight, None where that costs nothing;
-            (N nu, N nu) the Hessian of inputs and their changes; (N + 1, n + nu + 1, N nu + 1) each step's inputs and
-            1, as functions of all inputs and 1, below n zeros.
+            (n_r, n_r) L' of Q_y = L L'; (r, n) the same of the terminal weight, None if it is zero;
+            (N nu, N nu) the Hessian of inputs and input changes;
+            (N + 1, n + nu + 1, N nu + 1) each step's inputs and 1, as functions of all inputs and 1, below n zeros.
         """
         objective, model, N = self._problem.objective, self._problem.model, self._problem.horizon
         n, nu = model.n, model.nu
@@ -153,32 +153,32 @@ class Condensed:
         factor = np.asarray(np.linalg.cholesky(objective.Q_y).T, float)
         return factor, _root(objective.terminal_weights[0]), H, S
 
-    def pose(self, query: Query) -> Posed:
-        """The QP of a period; without `Query.steps`, its matrices are the very ones of `qp`."""
+    def assemble(self, query: Query) -> PeriodQP:
+        """Return the QP of a period; without `Query.steps` its matrices are those of `qp` itself."""
         if query.steps is not None:
-            return self._pose_changed(query)
+            return self._assemble_changed(query)
         terms, values, rows = self.cost, self._values, self._rows
         state, desired, u_before = query[:3]
         x_s, u_s = query.equilibrium or self._problem.equilibrium
         dx, dy, du = state - x_s, desired - self._problem.objective.C_r @ x_s, u_before - u_s
         c = self._linear.copy()
         c[: self._inputs] += terms.F_x @ dx + terms.F_y @ dy.ravel() + terms.F_d @ du - self._pull @ u_s
-        # Rows are of absolute inputs u = u_s + v and states x_s + dx(v).
+        # Rows refer to absolute inputs u = u_s + v and states x_s + dx(v).
         shift = rows.C @ x_s + rows.D @ u_s + values.of_state @ dx - self._of_rest @ u_s
         shift[0] += rows.E @ (u_s - u_before)
         qp = replace(self._blank, c=c, h_l=(rows.lower - shift).ravel(), h_u=(rows.upper - shift).ravel())
-        return Posed(qp, lambda x: predicted(self._problem, query, self.inputs(x)))
+        return PeriodQP(qp, lambda x: predicted(self._problem, query, self.inputs(x)))
 
-    def _pose_changed(self, query: Query) -> Posed:
-        """The same in absolute states and inputs, with a model that changes."""
+    def _assemble_changed(self, query: Query) -> PeriodQP:
+        """Return the same in absolute states and inputs, for a model that changes."""
         assert query.steps is not None
         (A, B, c), (state, desired, u_before) = query.steps, query[:3]
         rest, blank = query.equilibrium or self._problem.equilibrium, self._blank
         objective, rows, m = self._problem.objective, self._rows, self._inputs
         N, n, nu = B.shape
         (target, root_end, H, inputs), count, root = self._changing, len(rows.C), self._changing[0] @ objective.C_r
-        # Columns are the inputs of all steps, and the last is what no input changes; below the states of each step are
-        # its own inputs and 1, so that one product with [A B c] makes the next.
+        # Columns: the inputs of all steps, then the constant part.  Below the states of each step are its inputs and 1,
+        # so that one product with [A B c] gives the next states.
         S, steps = np.empty_like(inputs), np.concatenate([A, B, c[:, :, None]], axis=2)
         S[0, :n], S[:, n:] = 0.0, inputs[:, n:]
         S[0, :n, m] = state
@@ -190,14 +190,14 @@ class Condensed:
         stacked = R.reshape(-1, m + 1)
         if root_end is not None:
             end = root_end @ S[N]
-            # A last state's weight of its own is about x_s + C_r^+ (y_d - C_r x_s).
-            wanted = rest.x + np.linalg.pinv(objective.C_r) @ (desired[-1] - objective.C_r @ rest.x)
-            end[:, -1] -= root_end @ wanted
+            # A terminal weight of its own penalises the distance from x_s + C_r^+ (y_d - C_r x_s).
+            terminal_target = rest.x + np.linalg.pinv(objective.C_r) @ (desired[-1] - objective.C_r @ rest.x)
+            end[:, -1] -= root_end @ terminal_target
             stacked = np.concatenate([stacked, end])
         square = stacked.T @ stacked
         square *= 2.0
         P, gradient = blank.P.copy(order="F"), self._linear.copy()
-        np.add(square.T[:m, :m], H.T, out=P[:m, :m])  # symmetric both
+        np.add(square.T[:m, :m], H.T, out=P[:m, :m])  # both are symmetric
         gradient[:m] += square[:m, m]
         gradient[:m].reshape(N, nu)[:] -= rest.u @ (2.0 * objective.Q_u)
         gradient[:nu] -= 2.0 * objective.move_weight @ u_before
@@ -209,22 +209,22 @@ class Condensed:
             filled.reshape(N, count, -1)[:, :, :m] = _with_inputs(values[:, :, :m], rows)
             G, h_l, h_u = np.asfortranarray(filled), (rows.lower - known).ravel(), (rows.upper - known).ravel()
         qp = replace(blank, P=P, c=gradient, G=G, h_l=h_l, h_u=h_u)
-        return Posed(qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m])
+        return PeriodQP(qp, lambda x: S[1:, :, :m] @ x[:m] + S[1:, :, m])
 
     def inputs(self, x: Array) -> Array:
-        """(N, nu) the planned inputs [rad/s] in a primal point."""
+        """Return (N, nu) the planned inputs [rad/s] of a primal point."""
         return x[: self._inputs].reshape(self._problem.horizon, -1)
 
     def slacks(self, x: Array) -> Array:
-        """(N, m_s) the slacks in a primal point."""
+        """Return (N, m_s) the slacks of a primal point."""
         return x[self._inputs :].reshape(self._problem.horizon, -1)
 
     def multipliers(self, solution: Solution) -> Array:
-        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
+        """Return (N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
         return self._rows.multipliers(solution.z, solution.z_box[: self._inputs])
 
     def solution(self, plan: Array, slacks: Array, multipliers: Array) -> Solution:
-        """This QP's solution of a plan (N, nu), slacks (N, m_s) and rows' multipliers (N, m).
+        """Return this QP's solution for a plan (N, nu), slacks (N, m_s) and row multipliers (N, m).
 
         Multipliers are positive at upper bounds and negative at lower ones.
         """
@@ -238,9 +238,9 @@ class Condensed:
 
 
 class FreeOptimum:
-    """The unconstrained optimum of QPs of one form, where it satisfies every constraint: then it is the optimum.
+    """The unconstrained optimum, which is the optimum of the QP if it satisfies every constraint.  Eq. (22).
 
-    Eq. (22).  Unless the matrices are `changing` from one QP to the next, the Hessian is factorised once.
+    The Hessian is factorised once, unless the matrices are `changing` from one QP to the next.
     """
 
     def __init__(self, form: Condensed, *, changing: bool) -> None:
@@ -253,7 +253,7 @@ class FreeOptimum:
             self._usable &= np.abs(lapack.dpotrs(self._factor, H @ hold)[0] - hold).max() < ILL_CONDITIONED
 
     def __call__(self, qp: QP) -> Solution | None:
-        """The optimum of a QP; None where a constraint is in its way."""
+        """Return the optimum of a QP; None if it violates a constraint."""
         if not self._usable:
             return None
         m, x = self._inputs, np.zeros(qp.c.size)
@@ -270,7 +270,7 @@ class FreeOptimum:
 
 
 def _root(weight: Array) -> Array | None:
-    """(r, n) whose square is a weight (n, n) of rank r; None for 0."""
+    """Return (r, n) R with R' R = a weight (n, n) of rank r; None for 0."""
     values, vectors = np.linalg.eigh(weight)
     there = values > 1e-14 * max(values[-1], 0.0)
     return (vectors[:, there] * np.sqrt(values[there])).T if there.any() else None

@@ -24,19 +24,20 @@ from quadsim.vehicle import Vehicle
 
 
 class ConstrainedMPC:
-    """Finds the optimum of Eq. (27) each period and sends the first action of the optimal plan.
+    """The MPC of Eq. (27): it solves for the optimal plan in each period and sends the plan's first input.
 
-    Where the unconstrained optimum satisfies every constraint it is the solution, and no QP is solved: the status is
-    then `unconstrained`.  Only an answer that is the optimum, finite, whose first action is within the hard input
-    bounds and whose plan keeps the rows as posed (`mpc.answer.AnswerCheck`) is used.  Otherwise the previous plan,
-    shifted by one step, is held (fallback level 1) for as long as it lasts, and then the flight is given up.
-    `solver`: the problem's, see `mpc.solvers.make_solver`.  `space`: what to keep clear of.  `kkt_every`: see
-    `mpc.answer.AnswerCheck`.
+    If the unconstrained optimum satisfies every constraint, it is the solution and no QP is solved; the status is then
+    `unconstrained`.  The controller uses an answer only if it is solved and finite, its first input is within the hard
+    bounds, and its plan satisfies the problem's rows (`mpc.answer.AnswerCheck`).  Otherwise it holds the previous plan,
+    shifted by one step (fallback level 1), for as long as that plan lasts, and then ends the flight.
+
+    Arguments: `solver` is the problem's (`mpc.solvers.make_solver`), `space` the obstacles to avoid, `kkt_every` the
+    interval of KKT checks.  States, units and frames: `docs/conventions.md`.
 
     Attributes:
-        problem: as given.
-        unanswered: the first period since `reset` whose QP had no answer; None where all had.
-        answer: the last period's; None before the first.
+        problem: the optimal control problem.
+        infeasible_period: the first period since `reset` whose QP had no answer; None if there was none.
+        answer: the answer of the last period; None before the first.
     """
 
     name: Final = "constrained"
@@ -61,14 +62,14 @@ class ConstrainedMPC:
         self._before = np.array(speeds, float)
         self._plan: Array | None = None
         self._held = 0
-        self.unanswered: InfeasiblePeriod | None = None
+        self.infeasible_period: InfeasiblePeriod | None = None
         self._solver.reset()
         self._check.reset()
         if self._obstacles is not None:
             self._obstacles.reset()
 
     def adopt(self, previous: object) -> None:
-        """Hold the plan of the law before, should no QP have an answer."""
+        """Take over the plan of the previous law, to hold if a QP has no answer."""
         law = within(previous, ConstrainedMPC)
         if law is not None and law._plan is not None:
             self._plan, self._held = resized(law._plan, self.horizon), law._held
@@ -76,10 +77,10 @@ class ConstrainedMPC:
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`.
 
-        While landed the rotors are taken to their lowest speed as fast as their bounds allow.
+        While landed, the rotors slow down to their lowest speed as fast as their bounds allow.
 
         Raises:
-            PlanExhaustedError: the solver failed and no step of a previous plan is left.
+            PlanExhaustedError: the solver failed and the previous plan has no step left.
         """
         if now.acting is not None:
             self._before = now.acting
@@ -95,8 +96,8 @@ class ConstrainedMPC:
         refused = rejection(answer.status, answer.plan[0], answer.plan, self._bounds, self._before)
         answer, refused = self._check(problem, query, answer, refused)
         self.answer = answer
-        if refused not in (None, INVALID_DATA) and self.unanswered is None:
-            self.unanswered = InfeasiblePeriod(problem=problem, query=query, status=refused, time=now.time)
+        if refused not in (None, INVALID_DATA) and self.infeasible_period is None:
+            self.infeasible_period = InfeasiblePeriod(problem=problem, query=query, status=refused, time=now.time)
         if refused is None:
             self._plan, self._held = answer.plan, 0
         elif self._plan is None or self._held + 1 >= self.horizon:
@@ -121,7 +122,7 @@ class Constrained(Bounded):
     type: Annotated[Literal["constrained"], doc("the control law, by its name in `quadsim list`")] = "constrained"
     fallback: Annotated[
         FallbackSettings | None,
-        doc("absent: the last plan is held, shifted, and then the flight is given up"),
+        doc("absent: the last plan is held, shifted, and then the flight ends"),
     ] = None
 
     def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:

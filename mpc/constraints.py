@@ -1,4 +1,4 @@
-"""Constraints as values, and the rows of all of them: what is built from a problem walks these and knows no kind."""
+"""Constraints as values, and the stacked rows of all of them, which every formulation of a problem is built from."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from quadsim.state import N_STATES, STATE_NAMES, STATE_UNITS, Array, Indices
 
 @dataclass(frozen=True, kw_only=True)
 class Penalty:
-    """What violating a row of a soft constraint by e costs: l1 e + l2 e^2.
+    """The penalty l1 e + l2 e^2 for violating a row of a soft constraint by e.
 
     While l1 exceeds the multiplier that the hard row would have, the penalty is exact: e is zero wherever the hard
     problem is feasible (Kerrigan and Maciejowski, 2000, "Soft constraints and exact penalty functions in model
@@ -23,7 +23,7 @@ class Penalty:
 
     l1: Array  # (m,) at least 0
     l2: Array  # (m,) at least 0
-    largest: bool = False  # whether each step's rows have one slack, that of the largest violation; l1, l2 are then one
+    largest: bool = False  # whether a step's rows share one slack, the largest violation; l1, l2 are then uniform
 
     def __post_init__(self) -> None:
         for name in ("l1", "l2"):
@@ -38,17 +38,17 @@ class Penalty:
 class Constraint:
     """lower <= C x(k+i) + D u(k+i) + E (u(k+i) - u(k+i-1)) <= upper.
 
-    Rows of states alone hold at x(k+1) .. x(k+N), all others at i = 0 .. N-1.  Where rows differ from step to step, as
-    half-spaces along a plan do, C has them all: entry i is for x(k+i+1).
+    Rows on states alone hold at x(k+1) .. x(k+N), all others at i = 0 .. N-1.  Where rows differ from step to step, as
+    half-spaces along a plan do, C stacks them: entry i is for x(k+i+1).
     """
 
-    name: str  # as messages and audits name it
-    lower: Array  # (m,), or (N, m) where the steps' bounds differ; infinite where there is no bound
-    upper: Array  # likewise
-    C: Array | None = None  # (m, n), or (N, m, n) where the steps' rows differ; None for zeros
-    D: Array | None = None  # (m, nu); likewise
-    E: Array | None = None  # (m, nu); likewise
-    penalty: Penalty | None = None  # what violating it costs; None for a hard constraint
+    name: str  # used in messages and audits
+    lower: Array  # (m,), or (N, m) if bounds differ from step to step; infinite for no bound
+    upper: Array  # same
+    C: Array | None = None  # (m, n), or (N, m, n) if rows differ from step to step; None for zeros
+    D: Array | None = None  # (m, nu); same
+    E: Array | None = None  # (m, nu); same
+    penalty: Penalty | None = None  # penalty of a violation; None for a hard constraint
 
     def __post_init__(self) -> None:
         _check_order(f"{self.name}.lower", self.lower, "upper", self.upper)
@@ -65,7 +65,7 @@ class Constraint:
 
 
 def _check_order(low: str, lower: Array, high: str, upper: Array) -> None:
-    """Refuse bounds of different shapes, that are no numbers, or that leave nothing between them."""
+    """Reject bounds of different shapes, with NaN, or without a gap."""
     if lower.shape != upper.shape or np.isnan(lower).any() or np.isnan(upper).any():
         raise ParameterError("controller", low, lower, f"numbers of the same shape as {high} = {upper}")
     if np.any(lower >= upper):
@@ -73,40 +73,40 @@ def _check_order(low: str, lower: Array, high: str, upper: Array) -> None:
 
 
 def tightened(constraint: Constraint, margins: Array) -> Constraint:
-    """The constraint with both bounds moved inwards by margins (N, m).
+    """Return the constraint with both bounds moved inwards by margins (N, m).
 
     Raises:
-        ParameterError: a margin is negative or not finite, of another shape, or nothing is left between the bounds.
+        ParameterError: a margin is negative, not finite or of another shape, or leaves no gap between the bounds.
     """
     m = constraint.lower.shape[-1]
     if np.ndim(margins) != 2 or margins.shape[1] != m or not (np.isfinite(margins) & (margins >= 0.0)).all():
         raise ParameterError("controller", "margins", margins, f"finite numbers >= 0 of shape (N, {m})")
     lower, upper = constraint.lower + margins, constraint.upper - margins
     if not np.all(lower < upper):
-        raise ParameterError("controller", "margins", margins.max(0), "less than half of what is between the bounds")
+        raise ParameterError("controller", "margins", margins.max(0), "less than half of the gap between the bounds")
     return replace(constraint, lower=lower, upper=upper)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bounds:
-    """The constraints of Eqs. (12)-(20); an infinite entry is no bound."""
+    """The constraints of Eqs. (12)-(20); an infinite entry means no bound."""
 
     C_c: Array  # (n_c, n) constrained outputs y_c = C_c xi. Eq. (12)
     y_min: Array  # (n_c,) output bounds. Eq. (13)
-    y_max: Array  # likewise
+    y_max: Array  # same
     delta_min: Array  # (nu,) bounds on u(k) - u(k-1) [rad/s]. Eq. (15)
-    delta_max: Array  # likewise
+    delta_max: Array  # same
     u_min: Array  # (nu,) input bounds [rad/s]. Eq. (20)
-    u_max: Array  # likewise
-    penalty: Penalty | None = None  # what violating an output bound costs; None for hard ones
-    margins: Array | None = None  # (N, n_c) by which output bounds are tightened at each predicted state; None for none
+    u_max: Array  # same
+    penalty: Penalty | None = None  # penalty for violating an output bound; None for hard bounds
+    margins: Array | None = None  # (N, n_c) tightening of output bounds at each predicted state; None for none
 
     def __post_init__(self) -> None:
         for low, high in (("y_min", "y_max"), ("delta_min", "delta_max"), ("u_min", "u_max")):
             _check_order(low, getattr(self, low), high, getattr(self, high))
 
     def output(self, i: int) -> tuple[str, float, str]:
-        """A constrained output as scenario files name it: its state, what one of its unit is there, and that unit."""
+        """Return a constrained output as scenario files name it: its state, file units per SI unit, file unit."""
         (states,) = np.nonzero(self.C_c[i])
         if states.size != 1 or self.C_c[i, states[0]] != 1.0 or states[0] >= N_STATES:
             return f"row {i} of C_c", 1.0, ""
@@ -115,7 +115,7 @@ class Bounds:
 
     @property
     def constraints(self) -> tuple[Constraint, ...]:
-        """The same as values: outputs, slews, inputs."""
+        """The same as constraints: outputs, slews, inputs."""
         outputs = Constraint(name="outputs", lower=self.y_min, upper=self.y_max, C=self.C_c, penalty=self.penalty)
         return (
             outputs if self.margins is None else tightened(outputs, self.margins),
@@ -126,37 +126,37 @@ class Bounds:
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """The rows of all constraints that bound anything, m of them, in the constraints' order."""
+    """The m rows of all constraints that have a finite bound, in the constraints' order."""
 
-    C: Array  # (m, n), or (N, m, n) where the steps' rows differ
+    C: Array  # (m, n), or (N, m, n) if rows differ from step to step
     D: Array  # (m, nu)
     E: Array  # (m, nu)
     lower: Array  # (N, m)
-    upper: Array  # likewise
-    l1: Array  # (m,) what violating a row costs; l1 is infinite of hard ones
-    l2: Array  # likewise
-    slack: Indices  # (m,) which slack of its step a soft row has; -1 of hard ones
-    # (m,) whether a row is of the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i)
+    upper: Array  # same
+    l1: Array  # (m,) linear penalty of a row; infinite for hard rows
+    l2: Array  # (m,) quadratic penalty
+    slack: Indices  # (m,) index of a soft row's slack within its step; -1 for hard rows
+    # (m,) whether a row is on the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i)
     of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    input: Indices  # (m,) the input that a hard row bounds by itself; -1 where it is no such row
-    names: tuple[str, ...]  # (m,) of their constraints
+    input: Indices  # (m,) the input that a hard row bounds alone; -1 otherwise
+    names: tuple[str, ...]  # (m,) names of their constraints
 
     @cached_property
     def on_states(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """(m,) whether states are in a row at all."""
+        """Return (m,) whether a row involves states."""
         return np.asarray(self.C.any(axis=(0, 2) if self.C.ndim == 3 else 1)).reshape(len(self.D))
 
     @cached_property
     def soft(self) -> Indices:
-        """(m_s,) which rows are soft."""
+        """Return (m_s,) the indices of soft rows."""
         return np.flatnonzero(np.isfinite(self.l1))
 
     @cached_property
     def slacks(self) -> Indices:
-        """(m_s,) the first row of each slack; all soft ones where none is shared."""
+        """Return (m_s,) the first row of each slack; all soft rows if none share a slack."""
         return self.soft[np.unique(self.slack[self.soft], return_index=True)[1]]
 
 
 def renumbered(slack: Indices) -> Indices:
-    """Slacks' numbers (m,) without gaps, -1 of hard rows held."""
+    """Return the slack numbers (m,) without gaps; hard rows keep -1."""
     return np.asarray(np.unique(np.concatenate([[-1], slack]), return_inverse=True)[1][1:] - 1)

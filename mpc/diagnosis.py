@@ -1,17 +1,17 @@
-"""Why a problem has no answer: which constraints cannot hold together, by how much, and what would help.
+"""Explains why a problem has no answer: which constraints conflict, by how much, and what would help.
 
 An elastic problem has a slack e >= 0 for each bound at each step, and is a linear program:
 
     minimise  sum e / s    subject to    the dynamics,  lower - e <= C x + D u + E du <= upper + e,
 
-s half of what lies between a row's bounds, so that rows of any unit count alike.  It always has an answer, and that is
-zero if, and only if, the QP has one.  Bounds on inputs alone come first: what they allow is what actuators can do, and
-bounds on states are relaxed for it.  Of these, those with slack are *violated*.  Those that are *blocking* have
-none, and each is needed: without it less violation would do.  They are found by the multipliers, and then by leaving
-out one after the other (Chinneck and Dravnieks, 1991, "Locating minimal infeasible constraint sets in linear
-programs").
+where s is half of the gap between a row's bounds, so that rows of any unit count alike. It always has an answer, and
+its optimum is zero if and only if the QP is feasible. Bounds on inputs alone come first: they describe what the
+actuators can do, and bounds on states are relaxed to fit. Of the bounds on states, those with slack are *violated*.
+Those that are *blocking* have no slack, and dropping any one of them reduces the violation. Multipliers give the
+candidates, then deletion one by one confirms them (Chinneck and Dravnieks, 1991, "Locating minimal infeasible
+constraint sets in linear programs").
 
-It uses the constraints' rows, of any kind.  Soft constraints never make a problem infeasible.
+It uses the constraints' rows, of any kind. Soft constraints never make a problem infeasible.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from quadsim.controller import SOLVED
 from quadsim.state import Array
 
 SOLVER: Final = "piqp-multistage"
-"""Solves again what is suggested; the solver of the flight may be another."""
+"""Solves the suggested problems; the flight may use another solver."""
 FEASIBLE: Final = 1e-6
-"""Violation, as a share of half of what lies between a row's bounds, below which it is rounding."""
+"""Violation, as a share of half the gap between a row's bounds, attributed to rounding."""
 PRICED: Final = 1e-9
 """Multiplier of a bound, in shares per share, above which it may be blocking."""
 
@@ -43,8 +43,8 @@ PRICED: Final = 1e-9
 class Side(NamedTuple):
     """One of the two bounds of a row."""
 
-    place: int  # of its constraint among the problem's (`mpc.ocp.Problem.every_constraint`)
-    row: int  # of the constraint
+    place: int  # index of its constraint (`mpc.ocp.Problem.every_constraint`)
+    row: int  # row within the constraint
     upper: bool  # whether it is the upper bound
 
 
@@ -52,19 +52,19 @@ class Side(NamedTuple):
 class Violation:
     """A bound that has to be relaxed."""
 
-    amount: float  # the most that it is violated by, in its row's own unit
-    share: float  # the same as a share of half of what lies between the row's bounds
-    first: int  # when that begins, as whole periods after the instant of x(k)
-    last: int  # and ends
+    amount: float  # largest violation, in the row's unit
+    share: float  # the same as a share of half the gap between the row's bounds
+    first: int  # first violation, in whole periods after the instant of x(k)
+    last: int  # last violation
 
 
 @dataclass(frozen=True, kw_only=True)
 class Conflict:
-    """What cannot hold together; nothing where the problem has an answer, and its solver failed to find it."""
+    """Conflicting constraints; empty if the problem is feasible and its solver failed."""
 
-    total: float  # the sum of all violations, as shares
+    total: float  # sum of all violations, as shares
     violated: Mapping[Side, Violation]  # the bounds that have to be relaxed
-    blocking: tuple[Side, ...]  # the bounds that hold, and without each of which less violation would do
+    blocking: tuple[Side, ...]  # the bounds that hold, each of which increases the violation
 
     @property
     def feasible(self) -> bool:
@@ -72,9 +72,13 @@ class Conflict:
         return not self.violated
 
 
-def find_conflict(unanswered: InfeasiblePeriod) -> Conflict | None:
-    """Which constraints cannot hold together; None where the elastic problem cannot be solved either."""
-    problem, query, parts = unanswered.problem, unanswered.query, unanswered.problem.every_constraint
+def find_conflict(infeasible_period: InfeasiblePeriod) -> Conflict | None:
+    """Return which constraints conflict; None if the elastic problem cannot be solved either."""
+    problem, query, parts = (
+        infeasible_period.problem,
+        infeasible_period.query,
+        infeasible_period.problem.every_constraint,
+    )
     sides, scales = _sides(problem), _scales(problem)
     of_inputs = {side for side in sides if (C := parts[side.place].C) is None or not C.any()}
     total, violated, held = 0.0, dict[Side, Violation](), set[Side]()
@@ -97,31 +101,31 @@ def find_conflict(unanswered: InfeasiblePeriod) -> Conflict | None:
                 first=int(steps[0]) + later,
                 last=int(steps[-1]) + later,
             )
-            one, wider = sides[side], share + FEASIBLE  # for what comes next, as wide as it has to be
+            one, wider = sides[side], share + FEASIBLE  # widened for the next pass by the violation
             sides[side] = replace(one, lower=one.lower - wider, upper=one.upper + wider)
         held |= _needed(problem, query, present, elastic, relaxed, giving)
     return Conflict(total=total, violated=violated, blocking=tuple(sorted(held - violated.keys())))
 
 
-def smallest_widening(unanswered: InfeasiblePeriod, sides: Collection[Side]) -> float | None:
-    """By how much these bounds have to be moved outwards, all by the same amount at all steps, for an answer.
+def smallest_widening(infeasible_period: InfeasiblePeriod, sides: Collection[Side]) -> float | None:
+    """Return the smallest amount by which all `sides` must move outwards, at all steps, to make the problem feasible.
 
-    None where that does not help, however far they are moved.
+    None if no amount does.
     """
-    problem, query = unanswered.problem, unanswered.query
+    problem, query = infeasible_period.problem, infeasible_period.query
     scales = {side: _scales(problem)[side.place][side.row] for side in sides}
     relaxed = _relaxed(problem, query, _sides(problem), sides, together=scales)
     return None if relaxed is None else relaxed.total
 
 
 def has_answer(problem: Problem, query: Query) -> bool:
-    """Whether the problem is solved, by PIQP as controllers have it solved."""
+    """Return whether PIQP solves the problem, called as the controllers call it."""
     return _set_up(problem, query)(query)
 
 
-def recovery(unanswered: InfeasiblePeriod, plan: Array) -> int | None:
-    """After how many periods of a plan (N, nu) the problem has an answer, by the model; None for not within it."""
-    problem, query = unanswered.problem, unanswered.query
+def recovery(infeasible_period: InfeasiblePeriod, plan: Array) -> int | None:
+    """Return after how many periods of a plan (N, nu) the model predicts an answer; None if not within the plan."""
+    problem, query = infeasible_period.problem, infeasible_period.query
     is_solved, state = _set_up(problem, query), query.state
     for i, (u, A, B, c) in enumerate(zip(plan, *_steps(problem, query), strict=True)):
         state = A @ state + B @ u + c
@@ -131,13 +135,13 @@ def recovery(unanswered: InfeasiblePeriod, plan: Array) -> int | None:
 
 
 def _set_up(problem: Problem, query: Query) -> Callable[[Query], bool]:
-    """Whether queries of this one's kind are solved."""
+    """Return a function that tells whether queries of this kind are solved."""
     solver = QPSolver(SOLVER, problem, changing=query.steps is not None)
     return lambda query: solver.solve(query).status == SOLVED
 
 
 class _Relaxed(NamedTuple):
-    """An elastic problem's answer: its optimum, each elastic bound's slack (N,), and bounds with a multiplier."""
+    """An elastic problem's optimum, each elastic bound's slack (N,), and the bounds with a multiplier."""
 
     total: float
     slacks: dict[Side, Array]
@@ -145,7 +149,7 @@ class _Relaxed(NamedTuple):
 
 
 def _scales(problem: Problem) -> list[Array]:
-    """Of each constraint's rows (m,): half of what lies between the bounds; of one bound alone its size, or 1."""
+    """Return the scale of each row (m,): half the gap between its bounds; the size of a single bound, or 1."""
     scales = []
     for part in problem.every_constraint:
         lower, upper = np.atleast_2d(part.lower), np.atleast_2d(part.upper)
@@ -156,7 +160,7 @@ def _scales(problem: Problem) -> list[Array]:
 
 
 def _sides(problem: Problem) -> dict[Side, Constraint]:
-    """Every finite bound of a hard constraint as a constraint of its own, over its row's scale."""
+    """Return every finite bound of a hard constraint as its own constraint, scaled by its row."""
     sides = {}
     for place, (part, scales) in enumerate(zip(problem.every_constraint, _scales(problem), strict=True)):
         for row in range(scales.size if part.penalty is None else 0):
@@ -181,13 +185,13 @@ def _needed(
     relaxed: _Relaxed,
     giving: Collection[Side],
 ) -> set[Side]:
-    """Of the bounds that are held, those without each of which there is less violation; no fewer would do."""
+    """Return the smallest set of bounds without slack each of which increases the violation."""
 
     def is_enough(held: Mapping[Side, Constraint]) -> bool:
         less = _relaxed(problem, query, held, elastic)
         return less is not None and less.total >= relaxed.total * (1.0 - 1e-6) - FEASIBLE
 
-    # Multipliers may fall by powers of ten along a chain of bounds, each at the next step, below what can be resolved.
+    # Multipliers may fall by powers of ten along a chain of bounds over successive steps, below the resolution.
     priced = {side: one for side, one in sides.items() if side in relaxed.priced or side in giving}
     present = priced if is_enough(priced) else dict(sides)
     for side in sorted(present.keys() - set(giving)):
@@ -204,17 +208,17 @@ def _relaxed(
     elastic: Collection[Side],
     together: Mapping[Side, float] | None = None,
 ) -> _Relaxed | None:
-    """Solve the elastic problem of bounds over their rows' scales; None where that fails, or cannot be.
+    """Solve the elastic problem of scaled bounds; None if the solver fails.
 
-    `together` has the scales of elastic bounds that all have the same slack at all steps, in their own unit; it is what
-    is minimised.
+    `together` gives the scales of elastic bounds that share one slack over all steps, in their own unit; the problem
+    then minimises that slack.
     """
     from scipy.optimize import linprog  # takes a tenth of a second, which flights without failures do not need
 
     slack = Penalty(l1=np.ones(1), l2=np.zeros(1))
     rows = tuple(replace(one, penalty=slack if side in elastic else None) for side, one in sides.items())
     form = PartiallyCondensed(replace(problem, bounds=None, constraints=rows), changing=True)
-    qp = form.pose(query._replace(steps=_steps(problem, query))).qp
+    qp = form.assemble(query._replace(steps=_steps(problem, query))).qp
     named, columns = (
         [side for side in sides if side in elastic],
         form.slacks(np.arange(qp.c.size, dtype=float)).astype(int),

@@ -1,21 +1,23 @@
-"""A force and a torque that the model does not explain, and how fast the force changes.
+"""Estimates of unmodelled force and torque, and of the force's rate of change.
 
 The mean acceleration over a period that the model misses,
 
     d = (v(k) - v(k-1)) / tau_s + g e_z - mean(f / m R e_z + R d_drag),
 
-and the angular one likewise, are each followed by two states, the disturbance and its rate of change, with both poles
-of the error at exp(-bandwidth tau_s): the critically damped g-h filter (Morrison, "Introduction to Sequential Smoothing
-and Prediction", 1969).  A disturbance that changes steadily is met without lag, as that of drag on a curved path nearly
-is; the constant one of `mpc.observer` comes late by its time constant.
+The mean angular acceleration is defined in the same way.  Two states follow each of them, the disturbance and its rate
+of change, with both poles of the error at exp(-bandwidth tau_s): the critically damped g-h filter (Morrison,
+"Introduction to Sequential Smoothing and Prediction", 1969).  It tracks a disturbance that changes at a constant rate
+without lag; drag on a curved path nearly does so.  The estimate of a constant disturbance in `mpc.observer` lags by its
+time constant.
 
-Rotors that lag have their vehicle's rotor inertia: the torque that turns them faster acts on the body, and their
-momentum is turned with it.  On a Hummingbird, over a period of 25 ms, a change of commands turns the body more by this
-than by the rotors' drag; taken for a disturbance and made up for, that is a loop which oscillates.
+A vehicle with rotor lag has rotor inertia: the torque that accelerates the rotors acts on the body, and their momentum
+turns with it.  On a Hummingbird at a period of 25 ms, a change of commands turns the body more through this torque than
+through rotor drag.  A controller that compensated it as a disturbance would oscillate.
 
-With f / m taken from the rotor commands this is the acceleration feedback of incremental nonlinear dynamic inversion
-(Tal and Karaman, "Accurate tracking of aggressive quadrotor trajectories using incremental nonlinear dynamic inversion
-and differential flatness", 2021), f / m R e_z - g e_z + d = v', with a prediction in place of a low-pass filter's lag.
+With f / m computed from the rotor commands, this is the acceleration feedback of incremental nonlinear dynamic
+inversion (Tal and Karaman, "Accurate tracking of aggressive quadrotor trajectories using incremental nonlinear dynamic
+inversion and differential flatness", 2021), f / m R e_z - g e_z + d = v', with a prediction in place of the lag of a
+low-pass filter.
 """
 
 from __future__ import annotations
@@ -33,39 +35,39 @@ from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
 FORCE_SHARE: Final = 0.5
-"""Bandwidth of the force times the control period, where none is given."""
+"""Default bandwidth of the force estimate times the control period."""
 TORQUE_SHARE: Final = 0.25
-"""The same of the torque."""
+"""Default bandwidth of the torque estimate times the control period."""
 FITTED_FROM: Final = 1.0
-"""Speed along an axis [m/s] at which half the drag that would explain the force is believed."""
+"""Speed along an axis [m/s] at which the fitted drag explains half of the force."""
 _SAME_TIME: Final = 1e-6  # [s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RampSettings:
-    """Unmodelled force, its rate of change, and torque: estimated in flight and compensated."""
+    """Settings of the disturbance estimate: unmodelled force, its rate of change, and torque."""
 
     force: Annotated[
-        Positive | None, doc(f"[rad/s] bandwidth of the force's estimate; absent: {FORCE_SHARE:g} / control period")
+        Positive | None, doc(f"[rad/s] bandwidth of the force estimate; absent: {FORCE_SHARE:g} / control period")
     ] = None
     torque: Annotated[
-        Positive | None, doc(f"[rad/s] the same of the torque's; absent: {TORQUE_SHARE:g} / control period")
+        Positive | None, doc(f"[rad/s] bandwidth of the torque estimate; absent: {TORQUE_SHARE:g} / control period")
     ] = None
     drag_memory: Annotated[
         Positive, doc("[s] over which linear drag is fitted to the force, for a nonlinear MPC's predictions")
     ] = 1.0
     rotor_lag: Annotated[
         NonNegative | None,
-        doc("[s] time constant by which rotors follow commands; absent: the one that the controller predicts, or 0"),
+        doc("[s] rotor time constant; absent: the one that the controller predicts, or 0"),
     ] = None
     largest_force: Annotated[Positive, doc("[m/s^2] larger estimates are clipped")] = 20.0
     largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 100.0
 
 
 class RampObserver:
-    """The six filters, an evolving state: three of the force, world axes, and three of the torque, body axes.
+    """The six filters, an evolving state: three for the force (world axes) and three for the torque (body axes).
 
-    `drag` (3,) [1/s], and `quadratic_drag` (3,) [1/m] of each component's square, are what the model knows, body axes.
+    The model knows `drag` (3,) [1/s] and `quadratic_drag` (3,) [1/m], of the square of each component, in body axes.
     """
 
     def __init__(
@@ -92,7 +94,7 @@ class RampObserver:
         self.reset(np.full(4, vehicle.hover_speed))
 
     def reset(self, rotors: Array) -> None:
-        """Forget: nothing disturbs, and the rotors turn at `rotors` (4,) [rad/s]."""
+        """Clear the estimates; the rotors turn at `rotors` (4,) [rad/s]."""
         self._value, self._change = np.zeros(6), np.zeros(6)
         self._products, self._squares = np.zeros(3), np.zeros(3)
         self._rotors = np.array(rotors, float)
@@ -100,17 +102,17 @@ class RampObserver:
         self._time = 0.0
 
     def adopt(self, other: RampObserver) -> None:
-        """Go on from where another one is."""
+        """Take over the state of another observer."""
         self._value = np.clip(other._value, -self._largest, self._largest)
         self._change, self._rotors = other._change, other._rotors
         self._products, self._squares = other._products, other._squares
         self._last, self._time = other._last, other._time
 
     def update(self, time: float, velocity: Array, attitude: Array, rates: Array, speeds: Array) -> None:
-        """Take note of a period's end; of one whose beginning was not seen only as a beginning.
+        """Update the estimates at the end of a period; after a gap, only record the start of the next one.
 
-        Measured are the velocity (3,), world, the attitude (3, 3), body to world, and the body rates (3,); the speeds
-        (4,) were commanded over the period that ends [rad/s].
+        Measured values: velocity (3,), world; attitude (3, 3), body to world; body rates (3,). The speeds (4,) [rad/s]
+        were commanded over the period that ends.
         """
         period, J = self._period, np.array(self._vehicle.inertia)
         spun, squares = self._rotors, self._mean_squares(speeds)
@@ -124,7 +126,7 @@ class RampObserver:
         before, self._time = self._time, time
         if last is None or abs(time - before - period) > _SAME_TIME:
             return
-        # Means over the period from both its ends: of the thrust axis with its derivative too (Euler-Maclaurin).
+        # Mean over the period from its two ends; for the thrust axis also from its derivative (Euler-Maclaurin).
         b = 0.5 * (last[2][:3] + axis) + period / 12.0 * (last[2][3:] - turning)
         drag, gyroscopic = np.split(0.5 * (last[3] + now[3]), 2)
         thrust, torque = np.split(self._vehicle.allocation @ squares, [1])
@@ -144,18 +146,18 @@ class RampObserver:
         self._products, self._squares = self._decay * self._products + d_b * v_b, self._decay * self._squares + v_b**2
 
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
-        """What is missed so long [s] after the last measurement, (3,) each.
+        """Predict the disturbance `ahead` [s] after the last measurement: three arrays (3,).
 
-        Acceleration [m/s^2], its rate of change [m/s^3], world axes; angular acceleration, body axes [rad/s^2].
+        Acceleration [m/s^2] and its rate of change [m/s^3], world axes; angular acceleration [rad/s^2], body axes.
         """
-        value = self._value + (0.5 * self._period + ahead) * self._change  # estimated for the middle of the last period
+        value = self._value + (0.5 * self._period + ahead) * self._change  # the estimate is for mid-period
         return value[:3], self._change[:3], value[3:]
 
     @property
     def drag(self) -> Array:
-        """(3,) linear drag beyond what the model knows, body axes [1/s]: what of the force follows the velocity.
+        """(3,) linear drag [1/s], body axes, beyond the model's: the part of the force that follows the velocity.
 
-        The least squares of d_b + diag(drag) v_b, older samples with less weight; zero while the vehicle is slow.
+        A least-squares fit of d_b + diag(drag) v_b that weights older samples less; zero while the vehicle is slow.
         """
         return np.maximum(-self._products / (self._squares + self._ballast), 0.0)
 

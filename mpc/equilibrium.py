@@ -1,7 +1,7 @@
-"""Where a vehicle rests against a constant disturbance: the target of offset-free tracking, and of every fallback.
+"""The equilibrium of a vehicle under a constant disturbance: the target of offset-free tracking and of every fallback.
 
-At rest thrust holds what gravity and the disturbance's acceleration a leave over, and torques hold its angular
-acceleration alpha:
+At rest, thrust balances gravity less the disturbance's acceleration a, and torque balances its angular acceleration
+alpha:
 
     U / m R(eta) e_z = g e_z - a,    I^-1 tau = -alpha,    omega = 0.
 """
@@ -20,7 +20,7 @@ from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
 
-LEAST_LIFT: Final = 0.1  # share of the weight that thrust holds at least: no rest is upside down
+LEAST_LIFT: Final = 0.1  # least thrust at rest as a share of the weight, so that no equilibrium is upside down
 _ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]
 
 
@@ -28,9 +28,9 @@ _ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]
 class Trim:
     """The estimated equilibrium of a vehicle."""
 
-    speeds: Array  # (4,) of the rotors [rad/s]
-    lift: Array  # (3,) along which thrust points, world frame, of any length; upwards
-    # (3,) angular acceleration, body frame, over the acceleration by thrust that brings it about [1/m]
+    speeds: Array  # (4,) rotor speeds [rad/s]
+    lift: Array  # (3,) direction of thrust, world frame, upwards, any length
+    # (3,) angular acceleration, body frame, that thrust causes, per acceleration by thrust [1/m]
     twist: Array = field(default_factory=zero)
 
     def __post_init__(self) -> None:
@@ -42,14 +42,14 @@ class Trim:
             raise ParameterError("trim", "lift", self.lift, "upwards")
 
     def lean(self, yaw: float) -> tuple[float, float]:
-        """Roll and pitch at rest with a yaw [rad]."""
+        """Roll and pitch at rest for a yaw [rad]."""
         x, y, up = self.lift.tolist()
         cosine, sine = math.cos(yaw), math.sin(yaw)
         forward, left = cosine * x + sine * y, cosine * y - sine * x
         return -math.atan2(left, math.hypot(forward, up)), math.atan2(forward, up)
 
     def state(self, yaw: float = 0.0, n: int = N_STATES) -> Array:
-        """(n,) rest at the origin, seen from axes turned by the yaw [rad], where yaw is 0; rotor speeds last."""
+        """(n,) the equilibrium at the origin and zero yaw, in axes turned by the yaw [rad]; rotor speeds last."""
         state = np.zeros(n)
         state[_ROLL], state[_PITCH] = self.lean(yaw)
         state[N_STATES:] = self.speeds[: n - N_STATES]
@@ -57,7 +57,7 @@ class Trim:
 
 
 def twisted(effectiveness: Array, twist: Array) -> Array:
-    """(4, 4) the effectiveness of a model whose thrust brings about an angular acceleration; see `Trim.twist`."""
+    """(4, 4) effectiveness of a model whose thrust causes an angular acceleration; see `Trim.twist`."""
     changed = effectiveness.copy()
     changed[1:] += twist[:, None] * effectiveness[0]
     return changed
@@ -66,9 +66,9 @@ def twisted(effectiveness: Array, twist: Array) -> Array:
 def equilibrium(
     model: NonlinearModel, *, acceleration: Sequence[float] | None = None, twist: Array | None = None
 ) -> Trim:
-    """What rest takes under a model's disturbance; a rotor that would have to pull stands still.
+    """Compute the equilibrium under a model's disturbance; a rotor that would have to pull stops.
 
-    The model is not yet `twisted`; `acceleration` (3,), world frame [m/s^2], is in place of the model's.
+    The model is not yet `twisted`; `acceleration` (3,), world frame [m/s^2], replaces the model's.
     """
     a_x, a_y, a_z = model.acceleration.tolist() if acceleration is None else acceleration
     twist = np.zeros(3) if twist is None else twist

@@ -1,10 +1,10 @@
 """Differential flatness: attitude, body rates and rotor thrusts along a sampled course of positions.
 
-The thrust axis is b = (a + g e_z) / |a + g e_z| (Mellinger and Kumar 2011, Sec. III).  What turns about it is either
-left free, so that no rate about body z remains, or held, so that body x stays as near as can be to the direction of a
-given yaw, and body y at a right angle to it.
-A free heading along a course that turns the vehicle upside down, where no least rotation from upright is left, is
-carried from sample to sample by the least rotation from one thrust axis to the next.
+The thrust axis is b = (a + g e_z) / |a + g e_z| (Mellinger and Kumar 2011, Sec. III). The heading about it is either
+free, so that the rate about body z is zero, or held, so that body x is as close as possible to the direction of a given
+yaw, and body y is perpendicular to that direction. The free heading of a course that turns the vehicle upside down is
+propagated from sample to sample by the least rotation from one thrust axis to the next, since no least rotation from
+upright exists there.
 Derivatives along the samples are central differences, one-sided at both ends, as in the simplified simulation of
 Torrente et al., "Data-Driven MPC for Quadrotors" (2021), which leaves the heading free.
 """
@@ -23,21 +23,21 @@ from quadsim.state import Array, read_only
 from quadsim.vehicle import Vehicle
 
 STEEP: Final = math.cos(math.radians(150.0))
-"""Lowest vertical component of the thrust axis up to which an attitude is described by a least rotation."""
+"""Lowest vertical component of the thrust axis for which the least rotation from upright describes the attitude."""
 
 
 def motion_along(
     position: Array, velocity: Array, acceleration: Array, *, period: float, vehicle: Vehicle, yaw: Array | float = 0.0
 ) -> Motion:
-    """The reference motion of a vehicle that follows a course exactly, without drag.
+    """Return the reference motion of a vehicle that follows a course exactly, without drag.
 
     Args:
         position: (K, 3) world [m], K >= 2.
         velocity: (K, 3) world [m/s].
-        acceleration: (K, 3) world [m/s^2], of no sample the free fall.
-        period: of the samples [s].
+        acceleration: (K, 3) world [m/s^2]; no sample may be in free fall.
+        period: sample period [s].
         vehicle: mass, inertia, gravity and rotors.
-        yaw: (K,) direction from world x to which the heading is held [rad]; or where a free heading begins [rad].
+        yaw: (K,) held heading, as a direction from world x [rad]; or the initial value of a free heading [rad].
     """
     attitude, rates = attitudes(acceleration, period=period, gravity=vehicle.gravity, yaw=yaw)
     inertia = np.array(vehicle.inertia)
@@ -73,12 +73,12 @@ def attitudes(acceleration: Array, *, period: float, gravity: float, yaw: Array 
     attitude = multiply(least, _about_z(turn))
     rates = _body_rates(attitude, period)
     cos, sin, (wx, wy, wz) = np.cos(turn[0]), np.sin(turn[0]), least_rates[0]
-    rates[0] = cos * wx + sin * wy, cos * wy - sin * wx, wz  # without the turn, which has no step before it
+    rates[0] = cos * wx + sin * wy, cos * wy - sin * wx, wz  # the first sample has no step before it
     return attitude, rates
 
 
 def _carried(b: Array, yaw: float) -> Array:
-    """(K, 4) quaternions with thrust axes b (K, 3), each turned from the one before by the least rotation."""
+    """(K, 4) quaternions with thrust axes b (K, 3), each obtained from the previous one by the least rotation."""
     before = np.concatenate([[[0.0, 0.0, 1.0]], b[:-1]])
     turn = np.column_stack([1.0 + np.sum(before * b, axis=1), np.cross(before, b)])
     turn /= np.linalg.norm(turn, axis=1)[:, None]
@@ -91,7 +91,7 @@ def _carried(b: Array, yaw: float) -> Array:
 
 
 def _body_rates(attitude: Array, period: float) -> Array:
-    """(K, 3) body rates 2 vec(q* Dq) [rad/s] along quaternions (K, 4), a period [s] apart."""
+    """(K, 3) body rates 2 vec(q* Dq) [rad/s] of quaternions (K, 4) sampled at a period [s]."""
     rates: Array = 2.0 * multiply(conjugate(attitude), np.gradient(attitude, period, axis=0))[:, 1:]
     return rates
 
@@ -102,7 +102,7 @@ def _pushed(acceleration: Array, gravity: float) -> Array:
 
 
 def _turn_to(least: Array, yaw: Array) -> Array:
-    """(K,) angle about body z [rad], without jumps, that puts body y at a right angle to a yaw's direction."""
+    """(K,) angle about body z [rad], without jumps, that makes body y perpendicular to the direction of a yaw."""
     w, x, y, z = least.T
     cos, sin = np.cos(yaw), np.sin(yaw)
     of_x = cos * (1.0 - 2.0 * (y * y + z * z)) + sin * 2.0 * (x * y + w * z)
@@ -112,6 +112,6 @@ def _turn_to(least: Array, yaw: Array) -> Array:
 
 
 def _about_z(angle: Array) -> Array:
-    """(K, 4) quaternions of turns about z by angles (K,) [rad]."""
+    """(K, 4) quaternions of rotations about z by angles (K,) [rad]."""
     half, zero = 0.5 * angle, np.zeros_like(angle)
     return np.column_stack([np.cos(half), zero, zero, np.sin(half)])

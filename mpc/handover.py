@@ -1,4 +1,4 @@
-"""What a controller takes over from the one before it, so that a change in flight makes no bump."""
+"""Bumpless transfer: the state that a controller takes over from its predecessor."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ Law = TypeVar("Law")
 
 
 def hand_over(law: object, previous: object) -> None:
-    """Let a law take over what it can from the one before it, where it has a method `adopt`."""
+    """Let a law take over state from its predecessor, if it has a method `adopt`."""
     adopt = getattr(law, "adopt", None)
     if adopt is not None:
         adopt(previous)
 
 
 def within(previous: object, kind: type[Law]) -> Law | None:
-    """A law of the given kind, or the first such within it, as inside a fallback contract; None where there is none."""
+    """Return a law of a kind, or the first one inside it, as in a fallback contract; None if there is none."""
     law: Any = previous
     while law is not None and not isinstance(law, kind):
         law = getattr(law, "inner", None)
@@ -27,7 +27,7 @@ def within(previous: object, kind: type[Law]) -> Law | None:
 
 
 def observed(previous: object) -> Array | None:
-    """(6,) what the law before, or one within it, estimates to disturb: accelerations [m/s^2] and angular ones."""
+    """(6,) disturbance estimate of the previous law, or of one inside it: accelerations [m/s^2] and angular ones."""
     law: Any = previous
     while law is not None:
         estimate: Any = getattr(law, "disturbance", None)
@@ -38,5 +38,5 @@ def observed(previous: object) -> Array | None:
 
 
 def resized(rows: Array, count: int) -> Array:
-    """A plan (N, ...) as one of `count` steps: cut, or its last row held."""
+    """A plan (N, ...) cut to `count` steps, or extended by its last row."""
     return rows[np.minimum(np.arange(count), len(rows) - 1)]

@@ -1,6 +1,6 @@
-"""Axes turned by the heading: at hover the vehicle moves alike for any yaw, and the model at zero yaw holds there.
+"""The heading frame: axes turned by the yaw, in which the hover model at zero yaw holds for any yaw.
 
-It is anchored where the vehicle rests, (x_s, u_s) of `mpc.equilibrium`: in axes turned by the yaw
+The model is linearised at the equilibrium (x_s, u_s) of `mpc.equilibrium`: in axes turned by the yaw
 
     x(k+1) = x_s + A (x(k) - x_s) + B (u(k) - u_s).
 """
@@ -31,25 +31,25 @@ def turn_horizontally(states: Array, angles: Array | float) -> Array:
         cosine, sine = math.cos(angles), math.sin(angles)
     else:
         cosine, sine = np.cos(angles)[..., None], np.sin(angles)[..., None]
-    along, across = states[..., 0:2], states[..., 2:4]  # x and vx, y and vy
+    along, across = states[..., 0:2], states[..., 2:4]  # x and vx, then y and vy
     turned[..., 0:2] = cosine * along - sine * across
     turned[..., 2:4] = sine * along + cosine * across
     return turned
 
 
 def turn(yaw: float) -> Array:
-    """(12, 12) matrix T that turns positions and velocities by a yaw [rad]: from the heading frame to the world's."""
+    """(12, 12) matrix T that turns positions and velocities by a yaw [rad], from heading frame to world frame."""
     return turn_horizontally(np.eye(N_STATES), np.array(yaw)).T
 
 
 def slope(model: LinearModel) -> Array:
     """(4, 4) accelerations along z and about x, y, z per rotor speed [(m/s^2)/(rad/s)], [1/s]."""
-    # Rates and vz integrate accelerations alone, so that their rows of B are the period times the slope.
+    # Rates and vz only integrate accelerations, so their rows of B are the period times the slope.
     return np.asarray(model.B[_ACCELERATED] / model.period)
 
 
 def anchored(model: LinearModel, trim: Trim) -> LinearModel:
-    """The hover model linearised at the trim's speeds, as thrust goes with their squares, with what thrust twists."""
+    """Linearise the hover model at the trim, where thrust has another slope and causes a torque."""
     B = model.B * (trim.speeds / model.u_bar)
     if trim.twist.any():
         there = slope(model)
@@ -59,9 +59,9 @@ def anchored(model: LinearModel, trim: Trim) -> LinearModel:
 
 
 def predict_in_heading_frame(model: LinearModel, states: Array, plans: Array, trim: Trim | None = None) -> Array:
-    """Predicted states (K, N, 12) of the linear model turned by each measured yaw, of states (K, 12), plans (K, N, 4).
+    """Predict states (K, N, 12) from states (K, 12) and plans (K, N, 4), by the linear model turned by each yaw.
 
-    With a trim the model is one that is `anchored` there; otherwise at level hover.
+    With a trim, the model is `anchored` there; otherwise it is the model of level hover.
     """
     yaws = states[:, _YAW]
     seen, trim = turn_horizontally(states, -yaws), trim or Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
@@ -76,7 +76,7 @@ def advance(model: LinearModel, state: Array, speeds: Array, trim: Trim) -> Arra
 
 
 def with_nearest_yaw(reference: Array, yaw: float, largest: float) -> Array:
-    """The reference (N, 4) with a yaw that starts from the present one and has no larger jumps [rad]."""
+    """The reference (N, 4) with a yaw that starts from the present one and has no jumps above `largest` [rad]."""
     yaws, steps = reference[:, 3], np.empty(len(reference))
     steps[0] = yaws[0] - yaw
     np.subtract(yaws[1:], yaws[:-1], out=steps[1:])

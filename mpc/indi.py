@@ -1,19 +1,19 @@
 """Incremental nonlinear dynamic inversion (INDI) of the angular acceleration, an inner loop around any law.
 
-The law's rotor speeds give the wrench, and so the angular acceleration, that its model demands.  At a rate of its
-own, above the control rate, the inner loop demands the torque
+The law's rotor speeds define a wrench, and so the angular acceleration that its model demands. At its own rate, above
+the control rate, the inner loop demands the torque
 
     tau_c = tau_f + J (alpha_c - alpha_f),
 
-increments on the torque that the measured rotor speeds give and the measured angular acceleration, both through one
-low-pass filter, so that they stay in step: Smeur, Chu, de Croon, "Adaptive incremental nonlinear dynamic inversion for
-attitude control of micro air vehicles", 2016; Tal and Karaman (2021); around a nonlinear MPC Sun, Romero, Foehn,
-Kaufmann, Scaramuzza, "A comparative study of nonlinear MPC and differential-flatness-based control for quadrotor agile
-flight", 2022.  Whatever torque the model does not know (drag of the body, a worn rotor, an offset centre of mass) is in
-alpha_f and is made up for; collective thrust passes.
+the filtered torque of the measured rotor speeds plus an increment from the measured angular acceleration. Both pass the
+same low-pass filter, so that they stay synchronised: Smeur, Chu, de Croon, "Adaptive incremental nonlinear dynamic
+inversion for attitude control of micro air vehicles", 2016; Tal and Karaman (2021); around a nonlinear MPC, Sun,
+Romero, Foehn, Kaufmann, Scaramuzza, "A comparative study of nonlinear MPC and differential-flatness-based control for
+quadrotor agile flight", 2022. Torques that the model omits (drag of the body, a worn rotor, an offset centre of mass)
+appear in alpha_f and are compensated; collective thrust is passed through.
 
-With the gyroscopic torque left outside the filter this is tau_c = tau(u) + filtered(tau - J alpha - omega x J omega),
-so that a vehicle that is as modelled flies the law's own speeds.
+With the gyroscopic torque outside the filter, tau_c = tau(u) + filtered(tau - J alpha - omega x J omega), so that a
+vehicle that matches its model flies the law's speeds unchanged.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ if TYPE_CHECKING:
     from mpc.answer import ActuatorBounds
 
 DAMPING: Final = math.sqrt(0.5)
-"""Of the low-pass filter: Butterworth's, second order, as Tal and Karaman have it."""
+"""Damping of the second-order Butterworth low-pass filter, as in Tal and Karaman."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class INDISettings:
     """INDI of the angular acceleration in an inner loop."""
 
-    rate: Annotated[Positive, doc("[Hz] of the inner loop; its period is a whole number of physics steps")] = 500.0
-    cutoff: Annotated[Positive, doc("[Hz] of the filter of measured angular accelerations and torques")] = 30.0
+    rate: Annotated[Positive, doc("[Hz] inner loop; its period is a whole number of physics steps")] = 500.0
+    cutoff: Annotated[Positive, doc("[Hz] cutoff of the filter on measured angular accelerations and torques")] = 30.0
 
 
 class TorqueIncrement:
-    """The inner loop: commanded rotor speeds to those that turn the vehicle as the law's model would have turned.
+    """The inner loop: corrects the commanded rotor speeds so that the vehicle turns as the law's model predicts.
 
     See `quadsim.controller.InnerLoop`.
     """
@@ -60,16 +60,16 @@ class TorqueIncrement:
         self.reset()
 
     def reset(self) -> None:
-        """Forget: no torque is unknown."""
+        """Clear the filter; no unmodelled torque."""
         self._last: tuple[float, Array] | None = None
         self._filtered, self._slope = np.zeros(3), np.zeros(3)
 
     def adopt(self, other: TorqueIncrement) -> None:
-        """Go on from where another one is."""
+        """Take over the state of another inner loop."""
         self._last, self._filtered, self._slope = other._last, other._filtered, other._slope
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
-        """The rotor speeds (4,) to hold until the next call, from those that the law demands and the measured ones."""
+        """Return the rotor speeds (4,) to hold until the next call, from the demanded and the measured ones."""
         M, J = self._allocation.M, self._inertia
         last, self._last = self._last, (time, rates.copy())
         if last is not None and time > last[0]:
@@ -91,7 +91,7 @@ class TorqueIncrement:
 
 
 class Incremental:
-    """A controller whose commands go through the inner loop."""
+    """A controller whose commands pass through the inner loop."""
 
     def __init__(self, inner: Controller, vehicle: Vehicle, settings: INDISettings, bounds: ActuatorBounds) -> None:
         self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
@@ -103,14 +103,14 @@ class Incremental:
         self._loop.reset()
 
     def adopt(self, previous: object) -> None:
-        """Go on from what the law before knew, and from the filter's state."""
+        """Take over the state of the previous law, and of its filter."""
         hand_over(self.inner, previous)
         law = within(previous, Incremental)
         if law is not None:
             self._loop.adopt(law._loop)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """The law's command, with the inner loop that is to carry it out; on the ground without."""
+        """Return the law's command with its inner loop, which is off on the ground."""
         command = self.inner.step(now, state, reference)
         if now.phase in GROUNDED:
             self._loop.reset()
@@ -118,9 +118,9 @@ class Incremental:
         return replace(command, inner=self._loop)
 
     @property
-    def unanswered(self) -> object:
-        """That of the law, where it has one: the first period since `reset` whose QP had no answer."""
-        return getattr(self.inner, "unanswered", None)
+    def infeasible_period(self) -> object:
+        """The law's first period since `reset` whose QP had no answer; None if the law has none."""
+        return getattr(self.inner, "infeasible_period", None)
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""

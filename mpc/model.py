@@ -15,13 +15,13 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 class LinearModel:
     """xi(k+1) = A xi(k) + B (u(k) - u_bar).
 
-    Eq. (1) prints u(k) for the deviation; taken literally, hover would predict a climb.  A xi_bar = xi_bar at any
-    hover position, so only the input needs the offset.
+    Eq. (1) prints u(k) for the deviation; taken literally, hover would predict a climb. A xi_bar = xi_bar at any hover
+    position, so only the input needs the offset. `docs/conventions.md` lists the states.
     """
 
     A: Array  # (n, n) state matrix
     B: Array  # (n, nu) input matrix
-    u_bar: Array  # (nu,) input of the equilibrium, for a quadrotor omega_bar on all rotors [rad/s]
+    u_bar: Array  # (nu,) equilibrium input; for a quadrotor, omega_bar on all rotors [rad/s]
     period: float  # tau_s [s]
 
     @property
@@ -38,7 +38,7 @@ class LinearModel:
 def continuous_model(vehicle: Vehicle, rotor_lag: float = 0.0) -> tuple[Array, Array]:
     """Jacobians (A_c, B_c) of the nonlinear model of Sec. 2.2 at hover with zero yaw.
 
-    With a rotor lag T [s], dw/dt = (u - w) / T, the rotor speeds w are four more states.
+    With a rotor lag T [s], dw/dt = (u - w) / T, the rotor speeds w are four further states.
 
     Returns:
         (12, 12) and (12, 4): d(xi)/dt = A_c (xi - xi_bar) + B_c (u - u_bar); with lag (16, 16) and (16, 4).

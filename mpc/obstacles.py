@@ -1,16 +1,17 @@
-"""Keeping clear of obstacles, and inside corridors and a fence, by half-spaces along the predicted positions.
+"""Obstacles, corridors and fences as half-spaces along the predicted positions.
 
-An obstacle's convex solid is avoided at each predicted instant by the plane through its nearest point to where
-the last plan was to be then, p_i, at distance d_i and with the outward normal n_i:
+An obstacle is a union of convex solids. At each predicted instant, a plane keeps the vehicle clear of each solid. It
+passes through the point of the solid closest to p_i, the position that the last plan had for that instant, with d_i the
+distance and n_i the outward normal:
 
     n_i . p >= n_i . p_i - d_i + r + m_i,
 
-r the radius of the vehicle's bounding ball and m_i the margin.  Where p_i is inside, d_i is negative and the
-plane is that of the nearest way out.  Behind the plane lies all of the solid, so that what satisfies the half-space
-keeps clear at that instant, wherever p_i was: the restriction is safe, and it is conservative.  A moving obstacle is
-where it will be at that instant.  Corridors and the fence are half-spaces themselves, and exact.
+with r the radius of the vehicle's bounding ball and m_i the margin. If p_i is inside, d_i is negative and the plane is
+that of the shortest way out. The whole solid lies behind the plane, so a position that satisfies the half-space is
+clear at that instant, for any p_i: the restriction is safe and conservative. Moving obstacles are evaluated at the
+predicted instant. Corridors and fences are half-spaces themselves, and exact.
 
-The planes change with the plan, so that the QP is solved again along the new one, a few times per period at most
+The planes change with the plan, so the QP is solved again along the new plan, a few times per period at most
 (sequential convex programming; Schulman et al., 2014, "Motion planning with sequential convex optimization and convex
 collision checking").
 """
@@ -38,26 +39,26 @@ from quadsim.state import POSITION, Array
 Shape: TypeAlias = AnyObstacle | Corridor | Fence
 
 LOOSE: Final = 1e3
-"""By how much [m] a half-space that is not in force is left open."""
-SOLVER: Final = "piqp-multistage"  # solves QPs with half-spaces, whatever solves those without
+"""Bound [m] of a half-space that is switched off."""
+SOLVER: Final = "piqp-multistage"  # solves QPs with half-spaces; the problem's own solver solves the others
 ROUNDING: Final = 1e-6
-"""Violation of a half-space [m] that is taken for rounding."""
+"""Violation of a half-space [m] attributed to rounding."""
 NEAR: Final = 1e-2
-"""Distance from a half-space [m] within which a plan is taken to touch it."""
+"""Distance from a half-space [m] within which a plan counts as touching it."""
 SETTLED: Final = 1e-2
 """Change of all predicted positions [m] below which planes are not recomputed in the same period."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AvoidanceSettings:
-    """How obstacles, corridors and the fence are enforced, and how closely."""
+    """How obstacles, corridors and fences are enforced."""
 
-    margin: Annotated[NonNegative, doc("[m] added: planes change from instant to instant")] = 0.05
+    margin: Annotated[NonNegative, doc("[m] added clearance: planes change from instant to instant")] = 0.05
     rows: Annotated[
         int,
         Ge(1),
         Le(50),
-        doc("[-] half-spaces per predicted instant that the QP has, the tightest; more where it takes more"),
+        doc("[-] half-spaces per predicted instant in the QP, the tightest ones first; more are added if needed"),
     ] = 6
     iterations: Annotated[int, Ge(1), Le(50), doc("[-] QPs per period at most, each along the last one's plan")] = 3
 
@@ -67,14 +68,14 @@ class Space:
 
     Args:
         shapes: the obstacles and regions.
-        radius: of the vehicle's bounding ball [m].
-        period: from one predicted instant to the next [s].
+        radius: radius of the vehicle's bounding ball [m].
+        period: time between predicted instants [s].
         horizon: N.
-        settings: how closely.
-        margins: (N, 3) further ones along x, y, z at each predicted instant [m], as of a disturbance; None for none.
+        settings: how half-spaces are enforced.
+        margins: (N, 3) further margins along x, y, z at each predicted instant [m], for a disturbance; None for none.
         penalty: l1 [1/m] and l2 [1/m^2] of violating a half-space; None for hard ones.
-        positions: which of the states are x, y, z.
-        largest: whether the penalty is of the largest violation at each instant, instead of all.
+        positions: indices of the states x, y, z.
+        largest: whether the penalty applies to the largest violation at each instant, instead of to all of them.
     """
 
     def __init__(
@@ -110,13 +111,13 @@ class Space:
         for region, at in self._regions:
             rows, upper = region.half_spaces
             normals[at] = -rows[:, None, :]
-            # Also at the instants just before and after: what is between two of them is then inside as well.
+            # Also inside at the neighbouring instants, so that the motion between two instants stays inside.
             in_force = (t > region.start - self.period) & (t < region.stop + self.period)
             bounds[at] = np.where(in_force, -upper[:, None], (normals[at] * positions).sum(axis=2) - LOOSE)
         return normals, bounds + self._distance + (np.abs(normals) * self._margins).sum(axis=2)
 
     def constraint(self, normals: Array, bounds: Array, states: int, *, name: str = "space") -> Constraint:
-        """Half-spaces (m, N, 3), (m, N) as rows on so many states."""
+        """Return half-spaces (m, N, 3), (m, N) as rows on `states` states."""
         C = np.zeros((bounds.shape[1], len(bounds), states))
         C[:, :, self.positions] = normals.transpose(1, 0, 2)
         lower, (l1, l2) = bounds.T, (0.0, 0.0) if self.penalty is None else self.penalty
@@ -130,7 +131,7 @@ class Space:
         )
 
     def constraints(self, normals: Array, bounds: Array, states: int) -> tuple[Constraint, ...]:
-        """All half-spaces, one constraint per obstacle or region, by its name."""
+        """Return all half-spaces as one constraint per obstacle or region, by its name."""
         constraints = []
         for shape in self._shapes:
             kind = "obstacle" if isinstance(shape, Obstacle) else "corridor" if isinstance(shape, Corridor) else ""
@@ -140,13 +141,13 @@ class Space:
 
 
 class ObstacleQP:
-    """A solver's optimum where it keeps all half-spaces, and else the optimum with them.
+    """The optimum of a problem with half-spaces, which are added only when they matter.
 
-    The optimum of fewer constraints that satisfies all is the optimum: so is the solver's wherever the way is clear.
-    Where it is not, the whole QP is solved with the tightest half-spaces of each instant, and with twice as many as
-    long as the plan violates one that was left out.
+    An optimum under fewer constraints that satisfies all of them is the optimum. So the solver's answer is final
+    wherever the way is clear. Elsewhere the QP is solved with the tightest half-spaces of each instant, then with twice
+    as many for as long as the plan violates one that was left out.
 
-    The problem and its solver know no half-spaces; queries of a `changing` one have steps of their own.
+    The problem and its solver contain no half-spaces. Queries of a `changing` problem carry their own models.
     """
 
     def __init__(self, problem: Problem, solver: Solver, space: Space, *, changing: bool = False) -> None:
@@ -160,13 +161,13 @@ class ObstacleQP:
         self._last: Array | None = None
 
     def solve(self, time: float, query: Query, yaw: float = 0.0, along: Array | None = None) -> tuple[Answer, Problem]:
-        """The optimum for a query, with its `Answer.states`, and the problem that it is of.
+        """Return the optimum of a query, with its `Answer.states`, and the problem solved.
 
         Args:
-            time: of its x(k) [s].
+            time: instant of its x(k) [s].
             query: the state, reference and last input.
-            yaw: by which the states' axes x and y are turned from the world's [rad].
-            along: (N, 3) positions of the plan that planes are made along [m]; where absent, those of the last optimum,
+            yaw: angle by which the states' axes x and y are turned from the world's [rad].
+            along: (N, 3) positions of the plan along which planes are made [m]; by default those of the last optimum,
                 moved on by an instant.
         """
         turn = np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
@@ -190,7 +191,7 @@ class ObstacleQP:
             room = _room(normals, bounds, planned)
             if (room >= -ROUNDING).all() and not (among and i == 0):
                 break
-            answer, problem, planned = self._whole(query, normals, bounds, room, turn)
+            answer, problem, planned = self._solve_with_half_spaces(query, normals, bounds, room, turn)
             if answer.status not in ACCEPTED:
                 named = self._space.constraints(normals @ turn.T, bounds, problem.model.n)
                 constraints = (*self.problem.constraints, *named)
@@ -206,21 +207,21 @@ class ObstacleQP:
         states = predicted(self.problem, query, answer.plan)
         return answer._replace(states=states), states[:, self._space.positions] @ turn
 
-    def _posed(self, normals: Array, bounds: Array) -> Problem:
+    def _with_half_spaces(self, normals: Array, bounds: Array) -> Problem:
         """The problem with chosen half-spaces (m, N, 3), (m, N) in the states' axes."""
         added = self._space.constraint(normals, bounds, self.problem.model.n)
         return replace(self.problem, constraints=(*self.problem.constraints, added))
 
-    def _whole(
+    def _solve_with_half_spaces(
         self, query: Query, normals: Array, bounds: Array, room: Array, turn: Array
     ) -> tuple[Answer, Problem, Array]:
         """The optimum with half-spaces of the world, and its positions; `room` (S, N) gives the tightest."""
         count = self._space.settings.rows
         while True:
             at = np.argsort(room, axis=0, kind="stable")[:count], np.arange(bounds.shape[1])
-            problem = self._posed(normals[at] @ turn.T, bounds[at])
+            problem = self._with_half_spaces(normals[at] @ turn.T, bounds[at])
             form, backend = self._form(len(at[0]))
-            qp = form.pose(query, problem).qp
+            qp = form.assemble(query, problem).qp
             answer = Answer.of(form, qp, backend.solve(qp), SOLVER)
             if answer.status not in ACCEPTED:
                 return answer, problem, np.empty(0)
@@ -237,7 +238,9 @@ class ObstacleQP:
         """The QP with so many half-spaces at each instant, and what solves it."""
         if count not in self._forms:
             normals = np.full((count, self.problem.horizon, 3), 3.0**-0.5)  # in general position
-            form = PartiallyCondensed(self._posed(normals, np.zeros(normals.shape[:2])), changing=self._changing)
+            form = PartiallyCondensed(
+                self._with_half_spaces(normals, np.zeros(normals.shape[:2])), changing=self._changing
+            )
             backend = Piqp(changing=True)
             backend.setup(form.qp)
             self._forms[count] = form, backend

@@ -1,11 +1,11 @@
-"""The optimal control problem of an MPC, as a value: nothing else defines what is solved.
+"""The optimal control problem of an MPC as a value: the only definition of what is solved.
 
-Over N steps of a linear model, from x(k) and after the input u(k-1), minimised is
+Over N steps of a linear model, from x(k) and after the input u(k-1), the MPC minimises
 
     sum_i |C_r x(k+i) - y_d(i)|^2_Qy + |u(k+i-1) - u_s|^2_Qu + |u(k+i-1) - u(k+i-2)|^2_Qd,    i = 1 .. N,
 
-where the last state may have a weight P of its own, about the rest state x_s (`Equilibrium`), subject to a tuple of
-constraints, each a value.  What is built from a problem walks the rows of all its constraints and knows no kind.
+where the last state may have its own weight P, about the equilibrium x_s (`Equilibrium`), subject to a tuple of
+constraints. Every formulation is built from the stacked rows of all constraints, whatever their kind.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from quadsim.state import REFERENCE_STATES, Array
 
 
 class Equilibrium(NamedTuple):
-    """Where the model rests, x_s = A x_s + B (u_s - u_bar), and what the cost pulls inputs to."""
+    """An equilibrium of the model, x_s = A x_s + B (u_s - u_bar); u_s is also the target of the inputs."""
 
     x: Array  # (n,) x_s
-    u: Array  # (nu,) u_s [rad/s]; (N, nu) where it is another in each step, with a model that changes
+    u: Array  # (nu,) u_s [rad/s]; (N, nu) if it differs from step to step, with a model that changes
 
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
-    """The cost of Eq. (5), with two terms that the paper does not have."""
+    """The cost of Eq. (5), with two further terms."""
 
     C_r: Array  # (n_r, n) regulated outputs y_r = C_r xi. Eq. (4), where the paper prints n_r x n_r
     Q_y: Array  # (n_r, n_r) weight of the output error, symmetric positive definite
     Q_u: Array  # (nu, nu) weight of u - u_bar, symmetric positive definite
-    # (nu, nu) weight of an input's change from one step to the next, symmetric positive semidefinite; None for none
+    # (nu, nu) weight of input changes from step to step, symmetric positive semidefinite; None for none
     Q_d: Array | None = None
-    # (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), in place of Q_y's, symmetric positive
-    # semidefinite; None for none
+    # (n, n) weight of the last state's distance from x_s + C_r^+ (y_d - C_r x_s), replaces Q_y there; symmetric
+    # positive semidefinite; None for none
     P: Array | None = None
 
     def __post_init__(self) -> None:
@@ -55,34 +55,33 @@ class Objective:
             raise ParameterError("controller", "C_r", self.C_r.shape, f"of shape ({self.Q_y.shape[0]}, n)")
 
     def desired(self, reference: Array) -> Array:
-        """Desired outputs y_r^d (..., n_r) of a reference (..., 4) for x, y, z, yaw; other states are wanted at 0."""
+        """Return the desired outputs y_r^d (..., n_r) for a reference (..., 4) of x, y, z, yaw; 0 for other states."""
         return np.dot(reference, self.C_r[:, REFERENCE_STATES].T)
 
     @cached_property
     def weights(self) -> tuple[Array, Array]:
-        """Q (n, n) and W (n, n_r): a state costs x' Q x - 2 x' W y_d, and what does not depend on it."""
+        """Q (n, n) and W (n, n_r) of the state cost x' Q x - 2 x' W y_d, up to a constant."""
         W = self.C_r.T @ self.Q_y
         return W @ self.C_r, W
 
     @cached_property
     def terminal_weights(self) -> tuple[Array, Array]:
-        """The same for the last state, where x_s is the origin."""
+        """The same for the last state, with x_s as the origin."""
         return self.weights if self.P is None else (self.P, self.P @ np.linalg.pinv(self.C_r))
 
     @property
     def move_weight(self) -> Array:
-        """Q_d (nu, nu), zeros where there is none."""
+        """Q_d (nu, nu), zeros if there is none."""
         return np.zeros_like(self.Q_u) if self.Q_d is None else self.Q_d
 
 
 def lqr_terminal_weight(model: LinearModel, objective: Objective) -> Array:
-    """P (n, n) of the DARE: what it costs to come to rest from a state in any time, without constraints.
+    """Return P (n, n) of the DARE: the unconstrained cost of bringing a state to rest over an infinite horizon.
 
-    With it the unconstrained optimum over N steps is that over infinitely many, but for the weight of changes of
-    inputs, which the DARE leaves out.
+    With it, the unconstrained optimum over N steps is that over an infinite horizon, except for the weight of input
+    changes, which the DARE omits.
 
-    Raises:
-        ParameterError: it has no solution, as where some state costs nothing and does not come to rest by itself.
+    Raises:     ParameterError: the equation has no solution, for example if an undamped state has no weight.
     """
     try:
         P = scipy.linalg.solve_discrete_are(model.A, model.B, objective.weights[0], objective.Q_u)
@@ -94,13 +93,13 @@ def lqr_terminal_weight(model: LinearModel, objective: Objective) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """Everything that defines a controller but the way its optimum is found."""
+    """A complete definition of a controller, apart from how its optimum is computed."""
 
     model: LinearModel  # the prediction model
     horizon: int  # N, steps
-    objective: Objective  # what is minimised
+    objective: Objective  # the cost to minimise
     bounds: Bounds | None = None  # the paper's constraints; None for none
-    constraints: tuple[Constraint, ...] = ()  # others
+    constraints: tuple[Constraint, ...] = ()  # further constraints
 
     def __post_init__(self) -> None:
         if not isinstance(self.horizon, int) or self.horizon < 1:
@@ -122,12 +121,12 @@ class Problem:
 
     @property
     def equilibrium(self) -> Equilibrium:
-        """The equilibrium that the model is linearised at, the origin."""
+        """The equilibrium of the linearisation, at the origin."""
         return Equilibrium(np.zeros(self.model.n), self.model.u_bar)
 
     @property
     def every_constraint(self) -> tuple[Constraint, ...]:
-        """The paper's, in the order of `Bounds.constraints`, and then the others."""
+        """The paper's constraints, in the order of `Bounds.constraints`, then the others."""
         return (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
 
     @cached_property
@@ -176,18 +175,18 @@ class Problem:
 
 
 class Query(NamedTuple):
-    """What a problem is solved for in one period."""
+    """The data of one period: the arguments of the problem."""
 
     state: Array  # (n,) x(k)
     desired: Array  # (N, n_r) y_d for x(k+1) .. x(k+N)
     u_before: Array  # (nu,) u(k-1) [rad/s]
-    equilibrium: Equilibrium | None = None  # where the model rests; None for the problem's
-    # A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's about `rest`
+    equilibrium: Equilibrium | None = None  # None for the problem's own
+    # A_i (N, n, n), B_i (N, n, nu), c_i (N, n) of a model that changes; None for the problem's model
     steps: tuple[Array, Array, Array] | None = None
 
 
 def predicted(problem: Problem, query: Query, plan: Array) -> Array:
-    """(N, n) the states that a plan (N, nu) leads to."""
+    """(N, n) the predicted states of a plan (N, nu)."""
     states, state = np.empty((len(plan), query.state.size)), query.state
     if query.steps is not None:
         for i, (A, B, c, u) in enumerate(zip(*query.steps, plan, strict=True)):
@@ -202,14 +201,14 @@ def predicted(problem: Problem, query: Query, plan: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class InfeasiblePeriod:
-    """The first problem of a flight that had no answer, or whose SQP did not converge; `mpc.diagnosis` explains why."""
+    """The first period of a flight without an answer, or whose SQP did not converge; `mpc.diagnosis` explains it."""
 
-    problem: Problem  # what was to be solved
-    query: Query  # for what; its state and input are copied
-    status: str  # what spoke against the answer
-    time: float  # t_k, the period's begin [s]
-    delay: float = 0.0  # from there to the instant of x(k) [s]
-    converges: Callable[[int], bool] | None = None  # where SQP did not, whether it does within so many iterations
+    problem: Problem  # the problem
+    query: Query  # the state and reference without a solution; state and input are copied
+    status: str  # why the answer was rejected
+    time: float  # t_k, start of the period [s]
+    delay: float = 0.0  # from t_k to the instant of x(k) [s]
+    converges: Callable[[int], bool] | None = None  # if the SQP did not converge: whether it does within n iterations
 
     def __post_init__(self) -> None:
         query = self.query
@@ -222,7 +221,7 @@ def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
 
 
 def _check_definite(name: str, matrix: Array, *, least: float) -> None:
-    """Refuse a matrix that is not symmetric, or has an eigenvalue of `least` (of the largest entry) or less."""
+    """Reject a matrix that is not symmetric, or with an eigenvalue of at most `least` (times the largest entry)."""
     symmetric = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.array_equal(matrix, matrix.T)
     strict = least == 0.0
     if symmetric and np.all(np.isfinite(matrix)):

@@ -1,7 +1,7 @@
-"""The QP with a structure: the horizon in stages of a few steps each, for matrices that change and for fixed ones.
+"""The partially condensed QP: the horizon in stages of a few steps, for constant and for changing matrices.
 
-A condensed QP is dense; one with all states as variables is large.  In between, the horizon is cut into stages of M
-steps.  The variables, in stage order, are
+A condensed QP is dense; one with all states as variables is large. Partial condensing lies in between: it cuts the
+horizon into stages of M steps. The variables, in stage order, are
 
     v_0, e_0 | s_1, v_1, e_1 | s_2, v_2, e_2 | ... | s_J, e_J
 
@@ -12,7 +12,7 @@ the horizon.  The model may differ from step to step,
 
     x(k+i+1) = A_i x(k+i) + B_i u(k+i) + c_i.
 
-The pattern of the matrices is fixed when a `PartiallyCondensed` is built; where they change, only their values do.
+The sparsity pattern is fixed when a `PartiallyCondensed` is built; if matrices change, only their values do.
 """
 
 from __future__ import annotations
@@ -28,21 +28,22 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
 from mpc.ocp import Problem, Query
-from mpc.qp import QP, Posed, QPRows, Solution
+from mpc.qp import QP, PeriodQP, QPRows, Solution
 from quadsim.state import Array, Indices
 
 ROUNDING: Final = 1e-14
-"""Entries below this fraction of the largest of their block are products of rounding: left out of fixed matrices."""
+"""Entries below this fraction of the largest of their block are rounding errors: dropped from constant matrices."""
 STEPS_OF_ONE_INPUT: Final = 10
-"""M for one input; for more it falls with the root of their number.  Of stages of 1 to 25 steps, the resulting five of
-four rotors are the fastest for the paper's case."""
+"""M for one input; for more inputs, M falls with the square root of their number. The resulting five steps for four
+rotors were the fastest of 1 to 25 in the paper's case."""
 
 
 class Pattern:
-    """A sparse matrix assembled from blocks (..., rows, columns) that keep their positions.
+    """A sparse matrix assembled from blocks (..., rows, columns) at fixed positions.
 
-    These are the rows (..., rows) and the columns (..., columns) of each block.  What is zero in the first blocks, or
-    below the share `rounding` of the largest of its block's row and of its block's column, is left out permanently.
+    `rows` (..., rows) and `columns` (..., columns) are the positions of each block. Entries that are zero in the first
+    blocks, or below the share `rounding` of the largest entry of their block's row and of its column, are dropped
+    permanently.
     """
 
     def __init__(
@@ -59,13 +60,13 @@ class Pattern:
         self._shape = shape
 
     def matrix(self, blocks: list[Array]) -> csc_matrix:
-        """The matrix with these blocks, its zeros stored."""
+        """Return the matrix with these blocks; zeros inside its pattern stay stored."""
         data = np.concatenate([block.ravel() for block in blocks])[self._order]
         return csc_matrix((data, self._rows, self._starts), shape=self._shape)
 
 
 def _present(block: Array, rounding: float) -> NDArray[np.bool_]:
-    """Which entries (..., rows, columns) of a block are not zero."""
+    """Return which entries (..., rows, columns) of a block are not zero."""
     size = np.abs(block)
     if not rounding or not size.size:
         return size > 0.0
@@ -74,7 +75,7 @@ def _present(block: Array, rounding: float) -> NDArray[np.bool_]:
 
 
 class Layout:
-    """Where everything is among the variables, for N steps of n states, nu inputs and n_s slacks, M in a stage.
+    """Positions of the variables, for N steps of n states, nu inputs and n_s slacks, M steps per stage.
 
     Attributes:
         N, n, nu, L, M: horizon, states, inputs, steps in the first stage and in each other.
@@ -84,8 +85,8 @@ class Layout:
         inputs: (N, nu) in time order.
         slacks: (N, n_s) in time order; n_s = 0 where bounds are hard.
         ends: (J, n) equality rows.
-        lasts, firsts: (J - 1, nu) the last inputs of each stage but the last, and the first of the one after it.
-        size: of all.
+        lasts, firsts: (J - 1, nu) the last inputs of each stage but the last, and the first inputs of the next.
+        size: number of variables.
     """
 
     def __init__(self, N: int, n: int, nu: int, n_s: int, M: int) -> None:
@@ -109,22 +110,22 @@ class Layout:
 
 @dataclass(frozen=True, kw_only=True)
 class Matrices:
-    """What the A_i and B_i of a horizon make of the QP; to be used for as many periods as these hold."""
+    """The parts of the QP that depend on the A_i and B_i of a horizon; valid for as many periods as these are."""
 
     A: Array  # (N, n, n), A_i
     B: Array  # (N, n, nu), B_i
-    head: Array  # (1, L + 1, n, L nu) slopes of the states of the first stage by v_0
-    tail: Array  # (J - 1, M + 1, n, n + M nu) those of the others by [s_j, v_j]
+    head: Array  # (1, L + 1, n, L nu) slopes of the first stage's states in v_0
+    tail: Array  # (J - 1, M + 1, n, n + M nu) slopes of the other stages' states in [s_j, v_j]
     P: csc_matrix  # cost
     dynamics: csc_matrix  # equality rows
     G: csc_matrix  # inequality rows
-    rows: QPRows  # what these are
+    rows: QPRows  # the rows of G
 
 
 def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
-    """(J, L + 1, n, m + 1) states of J stages of L steps, as functions of the variables, the inputs the last, and of 1.
+    """(J, L + 1, n, m + 1) states of J stages of L steps, as functions of the variables (inputs last) and of 1.
 
-    From the first of them (J, n, m + 1) by A (J, L, n, n), B (J, L, n, nu) and c (J, L, n).
+    They start from (J, n, m + 1) and follow A (J, L, n, n), B (J, L, n, nu) and c (J, L, n).
     """
     (count, steps, n, nu), columns = B.shape, start.shape[2]
     states = np.empty((count, steps + 1, n, columns))
@@ -138,20 +139,20 @@ def condense_stages(start: Array, A: Array, B: Array, c: Array) -> Array:
 
 
 def condense(at: Layout, start: Array, free: Array, *steps: Array) -> tuple[Array, Array]:
-    """The first stage from `start` and the others from `free` on; see `condense_stages`."""
+    """Return the states of the first stage, from `start`, and of the others, from `free`; see `condense_stages`."""
     head = condense_stages(start, *(part[None, : at.L] for part in steps))
     return head, condense_stages(free, *(part[at.L :].reshape(len(free), at.M, *part.shape[1:]) for part in steps))
 
 
 class PartiallyCondensed:
-    """The partially condensed QP of a problem; `qp` is that for xi(k) and y_d zero and u(k-1) = u_bar.
+    """The partially condensed QP of a problem; `qp` is the QP for xi(k) = 0, y_d = 0 and u(k-1) = u_bar.
 
     Args:
-        problem: with constraints.
-        steps_per_stage: M; None for what suits the inputs.  The first stage, which has no state among its variables,
-            takes what is left of the horizon, and where M > 1 as many more steps as there is room for in blocks of the
-            others' size.
-        changing: whether the model's matrices will be others; then no entry is left out that might be needed.
+        problem: a problem with constraints.
+        steps_per_stage: M; None for a choice by the number of inputs.  The first stage has no state among its
+            variables: it takes the remainder of the horizon and, if M > 1, as many further steps as fit into blocks of
+            the others' size.
+        changing: whether the model's matrices will change; then no entry that might be needed is dropped.
     """
 
     def __init__(self, problem: Problem, *, steps_per_stage: int | None = None, changing: bool = False) -> None:
@@ -166,7 +167,7 @@ class PartiallyCondensed:
         self._input_costs = {steps: self._input_cost(steps) for steps in (at.L, at.M)}
         A, B = (np.broadcast_to(part, (N, *part.shape)) for part in (model.A, model.B))
         fixed = A, B
-        if changing:  # of numbers in general position an entry is zero only where it always is
+        if changing:  # for matrices in general position, an entry is zero only where it always is
             rng = np.random.default_rng(0)
             A, B = (rng.normal(size=(N, at.n, width)) for width in (at.n, at.nu))
         rounding = 0.0 if changing else ROUNDING
@@ -196,10 +197,10 @@ class PartiallyCondensed:
         self._x_l[at.inputs], self._x_u[at.inputs] = self._rows.u_min, self._rows.u_max
         self._x_l[at.slacks] = 0.0
         nothing = np.zeros((N, len(problem.objective.C_r)))
-        self.qp = self.pose(Query(np.zeros(model.n), nothing, model.u_bar)).qp
+        self.qp = self.assemble(Query(np.zeros(model.n), nothing, model.u_bar)).qp
 
     def _built(self, A: Array, B: Array) -> Matrices:
-        """The matrices of A (N, n, n), B (N, n, nu)."""
+        """Return the matrices for A (N, n, n), B (N, n, nu)."""
         head, tail = self._slopes(A, B)
         return Matrices(
             A=A,
@@ -213,7 +214,7 @@ class PartiallyCondensed:
         )
 
     def _slopes(self, A: Array, B: Array) -> tuple[Array, Array]:
-        """`head` and `tail` of `Matrices`."""
+        """Return `head` and `tail` of `Matrices`."""
         at = self._at
         start = np.zeros((1, at.n, at.head.size + 1))
         free = np.zeros((len(at.tail), at.n, at.tail.shape[1] + 1))
@@ -222,7 +223,7 @@ class PartiallyCondensed:
         return head[..., :-1], tail[..., :-1]
 
     def _costs(self, head: Array, tail: Array) -> list[Array]:
-        """P's blocks."""
+        """Return P's blocks."""
         at = self._at
         blocks = [self._stage_cost(head, at.L), self._stage_cost(tail, at.M)]
         (blocks[1] if len(tail) else blocks[0])[-1, -at.nu :, -at.nu :] -= self._move_weight  # none follows the last
@@ -230,7 +231,7 @@ class PartiallyCondensed:
         return [*blocks, 2.0 * self._Q_end, self._slack_weight, across, across.transpose(0, 2, 1)]
 
     def _stage_cost(self, slopes: Array, steps: int) -> Array:
-        """Hessian (J, m, m) of stages' cost, the end state's left out."""
+        """Hessian (J, m, m) of the stages' cost, without that of the end state."""
         inner = slopes[:, :-1].reshape(len(slopes), steps * self._at.n, slopes.shape[3])
         weighted = (2.0 * self._Q @ slopes[:, :-1]).reshape(inner.shape)
         hessian = inner.transpose(0, 2, 1) @ weighted
@@ -240,24 +241,24 @@ class PartiallyCondensed:
         return np.asarray(hessian)
 
     def _input_cost(self, steps: int) -> Array:
-        """Hessian of the cost of a stage's inputs, of changes both from the stage before and to the one after."""
+        """Hessian of the cost of a stage's inputs, with their changes from the previous and to the next stage."""
         beside = np.eye(steps, k=1) + np.eye(steps, k=-1)
         itself = np.kron(np.eye(steps), self._input_weight + 2.0 * self._move_weight)
         return np.asarray(itself - np.kron(beside, self._move_weight))
 
     def _dynamics(self, head: Array, tail: Array) -> list[Array]:
-        """The equality rows' blocks: each stage's end is the next one's start."""
+        """Return the equality rows' blocks: the end of each stage is the start of the next."""
         starts = np.broadcast_to(np.eye(self._at.n), (len(self._at.starts), self._at.n, self._at.n))
         return [-head[:, -1], -tail[:, -1], starts]
 
     def _inequalities(self, head: Array, tail: Array, rows: QPRows) -> list[Array]:
-        """G's blocks."""
+        """Return G's blocks."""
         at, later, now = self._at, self._later, self._now
         slack = np.broadcast_to(rows.slack, (at.N, *rows.slack.shape))
         before = np.broadcast_to(-rows.E[now], (len(at.lasts), now.size, at.nu))
         C = rows.C[..., later, :]
         first, middle, last, of_inputs = C, C, C, rows.C[..., now, :]
-        if C.ndim == 3:  # of states alone, which hold at the next step: the others are the same at all steps
+        if C.ndim == 3:  # rows on states alone hold at the next step; the others are the same at all steps
             first, middle, last = C[: at.L - 1], C[at.L - 1 : -1].reshape(len(tail), at.M, *C.shape[1:]), C[-1]
             of_inputs = of_inputs[0]
         return [
@@ -271,7 +272,7 @@ class PartiallyCondensed:
         ]
 
     def _inputs_too(self, of_states: Array, steps: int) -> Array:
-        """Rows (J, steps, k, m) of states with their own inputs and, but for the first, those before added."""
+        """Return state rows (J, steps, k, m) with the terms of their inputs and, but in the first, of those before."""
         rows, now, nu = self._rows, self._now, self._at.nu
         by_step = of_states[..., of_states.shape[-1] - steps * nu :].reshape(*of_states.shape[:3], steps, nu)
         for t in range(steps):
@@ -281,8 +282,8 @@ class PartiallyCondensed:
         of_states[..., of_states.shape[-1] - steps * nu :] = by_step.reshape(*of_states.shape[:3], steps * nu)
         return of_states
 
-    def pose(self, query: Query, problem: Problem | None = None) -> Posed:
-        """The QP of a period; `problem` differs in numbers of its constraints' rows alone."""
+    def assemble(self, query: Query, problem: Problem | None = None) -> PeriodQP:
+        """Return the QP of a period; `problem` may differ in the numbers of its constraints' rows."""
         rest = query.equilibrium or self._problem.equilibrium
         if query.steps is None:
             A, B = self._problem.model.A, self._problem.model.B
@@ -299,15 +300,15 @@ class PartiallyCondensed:
         at, rows, objective = self._at, matrices.rows, self._problem.objective
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))
         (Q, W), (Q_end, W_end) = objective.weights, objective.terminal_weights
-        # Entry i is for x(k+i), i = 0 .. N-1; x(k) itself is past changing, and its slopes are zero.
-        wanted = np.concatenate([np.zeros((1, at.n)), desired[:-1] @ W.T])
+        # Entry i is for x(k+i), i = 0 .. N-1; x(k) itself is fixed, and its slopes are zero.
+        desired_linear = np.concatenate([np.zeros((1, at.n)), desired[:-1] @ W.T])
         known = np.concatenate([head[0, :-1], tail[:, :-1].reshape(-1, at.n)])
-        pull = 2.0 * (known @ Q - wanted)
+        pull = 2.0 * (known @ Q - desired_linear)
         gradient = self._linear.copy()
         gradient[at.head] = np.tensordot(matrices.head[0, :-1], pull[: at.L], ([0, 1], [0, 1]))
         later = pull[at.L :].reshape(len(at.tail), at.M, at.n)
         gradient[at.tail] = np.einsum("jtnm,jtn->jm", matrices.tail[:, :-1], later)
-        # The last state's target, C_r^+ (y_d - C_r x_s) from x_s; where Q_y weighs it, x_s has no part in it.
+        # The last state's target is C_r^+ (y_d - C_r x_s) from x_s; if Q_y weighs it, x_s drops out.
         gradient[at.starts[-1]] = -2.0 * (W_end @ (desired[-1] - objective.C_r @ rest.x) + Q_end @ rest.x)
         gradient[at.inputs] -= rest.u @ (2.0 * objective.Q_u)
         gradient[at.inputs[0]] -= 2.0 * objective.move_weight @ u_before
@@ -329,18 +330,18 @@ class PartiallyCondensed:
             x_l=self._x_l,
             x_u=self._x_u,
         )
-        return Posed(qp, partial(self._states, matrices, c, state))
+        return PeriodQP(qp, partial(self._states, matrices, c, state))
 
     def inputs(self, x: Array) -> Array:
-        """(N, nu) the planned inputs [rad/s] in a primal point."""
+        """Return (N, nu) the planned inputs [rad/s] of a primal point."""
         return x[self._at.inputs]
 
     def slacks(self, x: Array) -> Array:
-        """(N, m_s) the slacks in a primal point."""
+        """Return (N, m_s) the slacks of a primal point."""
         return x[self._at.slacks]
 
     def _states(self, matrices: Matrices, c: Array, state: Array, x: Array) -> Array:
-        """(N, n) the predicted states in a primal point."""
+        """Return (N, n) the predicted states of a primal point."""
         at = self._at
         head, tail = (part[..., 0] for part in self._offsets(matrices, c, state))
         first = (matrices.head @ x[at.head] + head)[0, 1:-1]
@@ -348,10 +349,10 @@ class PartiallyCondensed:
         return np.concatenate([first, later.reshape(-1, at.n), x[at.starts[-1:]]])
 
     def multipliers(self, solution: Solution) -> Array:
-        """(N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
+        """Return (N, m) the multipliers of the problem's rows (`mpc.constraints.Rows`), signed as in `Solution`."""
         return self._rows.multipliers(solution.z, solution.z_box[self._at.inputs].ravel())
 
     def _offsets(self, matrices: Matrices, c: Array, state: Array) -> tuple[Array, Array]:
-        """(1, L + 1, n, 1) and (J - 1, M + 1, n, 1): the states of all stages where v_j and s_1 .. s_J are zero."""
+        """(1, L + 1, n, 1) and (J - 1, M + 1, n, 1): the states of all stages for v_j = 0 and s_1 .. s_J = 0."""
         zero = np.zeros((len(self._at.tail), self._at.n, 1))
         return condense(self._at, state[None, :, None], zero, matrices.A, matrices.B[:, :, :0], c)

@@ -1,4 +1,4 @@
-"""A quadratic program as a value, a solution as a value, and what makes one the other's: the KKT residuals."""
+"""A quadratic program and its solution as values, and the KKT residuals that relate them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from quadsim.state import Array
 Matrix: TypeAlias = Array | csc_matrix
 
 KKT_EVERY: Final = 20
-"""Periods from one whose KKT residuals are computed in flight to the next."""
+"""Default interval, in periods, at which KKT residuals are computed in flight."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,11 +39,11 @@ class QP:
 
 
 class QPRows:
-    """A problem's rows as a QP has them: bounds of single inputs in the box, a soft row as one or two with its slack.
+    """A problem's rows in a QP: bounds on single inputs go to the box; a soft row becomes one or two rows with a slack.
 
     Attributes:
-        C, D, E: (K, n), or (N, K, n) where the steps' rows differ, (K, nu), (K, nu).
-        slack: (K, m_s) how slacks enter.
+        C, D, E: (K, n), or (N, K, n) if rows differ from step to step, (K, nu), (K, nu).
+        slack: (K, m_s) slack coefficients.
         lower, upper: (N, K).
         of_states: (K,) see `mpc.constraints.Rows`.
         u_min, u_max: (N, nu) the box.
@@ -67,25 +67,25 @@ class QPRows:
         for row, j in zip(self._boxed, rows.input[self._boxed], strict=True):
             self.u_min[:, j] = np.maximum(self.u_min[:, j], rows.lower[:, row])
             self.u_max[:, j] = np.minimum(self.u_max[:, j], rows.upper[:, row])
-        # (N, K) bounds that rows of one side set to their multipliers, and (m, nu) which input a row bounds
+        # (N, K) limits of multipliers, for one-sided rows, and (m, nu) which input a row bounds
         self._least = np.where(np.isneginf(self.lower), 0.0, -np.inf)
         self._most = np.where(np.isposinf(self.upper), 0.0, np.inf)
         self._of_box = np.zeros((len(rows.D), problem.model.nu))
         self._of_box[self._boxed, rows.input[self._boxed]] = 1.0
 
     def multipliers(self, z: Array, z_inputs: Array) -> Array:
-        """(N, m) multipliers of the problem's rows, from those of the QP's rows (N K,) and of inputs (N nu,)."""
+        """(N, m) multipliers of the problem's rows, from those of the QP's rows (N K,) and inputs (N nu,)."""
         N = len(self.lower)
         multipliers = np.zeros((N, len(self._whole.D)))
         for column, row in zip(z.reshape(N, -1).T, self._origin, strict=True):
             multipliers[:, row] += column
         left = z_inputs.reshape(N, -1).copy()
-        for row in self._boxed:  # of several at the same bound, the first has it all
+        for row in self._boxed:  # the first of several rows at the same bound takes the whole multiplier
             j = self._whole.input[row]
             upper, lower = self._whole.upper[:, row] == self.u_max[:, j], self._whole.lower[:, row] == self.u_min[:, j]
-            held = np.where(left[:, j] > 0.0, upper, lower)
-            multipliers[held, row] = left[held, j]
-            left[held, j] = 0.0
+            active_side = np.where(left[:, j] > 0.0, upper, lower)
+            multipliers[active_side, row] = left[active_side, j]
+            left[active_side, j] = 0.0
         return multipliers
 
     def split(self, multipliers: Array) -> tuple[Array, Array]:
@@ -95,45 +95,45 @@ class QPRows:
 
 
 class Solution(NamedTuple):
-    """A primal point of a QP with its multipliers, and how it was found; arrays are no solver's own."""
+    """A primal point of a QP with its multipliers and solver statistics; the arrays are copies."""
 
     x: Array
     y: Array  # multipliers of A x = b
     z: Array  # multipliers of h_l <= G x <= h_u, positive at the upper side, negative at the lower
-    z_box: Array  # multipliers of x_l <= x <= x_u, signed likewise
-    status: str = SOLVED  # `solved`, or the solver's name for what went wrong
+    z_box: Array  # multipliers of x_l <= x <= x_u, with the same signs
+    status: str = SOLVED  # `solved`, or the solver's name for the failure
     iterations: int = 0
     active: int = 0  # inequality rows and box entries active at the point
-    reported_primal: float = math.nan  # residual as the solver reports it; NaN where none is reported
-    reported_dual: float = math.nan  # likewise
+    reported_primal: float = math.nan  # residual reported by the solver; NaN if it reports none
+    reported_dual: float = math.nan  # same
     solve_s: float = 0.0  # wall time inside the solver, updates included [s]
 
 
-class Posed(NamedTuple):
+class PeriodQP(NamedTuple):
     """The QP of one period."""
 
     qp: QP
-    states: Callable[[Array], Array]  # takes a primal point to the predicted states (N, n)
+    states: Callable[[Array], Array]  # maps a primal point to the predicted states (N, n)
 
 
 class Backend(Protocol):
     """A QP solver."""
 
     def setup(self, qp: QP) -> None:
-        """Prepare for QPs of these matrices, or at least of their pattern."""
+        """Prepare for QPs with these matrices, or at least with their pattern."""
 
     def solve(self, qp: QP) -> Solution:
-        """Solve; whatever happens is in the solution's status."""
+        """Solve; failures are reported in the solution's status."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class KKTResiduals:
-    """How far a point is from optimal, each as the largest absolute entry; all zero at the optimum."""
+    """Distance of a point from optimality, each as the largest absolute entry; all zero at the optimum."""
 
     stationarity: float  # P x + c + A' y + G' z + z_box
     primal: float  # violation of A x = b, h_l <= G x <= h_u, x_l <= x <= x_u
-    complementarity: float  # multiplier times distance to the bound it belongs to
-    dual: float  # size of multipliers with no bound to belong to (an infinite one)
+    complementarity: float  # multiplier times distance to its bound
+    dual: float  # multipliers at infinite bounds
 
     @property
     def worst(self) -> float:
@@ -142,7 +142,7 @@ class KKTResiduals:
 
 
 def kkt_residuals(qp: QP, solution: Solution) -> KKTResiduals:
-    """The KKT residuals of a solution, computed from the QP alone and believing no solver."""
+    """Compute the KKT residuals of a solution from the QP alone, independent of the solver."""
     x, y, z, z_box = solution[:4]
     gradient = qp.P @ x + qp.c + qp.A.T @ y + qp.G.T @ z + z_box
     values = np.concatenate([qp.G @ x, x])

@@ -31,19 +31,19 @@ class SequenceGains:
 
     K: Array  # (N nu, n)
     G: Array  # (N nu, N n_r)
-    L: Array  # (N nu, nu), in the first rows the identity, once F3 has its sign and the linearisation its offset
+    L: Array  # (N nu, nu); identity in the first rows, with F3's corrected sign and the linearisation's offset
 
 
 def sequence_gains(problem: Problem) -> SequenceGains:
     """Solve Eq. (21) for the optimal sequence; bounds of the problem are ignored."""
     terms = condensed_cost(problem, prediction(problem.model, problem.horizon))
     factor = scipy.linalg.cho_factor(terms.H)
-    # Of the paper's problem -(F3 + F4): what an input held at u_bar throughout costs.
-    held = terms.H @ np.tile(np.eye(problem.model.nu), (problem.horizon, 1))
+    # For the paper's problem, -(F3 + F4): the cost of an input held at u_bar.
+    cost_of_u_bar = terms.H @ np.tile(np.eye(problem.model.nu), (problem.horizon, 1))
     return SequenceGains(
         K=-scipy.linalg.cho_solve(factor, terms.F_x),
         G=-scipy.linalg.cho_solve(factor, terms.F_y),
-        L=scipy.linalg.cho_solve(factor, held),
+        L=scipy.linalg.cho_solve(factor, cost_of_u_bar),
     )
 
 
@@ -59,7 +59,7 @@ class UnconstrainedMPC:
         self._offset = self.gains.L @ problem.model.u_bar
 
     def reset(self, speeds: Array) -> None:
-        """Nothing to forget: the law has no memory."""
+        """Do nothing: the law has no memory."""
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Evaluate Eq. (22), rotors off while landed; see `quadsim.controller.Controller.step`."""

@@ -77,5 +77,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The public names, imported or not."""
-    return sorted({*globals(), *_PUBLIC})
+    """The public names, imported or not, and the module's own."""
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]

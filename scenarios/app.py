@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
     from scenarios.assembly import Assembly
-    from scenarios.campaign.campaign import CampaignResult, Replay, Sweep
+    from scenarios.campaign.campaign import CampaignResult, Replay
     from scenarios.campaign.paired import PairedComparison
+    from scenarios.campaign.sweep import Sweep
     from scenarios.catalogue import Catalogue
     from scenarios.design.vehicle_report import VehicleReport
     from scenarios.flight import Flight
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
     ScenarioName: TypeAlias = Scenario | File
     CampaignName: TypeAlias = ScenarioName
     Target: TypeAlias = Flight | ScenarioName
-    Changes: TypeAlias = Mapping[str, Any] | Sequence[str]
+    Changes: TypeAlias = Mapping[Any, Any] | Sequence[str]
     Whole = int
     Flag = bool
     UserCode = object
@@ -648,7 +649,7 @@ def live(
 
 def sweep(
     scenario: ScenarioName,
-    values: Mapping[str, Sequence[Any]],
+    values: Mapping[Any, Sequence[Any]],
     *,
     controller: object = None,
     forces: Sequence[object] = (),
@@ -659,14 +660,15 @@ def sweep(
 
     Args:
         scenario: what is flown, or its name or file.
-        values: what to try, by dotted path.
+        values: what to try, by dotted path; a tuple of paths varies together, with one value for all of them or a tuple
+            of one for each.
         controller: as of `fly`; a class or a function of a module that other processes can import.
         forces: what acts on it, as of `fly`; the same.
         workers: processes that fly; one per usable core where absent.
         progress: whether to show a bar on a terminal.
 
     Returns:
-        A row per flight, in the order of the combinations, the last field varying fastest.
+        A table with a row per flight, in the order of the combinations, the last field varying fastest.
 
     Raises:
         InputError: a value is not allowed, or the controller cannot be sent to other processes.
@@ -677,8 +679,12 @@ def sweep(
         >>> found = quadsim.sweep(scenario, {"controller.horizon": [20, 40]}, workers=1)
         >>> found["controller.horizon"].tolist(), found["verdict"].tolist()
         ([20.0, 40.0], ['satisfied', 'satisfied'])
+        >>> both = ("controller.output_bounds.roll", "controller.output_bounds.pitch")
+        >>> tilt = quadsim.sweep(scenario, {both: [[-2.0, 2.0], [-5.0, 5.0]]}, workers=1)
+        >>> tilt["controller.output_bounds.pitch.1"].tolist(), tilt["margin.roll"].round(3).tolist()
+        ([2.0, 5.0], [2.0, 5.0])
     """
-    from scenarios.campaign.campaign import fly_sweep
+    from scenarios.campaign.sweep import fly_sweep
     from scenarios.loading import load_scenario
     from scenarios.progress import reporting
     from scenarios.user_code import importable

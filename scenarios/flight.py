@@ -36,7 +36,7 @@ from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
-from scenarios.schema.scenario import Scenario, Verdict
+from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import leaves
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
     from mpc.ocp import InfeasiblePeriod
     from scenarios.assembly import Assembly
+    from scenarios.schema.scenario import Verdict  # only here: Jedi completes no object with a property of a Literal
 
 _LONGEST: Final = 500  # characters of why a product failed
 _log: Final = logging.getLogger("quadsim")
@@ -67,7 +68,7 @@ class Flight(Result):
         tallies: what became of each sensor's samples in the estimator; empty without one.
         directory: where it was read from or written to; None where it is in memory alone.
         recorded: `summary.json` of one that was read; None for one that was flown.
-        unanswered: the first period whose QP had no answer; None where all had, there is no QP, or it was read.
+        infeasible_period: the first period whose QP had no answer; None where all had, there is no QP, or it was read.
 
     Examples:
         >>> import quadsim
@@ -87,7 +88,7 @@ class Flight(Result):
     tallies: Mapping[SensorName, Tally] = field(repr=False)
     directory: Path | None = None
     recorded: Mapping[str, Any] | None = field(default=None, repr=False)
-    unanswered: InfeasiblePeriod | None = field(default=None, repr=False)
+    infeasible_period: InfeasiblePeriod | None = field(default=None, repr=False)
 
     @property
     def scenario(self) -> Scenario:
@@ -148,13 +149,13 @@ class Flight(Result):
         """
         if self.recorded is not None:
             return self.recorded.get("diagnosis")
-        if self.unanswered is None or (self.unanswered.status == NOT_CONVERGED and self.satisfied):
+        if self.infeasible_period is None or (self.infeasible_period.status == NOT_CONVERGED and self.satisfied):
             return None
         from scenarios.infeasibility import diagnose
 
-        spec = self.scenario.controller_at(self.unanswered.time)
+        spec = self.scenario.controller_at(self.infeasible_period.time)
         posed = self.scenario.altered(controller=spec, events=())
-        return diagnose(self.unanswered, posed, self.vehicle)
+        return diagnose(self.infeasible_period, posed, self.vehicle)
 
     @property
     def audit(self) -> tuple[Finding, ...]:
@@ -266,8 +267,8 @@ class Flight(Result):
         """Draw signals over time with their references and bounds, one panel each.
 
         Args:
-            signals: names that constraints can have, as `x`, `tilt`, `speed`; position and attitude where none is
-                given.
+            signals: names that constraints can have, as `x`, `tilt`, `speed`, and `xy` for the path from above;
+                position and attitude where none is given.
 
         Returns:
             The matplotlib axes, top to bottom; `axes[0].figure` is the figure, which is pyplot's.
@@ -279,8 +280,8 @@ class Flight(Result):
         from quadsim.report.to_matplotlib import draw
 
         for name in signals:
-            if name not in SIGNALS:
-                raise UnknownNameError("signal", name, SIGNALS)
+            if name not in (*SIGNALS, "xy"):
+                raise UnknownNameError("signal", name, (*SIGNALS, "xy"))
         figure = draw_signals(self.run, signals or ("x", "y", "z", "roll", "pitch", "yaw"))
         return draw(figure, interactive=True).axes
 

@@ -68,7 +68,7 @@ class FlightEvents:
 
     Attributes:
         assembly: of what is flown, with the events that were applied.
-        unanswered: the first period whose QP had no answer, of the controllers before the one that flies now.
+        infeasible_period: the first period whose QP had no answer, of the controllers before the one that flies now.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class FlightEvents:
         self._plant, self._navigation, self._reference, self._loop = plant, navigation, reference, loop
         self._build = build
         self._recent: list[Event] = [*scenario.events]  # those that the plant may still have to do with, and others
-        self.unanswered: InfeasiblePeriod | None = None
+        self.infeasible_period: InfeasiblePeriod | None = None
         self._due: list[tuple[int, float, SetpointEvent | ControllerEvent, Successor | None]] = []
         for event in scenario.events:
             self._schedule(event)
@@ -196,14 +196,18 @@ class FlightEvents:
             else:
                 self._switch(changed(self._spec, event.fields), ready)
 
-    def first_unanswered(self) -> InfeasiblePeriod | None:
+    def first_infeasible_period(self) -> InfeasiblePeriod | None:
         """Of all controllers so far: the first QP without an answer, or else the first SQP that did not converge."""
-        periods = [period for period in (self.unanswered, unanswered_by(self._loop.controller)) if period is not None]
+        periods = [
+            period
+            for period in (self.infeasible_period, infeasible_period_of(self._loop.controller))
+            if period is not None
+        ]
         return min(periods, key=lambda period: period.converges is not None, default=None)
 
     def _switch(self, spec: AnyController, ready: Successor | None) -> None:
         successor = ready if ready is not None and ready.spec == spec else self._built(spec)
-        self.unanswered = self.first_unanswered()
+        self.infeasible_period = self.first_infeasible_period()
         self._loop.switch(successor.controller)
         self._spec = spec
         self._loop.computation = self.assembly.computation(spec)
@@ -225,9 +229,9 @@ class FlightEvents:
         return Successor(spec=spec, controller=self._build(spec))
 
 
-def unanswered_by(controller: Controller) -> InfeasiblePeriod | None:
+def infeasible_period_of(controller: Controller) -> InfeasiblePeriod | None:
     """The first period whose QP had no answer; None where all had, or there is none."""
-    period = getattr(controller, "unanswered", None)  # a controller of another kind has none
+    period = getattr(controller, "infeasible_period", None)  # a controller of another kind has none
     return period if isinstance(period, InfeasiblePeriod) else None
 
 

@@ -54,22 +54,24 @@ class _Bound:
     field: str = ""  # of the file, a list of numbers
 
 
-def diagnose(unanswered: InfeasiblePeriod, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:
+def diagnose(infeasible_period: InfeasiblePeriod, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:
     """`diagnosis` of a flight's summary.
 
     Where the controller is one's own, its bounds are not a scenario file's: they are named by the problem, and the
     advice is by how much one of them alone would have to be wider.
     """
-    if unanswered.converges is not None:
-        return _unconverged(unanswered, unanswered.converges, getattr(scenario.controller, "iterations", 1))
+    if infeasible_period.converges is not None:
+        return _unconverged(
+            infeasible_period, infeasible_period.converges, getattr(scenario.controller, "iterations", 1)
+        )
     spec = scenario.controller
-    case = (_Case if isinstance(spec, Bounded) else _OwnCase)(unanswered, scenario, spec, vehicle)
-    conflict = find_conflict(unanswered)
+    case = (_Case if isinstance(spec, Bounded) else _OwnCase)(infeasible_period, scenario, spec, vehicle)
+    conflict = find_conflict(infeasible_period)
     entries = [] if conflict is None else _merged([*case.entries(conflict)])
     suggestions = [] if conflict is None or conflict.feasible else [*case.suggestions(conflict)]
     report = {
-        "time": round(unanswered.time, 9),
-        "status": unanswered.status,
+        "time": round(infeasible_period.time, 9),
+        "status": infeasible_period.status,
         "feasible": None if conflict is None else conflict.feasible,
         "conflict": entries,
         "suggestions": suggestions,
@@ -78,20 +80,20 @@ def diagnose(unanswered: InfeasiblePeriod, scenario: Scenario, vehicle: Vehicle)
     return {**report, "sentence": _sentence(report), "advice": advice}
 
 
-def _unconverged(unanswered: InfeasiblePeriod, converges: Callable[[int], bool], before: int) -> dict[str, Any]:
+def _unconverged(infeasible_period: InfeasiblePeriod, converges: Callable[[int], bool], before: int) -> dict[str, Any]:
     """`diagnose` where the QPs were solved, and sequential quadratic programming did not converge."""
     enough = next((count for count in ITERATIONS if count > before and converges(count)), None)
     suggestions = [] if enough is None else [{"settings": {"controller.iterations": enough}, "after": None}]
     more = f"to try: controller.iterations = {enough}, which takes up to {enough} times as long"
     advice = f"it does not within {ITERATIONS[-1]} iterations either" if enough is None else more
     return {
-        "time": round(unanswered.time, 9),
-        "status": unanswered.status,
+        "time": round(infeasible_period.time, 9),
+        "status": infeasible_period.status,
         "feasible": True,
         "conflict": [],
         "suggestions": suggestions,
-        "sentence": f"the QP was solved at t = {unanswered.time:.2f} s, but the SQP did not converge: the plan does "
-        "not follow the nonlinear dynamics",
+        "sentence": f"the QP was solved at t = {infeasible_period.time:.2f} s, but the SQP did not converge: "
+        "the plan does not follow the nonlinear dynamics",
         "advice": advice,
     }
 
@@ -99,8 +101,8 @@ def _unconverged(unanswered: InfeasiblePeriod, converges: Callable[[int], bool],
 class _Case:
     """One period's problem and the file that it is of."""
 
-    def __init__(self, unanswered: InfeasiblePeriod, scenario: Scenario, spec: Any, vehicle: Vehicle) -> None:
-        self._unanswered, self._spec, self._vehicle = unanswered, spec, vehicle
+    def __init__(self, infeasible_period: InfeasiblePeriod, scenario: Scenario, spec: Any, vehicle: Vehicle) -> None:
+        self._infeasible_period, self._spec, self._vehicle = infeasible_period, spec, vehicle
         self._period, self._file = scenario.control_period, scenario.to_toml()
 
     def bound(self, side: Side) -> _Bound:
@@ -114,7 +116,7 @@ class _Case:
             name = [state for state in STATE_NAMES if state in self._spec.output_bounds][side.row]
             factor, field = math.degrees(1.0) if name in IN_DEGREES else 1.0, f"controller.output_bounds.{name}"
             return _Bound(name=name, side=which, unit=TERMS[name].unit, factor=factor, field=field, entry=entry)
-        polytope, name = self._polytope(side), self._unanswered.problem.every_constraint[side.place].name
+        polytope, name = self._polytope(side), self._infeasible_period.problem.every_constraint[side.place].name
         if self._is_space(side):
             return _Bound(name=name, side=which, unit="m", entry=side.row)
         if polytope is None:  # of a kind that this module has no words for
@@ -125,17 +127,17 @@ class _Case:
         return _Bound(name=name, side=which, unit=unit, field=field, entry=side.row)
 
     def _polytope(self, side: Side) -> Polytope | None:
-        name = self._unanswered.problem.every_constraint[side.place].name
+        name = self._infeasible_period.problem.every_constraint[side.place].name
         return next((polytope for polytope in self._spec.polytopes if polytope.name == name), None)
 
     def _is_space(self, side: Side) -> bool:
         """Whether it is a half-space of an obstacle or region."""
-        C = self._unanswered.problem.every_constraint[side.place].C
+        C = self._infeasible_period.problem.every_constraint[side.place].C
         return C is not None and C.ndim == 3
 
     def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """What is violated, the largest share first, and what blocks it, each with its times and amount."""
-        delay, period = self._unanswered.delay, self._period
+        delay, period = self._infeasible_period.delay, self._period
         for side, violation in sorted(conflict.violated.items(), key=lambda item: -item[1].share):
             bound = self.bound(side)
             first, last = (round(delay + steps * period, 9) for steps in (violation.first, violation.last))
@@ -152,7 +154,7 @@ class _Case:
             if field and (side in conflict.violated or field not in giving):
                 rotors = range(N_ROTORS) if side.place in _ROTORS else (side.row,)
                 fields.setdefault(field, set()).update(side._replace(row=row) for row in rotors)
-        least = {field: smallest_widening(self._unanswered, sides) for field, sides in fields.items()}
+        least = {field: smallest_widening(self._infeasible_period, sides) for field, sides in fields.items()}
         changes = [{field: (fields[field], amount)} for field, amount in least.items() if amount is not None]
         alone = [settings for change in changes if (settings := self._widened(change))]
         if not alone:
@@ -206,10 +208,12 @@ class _Case:
             problem = spec.problem(self._vehicle, self._period)
         except InputError:
             return False
-        space = tuple(part for part in self._unanswered.problem.constraints if part.C is not None and part.C.ndim == 3)
+        space = tuple(
+            part for part in self._infeasible_period.problem.constraints if part.C is not None and part.C.ndim == 3
+        )
         if spec.avoidance is not None and (soft := spec.avoidance.soft) is not None:
             space = tuple(replace(part, penalty=soft.penalty(part.lower.shape[1])) for part in space)
-        return has_answer(replace(problem, constraints=(*problem.constraints, *space)), self._unanswered.query)
+        return has_answer(replace(problem, constraints=(*problem.constraints, *space)), self._infeasible_period.query)
 
     def _changed(self, settings: Settings) -> Constrained | Robust | None:
         """The controller with other fields; None where the file would be refused."""
@@ -232,7 +236,7 @@ class _Case:
         if fallback is not None and fallback.enabled:
             return
         settings: Settings = {"controller.fallback": {}}
-        changed, query = self._changed(settings), self._unanswered.query
+        changed, query = self._changed(settings), self._infeasible_period.query
         assert changed is not None
         law = changed.build(self._vehicle, self._period)
         assert isinstance(law, Guarded)
@@ -240,7 +244,7 @@ class _Case:
         target[[*REFERENCE_STATES]] = query.state[[*REFERENCE_STATES]]
         bounds = changed.input_bounds.actuators(self._vehicle)
         plan = law.law.plan(query.state[:N_STATES], target, query.u_before, bounds, changed.horizon, law.trim)
-        periods = recovery(self._unanswered, plan)
+        periods = recovery(self._infeasible_period, plan)
         if periods is not None:
             yield {"settings": settings, "after": round(periods * self._period, 9)}
 
@@ -250,7 +254,7 @@ class _OwnCase(_Case):
 
     def bound(self, side: Side) -> _Bound:
         """A side in the words of the problem."""
-        problem = self._unanswered.problem
+        problem = self._infeasible_period.problem
         name, rotor, factor, unit = problem.every_constraint[side.place].name, 0, 1.0, "-"
         if problem.bounds is not None and side.place in _ROTORS:
             name, rotor, unit = _ROTORS[side.place], side.row + 1, "rad/s"
@@ -276,7 +280,7 @@ class _OwnCase(_Case):
             sides.setdefault(key, set()).update(side._replace(row=row) for row in rows)
         widenings = []
         for (name, which), alike in sides.items():
-            least, bound = smallest_widening(self._unanswered, alike), self.bound(next(iter(alike)))
+            least, bound = smallest_widening(self._infeasible_period, alike), self.bound(next(iter(alike)))
             if least is not None:
                 amount = f"{least * bound.factor:.3g} {bound.unit.replace('-', '')}".rstrip()
                 widenings.append(f"{name} {which} wider by {amount}")

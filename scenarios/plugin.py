@@ -146,12 +146,12 @@ class PluginController:
             )
 
     @property
-    def unanswered(self) -> object:
+    def infeasible_period(self) -> object:
         """The first problem without an answer, an `mpc.InfeasiblePeriod`, where the law keeps one."""
         try:
-            return getattr(self._law, "unanswered", None)
+            return getattr(self._law, "infeasible_period", None)
         except Exception as error:  # after the flight, which is not to be lost by it
-            logging.getLogger("quadsim").warning("no diagnosis: unanswered raised %s", reason_of(error))
+            logging.getLogger("quadsim").warning("no diagnosis: infeasible_period raised %s", reason_of(error))
             return None
 
     def reset(self, speeds: Array) -> None:

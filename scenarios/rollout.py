@@ -291,5 +291,5 @@ class Rollout:
             solver=self._law[1],
             simulate_s=self._simulate_s,
             tallies={} if self._navigation is None else self._navigation.tallies,
-            unanswered=self._events.first_unanswered(),
+            infeasible_period=self._events.first_infeasible_period(),
         )

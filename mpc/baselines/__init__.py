@@ -1,1 +1,1 @@
-"""Feedback laws to compare an MPC with: LQR, cascaded PID, geometric control on SE(3)."""
+"""Feedback laws to compare with MPC: LQR, cascaded PID, geometric control on SE(3)."""

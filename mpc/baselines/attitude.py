@@ -1,4 +1,4 @@
-"""Attitudes as rotation matrices: what a force and a heading require, how that turns, and how far away it is."""
+"""Attitudes as rotation matrices: the attitude for a force and a heading, its derivatives, and attitude errors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from quadsim.rotation import body_to_world, euler_to_body_rates
 from quadsim.state import EULER, EULER_RATE, POSITION, VELOCITY, Array
 
 LEAST_LIFT: Final = 0.2
-"""Share of the weight below which thrust is not reduced, so that torques keep their authority.  Ours."""
+"""Least thrust as a share of the weight, so that torques keep their authority.  Our addition."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class Measured:
 
 
 def motion_of(state: Array, attitude: Array | None = None, rates: Array | None = None) -> Measured:
-    """The motion of a state (12,); attitude (4,) wxyz and body rates (3,) [rad/s] by themselves where given."""
+    """Return the motion of a state (12,), with the attitude (4,) wxyz and body rates (3,) [rad/s] if given."""
     euler = state[list(EULER)]
     return Measured(
         position=state[list(POSITION)],
@@ -41,21 +41,21 @@ def motion_of(state: Array, attitude: Array | None = None, rates: Array | None =
 
 
 def hat(vector: Array) -> Array:
-    """Skew matrix (3, 3) of the cross product with a vector: times b it gives vector x b."""
+    """The skew matrix (3, 3) of the cross product: `hat(a) @ b` is a x b."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def vee(matrix: Array) -> Array:
-    """(3,) inverse of `hat`, of the skew part of a matrix (3, 3)."""
+    """(3,) inverse of `hat`, applied to the skew part of a matrix (3, 3)."""
     skew = 0.5 * (matrix - matrix.T)
     return np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
 
 
 def limit_force(force: Array, *, least: float, tilt: float) -> Array:
-    """A force (3,) [N], world, that may be demanded of a vehicle: up by `least` [N], leant by `tilt` [rad] at most.
+    """Limit a force (3,) [N], world, to at least `least` [N] upwards and at most `tilt` [rad] from the vertical.
 
-    The vertical part is unchanged where it is enough; the horizontal part keeps its direction.
+    The limit changes the vertical part only if it is too small; the horizontal part keeps its direction.
     """
     upward = max(float(force[2]), least)
     horizontal = math.hypot(force[0], force[1])
@@ -76,21 +76,22 @@ def attitude_for(force: Array, yaw: float) -> Array:
 
 
 def prioritised_error(attitude: Array, desired: Array, yaw_weight: float) -> Array:
-    """Attitude error (3,) about the body axes [rad for small errors], heading last; attitudes (3, 3) body to world.
+    """Attitude error (3,) about the body axes [rad for small errors], heading reduced; attitudes (3, 3) body to world.
 
-    2 sgn(q_0) times the vector part of the error quaternion q = q_tilt q_yaw: the shortest rotation that brings body z
-    where it is desired, then the rest, a turn about it of which only the share `yaw_weight`, in (0, 1], is demanded.
-    Brescianini, Hehn, D'Andrea, "Nonlinear quadrocopter attitude control", ETH Zurich, 2013; PX4's
-    AttitudeControl.  The yaw part is divided by the weight, so that small errors of all three axes count alike.
+    2 sgn(q_0) times the vector part of the error quaternion q = q_tilt q_yaw: the shortest rotation of body z to its
+    desired direction, then the remaining rotation about it, of which only the share `yaw_weight`, in (0, 1], is
+    demanded.  Brescianini, Hehn, D'Andrea, "Nonlinear quadrocopter attitude control", ETH Zurich, 2013; PX4's
+    AttitudeControl.  The yaw part is divided by the weight, so that small errors about all three axes have the same
+    scale.
     """
-    thrust = attitude.T @ desired[:, 2]  # where body z is to go, seen from the body
+    thrust = attitude.T @ desired[:, 2]  # desired direction of body z, in body axes
     cosine = float(np.clip(thrust[2], -1.0, 1.0))
     if cosine > -1.0 + 1e-9:
         w = math.sqrt(0.5 * (1.0 + cosine))
         x, y = -thrust[1] / (2.0 * w), thrust[0] / (2.0 * w)
         cross = hat(np.array([-thrust[1], thrust[0], 0.0]))
         tilting = np.eye(3) + cross + cross @ cross / (1.0 + cosine)
-    else:  # upside down: every axis is as short, and roll is taken
+    else:  # upside down: all axes are equally short, so roll is chosen
         w, x, y = 0.0, 1.0, 0.0
         tilting = np.diag([1.0, -1.0, -1.0])
     tilted = attitude @ tilting
@@ -111,7 +112,7 @@ def rate_error(attitude: Array, rates: Array, desired: Array, desired_rates: Arr
 
 
 def unit_derivatives(v: Array, v1: Array, v2: Array) -> tuple[Array, Array, Array]:
-    """Direction v / |v| and its first two derivatives (3,), from v (3,), which is not zero, and its own."""
+    """The direction v / |v| of v (3,) != 0 and its first two derivatives (3,), from those of v."""
     length = np.linalg.norm(v)
     u = v / length
     along = u @ v1
@@ -122,7 +123,7 @@ def unit_derivatives(v: Array, v1: Array, v2: Array) -> tuple[Array, Array, Arra
 
 @dataclass(frozen=True, kw_only=True)
 class DesiredAttitude:
-    """The computed attitude R_c (3, 3), Omega_c (3,) [rad/s] and its derivative (3,) [rad/s^2], in its own axes."""
+    """The commanded attitude R_c (3, 3), Omega_c (3,) [rad/s] and its derivative (3,) [rad/s^2], in its own axes."""
 
     attitude: Array
     rates: Array
@@ -130,15 +131,15 @@ class DesiredAttitude:
 
 
 def desired_attitude(force: Sequence[Array], momentum: Sequence[Array], drag: Array, heading: Array) -> DesiredAttitude:
-    """R_c = [b_1c, b_2c, b_3c] with b_1c as near to the heading as the force leaves.
+    """R_c = [b_1c, b_2c, b_3c], with b_1c as close to the heading as the force allows.
 
-    What the rotors and drag give together is to be `force`, f b_3c - R_c diag(d) R_c' p = A: across the body
-    b_1c . (A + d_x p) = 0 and b_2c . (A + d_y p) = 0, and f = b_3c . (A + d_z p).  Faessler et al. (2018), Eqs. (12)
-    to (16), with body x rather than body y near to a given direction.  Without drag b_3c lies along A.
+    Rotors and drag together give `force`, f b_3c - R_c diag(d) R_c' p = A. Perpendicular to b_3c, b_1c . (A + d_x p) =
+    0 and b_2c . (A + d_y p) = 0; along it, f = b_3c . (A + d_z p). Faessler et al.  (2018), Eqs.  (12) to (16), with
+    body x rather than body y close to a given direction.  Without drag, b_3c lies along A.
 
     Args:
         force: A and its first two derivatives, (3,) each [N].
-        momentum: p, mass times the velocity that drag is computed from, and its first two derivatives, (3,) each.
+        momentum: p, mass times the velocity that causes drag, and its first two derivatives, (3,) each.
         drag: d (3,), body axes [1/s].
         heading: (3, 3) rows: the direction h and its first two derivatives.
     """
@@ -163,7 +164,7 @@ def _with_drag(force: Sequence[Array], momentum: Sequence[Array], drag: float) -
 
 
 def _cross(a: Sequence[Array], b: Sequence[Array]) -> tuple[Array, Array, Array]:
-    """The cross product of two vectors, each with its first two derivatives, and its own."""
+    """The cross product of two vectors and its first two derivatives, from those of the vectors."""
     (a0, a1, a2), (b0, b1, b2) = a, b
     first = np.cross(a1, b0) + np.cross(a0, b1)
     return np.cross(a0, b0), first, np.cross(a2, b0) + 2.0 * np.cross(a1, b1) + np.cross(a0, b2)

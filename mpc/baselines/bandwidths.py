@@ -1,4 +1,4 @@
-"""How fast nested loops may be at a control period: the gains of PID and geometric control follow from it."""
+"""Bandwidths of nested loops at a control period; the gains of PID and geometric control follow from them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ YAW_SHARE: Final = 0.4  # bandwidth of heading over that of roll and pitch: abou
 
 
 def require_positive(name: str, value: float) -> None:
-    """A setting that has to be a positive, finite number.
+    """Reject a setting that is not a positive, finite number.
 
-    Raises:
-        ParameterError: it is not.
+    Raises:     ParameterError: it is not.
     """
     if not 0.0 < value < math.inf:
         raise ParameterError("controller", name, value, "positive and finite")
@@ -27,12 +26,12 @@ def require_positive(name: str, value: float) -> None:
 class Bandwidths:
     """Bandwidths of the loops of a cascade [rad/s], each the gain from an error to the rate of change demanded."""
 
-    rate: float  # of roll and pitch rate; an angular acceleration per rate error
-    attitude: float  # of roll and pitch; a rate per angle
-    yaw_rate: float  # of the yaw rate, which reaction torques alone can change
-    yaw: float  # of the heading
-    velocity: float  # an acceleration per velocity error
-    position: float  # a velocity per position error
+    rate: float  # roll and pitch rate: angular acceleration per rate error
+    attitude: float  # roll and pitch: rate per angle error
+    yaw_rate: float  # yaw rate, limited by the weak reaction torques
+    yaw: float  # heading
+    velocity: float  # velocity: acceleration per velocity error
+    position: float  # position: velocity per position error
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -40,23 +39,22 @@ class Bandwidths:
 
 
 def lag_to_allow_for(vehicle: Vehicle, period: float) -> float:
-    """The delay [s] that gains have to tolerate besides sampling: the rotors' own lag, but half a period at least."""
+    """Delay [s] that the gains must tolerate besides sampling: the rotor lag, but at least half a period."""
     return max(0.5 * period, vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0)
 
 
 def bandwidths(*, period: float, lag: float) -> Bandwidths:
-    """Bandwidths of a cascade at a control period, with rotors and computation that lag [s].
+    """Return the bandwidths of a cascade for a control period and a `lag` of rotors and computation [s].
 
-    A held command acts half a period late on average, and the lag adds to that: theta = period / 2 + lag.  The
-    innermost loop, an integrator with that dead time, gets the gain 1 / (2 theta) (SIMC, Skogestad, "Simple analytic
-    rules for model reduction and PID controller tuning", 2003: time constant and dead time equal).  Each loop outside
-    is slower by `SEPARATION`, which is then every characteristic ratio a_i^2 / (a_{i-1} a_{i+1}) of the closed loop's
-    polynomial s^4 + k1 s^3 + k1 k2 s^2 + k1 k2 k3 s + k1 k2 k3 k4; 2 is the damping optimum (Naslin, 1960).  The
-    heading's loops have the share `YAW_SHARE` of roll's and pitch's.  At 50 ms and 25 ms of lag: 10, 5, 2.5 and 1.25
-    rad/s, where PX4 has 6.5, 1.8 and 0.95 from attitude to position.
+    A held command acts half a period late on average, and the lag adds to it: theta = period / 2 + lag.  The innermost
+    loop, an integrator with that dead time, gets the gain 1 / (2 theta) (SIMC, Skogestad, "Simple analytic rules for
+    model reduction and PID controller tuning", 2003: time constant equal to dead time). Each outer loop is slower by
+    `SEPARATION`, which then equals every characteristic ratio a_i^2 / (a_{i-1} a_{i+1}) of the closed loop's polynomial
+    s^4 + k1 s^3 + k1 k2 s^2 + k1 k2 k3 s + k1 k2 k3 k4; a ratio of 2 is the damping optimum (Naslin, 1960). The heading
+    loops have `YAW_SHARE` of the bandwidth of roll and pitch.  At a period of 50 ms and a lag of 25 ms: 10, 5, 2.5 and
+    1.25 rad/s; PX4 uses 6.5, 1.8 and 0.95 from attitude to position.
 
-    Raises:
-        ParameterError: a number is out of range.
+    Raises:     ParameterError: a number is out of range.
     """
     require_positive("period", period)
     if not 0.0 <= lag < math.inf:

@@ -43,7 +43,7 @@ from quadsim.vehicle import Vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class GeometricSettings:
-    """What a geometric controller is made from; `geometric_settings` derives it from a vehicle and a period."""
+    """Parameters of a geometric controller; `geometric_settings` derives them from a vehicle and a period."""
 
     period: float  # tau_s [s]
     k_x: float  # gain of the position error [1/s^2], k_x / m of Lee et al. (2010)
@@ -51,34 +51,34 @@ class GeometricSettings:
     k_R: float  # gain of the roll and pitch error [1/s^2], J^-1 k_R there
     k_Omega: float  # gain of the roll and pitch rate error [1/s], J^-1 k_Omega there
     yaw_share: float = YAW_SHARE
-    """How fast the heading is corrected over how fast roll and pitch are: its k_Omega has this factor, its k_R the
-    square; reaction torques are weak."""
+    """Bandwidth of the heading over that of roll and pitch: the factor of its k_Omega, and the square of it of its k_R.
+    Reaction torques are weak."""
     k_i: float = 0.0  # gain of the integral of e_v + c_1 e_x [1/s^2]; 0 for none, as in Lee et al. (2010)
     k_I: float = 0.0  # gain of the integral of e_Omega + c_2 e_R [1/s^2]; 0 for none
     c_1: float = 1.0  # weight of the position error in the first integral [1/s]
     c_2: float = 1.0  # weight of the attitude error in the second [1/s]
-    sigma: float = 5.0  # largest acceleration of the first integral, each axis [m/s^2]
-    sigma_R: float = 5.0  # largest angular acceleration of the second, each axis [rad/s^2]
-    tilt_max: float = 45.0  # largest tilt of the desired force [deg]; Lee et al. (2010) know none
+    sigma: float = 5.0  # limit of the first integral, per axis [m/s^2]
+    sigma_R: float = 5.0  # limit of the second integral, per axis [rad/s^2]
+    tilt_max: float = 45.0  # largest tilt of the desired force [deg]; our addition to Lee et al. (2010)
     feedforward: bool = False
-    """Whether the reference's jerk and snap are fed forward too, drag with them, and commands aimed at the middle of
-    the period that they are held for."""
-    drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # d of the acceleration -R diag(d) R' v that is fed forward [1/s]
-    disturbance: RampSettings | None = None  # of the observer of what the model misses; None for none
-    horizon: int = 10  # N, samples of preview; they give the reference's velocity and acceleration
-    bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
+    """Whether jerk, snap and drag of the reference are fed forward, and commands computed for the middle of the period
+    in which they are held."""
+    drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # d of the drag acceleration -R diag(d) R' v that is fed forward [1/s]
+    disturbance: RampSettings | None = None  # settings of the disturbance observer; None for none
+    horizon: int = 10  # N, preview samples, from which the reference's velocity and acceleration are computed
+    bounds: ActuatorBounds | None = None  # limits of the commands; None for the vehicle's range of speeds
 
 
 def geometric_settings(
     vehicle: Vehicle, *, period: float, lag: float | None = None, integral: bool = False, **others: object
 ) -> GeometricSettings:
-    """Settings whose gains follow from the period and the lag to allow for [s]; `others` are fields of theirs.
+    """Return settings whose gains follow from the period and the lag [s]; `others` sets further fields.
 
-    Since the law feeds forward how the desired attitude turns, its linearisation has the polynomial
-    (s^2 + k_Omega s + k_R)(s^2 + k_v s + k_x), and about k_Omega + k_v for the gain from a rate error to angular
-    acceleration: that sum is 1 / (2 (period / 2 + lag)), as in `bandwidths`.  The outer pair is four times slower than
-    the inner one (the cascade's separation of 2, twice), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2.
-    The integrals of Goodarzi et al. (2013) are, where they act, a quarter as fast as what they stand behind.
+    The law feeds forward the rotation of the desired attitude, so its linearisation has the polynomial (s^2 + k_Omega s
+    + k_R)(s^2 + k_v s + k_x), and its gain from rate error to angular acceleration is about k_Omega + k_v.  That sum is
+    1 / (2 (period / 2 + lag)), as in `bandwidths`. The outer pair is four times slower than the inner pair (twice the
+    cascade's separation of 2), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2. The integrals of Goodarzi et
+    al.  (2013) act at a quarter of the bandwidth of the loops that they support.
     """
     require_positive("period", period)
     allowed = lag_to_allow_for(vehicle, period) if lag is None else lag
@@ -100,19 +100,19 @@ def geometric_settings(
 
 @dataclass(frozen=True, kw_only=True)
 class Integrals:
-    """The integral terms, within +-sigma: an acceleration, world, and an angular one, body; (3,) each."""
+    """The integral terms, limited to +-sigma: acceleration, world, and angular acceleration, body; (3,) each."""
 
     translation: Array
     rotation: Array
 
 
 Disturbance: TypeAlias = tuple[Array, Array, Array]
-"""What the model misses: an acceleration and its rate of change, world, and an angular one, body; (3,) each."""
+"""The disturbance: acceleration and its rate of change, world, and angular acceleration, body; (3,) each."""
 UNDISTURBED: Final[Disturbance] = (zero(), zero(), zero())
 
 
 class GeometricController(FeedbackLaw):
-    """Thrust along the body axis and a moment from errors on SE(3).
+    """Thrust along the body axis and a moment from errors on SE(3).  Frames: `docs/conventions.md`.
 
     Attributes:
         k_R: (3,) gains of the attitude error about body x, y, z [1/s^2].
@@ -143,7 +143,7 @@ class GeometricController(FeedbackLaw):
             self._observer.reset(speeds)
 
     def adopt(self, previous: object) -> None:
-        """Go on from the integrals and the observer of the law before."""
+        """Take over the integrals and the observer of the previous law."""
         law = within(previous, GeometricController)
         if law is not None:
             self._integrals = law._integrals
@@ -151,7 +151,7 @@ class GeometricController(FeedbackLaw):
                 self._observer.adopt(law._observer)
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
-        """The law's wrench as rotor speeds; the integrals rest while bounds keep it from being given."""
+        """Return the law's wrench as rotor speeds; the integrals hold while bounds limit it."""
         exact = self.settings.feedforward or self._observer is not None
         motion = motion_of(state, now.attitude, now.body_rates) if exact else motion_of(state)
         target = target_of(reference, self._operator)
@@ -161,13 +161,15 @@ class GeometricController(FeedbackLaw):
         wrench, desired = self.wrench(motion, target, self._integrals, self._observed(now, motion, before))
         lower, upper = self.bounds.reach(before)
         speeds = allocate(self._allocation, wrench, lower, upper)
-        given = np.allclose(self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max())
-        if given and now.phase is Phase.FLYING:
+        attained = np.allclose(
+            self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max()
+        )
+        if attained and now.phase is Phase.FLYING:
             self._integrals = self.integrate(self._integrals, motion, target, desired)
         return self._held_for_a_period(speeds)
 
     def _observed(self, now: StepInputs, motion: Measured, before: Array) -> Disturbance:
-        """What the observer expects of the middle of the period that starts now; at rest until the vehicle flies."""
+        """Predict the disturbance in the middle of the period that starts now; zero until the vehicle flies."""
         if self._observer is None:
             return UNDISTURBED
         if now.phase is not Phase.FLYING:
@@ -179,16 +181,16 @@ class GeometricController(FeedbackLaw):
     def wrench(
         self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
     ) -> tuple[Array, DesiredAttitude]:
-        """[f, M_x, M_y, M_z] (4,) [N, N m], and the attitude that the moment turns to.
+        """Return [f, M_x, M_y, M_z] (4,) [N, N m], and the attitude that the moment turns to.
 
         f = A . R e_3 with A = m (-k_x e_x - k_v e_v + g e_3 + x_d'' - d) less the integral, and
         M = -J (k_R e_R + k_Omega e_Omega + d_Omega) + Omega x J Omega
             - J (hat(Omega) R' R_c Omega_c - R' R_c Omega_c'),
 
-        with the observed disturbance d, d_Omega.  With feed-forward the drag at the reference's velocity counts too:
-        `desired_attitude`, and f is that of half a period on.
+        with the observed disturbance d, d_Omega.  Feed-forward adds the drag at the reference's velocity
+        (`desired_attitude`), and f is that of half a period later.
 
-        Where the limits of tilt or of lift hold A, the attitude that it demands counts as one at rest.
+        Where the limits of tilt or lift change A, the desired attitude counts as constant.
         """
         settings, m, gravity = self.settings, self._vehicle.mass, self._vehicle.gravity
         J, R, Omega = np.array(self._vehicle.inertia), motion.attitude, motion.rates
@@ -219,7 +221,7 @@ class GeometricController(FeedbackLaw):
         return np.concatenate([[(along + half * along1) @ up], moment]), desired
 
     def integrate(self, integrals: Integrals, motion: Measured, target: Target, desired: DesiredAttitude) -> Integrals:
-        """The integrals one period on: of e_v + c_1 e_x and of e_Omega + c_2 e_R, saturated."""
+        """Return the integrals of e_v + c_1 e_x and e_Omega + c_2 e_R one period later, saturated."""
         settings = self.settings
         e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
         e_R = attitude_error(motion.attitude, desired.attitude)
@@ -234,9 +236,9 @@ class GeometricController(FeedbackLaw):
     def _force_derivatives(
         self, motion: Measured, target: Target, A: Array, e_v: Array, disturbance: Disturbance
     ) -> tuple[Array, Array]:
-        """A' and A'' (3,), by the equations of motion under the law's own thrust, drag and disturbance.
+        """Return A' and A'' (3,), by the equations of motion under the law's own thrust, drag and disturbance.
 
-        The disturbance counts as one that changes steadily, drag along the body as one that turns with it.
+        The disturbance is assumed to change at a constant rate; drag turns with the body.
         """
         m, R, Omega, k_x, k_v = self._vehicle.mass, motion.attitude, motion.rates, self.settings.k_x, self.settings.k_v
         disturbing, change, _ = disturbance
@@ -257,10 +259,10 @@ class GeometricController(FeedbackLaw):
 
 
 def _heading(yaw: float, target: Target) -> Array:
-    """(3, 3) rows: the horizontal direction desired for body x, its rate of change and that of this.
+    """(3, 3) rows: the desired horizontal direction of body x, and its first two derivatives.
 
-    e_R vanishes at half a turn, where it should be largest: of a heading more than a quarter turn away, a quarter turn
-    is desired, at rest.
+    e_R vanishes at half a turn, where it should be largest.  If the heading error exceeds a quarter turn, the desired
+    heading is a quarter turn away, at rest.
     """
     turn = wrapped(target.yaw - yaw)
     near = abs(turn) <= 0.5 * math.pi
@@ -285,10 +287,10 @@ class Geometric(Tuned):
     drag: Annotated[
         tuple[NonNegative, ...],
         Len(3, 3),
-        doc("[1/s] linear drag along body x, y, z that feedforward takes into account"),
+        doc("[1/s] linear drag along body x, y, z that feedforward compensates"),
     ] = (0.0, 0.0, 0.0)
-    disturbance: Annotated[RampSettings | None, doc("absent: what the model misses is not observed")] = None
-    indi: Annotated[INDISettings | None, doc("absent: rotors hold the commands for a period")] = None
+    disturbance: Annotated[RampSettings | None, doc("absent: no disturbance observer")] = None
+    indi: Annotated[INDISettings | None, doc("absent: rotors hold each command for a period")] = None
 
     def __post_init__(self) -> None:
         if any(self.drag) and not self.feedforward:

@@ -1,4 +1,4 @@
-"""What the feedback laws share: a period's course from measurement to command, and the model that forecasts it."""
+"""Code shared by the feedback laws: a period from measurement to command, and the prediction model."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from quadsim.vehicle import Vehicle
 
 
 class FeedbackLaw(ABC):
-    """A controller that solves nothing: a subclass defines what it commands in flight, `_command`."""
+    """A controller without an optimisation; a subclass defines its command in flight, `_command`."""
 
     solver: Final = ""
 
@@ -38,10 +38,10 @@ class FeedbackLaw(ABC):
         self._before = np.array(speeds, float)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """The law's command; on the ground the lowest speed, as fast as bounds allow; see `quadsim.controller`.
+        """Return the law's command; on the ground the lowest speed, as fast as bounds allow; see `quadsim.controller`.
 
-        Raises:
-            CommandError: the state or the reference is not finite; nothing was commanded, and nothing is remembered.
+        Raises:     CommandError: the state or the reference is not finite; no command is sent, and the law's state is
+        unchanged.
         """
         before = self._before if now.acting is None else now.acting
         if now.phase in GROUNDED:
@@ -63,10 +63,10 @@ class FeedbackLaw(ABC):
 
     @abstractmethod
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
-        """The command in the air after `before` (4,) [rad/s], from finite numbers; see `Controller.step`."""
+        """Return the command in the air after `before` (4,) [rad/s], for finite numbers; see `Controller.step`."""
 
     def _held_for_a_period(self, speeds: Array) -> Command:
-        """`speeds` (4,) with the plan of a law that plans one period ahead: these, then hover [rad/s]."""
+        """Return `speeds` (4,) [rad/s] with a plan that holds them for one period and hover after it."""
         plan = np.tile(self.model.u_bar, (self.horizon, 1))
         plan[0] = speeds
         return Command(speeds=speeds.copy(), plan=plan)
@@ -74,17 +74,17 @@ class FeedbackLaw(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Baseline(ControllerTable):
-    """The table of a law to compare an MPC with; every field has a default."""
+    """The table of a baseline law; every field has a default."""
 
     horizon: Annotated[
         int,
         Ge(SMALLEST_PREVIEW),
         Le(LARGEST_HORIZON),
-        doc("[periods] N, of the reference ahead, which give its velocity and acceleration"),
+        doc("[periods] N, preview of the reference, from which its velocity and acceleration are computed"),
     ] = 10
     input_bounds: Annotated[
         InputBounds | None,
-        doc("what commands are held to; absent: the speeds that the vehicle's rotors hold, and any step"),
+        doc("limits of the commands; absent: the vehicle's range of speeds, and any step"),
     ] = None
     tilt: Annotated[float, Ge(0.1), Le(80.0), doc("[deg] largest tilt commanded")] = 45.0
 
@@ -93,16 +93,16 @@ class Baseline(ControllerTable):
         return {} if self.input_bounds is None else self.input_bounds.audited(vehicle)
 
     def shared(self, vehicle: Vehicle, period: float) -> dict[str, Any]:
-        """What the settings of all these laws have in common."""
+        """Return the settings that all these laws share."""
         bounds = None if self.input_bounds is None else self.input_bounds.actuators(vehicle)
         return {"period": period, "horizon": self.horizon, "tilt_max": self.tilt, "bounds": bounds}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tuned(Baseline):
-    """One whose gains follow from the period and a lag."""
+    """A law whose gains follow from the period and a lag."""
 
     lag: Annotated[
         NonNegative | None,
-        doc("[s] lag of rotors and computer that gains allow for; absent: the vehicle's, or half a period"),
+        doc("[s] lag of rotors and computer that the gains allow for; absent: the vehicle's, or half a period"),
     ] = None

@@ -1,4 +1,4 @@
-"""The linear-quadratic regulator over an infinite horizon, which follows a moving reference."""
+"""The infinite-horizon linear-quadratic regulator, which follows a moving reference."""
 
 from __future__ import annotations
 
@@ -29,49 +29,48 @@ LARGEST_DEVIATIONS: Final = {
     "x": 0.5, "vx": 2.0, "y": 0.5, "vy": 2.0, "z": 0.1, "vz": 1.0,
     "roll": 0.3, "roll_rate": 1.5, "pitch": 0.3, "pitch_rate": 1.5, "yaw": 0.5, "yaw_rate": 3.0,
 }  # fmt: skip
-"""Deviations that weigh alike, each in its state's unit, and alike with `SPEED_SHARE`; see `bryson_objective`."""
+"""Deviations of equal cost, in each state's unit; `SPEED_SHARE` is that of the inputs; see `bryson_objective`."""
 HORIZONTAL: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 TILT: Final = [INDEX[name] for name in ("roll", "pitch")]
-SPEED_SHARE: Final = 0.05  # deviation of a rotor's speed from hover that weighs as much, as a share of the hover speed
-LAG_MARGIN: Final = 1.5  # times the lag of the vehicle's rotors that the default weights' loop stands
+SPEED_SHARE: Final = 0.05  # deviation of a rotor's speed of the same cost, as a share of the hover speed
+LAG_MARGIN: Final = 1.5  # multiple of the vehicle's rotor lag that the loop with default weights must tolerate
 _HALVINGS: Final = 12
 _SHORTEST_LAG: Final = 1e-4  # [s]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LQRSettings:
-    """What an LQR is made from."""
+    """Parameters of an LQR."""
 
     period: float  # tau_s [s]
-    objective: Objective  # weights of one period of the infinite sum; `bryson_objective` gives some for any vehicle
-    horizon: int = 10  # N, samples of preview; they give the reference's velocity, and N periods are planned
-    heading_frame: bool = True  # whether errors are turned into axes along the measured yaw, so that any heading flies
+    objective: Objective  # weights of one period; `bryson_objective` gives weights for any vehicle
+    horizon: int = 10  # N, preview samples for the reference's velocity, and periods planned
+    heading_frame: bool = True  # whether errors are turned into axes along the measured yaw, so that any heading works
     tilt_max: float | None = 30.0
-    """Largest tilt that errors of x, y and their rates demand [deg], or None.  The law is linear: without a limit a
-    large error demands more tilt than the model, or the vehicle, tolerates."""
-    bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
+    """Largest tilt that errors of x, y and their rates may demand [deg], or None.  The law is linear: without a limit,
+    a large error demands more tilt than the model, or the vehicle, tolerates."""
+    bounds: ActuatorBounds | None = None  # limits of the commands; None for the vehicle's range of speeds
 
 
 def bryson_objective(vehicle: Vehicle, period: float | None = None) -> Objective:
     """Weights 1 / (largest deviation)^2 of every state and input: Bryson's rule (Bryson and Ho, 1975).
 
-    The model knows no lag.  Where the vehicle's rotors lag so much that the loop of these weights would not be stable
-    with `LAG_MARGIN` times their time constant, the deviation of the rotor speeds is halved until it is.
-    Without a period [s] the lag counts for nothing.
+    The model has no lag.  If the loop with these weights would be unstable with `LAG_MARGIN` times the vehicle's rotor
+    lag, the deviation of the rotor speeds is halved until the loop is stable.  Without a period [s] the lag is ignored.
     """
     deviations = np.array([LARGEST_DEVIATIONS[name] for name in STATE_NAMES])
     share = SPEED_SHARE
     for _ in range(_HALVINGS):
         speed = share * vehicle.hover_speed
         objective = Objective(C_r=np.eye(N_STATES), Q_y=np.diag(deviations**-2.0), Q_u=np.eye(N_ROTORS) / speed**2)
-        if period is None or _stands_lag(vehicle, period, objective):
+        if period is None or _tolerates_lag(vehicle, period, objective):
             break
         share *= 0.5
     return objective
 
 
-def _stands_lag(vehicle: Vehicle, period: float, objective: Objective) -> bool:
-    """Whether an LQR's loop is stable with `LAG_MARGIN` times the lag of the vehicle's rotors."""
+def _tolerates_lag(vehicle: Vehicle, period: float, objective: Objective) -> bool:
+    """Return whether an LQR's loop is stable with `LAG_MARGIN` times the lag of the vehicle's rotors."""
     lag = LAG_MARGIN * max(vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0)
     if lag < _SHORTEST_LAG:
         return True
@@ -84,10 +83,9 @@ def _stands_lag(vehicle: Vehicle, period: float, objective: Objective) -> bool:
 def lqr_gain(model: LinearModel, objective: Objective) -> Array:
     """K (nu, n) of u = u_bar - K (xi - xi_r), which minimises the infinite sum of xi' C_r' Q_y C_r xi + u' Q_u u.
 
-    K = (Q_u + B' P B)^-1 B' P A, P the solution of the discrete algebraic Riccati equation.
+    K = (Q_u + B' P B)^-1 B' P A, with P the solution of the discrete algebraic Riccati equation.
 
-    Raises:
-        ParameterError: there is no such gain, as where an unstable state is not weighted.
+    Raises:     ParameterError: no such gain exists, for example because an unstable state has no weight.
     """
     Q = objective.C_r.T @ objective.Q_y @ objective.C_r
     try:
@@ -96,17 +94,17 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
     except (np.linalg.LinAlgError, ValueError):
         stable = False
     if not stable:
-        rule = "such that every state it leaves free comes to rest: weigh x, y, z and yaw"
+        rule = "such that every unweighted state comes to rest: weigh x, y, z and yaw"
         weights = {name: float(weight) for name, weight in zip(STATE_NAMES, Q.diagonal(), strict=True) if weight}
         raise ParameterError("controller", "output_weights", weights, rule)
     return read_only(K)
 
 
 class LQR(FeedbackLaw):
-    """u = u_bar - K (xi - xi_r), the reference's state xi_r being its pose and velocity, upright.
+    """u = u_bar - K (xi - xi_r), where the reference state xi_r has the reference's pose and velocity, upright.
 
-    Heading errors count the short way round.  Speeds that leave the bounds are held to them as by `allocate`; thrust,
-    roll and pitch torque go before yaw.
+    Heading errors are wrapped.  Speeds beyond the bounds are limited as by `allocate`: thrust, roll and pitch torque
+    take precedence over yaw.
     """
 
     name: Final = "lqr"
@@ -119,7 +117,7 @@ class LQR(FeedbackLaw):
         self._tilt_demand = np.linalg.pinv(self.gain[:, TILT]) @ self.gain[:, HORIZONTAL]
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
-        """The law's command now, held to the bounds, and then those of the closed loop of the model."""
+        """Return the bounded command, and a plan from the closed loop of the model."""
         targets = self._targets(state, reference)
         xi = state
         if self.settings.heading_frame:
@@ -132,14 +130,14 @@ class LQR(FeedbackLaw):
         for i in range(self.horizon):
             speeds = self.model.u_bar - self.gain @ self._limited(xi - targets[i])
             lower, upper = self.bounds.reach(before)
-            # The mixer's priorities matter for what is flown; the forecast is held to the bounds rotor by rotor.
+            # The mixer's priorities matter for the command; the forecast is limited rotor by rotor.
             plan[i] = self._held(speeds, lower, upper) if i == 0 else np.clip(speeds, lower, upper)
             before = plan[i]
             xi = self.model.A @ xi + self.model.B @ (plan[i] - self.model.u_bar)
         return Command(speeds=plan[0].copy(), plan=plan)
 
     def _targets(self, state: Array, reference: Array) -> Array:
-        """(N, 12) reference states at t_k .. t_{k+N-1}, yaw at t_k less than half a turn from the measured one."""
+        """(N, 12) reference states at t_k .. t_{k+N-1}, with the yaw at t_k within half a turn of the measured one."""
         (value, rate, acceleration), period = self._operator @ reference, self.settings.period
         poses = np.concatenate([value[None], reference[:-1]])
         rates = rate + period * np.arange(self.horizon)[:, None] * acceleration
@@ -151,9 +149,9 @@ class LQR(FeedbackLaw):
         return targets
 
     def _limited(self, error: Array) -> Array:
-        """The error (12,), its horizontal part scaled down where it demands more tilt than allowed.
+        """Scale down the horizontal part of the error (12,) where it demands more tilt than allowed.
 
-        K e = K_tilt (tilt + G e_horizontal) + ..., so -G e_horizontal is the tilt that the law steers to.
+        K e = K_tilt (tilt + G e_horizontal) + ..., so -G e_horizontal is the tilt that the law demands.
         """
         if self.settings.tilt_max is None:
             return error
@@ -166,10 +164,10 @@ class LQR(FeedbackLaw):
         return limited
 
     def _held(self, speeds: Array, lower: Array, upper: Array) -> Array:
-        """Speeds (4,) between `lower` and `upper` (4,) [rad/s] that give the wrench of `speeds`, or nearly so."""
+        """Return speeds (4,) between `lower` and `upper` (4,) [rad/s] whose wrench is closest to that of `speeds`."""
         if ((lower <= speeds) & (speeds <= upper)).all():
             return speeds
-        # Thrust goes with the square; a speed below zero demands what no rotor gives, and counts with its sign.
+        # Thrust is quadratic in speed; a negative speed demands an impossible thrust, and counts with its sign.
         return allocate(self._allocation, self._allocation.M @ (speeds * np.abs(speeds)), lower, upper)
 
 
@@ -181,14 +179,14 @@ class LQRTable(Baseline):
     output_weights: Annotated[
         Annotated[dict[str, Weight], Len(1)] | None,
         doc(
-            "diagonal of Q_y [1/unit of the state^2, rad for angles], of states by their names; absent: Bryson's rule "
+            "diagonal of Q_y [1/unit of the state^2, rad for angles], by state name; absent: Bryson's rule "
             "for all twelve and the inputs"
         ),
     ] = None
     input_weights: Annotated[
-        InputWeights | None, doc("[1/(rad/s)^2] diagonal of Q_u; given where output_weights are")
+        InputWeights | None, doc("[1/(rad/s)^2] diagonal of Q_u; required with output_weights")
     ] = None
-    heading: Annotated[bool, doc("whether errors are turned into axes along the present yaw")] = True
+    heading: Annotated[bool, doc("whether errors are turned into axes along the measured yaw")] = True
     tilt: Annotated[float, Ge(0.1), Le(80.0), doc("[deg] largest tilt commanded for position errors")] = 30.0
 
     def __post_init__(self) -> None:

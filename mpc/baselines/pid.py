@@ -1,6 +1,6 @@
-"""Cascaded PID, as autopilots fly it: one loop in the other, position P, velocity PID, attitude P, rate PID, mixer.
+"""Cascaded PID as autopilots fly it: position P, velocity PID, attitude P, rate PID, mixer.
 
-The structure is PX4's (PositionControl, AttitudeControl, RateControl); ArduPilot's differs in names.
+The structure is PX4's (PositionControl, AttitudeControl, RateControl); ArduPilot's is the same by other names.
 """
 
 from __future__ import annotations
@@ -28,29 +28,29 @@ from quadsim.vehicle import Vehicle
 
 HORIZONTAL_MARGIN: Final = 0.3  # share of the largest thrust that climbing leaves to the sides: PX4's MPC_THR_XY_MARG
 LARGEST_THRUST: Final = 0.85
-"""Share of all rotors' highest thrust that is demanded: PX4's mixer takes back up to 15 % of it for yaw."""
+"""Largest share of the rotors' total thrust that is demanded: PX4's mixer gives up to 15 % of it to yaw."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PIDSettings:
-    """What a cascade is made from; `pid_settings` derives it from a vehicle and a period."""
+    """Parameters of a cascade; `pid_settings` derives them from a vehicle and a period."""
 
     period: float  # tau_s [s]
     bandwidths: Bandwidths  # proportional gains of the loops [1/s]
     velocity_integral: float = 0.4  # integral over proportional gain of the velocity loop [1/s]; 0 for none
     rate_integral: float = 0.5  # the same of the rate loop [1/s]
-    velocity_derivative: float = 0.1  # share of the measured acceleration that is taken back
-    rate_derivative: float = 0.05  # share of the measured angular acceleration; late by a period, less than 1
+    velocity_derivative: float = 0.1  # gain on the measured acceleration
+    rate_derivative: float = 0.05  # gain on the measured angular acceleration; late by a period, less than 1
     yaw_weight: float = 0.4  # share of the heading error corrected while turning the thrust; PX4's MC_YAW_WEIGHT
     tilt_max: float = 45.0  # largest tilt commanded [deg]; PX4's MPC_TILTMAX_AIR
-    velocity_max: float = 12.0  # largest commanded, horizontal and vertical [m/s]; PX4's MPC_XY_VEL_MAX
+    velocity_max: float = 12.0  # largest velocity commanded, horizontal and vertical [m/s]; PX4's MPC_XY_VEL_MAX
     rate_max: tuple[float, float, float] = (220.0, 220.0, 200.0)  # body rates commanded [deg/s]; PX4's MC_ROLLRATE_MAX
-    horizon: int = 10  # N, samples of preview; they give the reference's velocity and acceleration
-    bounds: ActuatorBounds | None = None  # what commands are held to; None for the speeds that the rotors hold
+    horizon: int = 10  # N, preview samples, from which the reference's velocity and acceleration are computed
+    bounds: ActuatorBounds | None = None  # limits of the commands; None for the vehicle's range of speeds
 
 
 def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, **others: object) -> PIDSettings:
-    """Settings whose gains follow from the period and the lag to allow for [s]; `others` are fields of theirs."""
+    """Return settings whose gains follow from the period and the lag [s]; `others` sets further fields."""
     allowed = lag_to_allow_for(vehicle, period) if lag is None else lag
     speeds = bandwidths(period=period, lag=allowed)
     values: dict[str, object] = {
@@ -63,12 +63,12 @@ def pid_settings(vehicle: Vehicle, *, period: float, lag: float | None = None, *
 
 @dataclass(frozen=True, kw_only=True)
 class Memory:
-    """What the loops remember from one period to the next."""
+    """The state of the loops between periods."""
 
     velocity_integral: Array  # (3,) world [m/s^2]
     rate_integral: Array  # (3,) body [rad/s^2]
-    velocity: Array | None = None  # (3,) measured before, world [m/s]; None in the first period
-    rates: Array | None = None  # (3,) measured before, body [rad/s]; None in the first period
+    velocity: Array | None = None  # (3,) last measurement, world [m/s]; None in the first period
+    rates: Array | None = None  # (3,) last measurement, body [rad/s]; None in the first period
 
 
 class CascadedPID(FeedbackLaw):
@@ -89,36 +89,35 @@ class CascadedPID(FeedbackLaw):
         self._memory = Memory(velocity_integral=np.zeros(3), rate_integral=np.zeros(3))
 
     def adopt(self, previous: object) -> None:
-        """Go on from the integrals of the PID before."""
+        """Take over the integrals of the previous PID."""
         law = within(previous, CascadedPID)
         if law is not None:
             self._memory = law._memory
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
-        """One period of all loops, integrals at rest until the vehicle flies."""
+        """Run all loops for one period; the integrals hold until the vehicle flies."""
         target, reach = target_of(reference, self._operator), self.bounds.reach(before)
         speeds, after = self.fly(self._memory, state, target, *reach)
         if now.phase is not Phase.FLYING:
-            held = self._memory
-            after = replace(after, velocity_integral=held.velocity_integral, rate_integral=held.rate_integral)
+            memory = self._memory
+            after = replace(after, velocity_integral=memory.velocity_integral, rate_integral=memory.rate_integral)
         self._memory = after
         return self._held_for_a_period(speeds)
 
     def fly(self, memory: Memory, state: Array, target: Target, lower: Array, upper: Array) -> tuple[Array, Memory]:
-        """One period of all loops, from a state (12,) and speeds (4,) within reach [rad/s].
+        """Run all loops for one period, from a state (12,) and reachable speeds `lower` to `upper` (4,) [rad/s].
 
-        Returns:
-            (4,) rotor speeds [rad/s], and what to remember.
+        Returns:     (4,) rotor speeds [rad/s], and the loops' new state.
         """
         motion, k, inertia, period = motion_of(state), self.settings.bandwidths, self._inertia, self.settings.period
         force, velocity_integral = self._velocity_loop(memory, motion, target)
         turning = np.zeros(3) if memory.rates is None else (motion.rates - memory.rates) / period
-        error = self._rates_wanted(motion, force, target) - motion.rates
+        error = self._desired_rates(motion, force, target) - motion.rates
         proportional = np.array([k.rate, k.rate, k.yaw_rate])
         acceleration = proportional * error + memory.rate_integral - self.settings.rate_derivative * turning
         wrench = np.concatenate([[np.linalg.norm(force)], inertia * acceleration])
         speeds = allocate(self.allocation, wrench, lower, upper)
-        # What the mixer could not give stops an integral from asking for more of it.
+        # Anti-windup: an integral stops where it would ask for more than the mixer can give.
         missed = acceleration - (self.allocation.M @ np.square(speeds))[1:] / inertia
         windup = missed * error > 1e-9 * (1.0 + np.abs(acceleration)) * np.abs(error)
         summed = np.where(windup, 0.0, error)
@@ -130,12 +129,12 @@ class CascadedPID(FeedbackLaw):
         )
 
     def _velocity_loop(self, memory: Memory, motion: Measured, target: Target) -> tuple[Array, Array]:
-        """The force (3,) to command [N], world, and the velocity integral (3,) [m/s^2] of the next period."""
+        """Return the force (3,) [N] to command, world, and the velocity integral (3,) [m/s^2] of the next period."""
         settings, mass, gravity = self.settings, self._vehicle.mass, self._vehicle.gravity
         period, proportional = settings.period, settings.bandwidths.velocity
-        error = velocity_wanted(settings, motion.position, target) - motion.velocity
+        error = desired_velocity(settings, motion.position, target) - motion.velocity
         measured = np.zeros(3) if memory.velocity is None else (motion.velocity - memory.velocity) / period
-        wanted = (
+        demanded_acceleration = (
             target.acceleration
             + proportional * error
             + memory.velocity_integral
@@ -143,31 +142,31 @@ class CascadedPID(FeedbackLaw):
             + np.array([0.0, 0.0, gravity])
         )
         tilt = math.radians(settings.tilt_max)
-        force = force_within(mass * wanted, weight=mass * gravity, largest=self._largest, tilt=tilt)
-        # Tracking anti-windup: the integral is drawn to where it just saturates; PX4's gain, after Rundqwist (1990).
-        error = error - 2.0 / proportional * (wanted - force / mass)
+        force = force_within(mass * demanded_acceleration, weight=mass * gravity, largest=self._largest, tilt=tilt)
+        # Anti-windup by tracking: the integral moves to where it just saturates; PX4's gain, after Rundqwist (1990).
+        error = error - 2.0 / proportional * (demanded_acceleration - force / mass)
         integral = memory.velocity_integral + period * settings.velocity_integral * proportional * error
         return force, np.clip(integral, -gravity, gravity)
 
-    def _rates_wanted(self, motion: Measured, force: Array, target: Target) -> Array:
-        """(3,) body rates to turn at [rad/s], by the attitude loop."""
+    def _desired_rates(self, motion: Measured, force: Array, target: Target) -> Array:
+        """Return the body rates (3,) [rad/s] that the attitude loop demands."""
         k, limit = self.settings.bandwidths, np.radians(self.settings.rate_max)
         error = prioritised_error(motion.attitude, attitude_for(force, target.yaw), self.settings.yaw_weight)
-        heading = motion.attitude[2] * target.yaw_rate  # a turn about world z, seen from the body
+        heading = motion.attitude[2] * target.yaw_rate  # a rotation about world z, in body axes
         return np.clip(np.array([k.attitude, k.attitude, k.yaw]) * error + heading, -limit, limit)
 
 
-def velocity_wanted(settings: PIDSettings, position: Array, target: Target) -> Array:
-    """(3,) velocity to fly at [m/s]: the target's, and a share of the position error per second, within limits."""
-    wanted = target.velocity + settings.bandwidths.position * (target.position - position)
-    horizontal = math.hypot(wanted[0], wanted[1])
-    wanted[:2] *= min(1.0, settings.velocity_max / max(horizontal, 1e-9))
-    wanted[2] = np.clip(wanted[2], -settings.velocity_max, settings.velocity_max)
-    return wanted
+def desired_velocity(settings: PIDSettings, position: Array, target: Target) -> Array:
+    """(3,) velocity to fly at [m/s]: the target's, plus a share of the position error per second, within limits."""
+    velocity = target.velocity + settings.bandwidths.position * (target.position - position)
+    horizontal = math.hypot(velocity[0], velocity[1])
+    velocity[:2] *= min(1.0, settings.velocity_max / max(horizontal, 1e-9))
+    velocity[2] = np.clip(velocity[2], -settings.velocity_max, settings.velocity_max)
+    return velocity
 
 
 def force_within(force: Array, *, weight: float, largest: float, tilt: float) -> Array:
-    """A wanted force (3,) [N], world, as a vehicle can give it within a tilt [rad]: height before horizontal motion."""
+    """Limit a demanded force (3,) [N], world, to a tilt [rad] and to the thrust: height before horizontal motion."""
     upright = limit_force(force, least=LEAST_LIFT * weight, tilt=tilt)
     horizontal = math.hypot(upright[0], upright[1])
     spared = min(horizontal, HORIZONTAL_MARGIN * largest)

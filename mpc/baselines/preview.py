@@ -1,4 +1,4 @@
-"""A reference's derivatives now, from its next samples."""
+"""The derivatives of a reference now, from its next samples."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from quadsim.errors import ParameterError
 from quadsim.motion import Motion
 from quadsim.state import Array, read_only
 
-SMALLEST_PREVIEW: Final = 3  # samples that a parabola needs
-PREVIEW_DEGREE: Final = 4  # of the polynomial through a preview that gives jerk and snap
-MOTION_DEGREE: Final = 5  # of the one through a motion's next samples, which are exact
+SMALLEST_PREVIEW: Final = 3  # a parabola needs three samples
+PREVIEW_DEGREE: Final = 4  # degree of the polynomial through a preview for jerk and snap
+MOTION_DEGREE: Final = 5  # degree of the one through the next samples of a motion, which are exact
 MOTION_SAMPLES: Final = 7
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """What a baseline is to follow at t_k, world frame."""
+    """The target of a baseline at t_k, world frame."""
 
     position: Array  # (3,) [m]
     velocity: Array  # (3,) [m/s]
@@ -34,20 +34,20 @@ class Target:
     jerk: Array = field(default_factory=zero)  # (3,) [m/s^3]
     snap: Array = field(default_factory=zero)  # (3,) [m/s^4]
     heading: Array | None = None
-    """(3, 3) rows: the direction near which body x is wanted, any length but zero, its rate of change and that of this;
-    None where yaw gives it."""
+    """(3, 3) rows: the desired direction of body x, of any length but zero, and its first two derivatives; None to use
+    yaw."""
 
 
 @lru_cache(maxsize=32)
 def differentiator(samples: int, period: float, *, degree: int = 2, first: int = 1) -> Array:
     """(degree + 1, N): value and derivatives at t_k of samples at t_{k + first} .. t_{k + first + N - 1}.
 
-    Those of the least-squares polynomial through the samples (Savitzky and Golay, 1964), which N = degree + 1 makes the
-    ordinary differences.  Where the reference's velocity jumps, as a filtered step's does, the second derivative of a
-    parabola is a smooth hump of the jump's area over the N samples, not a spike.
+    The least-squares polynomial through the samples (Savitzky and Golay, 1964); N = degree + 1 gives ordinary
+    differences.  Where the reference's velocity jumps, as a filtered step's does, the second derivative of a parabola
+    spreads the jump over the N samples as a smooth hump instead of a spike.
 
     Raises:
-        ParameterError: there are too few samples, or the period is not positive.
+        ParameterError: too few samples, or a period that is not positive.
     """
     if samples < degree + 1:
         derivative = {SMALLEST_PREVIEW: "an acceleration", PREVIEW_DEGREE + 1: "a snap"}.get(degree + 1, "derivatives")
@@ -60,7 +60,7 @@ def differentiator(samples: int, period: float, *, degree: int = 2, first: int =
 
 
 def target_of(reference: Array, operator: Array) -> Target:
-    """What to follow, from the preview (N, 4) of x, y, z [m], yaw [rad] and its `differentiator` (degree + 1, N)."""
+    """Return the target from a preview (N, 4) of x, y, z [m], yaw [rad] and its `differentiator` (degree + 1, N)."""
     value, rate, acceleration, *higher = operator @ reference
     return Target(
         position=value[:3],
@@ -74,20 +74,20 @@ def target_of(reference: Array, operator: Array) -> Target:
 
 
 def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
-    """What to follow, from the present and next samples of a motion and the yaw (3,), its rate and acceleration.
+    """Return the target from the present and next samples of a motion and yaw (3,), its rate and acceleration.
 
-    All derivatives are those of the positions and attitudes, whatever velocities a course states of itself: they agree
-    with what the vehicle has to fly.  Near the course's end fewer samples give fewer derivatives.
+    All derivatives come from positions and attitudes, not from the velocities that a course states, so that they agree
+    with the flown path.  Near the end of the course fewer samples give fewer derivatives.
     """
     samples = min(len(motion), MOTION_SAMPLES)
     degree = min(MOTION_DEGREE, samples - 1)
     operator = differentiator(samples, period, degree=degree, first=0)
-    found = np.zeros((MOTION_DEGREE, 3))  # position to snap
+    derivatives = np.zeros((MOTION_DEGREE, 3))  # position to snap
     orders = min(degree + 1, MOTION_DEGREE)
-    found[:orders] = operator[:orders] @ motion.position[:samples]
+    derivatives[:orders] = operator[:orders] @ motion.position[:samples]
     heading = np.zeros((3, 3))
     heading[: min(degree + 1, 3)] = operator[:3] @ rotation(motion.attitude[:samples])[:, :, 0]
-    position, velocity, acceleration, jerk, snap = found
+    position, velocity, acceleration, jerk, snap = derivatives
     return Target(
         position=position,
         velocity=velocity,
@@ -102,5 +102,5 @@ def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
 
 
 def wrapped(angle: float) -> float:
-    """The same heading as an angle in [-pi, pi) [rad]."""
+    """Wrap an angle to [-pi, pi) [rad]."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

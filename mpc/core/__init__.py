@@ -1,1 +1,1 @@
-"""The core: the exact optimum of problems whose matrices are fixed, in C99, compiled once and exported as it is."""
+"""The core: the exact optimum of problems with constant matrices, in C99, compiled once and exported as it is."""

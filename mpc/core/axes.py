@@ -1,16 +1,15 @@
-"""The axes of a problem: parts that meet only in what the inputs can do.
+"""The axes of a problem: parts that are coupled only through the bounds on inputs.
 
-A hovering quadrotor is four systems: x with pitch, y with roll, z, and yaw.  Four rotors drive them all, so that bounds
-on rotors tie them together; but no prediction, no weight and no output bound does.  Take as axes the connected
-components of the states under
-
+A hovering quadrotor is four systems: x with pitch, y with roll, z, and yaw.  Four rotors drive all of them, so bounds
+on rotors couple them; no prediction, weight or output bound does.  The axes are the connected components of the states
+under
     A,  |C_r|' |Q_y| |C_r|,  P,  |C|' |C|,  B Q_u^-1 B',
 
-C of all rows, the last for what it costs to move two states at once, and for each axis g inputs w_g with T_g spanning
-Q_u^-1 B_g'.  Then u = u_s + sum T_g w_g, each w_g moves its own axis alone since B_h T_g = 0, and the cost falls apart
-since T_g' Q_u T_h = 0: without rows of inputs the problem is one small problem per axis.  What of u lies in none of the
-T_g moves nothing, and is u_s's at the optimum.  Where changes of inputs cost something, the axes are only used if they
-are all of u and Q_d falls apart alike.
+with C of all rows, and the last matrix for the cost of moving two states at once.  For each axis g there are inputs
+w_g, with T_g spanning Q_u^-1 B_g'. Then u = u_s + sum T_g w_g.  Each w_g moves only its own axis since B_h T_g = 0, and
+the cost separates since T_g' Q_u T_h = 0: without rows on inputs, the problem is one small problem per axis.  The part
+of u outside all T_g has no effect, and stays at u_s at the optimum.  With a weight on input changes, axes are used only
+if they span all of u and Q_d separates too.
 """
 
 from __future__ import annotations
@@ -28,25 +27,26 @@ from mpc.ocp import Objective, Problem
 from quadsim.state import Array, Indices
 
 ROUNDING: Final = 1e-12
-"""Relative size below which what ties two states is taken for a product of rounding."""
+"""Relative size below which a coupling of two states counts as rounding."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    """One axis, as a problem of its own."""
+    """One axis, as a separate problem."""
 
-    problem: Problem  # in w (N, m), without constraints; its u_bar is zero
-    states: Indices  # (n_g,) its states among those of the whole
-    regulated: Indices  # its rows of C_r
-    outputs: Indices  # the problem's rows (`mpc.constraints.Rows`) on its states
+    problem: Problem  # in w (N, m), without constraints; u_bar = 0
+    states: Indices  # (n_g,) indices of its states
+    regulated: Indices  # indices of its rows of C_r
+    outputs: Indices  # indices of its rows (`mpc.constraints.Rows`)
     T: Array  # (nu, m) the axis's part of u - u_s is T w; columns of unit length
 
 
 def axes(problem: Problem) -> list[Axis]:
-    """The axes of a problem, which together are all of it but its rows of inputs.
+    """Return the axes of a problem, which together contain all of it except its rows on inputs.
 
-    Pieces that nothing moves or regulates are left out: they want u_s.  Where such a piece has a row, or a row of
-    constraints or of C_r is on nothing, or the problem is all of one piece, the one axis is the whole problem.
+    Inputs without effect on cost or constraints stay at u_s: their axes are left out.  If such an axis has a row, or a
+    row of constraints or of C_r involves no state, or the problem does not separate, the whole problem is the only
+    axis.
     """
     rows, model, objective = problem.rows, problem.model, problem.objective
     bounded: NDArray[np.bool_] = np.asarray(rows.C.any(axis=1))
@@ -82,7 +82,7 @@ def axes(problem: Problem) -> list[Axis]:
 
 
 def axis_of(problem: Problem, T: Array, states: Indices, regulated: Indices, outputs: Indices) -> Axis:
-    """The axis of inputs along T, with these states, rows of C_r and rows."""
+    """Return the axis of inputs along T, with these states, rows of C_r and rows."""
     model, objective = problem.model, problem.objective
     return Axis(
         problem=Problem(
@@ -109,11 +109,11 @@ def axis_of(problem: Problem, T: Array, states: Indices, regulated: Indices, out
 
 
 def symmetric(matrix: Array) -> Array:
-    """The symmetric part of a matrix, which products leave but for rounding."""
+    """Return the symmetric part of a matrix that is symmetric up to rounding."""
     return np.asarray(0.5 * (matrix + matrix.T))
 
 
 def _normalised(matrix: Array) -> Array:
-    """The matrix with columns of unit length; those of zeros stay."""
+    """Return the matrix with columns of unit length; zero columns stay."""
     size = np.linalg.norm(matrix, axis=0)
     return np.asarray(matrix / np.where(size > 0.0, size, 1.0), dtype=np.float64)

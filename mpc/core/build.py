@@ -1,6 +1,6 @@
-"""Compile the core beside its sources: for the build hook, and by hand as `python mpc/core/build.py`.
+"""Compile the core beside its sources: run by the build hook, or by hand as `python mpc/core/build.py`.
 
-It needs the standard library alone and imports nothing of quadsim: the hook runs it in an environment of its own.
+It needs only the standard library and imports nothing of quadsim: the hook runs it in a separate environment.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from typing import Final
 
 FOLDER: Final = Path(__file__).resolve().parent
 FLAGS: Final = ("-std=c99", "-O3", "-ffp-contract=off", "-fPIC", "-shared")
-"""Without contraction all processors, and all levels of optimisation, have the same bits."""
+"""Without contraction, results are bitwise equal on all processors and at all optimisation levels."""
 UNIT: Final = "library.c"
-"""What is compiled; it includes the other sources."""
-NAME: Final = "_core.so"  # ctypes does not mind the suffix; macOS takes .so as well
+"""The file to compile; it includes the other sources."""
+NAME: Final = "_core.so"  # the suffix is free for ctypes; macOS takes .so as well
 COMPILERS: Final = ("cc", "gcc", "clang")
 
 
 def source_hash(folder: Path = FOLDER) -> str:
-    """Of all that the library's bits depend on but the compiler: flags, and sources by name."""
+    """Hash everything that determines the library's bits, except the compiler: flags, and sources by name."""
     digest = hashlib.sha256(" ".join(FLAGS).encode())
     for file in sorted((folder / "c").glob("*.[ch]")):
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
@@ -32,11 +32,9 @@ def source_hash(folder: Path = FOLDER) -> str:
 
 
 def build(folder: Path = FOLDER) -> Path:
-    """The library, compiled; it takes the place of an older one at once, which a process that uses it keeps.
+    """Compile the library; it replaces an older one atomically, and running processes keep theirs.
 
-    Raises:
-        FileNotFoundError: there is no compiler.
-        subprocess.CalledProcessError: it fails.
+    Raises:     FileNotFoundError: there is no compiler.     subprocess.CalledProcessError: the compiler fails.
     """
     named = shlex.split(os.environ.get("CC", ""))
     compiler = named or [path for path in map(shutil.which, COMPILERS) if path][:1]

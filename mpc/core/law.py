@@ -1,4 +1,4 @@
-"""The whole law in C: the library's controllers in place of Python's step."""
+"""The whole law in C: the library's controllers instead of Python's step."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ from quadsim.state import EULER, EULER_RATE, N_STATES, VELOCITY, Array
 from quadsim.vehicle import N_ROTORS
 
 STATUSES: Final = (UNCONSTRAINED, SOLVED, SOLVED, "clipped", "shifted", "before")
-"""What `enum quadsim_status` is in a flight's log."""
+"""Log entries for the values of `enum quadsim_status`."""
 ANSWERERS: Final = (GAIN, CORE, CORE, FALLBACK, FALLBACK, FALLBACK)
-"""Who answered."""
+"""The matching `answered_by`."""
 LEVELS: Final = (0, 0, 0, 1, 2, 3)
-"""And its fallback level."""
+"""The matching fallback level."""
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 _SAME_TIME: Final = 1e-6  # [s]
 _INT, _REAL, _AT = ctypes.c_int, ctypes.c_double, ctypes.c_void_p
@@ -88,7 +88,7 @@ def _library() -> ctypes.CDLL:
 
 
 class _Shared:
-    """A law's numbers where the library reads them, which equal laws of this process share."""
+    """A law's numbers in the library's memory layout, shared by equal laws of this process."""
 
     def __init__(self, law: Exportable) -> None:
         self.nominal = hover_model(law.vehicle, law.problem.model.period)
@@ -118,23 +118,21 @@ def _plain(value: float | Array) -> float | tuple[float, ...]:
 
 
 class CompiledMPC:
-    """A law by the library; it answers as the C does on a target, whatever there is no optimum for.
+    """A law run by the library; it falls back as the C does on a target.
 
-    Raises:
-        MissingCoreError: there is no library.
-        ParameterError: the problem is not one for the core.
+    Raises:     MissingCoreError: there is no library.     ParameterError: the core cannot take the problem.
     """
 
     solver: Final = "compiled"
-    """In place of a solver's name."""
+    """Stands for a solver's name."""
 
     def __init__(self, law: Exportable) -> None:
         library, shared = _library(), _shared(Key.to(law))
         self.name, self.problem, self.horizon = law.name, law.problem, law.problem.horizon
         self._shared, self._robust = shared, law.settings is not None
-        self._unbounded = shared.bounds is None  # whose law is the gain: no status reports a free optimum
+        self._unbounded = shared.bounds is None  # this law is the gain: no status reports a free optimum
         controller = ctypes.addressof(shared.struct)
-        # The struct points into this memory, and so do the views of it.
+        # The struct and its views point into this memory.
         self._memory, self._mpc = np.zeros(library.quadsim_mpc_reals(controller)), _MPC()
         at = ctypes.addressof(self._mpc)
         library.quadsim_mpc_start(at, controller, self._memory.ctypes.data)
@@ -159,7 +157,7 @@ class CompiledMPC:
         self.reset(shared.nominal.u_bar)
 
     def __reduce__(self) -> NoReturn:
-        """Addresses are of no use to a copy, or in another process."""
+        """Refuse: addresses are useless in a copy or another process."""
         raise TypeError("a CompiledMPC cannot be copied or pickled: make another")
 
     def reset(self, speeds: Array) -> None:
@@ -170,7 +168,7 @@ class CompiledMPC:
 
     @property
     def trim(self) -> Trim:
-        """What holds the vehicle at rest against the disturbance that is estimated."""
+        """The equilibrium under the estimated disturbance."""
         if self._robust:
             return Trim(speeds=self._trim.copy(), lift=self._lift.copy(), twist=self._twist.copy())
         return Trim(speeds=self._shared.nominal.u_bar, lift=np.array([0.0, 0.0, 1.0]))
@@ -187,7 +185,7 @@ class CompiledMPC:
         status = self._step(*self._arguments)
         spent_s = clock.perf_counter() - started
         self._before = self._command.copy()
-        if now.phase is not Phase.FLYING:  # the ground holds the vehicle, which is nothing to learn from
+        if now.phase is not Phase.FLYING:  # the ground holds the vehicle, so its motion shows no disturbance
             self._mpc.known = 0
         accepted = LEVELS[status] == 0
         plan = self._plan.copy() if accepted else np.empty_like(self._plan)
@@ -212,7 +210,7 @@ class CompiledMPC:
         return rollout(self.problem.model, states, plans)
 
     def _most_slack(self) -> float:
-        """By how much the optimum leaves a soft bound."""
+        """Return the largest violation of a soft bound by the optimum."""
         beyond = np.flatnonzero(np.abs(self._side) == 2)
         values = self._value[beyond] + self._shift[beyond]
         return float(np.maximum(values - self._upper[beyond], self._lower[beyond] - values).max(initial=0.0))
@@ -224,7 +222,7 @@ class CompiledMPC:
         return stopped(speeds.copy(), self.horizon, phase)
 
     def _may_learn(self, now: StepInputs) -> bool:
-        """Whether what was expected for now may be held against the state; see `RobustMPC.pose`."""
+        """Return whether the observer may compare the state with its prediction; see `RobustMPC.query`."""
         if abs(now.time - self._called_at - self._shared.nominal.period) > _SAME_TIME:
             self._measured = -math.inf
         self._called_at = now.time

@@ -1,4 +1,4 @@
-"""The compiled core, where there is one that belongs to these sources."""
+"""The compiled core, if it exists and matches these sources."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MIRRORS: Final = (
 
 
 def load() -> ctypes.CDLL:
-    """The library, loaded once per process; `MissingCoreError` where it was not compiled, or of other sources."""
+    """Return the library, loaded once per process; `MissingCoreError` if it is missing or of other sources."""
     reason = why_missing()
     if reason is not None:
         raise MissingCoreError(reason)
@@ -27,7 +27,7 @@ def load() -> ctypes.CDLL:
 
 
 def check_mirrors(**mirrors: type[ctypes.Structure]) -> None:
-    """Assert that structs named in `MIRRORS` are of the library's sizes."""
+    """Assert that the structs named in `MIRRORS` have the library's sizes."""
     sizes = (ctypes.c_size_t * len(MIRRORS))()
     load().quadsim_library_sizes(sizes)
     theirs = dict(zip(MIRRORS, sizes, strict=True))
@@ -36,7 +36,7 @@ def check_mirrors(**mirrors: type[ctypes.Structure]) -> None:
 
 
 def why_missing() -> str | None:
-    """Why there is no core here, in one line that says what to do; None where there is one."""
+    """Return why there is no core, in one line with a remedy; None if there is one."""
     library = _load()
     return library if isinstance(library, str) else None
 

@@ -1,4 +1,4 @@
-"""The numbers of a law in C besides those of its problem: members of the structs of quadsim_mpc.h, in their order."""
+"""The numbers of a law in C except those of its problem: members of the structs of quadsim_mpc.h, in their order."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class Exportable:
-    """What a law in C is made from."""
+    """The data of a law in C."""
 
     name: str
     problem: Problem
-    vehicle: Vehicle  # that modelled
-    settings: RobustSettings | None = None  # the parts of the robust controller; None for the paper's controllers
+    vehicle: Vehicle  # the modelled vehicle
+    settings: RobustSettings | None = None  # parts of the robust controller; None for the paper's controllers
 
 
 def controller_numbers(law: Exportable) -> dict[str, Array]:
-    """Those of a `quadsim_controller`."""
+    """Return the members of a `quadsim_controller`."""
     problem, free = law.problem, np.full(N_ROTORS, NO_BOUND)
     limits = {"speed_min": -free, "speed_max": free, "step_min": -free, "step_max": free}
     if problem.every_constraint:
@@ -42,7 +42,7 @@ def controller_numbers(law: Exportable) -> dict[str, Array]:
 
 
 def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
-    """Those of a `quadsim_robust`; `modes` (4, 4) as in `mpc.core.tables.Tables`."""
+    """Return the members of a `quadsim_robust`; `modes` (4, 4) as in `mpc.core.tables.Tables`."""
     settings, vehicle, period = law.settings, law.vehicle, law.problem.model.period
     assert settings is not None
     lag, delay = settings.rotor_lag, settings.delay
@@ -51,7 +51,7 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
     instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
 
     def decay(time: Array | float) -> Array:
-        """Share of rotor speeds that is left after a time [s]."""
+        """Return the share of a deviation of rotor speeds that is left after a time [s]."""
         return np.asarray(np.exp(-np.asarray(time) / lag) if lag else np.zeros(np.shape(time)), float)
 
     return {

@@ -1,4 +1,4 @@
-"""The exact optimum of a problem whose matrices are fixed, by the compiled core."""
+"""The exact optimum of a problem with constant matrices, by the compiled core."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from quadsim.state import N_STATES, Array, read_only
 from quadsim.vehicle import N_ROTORS
 
 MOST_CHANGES: Final = 3000
-"""Of the active set in a search, before it is given up; the most seen is 2507, of a state drawn far off."""
+"""Limit of active-set changes in a search; the most observed is 2507, for a state drawn far off."""
 PROBLEMS: Final = 16
-"""Whose tables are kept, those used last, for the controllers to come."""
+"""Number of problems whose tables are cached, most recently used first."""
 WAYS: Final = (Method.FREE, Method.AXES, Method.WHOLE)
-"""By `enum quadsim_found`; beyond these there is no optimum."""
+"""Status by `enum quadsim_found`; other values mean no optimum."""
 
 Made = TypeVar("Made")
 Filled = TypeVar("Filled", bound=ctypes.Structure)
@@ -62,7 +62,7 @@ class _Problem(ctypes.Structure):
 
 
 STRUCTS: Final = {"axes": _Axis, "rows": _Row, "terms": _Term}
-"""Of the lists among a problem's members."""
+"""Members of a problem that are lists."""
 
 
 class Work(ctypes.Structure):
@@ -79,7 +79,7 @@ class Work(ctypes.Structure):
 
 @cache
 def core_library() -> ctypes.CDLL:
-    """The library, its functions declared."""
+    """Return the library with its functions declared."""
     library = load()
     check_mirrors(quadsim_axis=_Axis, quadsim_row=_Row, quadsim_term=_Term, quadsim_problem=_Problem, quadsim_work=Work)
     library.quadsim_work_reals.restype, library.quadsim_work_reals.argtypes = ctypes.c_long, [_AT]
@@ -90,22 +90,22 @@ def core_library() -> ctypes.CDLL:
 
 
 class CoreProblem:
-    """A problem's `tables` where the core reads them; any number of controllers may share them.
+    """A problem's `tables` in the core's memory layout; any number of controllers may share them.
 
-    `struct` is the `quadsim_problem`, which points to memory that this object holds.
+    `struct` is the `quadsim_problem`, which points to memory that this object owns.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._problem, self.tables = problem, tables(problem)
         self._kept: list[object] = []
-        # Hard rows that are independent are no more than inputs; soft ones beyond their bounds may add their number.
+        # Independent hard rows are at most as many as inputs; violated soft rows may add their number.
         N, rows = problem.horizon, self.tables.rows
         at_most = N * (N_ROTORS + sum(math.isfinite(row.l1) for row in rows))
         room = min(N * len(rows), at_most) + 1
         self.struct = self._filled(_Problem, members(self.tables, room=room, changes=MOST_CHANGES))
 
     def _filled(self, kind: type[Filled], values: Mapping[str, Any]) -> Filled:
-        """A struct; what its pointers point to is kept."""
+        """Return a struct, and keep the memory that it points to."""
         return kind(**{name: self._member(name, value) for name, value in values.items()})
 
     def _member(self, name: str, value: Any) -> int | float:
@@ -119,20 +119,20 @@ class CoreProblem:
 
     @cached_property
     def condensed(self) -> Condensed:
-        """The QP that the optimum's KKT residuals are of."""
+        """The QP to which the KKT residuals of the optimum refer."""
         return Condensed(self._problem)
 
 
 @dataclass(frozen=True)
 class Key(Generic[Made]):
-    """Something made of dataclasses, by what it consists of."""
+    """A cache key of something built from dataclasses, by its contents."""
 
     content: object
     of: Made = field(compare=False)
 
     @classmethod
     def to(cls, value: Made) -> Key[Made]:
-        """The key of a value."""
+        """Return the key of a value."""
         return cls(_content(value), value)
 
 
@@ -145,7 +145,7 @@ def _content(value: object) -> object:
 
 
 def core_problem(problem: Problem) -> CoreProblem:
-    """A problem's tables, which equal problems of this process share."""
+    """Return a problem's tables, shared by equal problems of this process."""
     return _core_problem(Key.to(problem))
 
 
@@ -155,13 +155,12 @@ def _core_problem(key: Key[Problem]) -> CoreProblem:
 
 
 class Core:
-    """Finds a problem's optimum by the compiled core; see `mpc.solvers.Solver`.
+    """Computes a problem's optimum with the compiled core; see `mpc.solvers.Solver`.
 
-    The search starts from the last optimum's active set, moved one step earlier.  What the core gives up, or finds
-    infeasible, PIQP answers, and is named for it.
+    The search starts from the last optimum's active set, shifted by one step.  PIQP answers the problems that the core
+    gives up or finds infeasible, and `answered_by` names it.
 
-    Raises:
-        MissingCoreError: there is no library.
+    Raises:     MissingCoreError: there is no library.
     """
 
     name: Final = CORE
@@ -177,7 +176,7 @@ class Core:
         self._no_slacks, self._no_multipliers = (
             read_only(np.zeros((problem.horizon, count))) for count in (rows.soft.size, len(rows.D))
         )
-        # The work points into this memory, and so do the views of it.
+        # The work struct and its views point into this memory.
         self._memory = np.zeros(self._library.quadsim_work_reals(ctypes.addressof(p)))
         self._work = Work()
         self._at = ctypes.addressof(self._work)
@@ -190,8 +189,8 @@ class Core:
         sizes = p.states, p.horizon * p.regulated, p.states, N_ROTORS, N_ROTORS
         self._query = np.zeros(sum(sizes))
         parts = np.split(self._query, np.cumsum(sizes[:-1]))
-        self._state, wanted, self._x_s, self._u_s, self._before = parts
-        self._wanted = wanted.reshape(p.horizon, -1)
+        self._state, desired, self._x_s, self._u_s, self._before = parts
+        self._desired = desired.reshape(p.horizon, -1)
         self._arguments = self._at, *(part.ctypes.data for part in parts)
 
     def _view(self, address: int, kind: type[ctypes.c_double | ctypes.c_int8], columns: int) -> Array:
@@ -199,7 +198,7 @@ class Core:
         return np.ctypeslib.as_array((kind * math.prod(shape)).from_address(address)).reshape(shape)
 
     def __reduce__(self) -> NoReturn:
-        """Addresses are of no use to a copy, or in another process."""
+        """Refuse: addresses are useless in a copy or another process."""
         raise TypeError("a Core cannot be copied or pickled: make another from its problem")
 
     def reset(self) -> None:
@@ -213,7 +212,7 @@ class Core:
         started, (state, desired, u_before, rest, _) = clock.perf_counter(), query
         x_s, u_s = self._equilibrium if rest is None else rest
         self._state[:], self._x_s[:], self._u_s[:], self._before[:] = state, x_s, u_s, u_before
-        np.subtract(desired, 0.0 if rest is None else self._C_r @ x_s, out=self._wanted)
+        np.subtract(desired, 0.0 if rest is None else self._C_r @ x_s, out=self._desired)
         if self._modes is not None:
             for speeds in (self._state[N_STATES:], self._x_s[N_STATES:]):
                 speeds[:] = self._modes @ speeds
@@ -240,8 +239,8 @@ class Core:
         )
 
     def _certificate(self, query: Query, plan: Array, slacks: Array, multipliers: Array) -> tuple[QP, Solution]:
-        """The condensed QP of a query, and the solution that a plan is of it."""
-        return self.formulation.pose(query).qp, self.formulation.solution(plan, slacks, multipliers)
+        """Return the condensed QP of a query, and a plan as its solution."""
+        return self.formulation.assemble(query).qp, self.formulation.solution(plan, slacks, multipliers)
 
     def _by_piqp(self, query: Query, started: float) -> Answer:
         if self._piqp is None:

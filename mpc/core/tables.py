@@ -1,14 +1,15 @@
-"""The numbers that a problem's optimum is computed from without a linear algebra library.
+"""Tables from which a problem's optimum is computed without a linear algebra library.
 
-Axis by axis (`mpc.core.axes`), the inputs u - u_s = T w fall into parts w that no cost ties together.  For each axis
+Axis by axis (`mpc.core.axes`), the inputs u - u_s = T w separate into parts w without a common cost.  For each axis:
 
-- the optimum without rows of a linear-quadratic problem with any linear terms is one pass of dynamic programming
-  backwards, with gains K_i that do not depend on them, and one forwards: O(N) numbers in place of the O(N^2) of
-  Eq. (22).  Where changes of inputs cost something, the input before is one more state;
-- the responses G H^-1 G' of its inputs and of its rows' outputs to one another, of which an active set's system is
-  made, are a table.
+- without rows, the optimum of a linear-quadratic problem with any linear terms is one backward pass of dynamic
+programming, with gains K_i that do not depend on these terms, and one forward pass: O(N) numbers instead of the O(N^2)
+of Eq.  (22). With a weight on input changes, the previous input is a further state;
 
-Inputs that move nothing the cost or a row sees are one more axis, without states.
+- a table holds the responses G H^-1 G' of its inputs and of its rows' outputs to one another, from which the system of
+an active set is assembled.
+
+Inputs that affect neither cost nor rows are one further axis, without states.
 """
 
 from __future__ import annotations
@@ -30,76 +31,76 @@ from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS
 
 ROUNDING: Final = 1e-13
-"""Share of the largest number of a row of C_r, D, E, or T below which one is taken for a product of rounding."""
+"""Share of the largest number of a row of C_r, D, E, or T below which a number counts as rounding."""
 LARGEST: Final = 2**20
-"""Entries of all responses beyond which a problem is not one for the core: 8 MiB."""
+"""Largest total of entries of all responses that the core takes: 8 MiB."""
 LEAST_QUADRATIC: Final = 1e-9
-"""Share of l1 that replaces a quadratic penalty of zero, for which a step has no length."""
+"""Share of l1 that replaces a zero quadratic penalty, for which a step length is undefined."""
 MOST_STATES: Final = 20
-"""Of an axis, with the inputs before where changes cost something; as in quadsim_core.h."""
+"""Most states of an axis, including previous inputs where changes have a weight; as in quadsim_core.h."""
 MOST_ROWS: Final = 256
-"""Rows of a step, which are numbered in bytes."""
+"""Most rows of a step, numbered in bytes."""
 NO_BOUND: Final = 1e30
-"""In place of infinity."""
+"""Stands for infinity."""
 TINY: Final = 1e-18
-"""Share of the largest response below which one is taken for zero: arithmetic on the least numbers is slow."""
+"""Share of the largest response below which a response is set to zero: denormal arithmetic is slow."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AxisTables:
-    """One axis: n states, of which the last m are the inputs before where changes cost something, and m inputs."""
+    """One axis: n states, the last m of them the previous inputs if changes have a weight, and m inputs."""
 
-    states: list[int]  # which of the problem's states the first n are
-    before: bool  # whether the inputs before are states
+    states: list[int]  # indices of the first n states in the problem
+    before: bool  # whether the previous inputs are states
     inputs: int  # m
-    first: int  # where w is among all axes' inputs
-    rows: list[int]  # which of the problem's rows have its states, o of them
-    regulated: list[int]  # its rows of C_r, r of them
+    first: int  # index of w among the inputs of all axes
+    rows: list[int]  # indices of the o rows on its states
+    regulated: list[int]  # indices of its r rows of C_r
     B: Array  # (n, m)
     closed: Array  # (N, n, n) A - B K_i
     K: Array  # (N, m, n) w_i = k_i - K_i x_i
     inverse: Array  # (N, m, m) (R + B' P_{i+1} B)^-1
-    W: Array  # (n, r) linear term of a state's cost by y_d - C_r x_s
-    W_end: Array  # (n, r) of the last state's
+    W: Array  # (n, r) linear term of a state's cost in y_d - C_r x_s
+    W_end: Array  # (n, r) the same for the last state
     C: Array  # (o, n) its rows
-    responses: Array  # (N (m + o), N (m + o)) of inputs and outputs of each step to one another
+    responses: Array  # (N (m + o), N (m + o)) responses of the inputs and outputs of each step to one another
 
 
 @dataclass(frozen=True, kw_only=True)
 class RowTables:
-    """A row of each step: C x, at the step's end or its beginning, and terms of inputs of the step and the one before.
+    """A row of each step: C x, at the end or start of the step, and terms in the inputs of the step and the one before.
 
-    The row's value is C x + sum of coefficient u_input(step - lag).
+    Its value is C x + sum of coefficient u_input(step - lag).
     """
 
     axis: int  # -1 for a row without states
-    later: bool  # C x is that at the step's end
+    later: bool  # whether C x is taken at the end of the step
     terms: list[tuple[float, int, int]]  # coefficient, input, lag
-    l1: float  # linear penalty; infinite of a hard row
+    l1: float  # linear penalty; infinite for a hard row
     compliance: float  # 1 / (2 l2)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tables:
-    """A problem in numbers."""
+    """A problem as numbers."""
 
     problem: Problem
     axes: list[AxisTables]
     rows: list[RowTables]
-    lower: Array  # (N, m), (1, m) where all steps have the same
+    lower: Array  # (N, m); (1, m) if all steps share it
     upper: Array
-    scale: Array  # (N, m) 1 over the root of a row's response to itself
-    tolerance: Array  # (m,) the largest of these roots
+    scale: Array  # (N, m) 1 / sqrt of a row's response to itself
+    tolerance: Array  # (m,) the largest of these square roots
     T: Array  # (nu, nu) u - u_s = T w
     T_inverse: Array
-    modes: Array  # (nu, nu) takes rotor speeds that are states to the modes in their place, one of each axis
+    modes: Array  # (nu, nu) maps rotor speeds that are states to modes, one per axis
 
 
 def tables(problem: Problem) -> Tables:
-    """The numbers of a problem.
+    """Return the tables of a problem.
 
-    Raises:
-        ParameterError: it is not one for the core: too large, rows that differ from step to step, shared slacks.
+    Raises:     ParameterError: the core cannot take it: too large, rows that differ from step to step, or shared
+    slacks.
     """
     problem = with_constraints(problem)
     N, modes = problem.horizon, np.eye(problem.model.nu)
@@ -147,9 +148,9 @@ def tables(problem: Problem) -> Tables:
 
 
 def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
-    """Those of a `quadsim_problem`: integers, arrays of numbers or bytes, and lists of structs' members.
+    """Return the members of a `quadsim_problem`: integers, arrays of numbers or bytes, and lists of structs' members.
 
-    There is `room` for so many active rows and one more; a search is given up after so many `changes` of their set.
+    `room` is the capacity for active rows, less one; a search stops after `changes` changes of the active set.
     """
     problem, rows = tables.problem, tables.rows
     past = np.cumsum([len(row.terms) for row in rows]).tolist()
@@ -187,7 +188,7 @@ def members(tables: Tables, *, room: int, changes: int) -> dict[str, Any]:
 
 
 def _axis_members(part: AxisTables, *, bounded: bool) -> dict[str, Any]:
-    """Those of a `quadsim_axis`; its responses only where there are rows."""
+    """Return the members of a `quadsim_axis`; its responses only if there are rows."""
     n, m = part.B.shape
     responses = part.responses[np.tril_indices(len(part.responses))]
     responses[np.abs(responses) < TINY * np.abs(responses).max(initial=0.0)] = 0.0
@@ -207,7 +208,7 @@ def _axis_members(part: AxisTables, *, bounded: bool) -> dict[str, Any]:
 
 
 def with_constraints(problem: Problem) -> Problem:
-    """A problem without constraints with one that bounds nothing; any other as it is."""
+    """Return a problem with at least one constraint: one that bounds nothing is added if there is none."""
     if problem.every_constraint:
         return problem
     nothing = np.full(problem.model.nu, -math.inf)
@@ -216,7 +217,7 @@ def with_constraints(problem: Problem) -> Problem:
 
 
 def _modes(problem: Problem) -> Array:
-    """T^-1 of the problem without rotor lag: speeds that all follow their inputs alike then fall into the axes."""
+    """T^-1 of the problem without rotor lag, which separates rotor speeds that follow their inputs alike into axes."""
     model, objective, n = problem.model, problem.objective, N_STATES
     without = Problem(
         model=replace(model, A=model.A[:n, :n], B=model.B[:n]),
@@ -230,7 +231,7 @@ def _modes(problem: Problem) -> Array:
 
 
 def _in_modes(problem: Problem, modes: Array) -> Problem:
-    """The problem whose last states are `modes` times the rotor speeds."""
+    """Return the problem with `modes` times the rotor speeds as its last states."""
     model, objective = problem.model, problem.objective
     to = scipy.linalg.block_diag(np.eye(N_STATES), modes)
     back = np.linalg.inv(to)
@@ -247,7 +248,7 @@ def _in_modes(problem: Problem, modes: Array) -> Problem:
 
 
 def _all_axes(problem: Problem) -> tuple[list[Axis], Array]:
-    """The axes, the last perhaps one that moves nothing, and T (nu, nu) of all of them."""
+    """Return the axes, the last perhaps without effect, and T (nu, nu) of all of them."""
     parts, nu = axes(problem), problem.model.nu
     T = np.hstack([part.T for part in parts])
     T[np.abs(T) < ROUNDING] = 0.0
@@ -322,7 +323,7 @@ def _row(rows: Rows, i: int, axes: list[AxisTables]) -> RowTables:
 
 
 def _scale(axes: list[AxisTables], rows: list[RowTables], T: Array, N: int) -> Array:
-    """(N, m) 1 over the root of each row's response to itself."""
+    """(N, m) 1 / sqrt of each row's response to itself."""
     scale = np.zeros((N, len(rows)))
     for r, row in enumerate(rows):
         total = np.zeros(N)

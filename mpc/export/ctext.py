@@ -1,4 +1,4 @@
-"""Constants as C99 text, the same for the same numbers."""
+"""Constants as C99 text; equal numbers give equal text."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from quadsim.state import Array
 
 Precision = Literal["double", "float"]
 LEAST_FLOAT: Final = 1.2e-38
-"""Magnitude below which a number is 0: single precision would truncate it, which is an error of some compilers."""
+"""Magnitude below which a number becomes 0: some compilers reject constants that single precision would truncate."""
 STRUCTS: Final = {"axes": "quadsim_axis", "rows": "quadsim_row", "terms": "quadsim_term"}
-"""What lists among the members of a struct are of."""
+"""Element types of the lists among a struct's members."""
 
 
 @dataclass(frozen=True)
 class CText:
-    """Constants whose numbers are of a precision, and whose names all begin with `prefix`."""
+    """Constants of one precision whose names start with `prefix`."""
 
     precision: Precision
     prefix: str = ""
@@ -28,18 +28,18 @@ class CText:
     def number(self, value: float) -> str:
         """A finite number, e.g. `-1.5F`; the compiler rounds it once."""
         if not np.isfinite(value):
-            raise ValueError(f"{value} has no place in C")
+            raise ValueError(f"{value} cannot be written in C")
         text = "0.0" if abs(value) < LEAST_FLOAT else repr(float(value))
         return text if self.precision == "double" else f"{text}F"
 
     def value(self, value: float | Array) -> str:
-        """An initialiser of an integer, a number, or an array of these, row by row."""
+        """Return an initialiser of an integer, a number, or an array of these, row by row."""
         if isinstance(value, np.ndarray):
             return "{" + ", ".join(map(self.number, value.ravel().tolist())) + "}"
         return str(value) if isinstance(value, int) else self.number(value)
 
     def array(self, name: str, values: Array) -> str:
-        """A constant array of bytes or numbers, row by row; of one zero where there are none."""
+        """Return a constant array of bytes or numbers, row by row; an empty one gets a single zero."""
         kind, text = ("unsigned char", str) if values.dtype == np.uint8 else ("quadsim_real", self.number)
         entries = ", ".join(map(text, values.ravel().tolist() or [0]))
         return self._array(kind, name, values.size, textwrap.wrap(entries, 116, break_on_hyphens=False))
@@ -51,7 +51,7 @@ class CText:
         return "\n".join([f"static const {kind} {name} = {{", *lines, "};\n"])
 
     def members(self, values: Mapping[str, Any], suffix: str = "") -> tuple[list[str], dict[str, str]]:
-        """The arrays that a struct's members point to, their names ending in `suffix`, and its initialisers."""
+        """Return the arrays that a struct's members point to, with names ending in `suffix`, and its initialisers."""
         blocks, initialisers = list[str](), dict[str, str]()
         for name, value in values.items():
             initialisers[name] = f"{self.prefix}{name}{suffix}"

@@ -1,4 +1,4 @@
-"""The C files of a controller: the core's, as they are, and one of its numbers."""
+"""The C files of a controller: the core's sources, verbatim, and one file of its numbers."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from mpc.export.ctext import CText, Precision
 from quadsim.vehicle import N_ROTORS
 
 CORE: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_math.h", "quadsim_mpc.h", "quadsim_mpc.c")
-"""Files of `mpc/core/c`, which are exported byte for byte."""
+"""Files of `mpc/core/c` to export verbatim."""
 DATA: Final = "quadsim_data.h"
 """The generated file."""
 CHANGES: Final = 500
-"""Of the active set in a search, after which it is given up."""
+"""Limit of active-set changes in a search."""
 ROWS_PER_STEP: Final = 2.56
-"""Active rows that there is room for, per step of the horizon."""
+"""Capacity for active rows, per step of the horizon."""
 LEAST_ROWS: Final = 64
 
 
 def part(name: str, package: str = "mpc.export") -> str:
-    """A hand-written C source of a package."""
+    """Return a hand-written C source of a package."""
     return (resources.files(package) / "c" / name).read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True, kw_only=True)
 class CController:
-    """A controller as C."""
+    """A controller as C source."""
 
-    law: Exportable  # what it is made from
+    law: Exportable  # the law to export
     precision: Precision = "double"  # of all numbers
     title: str = ""  # a line that identifies it, in ASCII
     asked: int | None = None  # active rows with room; None for 2.56 per step of the horizon, and at least 64
@@ -46,14 +46,14 @@ class CController:
 
     @property
     def rows(self) -> int:
-        """Active rows that there is room for."""
+        """Capacity for active rows."""
         N = self.law.problem.horizon
         usual = max(LEAST_ROWS, math.ceil(ROWS_PER_STEP * N))
         return min(N * len(self.tables.rows), usual if self.asked is None else self.asked)
 
     @property
     def reals(self) -> int:
-        """Numbers of memory, as `quadsim_mpc_reals` has it."""
+        """Numbers of memory needed, as counted by `quadsim_mpc_reals`."""
         N, problem, room = self.law.problem.horizon, self.tables.problem, self.rows + 1
         rows = N * len(self.tables.rows)
         packed = 4 * room + 3 * rows  # bytes of integers
@@ -63,7 +63,7 @@ class CController:
 
     @property
     def real_bytes(self) -> int:
-        """Of a number."""
+        """Size of a number in bytes."""
         return 8 if self.precision == "double" else 4
 
     @cached_property
@@ -86,13 +86,13 @@ class CController:
 
 
 def problem_data(text: CText, tables: Tables, room: int) -> list[str]:
-    """The optimisation's numbers, the last of them its `quadsim_problem`."""
+    """Return the optimisation's numbers, with its `quadsim_problem` last."""
     blocks, entries = text.members(members(tables, room=room, changes=CHANGES))
     return [*blocks, text.struct("quadsim_problem", f"{text.prefix}problem", **entries)]
 
 
 def _controller(text: CText, law: Exportable, tables: Tables) -> list[str]:
-    """The numbers besides those of the optimisation, the last of them the `quadsim_controller`."""
+    """Return the numbers apart from those of the optimisation, with the `quadsim_controller` last."""
     numbers, robust = controller_numbers(law), "NULL"
     blocks = [text.array("C_r", numbers.pop("C_r"))]
     if law.settings is not None:

@@ -1,4 +1,4 @@
-"""The machines that an export is made for, as the first lines of its Makefile."""
+"""The machines that an export can be made for, as the first lines of its Makefile."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from mpc.export.ctext import Precision
 
 EMULATOR: Final = "qemu-system-arm"
 TICK: Final = 40
-"""Instructions of the emulated processors between two ticks of their clock, with `-icount shift=0`."""
+"""Instructions per tick of the emulated processors' clock, with `-icount shift=0`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """A machine: how its programs are compiled, and how they are run."""
+    """A machine: how programs for it are compiled and run."""
 
-    name: str  # what `--target` calls it
-    title: str  # what a person calls it
-    sources: tuple[str, ...]  # the file that implements `target.h`, and others that it takes
+    name: str  # value of `--target`
+    title: str  # display name
+    sources: tuple[str, ...]  # the file that implements `target.h`, and further sources
     compiler: str
-    machine: str = ""  # flags that choose the processor
+    machine: str = ""  # compiler flags that choose the processor
     link: str = ""  # flags of the linker
-    board: str = ""  # what QEMU calls the machine to emulate; none where programs are run as they are
+    board: str = ""  # QEMU's name of the machine to emulate; empty to run programs natively
 
     @property
     def emulation(self) -> tuple[str, ...]:
-        """The command that runs an image, but for the image and what the serial line is; empty without an emulator."""
+        """The command that runs an image, up to the image and the serial line; empty without an emulator."""
         if not self.board:
             return ()
         options = f"-M {self.board} -nographic -monitor none -semihosting -icount shift=0"
         return (EMULATOR, *options.split())
 
     def makefile(self, precision: Precision) -> str:
-        """The first lines of the Makefile."""
+        """Return the first lines of the Makefile."""
         run = " ".join(["timeout 600", *self.emulation, "-serial none -kernel"]) if self.board else ""
         lines = {
             "COMPILER": self.compiler,
@@ -66,4 +66,4 @@ TARGETS: Final = {
         _cortex("cortex-m4f", "Cortex-M4F", "-mcpu=cortex-m4 -mfpu=fpv4-sp-d16", "mps2-an386"),
     )
 }
-"""By name; the Cortex-M7 has an FPU for doubles, the Cortex-M4F one for floats alone."""
+"""Targets by name; the Cortex-M7 has a double-precision FPU, the Cortex-M4F a single-precision one."""

@@ -1,1 +1,1 @@
-"""What is flown when a controller has no good answer."""
+"""The commands flown when a controller has no usable answer."""

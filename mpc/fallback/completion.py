@@ -1,16 +1,14 @@
 """State completion: a whole state from one whose measured channels are partly missing.
 
-A channel that is not finite, implausibly large, or frozen is missing.  It is replaced by its conditional mean given
+A channel is missing if it is not finite, implausibly large, or frozen.  It is replaced by its conditional mean given
 the available channels: the hover model, linearised about the estimated equilibrium (`mpc.equilibrium`), predicts the
-state under the command in force, and a Kalman filter whose only measurements are the available channels corrects it
-(Simon, "Optimal State Estimation", 2006, Sec. 5.1; the
-process noise is an acceleration, constant over a period and white from one to the next, Bar-Shalom, Li and Kirubarajan,
-"Estimation with Applications to Tracking and Navigation", 2001, Sec. 6.3.2).  Available channels are passed on as
-measured, so that nothing changes while all are available.
+state under the command in force, and a Kalman filter corrects it with the available channels as its only measurements
+(Simon, "Optimal State Estimation", 2006, Sec.  5.1). The process noise is an acceleration, constant over a period and
+white from one to the next (Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation",
+2001, Sec.  6.3.2). Available channels pass unchanged, so a complete measurement is not altered.
 
-A group of three channels is frozen when it repeats the last period's numbers to the last bit although the prediction
-has moved away from them.  A sensor slower than the controller repeats its numbers between its samples; they are
-predicted then.
+A group of three channels is frozen if it repeats the last period's numbers bit by bit although the prediction has moved
+away from them.  A sensor slower than the controller repeats its numbers between samples; they are predicted then.
 """
 
 from __future__ import annotations
@@ -52,31 +50,31 @@ _NO_RATES: Final = (math.nan, math.nan, math.nan)
 
 
 PLAUSIBLE: Final = by_group(1e5, 1e3, 1e5, 1e3)
-"""Largest magnitudes taken for a measurement [m, m/s, rad, rad/s]; a yaw counts its turns."""
+"""Largest magnitudes accepted as measurements [m, m/s, rad, rad/s]; a yaw counts its turns."""
 PLAUSIBLE_REFERENCE: Final = float(PLAUSIBLE[list(REFERENCE_STATES)].min())
-"""The same of references x, y, z [m], yaw [rad]."""
+"""Largest magnitudes accepted in references x, y, z [m], yaw [rad]."""
 UNMOVED: Final = by_group(1e-3, 5e-3, 1e-3, 2e-2)
-"""Distance of the prediction from repeated numbers beyond which these count as frozen [same]."""
+"""Distance of the prediction from repeated numbers above which these count as frozen [same]."""
 UPRIGHT: Final = 1.4
-"""Pitch [rad] up to which implausible rates of Euler angles are the measurement's fault, not the angles'."""
-NOISE: Final = by_group(0.01, 0.02, 0.005, 0.02)  # standard deviations ascribed to measured channels [same]
+"""Pitch [rad] up to which implausible Euler rates indicate a fault of the measurement, not the singularity."""
+NOISE: Final = by_group(0.01, 0.02, 0.005, 0.02)  # standard deviations of measured channels [same]
 ACCELERATION: Final = (1.0, 2.0)  # standard deviations of unmodelled accelerations [m/s^2, rad/s^2]
 UNKNOWN: Final = by_group(100.0, 10.0, 1.0, 1.0)
-"""Standard deviations before anything was measured [m, m/s, rad, rad/s]."""
+"""Standard deviations before the first measurement [m, m/s, rad, rad/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompletedInputs(StepInputs):
-    """A moment whose state may in part be predicted rather than measured."""
+    """The inputs of a step, with a state that may be predicted in part."""
 
-    unseen: Array  # (12,) periods since each channel was measured; 0 for one that is
+    unseen: Array  # (12,) periods since each channel was measured; 0 for a measured one
 
 
 def completed_inputs(now: StepInputs, acting: Array, unseen: Array, known: Array) -> CompletedInputs:
-    """A moment with the command in force (4,) and which channels (12,) of the state `known` (12,) are not measured.
+    """Return a step's inputs with the command in force (4,), and the state `known` (12,) of ages `unseen` (12,).
 
-    Its attitude and body rates are left out where the state's are predicted.  Next to a pitch of 90 deg the rates of
-    Euler angles are implausibly large; those of the body are not.
+    Attitude and body rates are omitted where those of the state are predicted.  Near a pitch of 90 deg, Euler rates are
+    implausibly large, but body rates are not.
     """
     values = {**vars(now), "acting": acting, "unseen": unseen}
     if unseen[ANGLES].any():
@@ -87,9 +85,9 @@ def completed_inputs(now: StepInputs, acting: Array, unseen: Array, known: Array
 
 
 class StateCompletion:
-    """Completes one state after the other, one per control period.
+    """Completes one state per control period.
 
-    `unseen` (12,) is the number of periods since each channel was last measured; infinite before it ever was.
+    `unseen` (12,) is the number of periods since each channel was last measured; infinite before the first measurement.
     """
 
     def __init__(self, model: LinearModel) -> None:
@@ -99,7 +97,7 @@ class StateCompletion:
         self.reset()
 
     def reset(self) -> None:
-        """Restart: nothing measured yet; at rest, level and at the origin is assumed."""
+        """Restart without measurements: assume rest, level, at the origin."""
         self._state = np.zeros(N_STATES)
         self._covariance: Array = np.diag(UNKNOWN**2)
         self._last = np.full(N_STATES, np.nan)
@@ -107,22 +105,20 @@ class StateCompletion:
         self.unseen = np.full(N_STATES, np.inf)
 
     def adopt(self, other: StateCompletion) -> None:
-        """Go on from where another one is."""
+        """Take over the state of another completion."""
         self._state, self._covariance, self.unseen = other._state, other._covariance, other.unseen
         self._last, self._last_body_rates = other._last, other._last_body_rates
 
     def complete(self, measured: Array, acting: Array, trim: Trim, *, free: bool = True) -> Array:
-        """The whole state (12,) now.
+        """Return the complete state (12,) now.
 
-        Args:
-            measured: (12,) in part perhaps not finite; of another shape, nothing was measured.
-            acting: (4,) rotor speeds in force since the last state [rad/s].
-            trim: what holds the vehicle at rest.
-            free: whether the vehicle flies, as the model predicts; otherwise nothing counts as frozen.
+        Args:     measured: (12,), in part perhaps not finite; another shape counts as no measurement.     acting: (4,)
+        rotor speeds in force since the last state [rad/s].     trim: the equilibrium of the vehicle.     free: whether
+        the vehicle flies, as the model assumes; otherwise no channel counts as frozen.
         """
         if np.shape(measured) != (N_STATES,):
             measured = np.full(N_STATES, np.nan)
-        seen = np.abs(measured) <= PLAUSIBLE  # as NaN is not
+        seen = np.abs(measured) <= PLAUSIBLE  # false for NaN
         repeated = self._repeats(measured, seen)
         if all_true(seen) and not (free and np.count_nonzero(repeated)):
             return self._take(measured)
@@ -144,9 +140,9 @@ class StateCompletion:
         return self._state.copy()
 
     def _repeats(self, measured: Array, seen: Flags) -> Flags:
-        """(12,) which channels have the numbers of the period before.
+        """(12,) whether a channel repeats the numbers of the previous period.
 
-        Rates are compared as the body's too, which a gyro measures: Euler-angle rates change with the attitude.
+        Body rates, which a gyro measures, are compared too: Euler rates change with the attitude.
         """
         repeated, last = np.asarray(measured == self._last), self._last_body_rates
         body_rates = body_rates_of(measured.tolist()) if all_true(seen) or seen[_TURNING].all() else _NO_RATES

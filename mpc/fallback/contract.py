@@ -1,19 +1,21 @@
-"""The fallback contract: what is flown when a controller has no good answer.
+"""The fallback contract: the commands flown when a controller has no usable answer.
 
-Each period, the first of these that can be had:
+Each period flies the first of these that is available:
 
 0. the inner controller's answer, if its status is one of `ACCEPTED` and it is finite and within the actuators' bounds;
 1. its last good plan, shifted by the periods since, with an LQR correction towards the states that the plan predicted,
-   while it is not too old and the vehicle not too far from it;
-2. level hover by LQR: velocity to zero, then the place held; height and yaw held from the start;
-3. descent: the same, sinking at a steady speed, once level 2 has lasted too long.
+unless the plan is too old or the vehicle too far from it;
 
-The inner controller is called in every period in which the state is known, so that recovery is automatic.  It receives
-the command in force, so that its bounds on steps refer to what acts, whatever commanded it, and which channels of the
-state are predicted rather than measured (`mpc.fallback.completion.CompletedInputs`).
+2. level hover by LQR: velocity to zero, then the position held; height and yaw held from the start;
 
-One that estimates disturbances gives the equilibrium under them as an attribute `trim` (`mpc.equilibrium.Trim`).
-Levels 1 to 3, and predictions of channels that are not measured, start from it; it is held while nothing is measured.
+3. descent: the same, sinking at a constant speed, after level 2 has lasted too long.
+
+The inner controller is called in every period with a known state, so it resumes automatically.  It receives the command
+in force, so that its slew bounds refer to the acting command, and the list of predicted channels
+(`mpc.fallback.completion.CompletedInputs`).
+
+A controller that estimates disturbances provides its equilibrium as an attribute `trim` (`mpc.equilibrium.Trim`).
+Levels 1 to 3, and predictions of missing channels, start from it; it is held while nothing is measured.
 """
 
 from __future__ import annotations
@@ -51,16 +53,16 @@ from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, al
 from quadsim.vehicle import N_ROTORS
 
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
-"""What numerics and compiled back ends raise.  A programmer's mistakes (`TypeError`, `KeyError`, ...) end the run."""
-_MISTAKES: Final = (NotImplementedError, RecursionError)  # kinds of `RuntimeError` that are a programmer's, too
+"""Exceptions of numerics and compiled back ends.  Programming errors (`TypeError`, `KeyError`, ...) end the run."""
+_MISTAKES: Final = (NotImplementedError, RecursionError)  # subclasses of `RuntimeError` that are programming errors
 _USUAL: Final = FallbackSettings()
 
 
 class Guarded:
-    """A controller that keeps the fallback contract, whatever the one inside it does.
+    """A controller that keeps the fallback contract, whatever the inner controller does.
 
-    A command that is not finite or not within the bounds cannot leave it.  While all is well, the inner controller's
-    commands pass unchanged; one that falls back by itself does no harm.
+    It never sends a command that is not finite or not within the bounds.  It passes the inner controller's usable
+    commands unchanged; an inner controller may have its own fallback.
     """
 
     def __init__(
@@ -83,14 +85,14 @@ class Guarded:
         self.inner.reset(self._before.copy())
 
     def _forget(self) -> None:
-        """Leave every fallback level."""
+        """Leave all fallback levels."""
         self._good: tuple[Array, Array] | None = None  # state (12,) of the last accepted answer, and its plan (N, 4)
         self._foreseen: Array | None = None
         self._target: Array | None = None
-        self._age = self._hovered = 0  # periods in fallback, and of them on level 2 or 3
+        self._age = self._hovered = 0  # periods in fallback, and periods of these on level 2 or 3
 
     def adopt(self, previous: object) -> None:
-        """Go on from the level of fallback, the state and the plan of the contract before, and hand over within it."""
+        """Take over the previous contract's level, state and plan, and hand over between the inner controllers."""
         hand_over(self.inner, previous)
         law = within(previous, Guarded)
         if law is None:
@@ -102,10 +104,10 @@ class Guarded:
             self._good = state, resized(plan, self.horizon)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """The first level's command that can be had; see `quadsim.controller.Controller.step`.
+        """Return the command of the first available level; see `quadsim.controller.Controller.step`.
 
-        However the inner controller fails, this raises none of its `FAILURES`, whose names become the status.
-        While grounded, rotors are taken to their lowest speed as fast as the bounds allow.
+        It catches the `FAILURES` of the inner controller; their names become the status.  While grounded, the rotors
+        slow down to their lowest speed as fast as the bounds allow.
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
         known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
@@ -118,7 +120,7 @@ class Guarded:
             command = self._fall_back(status, answer, known, acting)
         else:
             self._forget()
-            # Moved onto its bounds; so is what it plans for later, which may act without a call.
+            # Moved onto its bounds, and so is the rest of the plan, which may act without a call.
             speeds = self._bounds.clip(answer.speeds, acting)
             later = self._bounds.clip_plan(answer.plan[1:], speeds) if self.horizon > 1 else answer.plan[1:]
             command = replace(answer, speeds=speeds, plan=np.concatenate([speeds[None], later]), fallback=0)
@@ -128,14 +130,14 @@ class Guarded:
 
     @property
     def trim(self) -> Trim:
-        """The equilibrium that the inner controller estimates; level hover where it has none."""
+        """The equilibrium that the inner controller estimates; level hover if it estimates none."""
         trim = _tried(lambda: getattr(self.inner, "trim", None))
         return trim if isinstance(trim, Trim) else self._level
 
     @property
-    def unanswered(self) -> InfeasiblePeriod | None:
-        """The first period since `reset` whose QP had no answer; None where all had, or there is no QP."""
-        period = getattr(self.inner, "unanswered", None)
+    def infeasible_period(self) -> InfeasiblePeriod | None:
+        """The first period since `reset` whose QP had no answer; None if there was none, or there is no QP."""
+        period = getattr(self.inner, "infeasible_period", None)
         return period if isinstance(period, InfeasiblePeriod) else None
 
     def predict(self, states: Array, plans: Array) -> Array:
@@ -146,7 +148,7 @@ class Guarded:
         return predict_in_heading_frame(anchored(self._model, self.trim), states, plans, self.trim)
 
     def _call(self, now: CompletedInputs, known: Array, reference: Array) -> tuple[str, Command | None]:
-        """The inner controller's answer where one was given, and its status: an accepted one is good to fly."""
+        """Return the inner controller's status and, if it gave one, its answer; an accepted answer is safe to fly."""
         assert now.acting is not None
         if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:
             return "state_unknown", None
@@ -154,7 +156,7 @@ class Guarded:
         if np.shape(reference) != shape or not all_true(np.abs(reference) <= PLAUSIBLE_REFERENCE):
             return "invalid_reference", None
         answer: Command | Exception = _tried(lambda: self.inner.step(now, known.copy(), reference))
-        if isinstance(answer, Exception):  # `PlanExhaustedError` as `plan_exhausted_error`
+        if isinstance(answer, Exception):  # e.g. `PlanExhaustedError` as `plan_exhausted_error`
             return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(answer).__name__).lower(), None
         if answer.status in ACCEPTED and (
             np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (self.horizon, N_ROTORS)
@@ -172,13 +174,13 @@ class Guarded:
         return replace(spent, speeds=plan[0].copy(), plan=plan, active=0, slack=0.0)
 
     def _shifted(self, known: Array, acting: Array, *, lost: bool) -> Array | None:
-        """The rest of the last good plan (N, 4), corrected now; None once it is unusable, from then on."""
+        """Return the rest of the last good plan (N, 4), corrected; None from when it becomes unusable."""
         if self._good is None:
             return None
         (state, plan), age = self._good, self._age
         if self._foreseen is None:
             self._foreseen = self.predict(state[None], plan[None])[0]
-        deviation = known - self._foreseen[min(age, self.horizon) - 1]  # row i is of the state i + 1 periods later
+        deviation = known - self._foreseen[min(age, self.horizon) - 1]  # row i is the state i + 1 periods later
         old = age >= self.horizon or age * self._model.period > self._settings.plan_age + 1e-9
         if lost or old or not (np.abs(deviation) <= self._distance).all():
             self._good = None
@@ -188,7 +190,7 @@ class Guarded:
         return self._bounds.clip_plan(plan, acting)
 
     def _hover(self, known: Array, acting: Array) -> tuple[Array, int]:
-        """The plan (N, 4) of level hover or descent, and its level."""
+        """Return the plan (N, 4) of level hover or descent, and its level."""
         settings, period = self._settings, self._model.period
         if self._target is None:
             self._target = np.zeros(N_STATES)
@@ -207,7 +209,7 @@ class Guarded:
 
 
 def _tried(call: Callable[[], Any]) -> Any:
-    """What a call returns, or which of `FAILURES` it raises."""
+    """Return the result of a call, or the exception of `FAILURES` that it raises."""
     try:
         return call()
     except _MISTAKES:

@@ -1,16 +1,16 @@
-"""Level hover by LQR: what a vehicle falls back on, and what brings it back onto a plan.
+"""Level hover by LQR: the last resort of every controller, and the correction that returns a vehicle to its plan.
 
-The gain is that of the infinite horizon on the hover model, in the frame turned by the heading: there the model at zero
-yaw holds for any yaw.  Weights are those of Bryson's rule (Bryson and Ho, "Applied Optimal Control", 1975, Sec. 5.2),
-one over the square of the largest acceptable value, on states and on the *accelerations* that inputs make, not on rotor
-speeds: the closed loop is then the same for every vehicle.
+The gain is that of the infinite horizon on the hover model, in the heading frame, where the model at zero yaw holds for
+any yaw.  The weights follow Bryson's rule (Bryson and Ho, "Applied Optimal Control", 1975, Sec.  5.2), one over the
+square of the largest acceptable value, for states and for the *accelerations* that inputs cause, not for rotor speeds:
+the closed loop is then the same for every vehicle.
 
     acceleration = -K (xi - xi_target)    u = u_s + S^-1 acceleration
 
-u_s holds the vehicle at rest against what is known to disturb it; see `mpc.equilibrium.Trim`.  S takes rotor speeds to
-accelerations along z and about x, y, z.  K acts on horizontal errors through the tilt that it demands, beside that at
-rest, tilt* = -(k_p e_p + k_v e_v) / k_tilt.  The sum is bounded here: exactly the LQR within the bound, and no more
-tilt than that beyond.
+u_s holds the vehicle at rest under the known disturbance; see `mpc.equilibrium.Trim`. S maps rotor speeds to
+accelerations along z and about x, y, z.  K acts on horizontal errors through the tilt that it demands in addition to
+the tilt at rest, tilt* = -(k_p e_p + k_v e_v) / k_tilt.  That sum is bounded here: the law is exactly the LQR within
+the bound, and demands no more tilt beyond.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from quadsim.vehicle import N_ROTORS
 
 ACCEPTABLE_ACCELERATION: Final = (2.0, 8.0, 8.0, 2.0)  # along z [m/s^2], about x, y and z [rad/s^2]
 LARGEST_CLIMB: Final = 2.0
-"""Acceleration along z [m/s^2], beside what rest takes, beyond which height does not pull: rotors keep the range that
-levels the vehicle."""
-LARGEST_TURN: Final = 2.0  # the same of yaw [rad/s^2]
+"""Largest acceleration along z [m/s^2] that height errors demand beyond the trim: rotors keep the range that levels the
+vehicle."""
+LARGEST_TURN: Final = 2.0  # the same for yaw [rad/s^2]
 
 _POSITION: Final = list(POSITION)
 _VELOCITY: Final = list(VELOCITY)
 _SIDEWAYS: Final = [INDEX[name] for name in ("x", "vx", "y", "vy")]
 _TILTS: Final = [INDEX["roll"], INDEX["pitch"]]
 _ROLL_PITCH: Final = [1, 2]  # rows of an acceleration (4,)
-ACCEPTABLE: Final = by_group(0.5, 1.0, 0.2, 1.0)  # [m], [m/s], [rad], yaw as well, [rad/s]
+ACCEPTABLE: Final = by_group(0.5, 1.0, 0.2, 1.0)  # [m], [m/s], [rad], also for yaw, [rad/s]
 
 
 class HoverLaw:
-    """The LQR of hover, set up once: `gain` (4, 12) is K, from errors in the heading frame, and `slope` (4, 4) is S.
+    """The LQR of hover, set up once: `gain` (4, 12) is K, for errors in the heading frame, and `slope` (4, 4) is S.
 
-    `tilt` is the largest roll and pitch demanded together [rad].
+    `tilt` is the largest demanded tilt, of roll and pitch together [rad].
     """
 
     def __init__(self, model: LinearModel, *, tilt: float) -> None:
@@ -59,18 +59,18 @@ class HoverLaw:
         self._lean = np.linalg.solve(rows[:, _TILTS], rows[:, _SIDEWAYS])
 
     def correction(self, error: Array, yaw: float) -> Array:
-        """What to add to the rotor speeds (4,) [rad/s] to come closer to a state that the vehicle moves through.
+        """Return the correction of the rotor speeds (4,) [rad/s] towards a moving state.
 
-        The error (12,) is the measured minus the wanted state, the yaw the measured one [rad].
+        The error (12,) is the measured minus the desired state, the yaw the measured one [rad].
         """
         return self._inverse @ self._acceleration(turn_horizontally(error, np.array(-yaw)), np.zeros(2))
 
     def plan(
         self, state: Array, target: Array, before: Array, bounds: ActuatorBounds, horizon: int, trim: Trim
     ) -> Array:
-        """The speeds (N, 4) [rad/s] of the next periods, as the model predicts them, turned by the present yaw.
+        """Plan the speeds (N, 4) [rad/s] of the next periods by the model, turned by the measured yaw.
 
-        The target (12,) is what is wanted now, level; its velocity moves it on.
+        The target (12,) is the desired state now, level; it moves at its velocity.
         """
         model, yaw = anchored(self.model, trim), float(state[INDEX["yaw"]])
         A, B = model.A, model.B
@@ -79,14 +79,14 @@ class HoverLaw:
         state, target = turn_horizontally(np.array([state, target]), np.array(-yaw))
         plan = np.empty((horizon, N_ROTORS))
         for i in range(horizon):
-            wanted = trim.speeds + self._inverse @ self._acceleration(state - target, rest[_TILTS])
-            plan[i] = before = bounds.clip(wanted, before)
+            speeds = trim.speeds + self._inverse @ self._acceleration(state - target, rest[_TILTS])
+            plan[i] = before = bounds.clip(speeds, before)
             state = A @ state + B @ before + drift
             target[_POSITION] += self.model.period * target[_VELOCITY]
         return plan
 
     def _acceleration(self, error: Array, rest: Array) -> Array:
-        """-K error (4,) in the heading frame, within its limits; roll and pitch (2,) at rest belong to no error."""
+        """-K error (4,) in the heading frame, within its limits; roll and pitch (2,) at rest are not errors."""
         lean = rest - self._lean @ error[_SIDEWAYS]
         lean *= min(1.0, self.tilt / max(math.hypot(*lean), self.tilt))
         error = error.copy()

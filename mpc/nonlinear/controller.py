@@ -95,8 +95,8 @@ def frames_of(q: Array) -> Array:
 class NonlinearMPC:
     """One step of sequential quadratic programming per period, or more; see the module.
 
-    Of `unanswered`, see `mpc.ocp.InfeasiblePeriod`; a period without an answer takes precedence over one that has not
-    converged.
+    Attributes:
+        infeasible_period: the first period whose QP had no answer or, if there is none, whose SQP did not converge.
     """
 
     name: Final = "nonlinear"
@@ -258,7 +258,7 @@ class NonlinearMPC:
         if self._obstacles is not None:
             self._obstacles.reset()
         self._check.reset()
-        self.unanswered: InfeasiblePeriod | None = None
+        self.infeasible_period: InfeasiblePeriod | None = None
 
     def _forget(self) -> None:
         """Start without a plan, and assume no disturbance."""
@@ -334,17 +334,19 @@ class NonlinearMPC:
         query, answer, problem, sqp = self._iterate(now.time, measured, nodes)
         answer, status = self._check(problem, query, answer, self._rejection(answer))
         if status is not None:
-            if status != INVALID_DATA and (self.unanswered is None or self.unanswered.converges is not None):
-                self.unanswered = InfeasiblePeriod(problem=problem, query=query, status=status, time=now.time)
+            if status != INVALID_DATA and (
+                self.infeasible_period is None or self.infeasible_period.converges is not None
+            ):
+                self.infeasible_period = InfeasiblePeriod(problem=problem, query=query, status=status, time=now.time)
             self._plan = None
             return refused(self._acting, self.horizon, status, answer)
         assert sqp is not None
         status = answer.status
         if sqp.defect > CONVERGED:
             status = NOT_CONVERGED
-            if self.unanswered is None:
+            if self.infeasible_period is None:
                 converges = partial(_converges, self._again, self.settings, start, now.time, measured, nodes)
-                self.unanswered = InfeasiblePeriod(
+                self.infeasible_period = InfeasiblePeriod(
                     problem=problem, query=query, status=status, time=now.time, converges=converges
                 )
         speeds = self._speeds(self._clip(answer.plan))
@@ -417,11 +419,14 @@ class NonlinearMPC:
         axis = thrust_axis(q)
         total = np.sum(thrusts, axis=1) / mass
         force = np.concatenate([total, total[-1:]])[:, None] * axis
-        wanted = force - model.acceleration - drag_acceleration(model, q, states[:, V])
-        size = np.maximum(np.linalg.norm(wanted, axis=1), 1e-9)
+        thrust_acceleration = force - model.acceleration - drag_acceleration(model, q, states[:, V])
+        size = np.maximum(np.linalg.norm(thrust_acceleration, axis=1), 1e-9)
         # The least rotation from one axis to another is (1 + a . b, a x b), up to its length.
         turn = np.concatenate(
-            [1.0 + np.sum(axis * wanted, axis=1)[:, None] / size[:, None], np.cross(axis, wanted) / size[:, None]],
+            [
+                1.0 + np.sum(axis * thrust_acceleration, axis=1)[:, None] / size[:, None],
+                np.cross(axis, thrust_acceleration) / size[:, None],
+            ],
             axis=1,
         )
         length = np.linalg.norm(turn, axis=1)
@@ -437,19 +442,19 @@ class NonlinearMPC:
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
         inputs = self._model.shares(nodes.thrusts)
         start = np.hstack([nodes.states, np.vstack([inputs, inputs[-1:]])])[:, :n]
-        wanted, s0 = start.copy(), measured.copy()
-        wanted[:, Q], s0[Q] = 0.0, frames[0] @ measured[Q]
-        wanted[:, 3] = self.settings.attitude_error is AttitudeError.DIFFERENCE
+        target, s0 = start.copy(), measured.copy()
+        target[:, Q], s0[Q] = 0.0, frames[0] @ measured[Q]
+        target[:, 3] = self.settings.attitude_error is AttitudeError.DIFFERENCE
         if self._tilted:
-            wanted = np.hstack([wanted, np.zeros((len(wanted), 2))])
+            target = np.hstack([target, np.zeros((len(target), 2))])
             s0 = np.append(s0, thrust_axis(measured[Q])[:2])
-        desired = wanted[1:] @ self.problem.objective.C_r.T
+        desired = target[1:] @ self.problem.objective.C_r.T
         if self._plan is None:
             self._plan = start, self._clip(inputs)
         elif self._shift:
             x, u = self._plan
             self._plan = np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
-        rest, before = Equilibrium(wanted[-1], inputs), self._shares(self._acting)
+        rest, before = Equilibrium(target[-1], inputs), self._shares(self._acting)
         share, largest, last, least, patience = 1.0, 1.0, np.zeros(0), math.inf, PATIENCE
         for _ in range(self.settings.iterations):
             x, u = self._plan

@@ -1,1 +1,1 @@
-"""An MPC for vehicles as they are: disturbances, rotors that lag, delays, soft and tightened bounds."""
+"""An MPC for imperfect vehicles: disturbances, rotor lag, delays, soft and tightened bounds."""

@@ -1,13 +1,14 @@
-"""An MPC for vehicles as they are: soft output bounds, rotors that lag, known delays, disturbances, any heading.
+"""An MPC for imperfect vehicles: soft output bounds, rotor lag, known delays, disturbances, any heading.
 
-Each part is a setting of its own and absent unless it is given; without any it is the paper's optimisation.
+Each part has its own setting and is off by default; without any part it solves the paper's optimisation.
 
-The hover model is anchored where the vehicle rests against the estimated disturbance, (x_s, u_s) of `mpc.equilibrium`,
+The hover model is linearised at the vehicle's equilibrium under the estimated disturbance, (x_s, u_s) of
+`mpc.equilibrium`,
 
     x(k+1) = x_s + A (x(k) - x_s) + B (u(k) - u_s),
 
-and u_s is the input that the cost pulls to.  Rest there is then predicted exactly, and tracking has no steady error,
-whatever A and B are worth.
+and u_s is the target of the inputs.  The equilibrium is then predicted exactly, and tracking has no steady-state error,
+whatever the errors of A and B.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ def robust_problem(
     settings: RobustSettings,
     constraints: tuple[Constraint, ...] = (),
 ) -> Problem:
-    """The optimisation of the hover model, its states perhaps with the rotor speeds; see `RobustMPC`.
+    """Return the optimisation of the hover model, with rotor speeds as states if they lag; see `RobustMPC`.
 
-    Objective, bounds and constraints are for the paper's 12 states.
+    Objective, bounds and constraints refer to the paper's 12 states.
     """
     if settings.delay > period:
         raise ParameterError("controller", "delay", settings.delay, f"at most the control period of {period} s")
@@ -79,13 +80,12 @@ def robust_problem(
 class RobustMPC:
     """One optimum per period of a `robust_problem`; see the module.
 
-    It holds no earlier plan: where nothing is solved, the status reports it, with the command in force, for
-    `mpc.fallback.contract.Guarded` to act on.
+    It keeps no earlier plan: without a solution, it reports the status with the command in force, and
+    `mpc.fallback.contract.Guarded` acts on it.
 
-    Attributes:
-        trim: what holds the vehicle at rest against the disturbance that is estimated.
-        unanswered: the first period since `reset` whose QP had no answer; None where all had.
-        answer: of the last period that had one to solve; None before the first.
+    Attributes:     trim: the equilibrium under the estimated disturbance.     infeasible_period: the first period since
+    `reset` whose QP had no answer; None if there was none.     answer: the answer of the last period that solved a QP;
+    None before the first.
     """
 
     name: Final = "robust"
@@ -115,11 +115,11 @@ class RobustMPC:
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
         self._acting = np.array(speeds, float)
-        # Rotor speeds and state at the instant from which this period's command acts, the delay after its beginning.
+        # Rotor speeds and state at the instant at which this period's command takes effect, `delay` after its start.
         self._rotors = self._acting.copy()
         self._ahead: Array | None = None
         self._called_at = self._measured = -math.inf
-        self.unanswered: InfeasiblePeriod | None = None
+        self.infeasible_period: InfeasiblePeriod | None = None
         self._check.reset()
         self._solver.reset()
         if self._obstacles is not None:
@@ -127,7 +127,7 @@ class RobustMPC:
         self._forget()
 
     def adopt(self, previous: object) -> None:
-        """Go on from what the law before knew: rotor speeds and disturbance."""
+        """Take over the rotor speeds and the disturbance of the previous law."""
         law = within(previous, RobustMPC)
         if law is not None:
             self._rotors = law._rotors.copy()
@@ -140,10 +140,10 @@ class RobustMPC:
             self._observer.adopt(estimate)
             self._update_trim()
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # values out of range are rejected, not warned of
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """See `quadsim.controller.Controller.step`; what is answered without a QP: `pose`."""
-        query = self.pose(now, state, reference)
+        """See `quadsim.controller.Controller.step`; what is answered without a QP: `query`."""
+        query = self.query(now, state, reference)
         if isinstance(query, Command):
             return query
         problem = self.problem
@@ -155,8 +155,8 @@ class RobustMPC:
         answer, reason = self._check(problem, query, answer, reason)
         self.answer = answer
         if reason is not None:
-            if reason != INVALID_DATA and self.unanswered is None:
-                self.unanswered = InfeasiblePeriod(
+            if reason != INVALID_DATA and self.infeasible_period is None:
+                self.infeasible_period = InfeasiblePeriod(
                     problem=problem, query=query, status=reason, time=now.time, delay=self.settings.delay
                 )
             return refused(self._acting, self.horizon, reason, answer)
@@ -164,14 +164,14 @@ class RobustMPC:
         self._acting = plan[0] = self._actuators.clip(plan[0], self._acting)
         return command_of(plan[0], plan, answer.status, answer)
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # numbers out of hand are refused, not warned of
-    def pose(self, now: StepInputs, state: Array, reference: Array) -> Query | Command:
-        """What this period's problem is solved for, once per period; or the answer, where nothing is to be solved.
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # values out of range are rejected, not warned of
+    def query(self, now: StepInputs, state: Array, reference: Array) -> Query | Command:
+        """Return the query of this period, to call once per period; or a command, if there is nothing to solve.
 
-        Numbers that are not finite, not `mpc.fallback.completion.PLAUSIBLE`, or lead to such are answered with the
-        status `invalid_data`, and do not update the observer.  Neither does a state that is in part predicted
-        (`mpc.fallback.completion.CompletedInputs`), the first measured one after more than `LONGEST_SPAN` of such, or
-        one after a pause: `now.time` has to be a period later than last time.
+        Numbers that are not finite, exceed `mpc.fallback.completion.PLAUSIBLE`, or lead to such numbers give a command
+        with the status `invalid_data` and do not update the observer.  Nor does a state that is predicted in part
+        (`mpc.fallback.completion.CompletedInputs`), the first measured state after more than `LONGEST_SPAN` of such
+        states, or a state after a pause: `now.time` must be one period later than last time.
         """
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
@@ -197,10 +197,10 @@ class RobustMPC:
         x0 = self._after(self.settings.delay, state, rotors)
         if not all_true(np.isfinite(x0)):
             return refused(self._acting, self.horizon, INVALID_DATA)
-        self._yaw = float(x0[_YAW]) if self.settings.heading else 0.0  # by which the problem's axes are turned
-        if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, which is nothing to learn from
+        self._yaw = float(x0[_YAW]) if self.settings.heading else 0.0  # rotation of the problem's axes
+        if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, so its motion shows no disturbance
             self._ahead = x0
-        if self.settings.delay:  # the reference at the instants that the prediction is for, the delay later
+        if self.settings.delay:  # the reference at the predicted instants, later by the delay
             later = np.concatenate([reference[1:], reference[-1:]])
             reference = reference + self.settings.delay / self._period * (later - reference)
         x0 = np.concatenate([x0, self._rotors])[: self._model.n]
@@ -215,7 +215,7 @@ class RobustMPC:
         return Query(x0, desired, self._acting, Equilibrium(x_s, u_s))
 
     def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`; by the hover model, with the disturbance estimated last."""
+        """See `quadsim.controller.Controller.predict`; by the hover model, with the latest disturbance estimate."""
         return predict_in_heading_frame(self._nominal, states, plans, replace(self.trim, speeds=self._balanced()))
 
     @property
@@ -231,7 +231,7 @@ class RobustMPC:
         self._update_trim()
 
     def _update_trim(self) -> None:
-        """Rest against the disturbance that is estimated now."""
+        """Update the equilibrium from the disturbance estimate."""
         self._estimate = np.zeros(6) if self._observer is None else self._observer.estimate
         estimate, gravity = self._estimate, self._model.gravity
         (x, y), twist = estimate[:2].tolist(), estimate[3:] / gravity
@@ -241,19 +241,19 @@ class RobustMPC:
         self.trim: Trim = equilibrium(self._model, acceleration=self._resting, twist=twist)
 
     def _acceleration(self, axis: Triple) -> Triple:
-        """What the estimated disturbance is, in the world frame [m/s^2], with thrust along an axis there."""
+        """Return the estimated disturbance in the world frame [m/s^2], for thrust along a world-frame axis."""
         x, y, along = self._estimate[:3].tolist()
         return along * axis[0] + x, along * axis[1] + y, along * axis[2]
 
     def _span(self, now: StepInputs) -> float:
-        """Time since the last measured state [s]; infinite after a pause, or where the present one is not measured."""
+        """Time since the last measured state [s]; infinite after a pause, or if the present one is not measured."""
         if isinstance(now, CompletedInputs) and now.unseen[_MOVING].any():
             return math.inf
         span, self._measured = now.time - self._measured, now.time
         return span - _SAME_TIME
 
     def _after(self, time: float, state: Array, rotors: Array) -> Array:
-        """State (12,) some time [s] after a state (12,) with such rotor speeds (4,), under the command in force."""
+        """Predict the state (12,) a time [s] after a state (12,) with rotor speeds (4,), under the command in force."""
         if time <= 1e-9:
             return state
         start = np.concatenate((state, rotors))[: self._model.n]
@@ -261,12 +261,12 @@ class RobustMPC:
         return advance_disturbed(self._model, start, self._acting, time, self._effectiveness, acceleration)[:N_STATES]
 
     def _balanced(self) -> Array:
-        """(4,) speeds at rest [rad/s] that also balance what thrust twists now, which the hover matrices leave out."""
+        """(4,) speeds at rest [rad/s] that also balance the torque caused by thrust, which the hover matrices omit."""
         thrust = self._model.effectiveness[0]
         excess = np.dot(thrust, np.square(self._rotors) - np.square(self.trim.speeds))
         return np.asarray(self.trim.speeds - np.dot(self._of_twist, excess * self.trim.twist))
 
 
 def _widened(matrix: Array, n: int) -> Array:
-    """Rows over 12 states as rows over n."""
+    """Extend rows over 12 states to n states."""
     return np.hstack([matrix, np.zeros((len(matrix), n - matrix.shape[1]))])

@@ -1,18 +1,18 @@
-"""A predictive safety filter: it passes a wanted command after which the robust MPC's constraints can still hold.
+"""A predictive safety filter: it passes a requested command if the robust MPC's constraints can still hold after it.
 
 Wabersich and Zeilinger (2021), "A predictive safety filter for learning-based control of constrained nonlinear
-dynamical systems", with the model, the disturbance observer and the tightened bounds of `mpc.robust.controller`.  Once
-per period one QP is solved,
+dynamical systems", with the model, the disturbance observer and the tightened bounds of `mpc.robust.controller`. It
+solves one QP per period,
 
-    min_u  |u(k) - u_wanted|^2 + epsilon sum_i |u(k+i) - u_s|^2,    i = 0 .. N-1,
+        min_u  |u(k) - u_requested|^2 + epsilon sum_i |u(k+i) - u_s|^2,    i = 0 .. N-1,
 
-subject to the robust MPC's constraints and to a condition on the end of the plan: what the bounds see of the state
-stands still there,
+subject to the robust MPC's constraints and a terminal condition: the part of the state that the bounds involve is
+steady,
 
     V' (A - I) (x(k+N) - x_s) = 0,    V a basis of the row space of [C; C A; ...],
 
-so that holding u_s from then on keeps every bound on states forever.  The plan of one period, moved on, is then a plan
-of the next: as far as the disturbances are within the bounds stated for the tightening, the problem stays feasible.
+so that holding u_s from then on keeps every bound on states.  The plan of one period, shifted, is then feasible in the
+next: while the disturbances stay within the bounds stated for the tightening, the problem stays feasible.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ from quadsim.controller import ACCEPTED, UNCONSTRAINED, Command, StepInputs
 from quadsim.state import Array
 
 LATER: Final = 1e-6
-"""epsilon: how far later inputs' distance from rest counts, against the first input's from what was wanted."""
+"""epsilon: weight of the later inputs' distance from trim, relative to the first input's from the request."""
 PENALTY: Final = 1e4
-"""l1 of violating a soft row by as much as it has room on one side, where the weight of the first input is 1."""
-STANDING: Final = 1e-4
-"""How fast what stands still at the plan's end may still change, per period [unit of the state]."""
+"""l1 of violating a soft row by its room on one side, for a unit weight of the first input."""
+TERMINAL_TOLERANCE: Final = 1e-4
+"""Largest change per period of the steady part of the state at the plan's end [unit of the state]."""
 LOOSE: Final = 1e2
-"""A bound that is none, per period: PIQP is to see no infinite one that changes, or that is on both sides of a row."""
+"""Stands for an infinite bound that changes or is on both sides of a row, which PIQP does not take."""
 END: Final = "standing"
-"""The name of the constraint on the plan's end."""
-PASSED: Final = 1e-2
-"""Difference from the wanted command [rad/s] that is rounding of the QP: the wanted one is then passed as it is."""
+"""Name of the terminal constraint."""
+PASS_TOLERANCE: Final = 1e-2
+"""Difference from the request [rad/s] attributed to rounding of the QP: the request is then passed unchanged."""
 
 
 class SafetyFilter:
-    """A controller that commands what is requested, as far as that is safe; see the module.
+    """A controller that sends the requested command as far as it is safe; see the module.
 
-    Where the constraints cannot hold, as after a disturbance larger than stated, those on states are softened and
-    the QP is solved once more.  Where that has no answer either, the status reports it, for
-    `mpc.fallback.contract.Guarded` to fly the last good plan.
+    If the constraints cannot hold, for example after a disturbance larger than stated, the filter softens those on
+    states and solves the QP once more.  If that fails too, the status reports it, and `mpc.fallback.contract.Guarded`
+    flies the last good plan.
 
-    The robust MPC, one without half-spaces, lends its model, observer and constraints; it solves nothing itself.
-    `wanted` (4,) is the command to let pass in the next period [rad/s].
+    The robust MPC, without half-spaces, provides model, observer and constraints; it solves nothing itself.  Set
+    `requested` (4,) to the command of the next period [rad/s].
     """
 
     name: Final = "safety-filter"
@@ -65,40 +65,40 @@ class SafetyFilter:
 
     def __init__(self, mpc: RobustMPC) -> None:
         self._mpc, self.horizon = mpc, mpc.horizon
-        standing = _standing(mpc.problem)
-        self.problem = _feasibility(mpc.problem, standing)
+        steady_rows = _steady_rows(mpc.problem)
+        self.problem = _feasibility(mpc.problem, steady_rows)
         self._actuators = ActuatorBounds.of_problem(self.problem)
-        # The same with all constraints on states soft, but for that on the plan's end.
+        # The same with soft constraints on states, except for the terminal one.
         parts = self.problem.constraints
         soft = replace(self.problem, constraints=tuple(p if p.C is None or p.name == END else _soft(p) for p in parts))
-        self._nearest, self._softened = _Nearest(self.problem, standing), _Nearest(soft, standing)
-        self.wanted = self.problem.model.u_bar.copy()
+        self._nearest, self._softened = _Nearest(self.problem, steady_rows), _Nearest(soft, steady_rows)
+        self.requested = self.problem.model.u_bar.copy()
 
     @property
     def trim(self) -> Trim:
-        """What holds the vehicle at rest against the disturbance that is estimated."""
+        """The equilibrium under the estimated disturbance."""
         return self._mpc.trim
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
         self._mpc.reset(speeds)
-        self.wanted = np.array(speeds, float)
+        self.requested = np.array(speeds, float)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """The nearest command to `wanted` after which the constraints can hold; `unconstrained` where that is it."""
-        query = self._mpc.pose(now, state, reference)
+        """The command closest to `requested` that keeps the constraints feasible; `unconstrained` if unchanged."""
+        query = self._mpc.query(now, state, reference)
         if isinstance(query, Command):
             return query
-        answer = self._nearest.solve(query, self.wanted)
+        answer = self._nearest.solve(query, self.requested)
         if answer.status not in ACCEPTED:
-            answer = self._softened.solve(query, self.wanted)
+            answer = self._softened.solve(query, self.requested)
         plan, status = answer.plan, answer.status
         problem = rejection(status, plan[0], plan, self._actuators, query.u_before)
         if problem is not None:
             return refused(query.u_before, self.horizon, problem, answer)
         plan = plan.copy()
-        passed = np.abs(plan[0] - self.wanted).max() <= PASSED
-        plan[0] = self._actuators.clip(self.wanted if passed else plan[0], query.u_before)
+        passed = np.abs(plan[0] - self.requested).max() <= PASS_TOLERANCE
+        plan[0] = self._actuators.clip(self.requested if passed else plan[0], query.u_before)
         return command_of(plan[0], plan, UNCONSTRAINED if passed else status, answer)
 
     def predict(self, states: Array, plans: Array) -> Array:
@@ -107,38 +107,38 @@ class SafetyFilter:
 
 
 class _Nearest:
-    """The QP of a problem whose first input is to be near a wanted one."""
+    """The QP of a problem whose first input should be close to a request."""
 
-    def __init__(self, problem: Problem, standing: Array) -> None:
+    def __init__(self, problem: Problem, steady_rows: Array) -> None:
         self._form = form = PartiallyCondensed(problem)
-        self._horizon, self._at_rest = problem.horizon, standing
+        self._horizon, self._steady_rows = problem.horizon, steady_rows
         self._first = form.inputs(np.arange(form.qp.c.size, dtype=np.float64))[0].astype(np.intp)
         self._P = form.qp.P.copy()
         self._P[self._first, self._first] += 2.0
         self._backend = Piqp()
         self._backend.setup(replace(form.qp, P=self._P))
         earlier, last = (form.qp.h_u.reshape(self._horizon, -1)[i] for i in (0, -1))
-        self._ends = (earlier == LOOSE) & (last < LOOSE)  # rows that hold at the last state alone
+        self._ends = (earlier == LOOSE) & (last < LOOSE)  # rows on the last state only
 
-    def solve(self, query: Query, wanted: Array) -> Answer:
-        """The plan whose first input is nearest to `wanted` (4,) [rad/s]."""
-        qp = replace(self._form.pose(query).qp, P=self._P)
-        qp.c[self._first] -= 2.0 * wanted
+    def solve(self, query: Query, requested: Array) -> Answer:
+        """Return the plan whose first input is closest to `requested` (4,) [rad/s]."""
+        qp = replace(self._form.assemble(query).qp, P=self._P)
+        qp.c[self._first] -= 2.0 * requested
         if query.equilibrium is not None:
             for side in (qp.h_l, qp.h_u):
-                side.reshape(self._horizon, -1)[-1, self._ends] += self._at_rest @ query.equilibrium.x
+                side.reshape(self._horizon, -1)[-1, self._ends] += self._steady_rows @ query.equilibrium.x
         return Answer.of(self._form, qp, self._backend.solve(qp), SafetyFilter.solver)
 
 
-def _feasibility(problem: Problem, standing: Array) -> Problem:
-    """The constraints of a problem, all hard, the condition (m, n) on the plan's end, and a cost of inputs alone."""
+def _feasibility(problem: Problem, steady_rows: Array) -> Problem:
+    """Return a problem's constraints, all hard, with the terminal condition (m, n) and a cost of inputs alone."""
     C_r, nu = problem.objective.C_r, problem.model.nu
     objective = Objective(C_r=C_r, Q_y=LATER**2 * np.eye(len(C_r)), Q_u=LATER * np.eye(nu))
     constraints = [replace(part, penalty=None) for part in problem.every_constraint]
-    if len(standing):
-        bound = np.full((problem.horizon, len(standing)), LOOSE)
-        bound[-1] = STANDING
-        constraints.append(Constraint(name=END, lower=-bound, upper=bound, C=standing))
+    if len(steady_rows):
+        bound = np.full((problem.horizon, len(steady_rows)), LOOSE)
+        bound[-1] = TERMINAL_TOLERANCE
+        constraints.append(Constraint(name=END, lower=-bound, upper=bound, C=steady_rows))
     return replace(problem, objective=objective, bounds=None, constraints=tuple(constraints))
 
 
@@ -150,8 +150,8 @@ def _soft(part: Constraint) -> Constraint:
     return replace(part, penalty=Penalty(l1=PENALTY / room, l2=np.zeros(room.size)))
 
 
-def _standing(problem: Problem) -> Array:
-    """(m, n) orthonormal rows, zero times x - x_s where what the bounds see of the state stands still."""
+def _steady_rows(problem: Problem) -> Array:
+    """(m, n) orthonormal rows, zero times x - x_s where the part of the state that the bounds involve is steady."""
     rows, A = problem.rows, problem.model.A
     bounded = rows.C[rows.on_states]
     if not len(bounded):

@@ -1,4 +1,4 @@
-"""`[controller] type = "robust"`: the MPC for vehicles as they are, each part a field of its own."""
+"""`[controller] type = "robust"`: the MPC for imperfect vehicles, one field per part."""
 
 from __future__ import annotations
 
@@ -37,56 +37,53 @@ if TYPE_CHECKING:
     from mpc.robust.controller import RobustMPC
     from mpc.robust.filter import SafetyFilter
 
-TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that have other values in axes turned by the yaw
+TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that depend on the yaw of the axes
 
 LONGEST_SPAN: Final = 0.25
-"""Longest time between two measured states [s] for their difference to show a disturbance; a sensor of 4 Hz."""
+"""Longest time between two measured states [s] that the observer compares; a sensor of 4 Hz."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RobustSettings:
-    """The parts of the robust controller; each absent or off unless given."""
+    """The parts of the robust controller; each is off by default."""
 
-    penalty: Penalty | None = None  # what leaving an output bound costs; None for hard output bounds
-    rotor_lag: float = 0.0  # time constant of the rotor speeds that the prediction knows [s]; 0 for none
-    delay: float = 0.0  # time from measurement to command that the prediction bridges [s]
-    observer: ObserverSettings | None = None  # of the disturbance observer; None for no offset-free tracking
+    penalty: Penalty | None = None  # penalty for violating an output bound; None for hard output bounds
+    rotor_lag: float = 0.0  # rotor time constant in the prediction [s]; 0 for none
+    delay: float = 0.0  # delay from measurement to command that the prediction bridges [s]
+    observer: ObserverSettings | None = None  # settings of the disturbance observer; None for no offset-free tracking
     heading: bool = False
-    """Whether the hover model is turned by the yaw.  The weights of x and y are then those forward and to the left;
-    where these differ, flights to different headings do."""
+    """Whether the hover model is turned by the yaw.  The weights of x and y then apply forward and to the left; if they
+    differ, so do flights at different headings."""
     largest_turn: float = 0.5
-    """How far the prediction may turn at once [rad], from the present yaw or from one period to the next; it goes on
-    from there.  Of no effect on the hover model without `heading`."""
-    move_weight: Array | None = None  # Q_d (4, 4), of a command's change from one period to the next; None for none
-    margins: Array | None = None  # (N, n_c) by which the output bounds are tightened; None for none
-    terminal: bool = False  # whether the last state has the weight of the hover model's LQR
+    """Largest predicted step of the yaw [rad], from the measured yaw or from one period to the next.  Without effect on
+    the hover model unless `heading` is set."""
+    move_weight: Array | None = None  # Q_d (4, 4), weight of command changes from period to period; None for none
+    margins: Array | None = None  # (N, n_c) tightening of the output bounds; None for none
+    terminal: bool = False  # whether the last state has the hover model's LQR weight
 
 
 @dataclass(frozen=True, kw_only=True)
 class Robust(Bounded):
-    """The robust MPC: soft bounds, lag, delay, disturbances, heading and more, each switched on alone."""
+    """The robust MPC: soft bounds, rotor lag, delay, disturbances, heading and more, each switched on separately."""
 
     type: Annotated[Literal["robust"], doc("the control law, by its name in `quadsim list`")] = "robust"
     soft: Soft | None = None
     rotor_lag: Annotated[
         Lag,
-        doc(
-            "[s] time constant of the rotor speeds that is predicted, 0 for none; "
-            '"vehicle": the rotor_rise of the vehicle'
-        ),
+        doc('[s] rotor time constant in the prediction, 0 for none; "vehicle": the rotor_rise of the vehicle'),
     ] = 0.0
-    delay: Annotated[Seconds, doc("[s] known time from measurement to command that is predicted through")] = 0.0
+    delay: Annotated[Seconds, doc("[s] known delay from measurement to command, bridged by prediction")] = 0.0
     offset_free: ObserverSettings | None = None
     tightening: TighteningSettings | None = None
-    heading: Annotated[bool, doc("whether the hover model is turned by the present yaw")] = False
+    heading: Annotated[bool, doc("whether the hover model is turned by the measured yaw")] = False
     largest_turn: Annotated[
         float,
         Gt(0.0),
         Le(180.0),
-        doc("[deg] largest step of the yaw reference, from the present yaw or from one period to the next"),
+        doc("[deg] largest step of the yaw reference, from the measured yaw or from one period to the next"),
     ] = 30.0
     move_weight: Annotated[
-        Weight | None, doc("[1/(rad/s)^2] diagonal of Q_d, of a command's change from one period to the next")
+        Weight | None, doc("[1/(rad/s)^2] diagonal of Q_d, weight of command changes from period to period")
     ] = None
     fallback: FallbackSettings = USUAL_FALLBACK
 
@@ -96,7 +93,10 @@ class Robust(Bounded):
         if self.tightening is not None and not self.output_bounds:
             raise ValueError("tightening must be absent where there are no output_bounds to tighten")
         if self.heading:
-            bounded = {"output_bounds": [*self.output_bounds], **{each.name: each.of for each in self.polytopes}}
+            bounded = {
+                "output_bounds": [*self.output_bounds],
+                **{polytope.name: polytope.of for polytope in self.polytopes},
+            }
             for name, states in bounded.items():
                 turned = [state for state in states if state in TURNED]
                 if turned:
@@ -111,10 +111,9 @@ class Robust(Bounded):
         return self.guarded(law, self.fallback, vehicle, period)
 
     def safety_filter(self, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Controller]:
-        """The safety filter with these constraints, and the same within its fallback contract, which flies.
+        """Return the safety filter with these constraints, and the same within its fallback contract, to fly.
 
-        Raises:
-            InputError: it cannot be made from these numbers.
+        Raises:     InputError: no filter can be built from these numbers.
         """
         from mpc.robust.filter import SafetyFilter
 
@@ -126,14 +125,14 @@ class Robust(Bounded):
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
         """See `mpc.bounded.Weighted.problem`."""
-        return self._posed(vehicle, period, self.settings(vehicle, period))
+        return self._robust_problem(vehicle, period, self.settings(vehicle, period))
 
     def exportable(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
         """See `mpc.bounded.Weighted.exportable`."""
         return replace(super().exportable(vehicle, period, shapes), settings=self.settings(vehicle, period))
 
     def settings(self, vehicle: Vehicle, period: float) -> RobustSettings:
-        """The same parts in SI units."""
+        """Return the same parts in SI units."""
         return RobustSettings(
             penalty=None if self.soft is None else self.soft.penalty(len(self.output_bounds)),
             rotor_lag=resolved_lag(self.rotor_lag, vehicle),
@@ -147,16 +146,15 @@ class Robust(Bounded):
         )
 
     def margins(self, vehicle: Vehicle, period: float) -> Array | None:
-        """By how much the output bounds are tightened at each predicted state, (N, n_c); None where they are not.
+        """Return the tightening of the output bounds at each predicted state, (N, n_c); None without tightening.
 
-        Raises:
-            ParameterError: they cannot be.
+        Raises:     ParameterError: the bounds are too narrow for it.
         """
         if self.tightening is None:
             return None
         return margins(bounds=self.bounds(), **self._tightened(vehicle, period))
 
-    def _posed(self, vehicle: Vehicle, period: float, settings: RobustSettings) -> Problem:
+    def _robust_problem(self, vehicle: Vehicle, period: float, settings: RobustSettings) -> Problem:
         from mpc.robust.controller import robust_problem
 
         return robust_problem(
@@ -170,7 +168,7 @@ class Robust(Bounded):
         )
 
     def _tightened(self, vehicle: Vehicle, period: float) -> dict[str, Any]:
-        """What tightened bounds follow from."""
+        """Return the inputs of the tightening."""
         return {
             "vehicle": vehicle,
             "period": period,
@@ -184,10 +182,10 @@ class Robust(Bounded):
     def _mpc(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
         from mpc.robust.controller import RobustMPC
 
-        margins = None  # by which half-spaces are tightened along x, y, z at each predicted state, (N, 3) [m]
+        margins = None  # tightening of half-spaces along x, y, z at each predicted state, (N, 3) [m]
         if self.tightening is not None and self.avoidance is not None:
             margins = position_margins(**self._tightened(vehicle, period))
         space, settings = self.space(shapes, vehicle, period, margins), self.settings(vehicle, period)
-        problem = self._posed(vehicle, period, settings)
+        problem = self._robust_problem(vehicle, period, settings)
         solver = self.make_solver(problem, space)
         return RobustMPC(vehicle, problem, settings, solver, space=space, kkt_every=self.kkt_every)

@@ -1,27 +1,26 @@
 """Tightening of output bounds, so that they hold under bounded disturbances and between samples.
 
-Let the vehicle differ from its prediction by accelerations w of at most a stated size.  Where the prediction holds an
-estimate of the disturbance, itself within the stated bounds, a disturbance that changes sign is w = 2 times these away
-from it, and that is counted then.  Following a plan with the correction -K e at each sample, the error e after
-i periods is bounded in each output by
+The vehicle may differ from its prediction by accelerations w up to a stated bound.  If the prediction uses an estimate
+of the disturbance, which stays within the stated bounds, a disturbance that changes sign differs from it by twice the
+bounds; w is doubled then.  With the correction -K e towards the plan at each sample, the error e after i periods is
+bounded in each output by
 
     r_i = int_0^d |C e^(A_c s) E| w ds + sum_{j=0}^{i-1} int_0^tau |C (A - B K)^j e^(A_c (s + d)) E| w ds,
 
-the support function of what w of any course can do, d the delay between measuring and acting.  With bounds tightened by
-r_i the plan of one period, moved on and corrected, keeps those of the next (Chisci, Rossiter and Zappa, 2001, "Systems
-with persistent disturbances: predictive control with restricted constraints"; Mayne, Seron and Rakovic, 2005, "Robust
-model predictive control of constrained linear systems with bounded disturbances").  Bounds on inputs are not tightened:
-near them the correction may lack authority.
+the support function of the reachable errors, with d the delay between measuring and acting.  With bounds tightened by
+r_i, the plan of one period, shifted and corrected, satisfies those of the next (Chisci, Rossiter and Zappa, 2001,
+"Systems with persistent disturbances: predictive control with restricted constraints"; Mayne, Seron and Rakovic, 2005,
+"Robust model predictive control of constrained linear systems with bounded disturbances"). Bounds on inputs are not
+tightened: near them the correction may lack authority.
 
-Between two samples an output y may pass both.  From the straight line through them it differs by at most
+Between two samples an output y may exceed both.  It differs from the straight line through them by at most
 
     max |d2y/dt2| tau^2 / 8,
 
-the error of linear interpolation, whatever drives it.
+the error of linear interpolation for any input.
 
-K is needed for no more than the outputs, so that it acts on what they observe and on nothing else.  Of roll and pitch
-these are the angles, their rates and, where they lag, the rotors: a wind moves the vehicle, for the next plan to see
-to, and not its tilt.
+K serves only the outputs, so it acts on the states that they observe.  For roll and pitch these are the angles, their
+rates and, with lag, the rotors: a wind moves the vehicle, which the next plan corrects, but not its tilt.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ from quadsim.fields import NonNegative
 from quadsim.state import INDEX, N_STATES, POSITION, Array, read_only
 from quadsim.vehicle import Vehicle
 
-LARGEST_SHARE: Final = 0.5  # of the room on either side of the middle of an output's bounds, no more is given up
-ERROR_SHARE: Final = 0.1  # output error, as a share of that room, to which the correction answers...
+LARGEST_SHARE: Final = 0.5  # largest part of the half-width of an output's bounds to give up
+ERROR_SHARE: Final = 0.1  # output error, as a share of that half-width, which the correction answers...
 SPEED_SHARE: Final = 0.025
 """...with about this share of the hover speed (Bryson's rule; Bryson and Ho, 1975, "Applied Optimal Control")."""
 POSITION_ERROR: Final = 0.05  # [m]
@@ -54,17 +53,17 @@ _TURNS: Final = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])  # which of them are an
 
 @dataclass(frozen=True, kw_only=True)
 class TighteningSettings:
-    """Output bounds tightened, so that they hold under disturbances within stated bounds, and between samples.
+    """Output bounds tightened to hold under disturbances within stated bounds, and between samples.
 
-    The stated bounds are the same along and about each axis; what exceeds them is not answered for.  What the
-    prediction leaves out, as of tilted thrust or of rotors that lag otherwise, counts as a disturbance.  Inputs alone
-    would allow far more than `turning`.
+    The stated bounds are the same along and about each axis; nothing is guaranteed beyond them.  Model errors, such as
+    tilted thrust or a different rotor lag, count as disturbances.  Bounds on inputs alone would allow far more than
+    `turning`.
     """
 
     acceleration: Annotated[
         NonNegative, doc("[m/s^2] bound on a disturbance's acceleration along each axis, world frame")
     ] = 0.5
-    angular_acceleration: Annotated[NonNegative, doc("[rad/s^2] the same of angular ones, body frame")] = 0.5
+    angular_acceleration: Annotated[NonNegative, doc("[rad/s^2] same for angular accelerations, body frame")] = 0.5
     turning: Annotated[
         NonNegative, doc("[unit of the state/s^2, rad for angles] largest second derivative of an output at its bound")
     ] = 3.0
@@ -81,20 +80,20 @@ def margins(
     delay: float = 0.0,
     estimated: bool = False,
 ) -> Array:
-    """By how much the bounds of each output are tightened at each predicted state, (N, n_c) in its unit.
+    """Return the tightening of the bounds of each output at each predicted state, (N, n_c), in the output's unit.
 
     Args:
         vehicle: the modelled vehicle.
         period: tau [s].
         horizon: N.
-        bounds: of outputs of the 12 states.
-        settings: stated bounds.
-        rotor_lag: time constant that the prediction knows [s]; 0 for none, else at least `SHORTEST_LAG`.
+        bounds: bounds on outputs of the 12 states.
+        settings: the stated bounds.
+        rotor_lag: rotor time constant in the prediction [s]; 0 for none, else at least `SHORTEST_LAG`.
         delay: d [s], between measuring and acting.
-        estimated: whether the prediction holds an estimate of the disturbance, which may be wrong by twice its bounds.
+        estimated: whether the prediction uses a disturbance estimate, which may err by twice the bounds.
 
     Raises:
-        ParameterError: an output is bounded on one side only, or too narrowly; the lag is too short.
+        ParameterError: an output is bounded on one side only, or too narrowly; or the lag is too short.
     """
     if 0.0 < rotor_lag < SHORTEST_LAG:
         raise ParameterError("controller", "rotor_lag", rotor_lag, f"0, or at least {SHORTEST_LAG:g} s")
@@ -107,7 +106,7 @@ def margins(
     margins = growth(A, B, C, E, K, period=period, horizon=horizon, delay=delay)
     passed = between_samples(settings.turning, period)
     margins += passed
-    worst = int(np.argmax(np.round(margins[-1] / room, 9)))  # of equal ones, the first
+    worst = int(np.argmax(np.round(margins[-1] / room, 9)))  # the first of equal ones
     if margins[-1, worst] > LARGEST_SHARE * room[worst]:
         turned = growth(A, B, C, E * _TURNS, K, period=period, horizon=horizon, delay=delay)[-1, worst]
         shares = {
@@ -136,10 +135,10 @@ def position_margins(
     delay: float = 0.0,
     estimated: bool = False,
 ) -> Array:
-    """By how much half-spaces are tightened along x, y and z at each predicted state, (N, 3) [m].
+    """Return the tightening of half-spaces along x, y and z at each predicted state, (N, 3) [m].
 
-    The correction weighs an error of `POSITION_ERROR` as it does one of `ERROR_SHARE` of an output's room.  Arguments
-    and errors as of `margins`.
+    The correction weights an error of `POSITION_ERROR` like one of `ERROR_SHARE` of an output's half-width.  Arguments
+    and errors as in `margins`.
     """
     rows, sizes = np.eye(N_STATES)[list(POSITION)], np.full(3, POSITION_ERROR)
     A, B, C, E, K = _corrected(vehicle, rotor_lag, period, rows, sizes, settings, estimated)
@@ -155,7 +154,7 @@ def _corrected(
     settings: TighteningSettings,
     estimated: bool,
 ) -> tuple[Array, ...]:
-    """A, B, C, E of what the rows (n_c, 12) observe, and K, which weighs errors of these sizes (n_c,) alike."""
+    """Return A, B, C, E of the states that the rows (n_c, 12) observe, and K, which weights errors (n_c,) equally."""
     A, B, E = disturbed_model(vehicle, rotor_lag)
     C = np.hstack([rows, np.zeros((len(rows), len(A) - N_STATES))])
     basis = observed(A, C)
@@ -166,31 +165,31 @@ def _corrected(
 
 
 def between_samples(acceleration: float, period: float) -> float:
-    """How far an output of at most this second derivative passes both of two samples, `period` [s] apart."""
+    """Return how far an output with at most this second derivative exceeds two samples that are `period` [s] apart."""
     return acceleration * period**2 / 8.0
 
 
 def growth(
     A: Array, B: Array, C: Array, E: Array, K: Array, *, period: float, horizon: int, delay: float = 0.0
 ) -> Array:
-    """r_1 .. r_N (N, n_c) of dx/dt = A x + B u + E w, |w| <= 1 in each component, u = -K x(k) held, outputs C x.
+    """Return r_1 .. r_N (N, n_c) for dx/dt = A x + B u + E w, |w| <= 1 per component, u = -K x(k) held, outputs C x.
 
     Period tau and delay d [s]; see the module.
     """
     A_d, B_d = discretise(A, B, period)
     closed = A_d - B_d @ K
-    unanswered = _absolute_integral(C, _transitions(A, 0.0, delay), E, delay)
+    growth_in_delay = _absolute_integral(C, _transitions(A, 0.0, delay), E, delay)
     transitions = _transitions(A, delay, delay + period)
     terms = np.empty((horizon, len(C)))
     seen = C
     for j in range(horizon):
         terms[j] = _absolute_integral(seen, transitions, E, period)
         seen = seen @ closed
-    return np.asarray(unanswered + np.cumsum(terms, axis=0))
+    return np.asarray(growth_in_delay + np.cumsum(terms, axis=0))
 
 
 def disturbed_model(vehicle: Vehicle, rotor_lag: float) -> tuple[Array, Array, Array]:
-    """(n, n), (n, 4) and (n, 6): dx/dt = A x + B u + E w at hover, of 12 states, or of 16 where rotors lag [s].
+    """(n, n), (n, 4) and (n, 6): dx/dt = A x + B u + E w at hover, with 12 states, or 16 with rotor lag [s].
 
     w is acceleration along the axes and angular acceleration about them.
     """
@@ -201,10 +200,10 @@ def disturbed_model(vehicle: Vehicle, rotor_lag: float) -> tuple[Array, Array, A
 
 
 def observed(A: Array, C: Array) -> Array:
-    """(n, r) orthonormal basis of the states that the outputs C x observe, the row space of [C; C A; ...]."""
+    """(n, r) orthonormal basis of the states observed through C x, the row space of [C; C A; ...]."""
     basis = scipy.linalg.orth(C.T)
     while True:
-        # Directions, not magnitudes, make the rank.
+        # Normalised, so that directions and not magnitudes determine the rank.
         further = basis @ (basis.T @ A.T @ basis) - A.T @ basis
         size = np.linalg.norm(further, axis=0)
         new = further[:, size > 1e-9 * np.linalg.norm(A)]
@@ -214,12 +213,12 @@ def observed(A: Array, C: Array) -> Array:
 
 
 def correction(A: Array, B: Array, C: Array, size: float) -> Array:
-    """K (nu, n) of the discrete LQR that weighs outputs C x against inputs over `size`."""
+    """K (nu, n) of the discrete LQR that weights outputs C x relative to inputs over `size`."""
     return lqr(A, B, C.T @ C, np.eye(B.shape[1]) / size**2)
 
 
 def _transitions(A: Array, start: float, stop: float) -> Array:
-    """(q, n, n) e^(A s) at the nodes of Gauss and Legendre's rule between two instants [s]."""
+    """(q, n, n) e^(A s) at the nodes of the Gauss-Legendre rule between two instants [s]."""
     instants = start + 0.5 * (stop - start) * (_NODES + 1.0)
     return np.asarray(scipy.linalg.expm(A * instants[:, None, None]))
 

@@ -258,20 +258,20 @@ class QPSolver:
         if not _usable(query):
             nowhere = np.full_like(form.qp.c, math.nan)
             return Answer(form.inputs(nowhere), form.slacks(nowhere), INVALID_DATA, self.name)
-        posed, solution = None, None
+        period_qp, solution = None, None
         if self._free is not None:
-            started, posed = clock.perf_counter(), self._free.form.pose(query)
-            solution, spent_s = self._free(posed.qp), clock.perf_counter() - started
+            started, period_qp = clock.perf_counter(), self._free.form.assemble(query)
+            solution, spent_s = self._free(period_qp.qp), clock.perf_counter() - started
             if solution is not None:
                 form, by, method = self._free.form, GAIN, Method.FREE
             elif self._free.form is not form:
-                posed = None
-        posed = form.pose(query) if posed is None else posed
-        solution = self._backend.solve(posed.qp) if solution is None else solution
-        answer = Answer.of(form, posed.qp, solution, by)
+                period_qp = None
+        period_qp = form.assemble(query) if period_qp is None else period_qp
+        solution = self._backend.solve(period_qp.qp) if solution is None else solution
+        answer = Answer.of(form, period_qp.qp, solution, by)
         answer = answer._replace(method=method, solve_s=spent_s + solution.solve_s)
         if self._changing and answer.status in ACCEPTED and np.isfinite(answer.plan).all():
-            return answer._replace(states=posed.states(solution.x))
+            return answer._replace(states=period_qp.states(solution.x))
         return answer
 
 

@@ -14,6 +14,7 @@ from quadsim.flight.rundir import Run
 from quadsim.report.comparison import distinct_courses, run_names
 from quadsim.report.figure import (
     BOUND,
+    LEAST_SPANS,
     OBSTACLE,
     REFERENCE,
     Area,
@@ -35,6 +36,7 @@ from quadsim.report.figure import (
     region_edges,
 )
 from quadsim.report.to_matplotlib import write_pngs
+from quadsim.space import Obstacle
 from quadsim.state import POSITION, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 
@@ -45,6 +47,7 @@ PAPER_FIGURES: Final = {
 """Before the keys of the figures of states and of inputs, by scenario: their numbers in the paper."""
 _REFERENCE: Final[dict[str, Any]] = {"colour": REFERENCE, "label": "reference, filtered", "dashed": True, "width": 1.1}
 _NEAR: Final = 3.0  # clearance [m] below which a moving obstacle is drawn, and up to which curves are shown
+_MOVES: Final = 0.1  # span of a course [m] from which on it moves along an axis
 _EVERY: Final = 0.25  # how often it is drawn [s]
 _MOST_NAMED: Final = 9  # obstacles and regions of which each is named in the legend
 _DIRECTIONS: Final = 300  # in which the points of a solid are taken whose hull is drawn
@@ -62,7 +65,7 @@ def write_figures(run: Run, directory: Path) -> list[Path]:
         return []
     prefixes = dict(zip(("states", "inputs"), PAPER_FIGURES.get(run.name, ("", "")), strict=True))
     ended = "" if run.log.reason is None else " (aborted)"
-    figures = [states([run]), inputs([run]), times([run]), *effects(run), *space(run)]
+    figures = [states([run]), inputs([run]), times([run]), *effects(run), *space(run), *xy(run)]
     return write_pngs(
         (
             replace(figure, key=prefixes.get(figure.key, "") + figure.key, title=f"{run.name}{ended}: {figure.title}")
@@ -79,7 +82,7 @@ def page_figures(runs: Sequence[Run]) -> list[Figure | Scene]:
         return []
     figures: list[Figure | Scene] = [states(runs), inputs(runs), times(runs)]
     if len(runs) == 1:
-        figures += [*effects(runs[0]), *space(runs[0])]
+        figures += [*effects(runs[0]), *space(runs[0]), *xy(runs[0])]
     return [*figures, path(runs)]
 
 
@@ -102,8 +105,9 @@ def overview(runs: Sequence[Run]) -> Figure:
 
 
 def signals(run: Run, names: Sequence[str]) -> Figure:
-    """Signals of the audit over time, a panel each."""
-    return _timed("signals", "", tuple(_signal([run], name) for name in names), [run], columns=1)
+    """Signals of the audit over time, and `xy`, the path from above, a panel each."""
+    panels = tuple(_above(run) if name == "xy" else _signal([run], name) for name in names)
+    return _timed("signals", "", panels, [run], columns=1)
 
 
 def states(runs: Sequence[Run]) -> Figure:
@@ -193,26 +197,6 @@ def space(run: Run) -> list[Figure]:
         return []
     limits = [limit for limit in run.limits if isinstance(limit, SpaceLimit)]
     clearances = {limit.name: limit.source.finest(run.log) for limit in limits}
-    areas = []
-    for obstacle in obstacles_in(run.limits):
-        t, values = clearances[obstacle.name]
-        near = t[values < _NEAR]
-        for instant in np.arange(near[0], near[-1], _EVERY) if obstacle.moves and near.size else [0.0]:
-            for outline in outlines(obstacle, instant):
-                opacity = 0.3 if obstacle.moves else 0.55
-                areas.append(Area(outline=outline, colour=OBSTACLE, opacity=opacity, label="obstacle"))
-    regions = [
-        Series(x=edge[:, 0], y=edge[:, 1], colour=BOUND, label="region", dashed=True, width=0.9)
-        for _, edges in region_edges(run)
-        for edge in edges
-    ]
-    course, position = run.log.control.reference, run.log.plant.state[:, POSITION]
-    lines = [
-        Series(x=course[:, 0], y=course[:, 1], **_REFERENCE),
-        Series(x=position[:, 0], y=position[:, 1], colour=line_colour(0), label="flight"),
-    ]
-    above = Panel(title="from above", x_label="x [m]", y_label="y [m]", equal=True, height=2.0,
-                  areas=tuple(areas), series=(*regions, *lines))  # fmt: skip
     curves = []
     for i, limit in enumerate(limits):
         t, values = clearances[limit.name]
@@ -224,7 +208,47 @@ def space(run: Run) -> list[Figure]:
     ends = (min(0.0, low) - 0.1, min(high, _NEAR) + 0.1)
     clear = Panel(title="clearance", unit="m", series=tuple(curves), bounds=(Bound(value=0.0),), y_range=ends,
                   legend=True, height=1.5)  # fmt: skip
-    return [_timed("space", "from above, and clearances", (above, clear), [run], columns=1)]
+    return [_timed("space", "from above, and clearances", (_above(run), clear), [run], columns=1)]
+
+
+def xy(run: Run) -> list[Figure]:
+    """A flight from above where its course moves in x and y at one height, and `space` does not show it."""
+    course = run.log.control.reference[:, :3]
+    spans = course.max(axis=0) - course.min(axis=0)
+    planar = spans[:2].min() > _MOVES and spans[2] < LEAST_SPANS["m"]
+    return [_timed("xy", "path", (_above(run),), [run], columns=1)] if planar and not space(run) else []
+
+
+def _above(run: Run) -> Panel:
+    """A flight and its course from above, among obstacles and the edges of regions."""
+    areas = []
+    for limit in run.limits:
+        if not isinstance(limit, SpaceLimit) or not isinstance(limit.shape, Obstacle):
+            continue
+        t, values = limit.source.finest(run.log)
+        near = t[values < _NEAR]
+        for instant in np.arange(near[0], near[-1], _EVERY) if limit.shape.moves and near.size else [0.0]:
+            for outline in outlines(limit.shape, instant):
+                opacity = 0.3 if limit.shape.moves else 0.55
+                areas.append(Area(outline=outline, colour=OBSTACLE, opacity=opacity, label="obstacle"))
+    regions = [
+        Series(x=edge[:, 0], y=edge[:, 1], colour=BOUND, label="region", dashed=True, width=0.9)
+        for _, edges in region_edges(run)
+        for edge in edges
+    ]
+    course, position = run.log.control.reference, run.log.plant.state[:, POSITION]
+    lines = [
+        Series(x=course[:, 0], y=course[:, 1], **_REFERENCE),
+        Series(x=position[:, 0], y=position[:, 1], colour=line_colour(0), label="flight"),
+        _point(position[0], "start", line_colour(0), width=9.0),
+        _point(position[-1], "end", line_colour(1), width=5.0, marker="square"),
+    ]
+    return Panel(title="from above", x_label="x [m]", y_label="y [m]", equal=True, height=2.0, areas=tuple(areas),
+                 series=(*regions, *lines))  # fmt: skip
+
+
+def _point(place: Array, label: str, colour: str, **looks: Any) -> Series:
+    return Series(x=place[:1], y=place[1:2], label=label, colour=colour, style="points", **looks)
 
 
 def path(runs: Sequence[Run]) -> Scene:

@@ -1,6 +1,6 @@
 """Campaigns flown: what is missing is flown, rows are saved as they come, the whole is summed up.
 
-Beside it what else maps over `Plan.fly_all`: a sweep of every combination of values; and one flight flown again.
+Beside it, one of its flights flown again.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from quadsim.errors import InputError, OutputError, ParameterError, UnknownNameError
+from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.outputs import Growing, growing
-from scenarios.assembly import Assembly
 from scenarios.campaign import store as records
 from scenarios.campaign.campaign_report import write_report
-from scenarios.campaign.plan import Plan, parse_campaign
-from scenarios.campaign.rows import DRAW, make_table, read_table
+from scenarios.campaign.plan import Plan
+from scenarios.campaign.rows import make_table, read_table
 from scenarios.campaign.statistics import Judgement, estimate, proportion, worst_flight
 from scenarios.campaign.store import (
     FLIGHTS_FILE,
@@ -38,7 +37,6 @@ from scenarios.campaign.store import (
 )
 from scenarios.flight import Flight, to_pandas
 from scenarios.many import MEMORY, TIMEOUT, count_workers
-from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario
 
@@ -218,67 +216,6 @@ def put_report(files: Growing, names: Sequence[str], write: Callable[[Path], obj
         made = {path.name: path.read_bytes() for path in Path(scratch).iterdir()}
     files.remove([name for name in names if name not in made])
     files.write(made)
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """The flights of a sweep, a row each, with the units in the columns' metadata."""
-
-    table: pa.Table  # what was swept, by dotted path; verdict; tracking errors; commands; margins; step times
-
-    def __getitem__(self, column: str) -> np.ndarray[Any, Any]:
-        """(flights,) of a column by its name.
-
-        Raises:
-            UnknownNameError: there is none.
-        """
-        if column not in self.table.column_names:
-            raise UnknownNameError("column", column, self.table.column_names)
-        return np.asarray(self.table[column].to_numpy())
-
-    def __len__(self) -> int:
-        """Flights."""
-        return int(self.table.num_rows)
-
-    def to_arrow(self) -> pa.Table:
-        """The table."""
-        return self.table
-
-    def to_pandas(self) -> Any:
-        """The table as a pandas DataFrame.
-
-        Raises:
-            MissingPackageError: pandas is not installed.
-        """
-        return to_pandas(self.table)
-
-
-def fly_sweep(
-    scenario: Scenario, values: Mapping[str, Sequence[Any]], workers: int | None = None, progress: Progress = silent
-) -> Sweep:
-    """Fly every combination of values, by dotted path, the last field varying fastest; see `quadsim.sweep`."""
-    for path, tried in values.items():
-        if isinstance(tried, str) or not len(tried):
-            raise ParameterError("sweep", path, tried, "a list of values to try")
-    lists = [getattr(tried, "tolist", lambda tried=tried: list(tried))() for tried in values.values()]
-    entries = [
-        {"name": f"field-{i}", "fields": [path], "distribution": "grid", "values": lists[i]}
-        for i, path in enumerate(values)
-    ]
-    count = math.prod(map(len, lists))
-    data = {"name": scenario.name, "scenario": scenario.name, "flights": count, "vary": entries}
-    spec = parse_campaign(data, source="sweep")
-    plan = Plan(spec, Assembly(scenario).with_vehicle, one_seed=True)
-    plan.check()
-    progress("sweep", 0, count)
-    rows = []
-    with closing(plan.fly_all(range(count), workers=workers)) as flown:
-        for row in flown:
-            rows.append(row)
-            progress("sweep", len(rows), count)
-    table = make_table(rows, plan.schema).drop_columns(["flight", "seed", "failed"])
-    table = table.rename_columns({f"{DRAW}field-{i}": path for i, path in enumerate(values)})
-    return Sweep(table.select([*values, *(name for name in table.column_names if name not in values)]))
 
 
 @dataclass(frozen=True, kw_only=True)

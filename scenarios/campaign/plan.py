@@ -28,7 +28,15 @@ from scenarios.rollout import Rollout
 from scenarios.schema.bases import locate_files, merge, read_scenario
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.scenario import Scenario
-from scenarios.schema.settings import NOT_DESCRIBED, apply_setting, differences, get_field, note_changes, set_field
+from scenarios.schema.settings import (
+    NOT_DESCRIBED,
+    apply_setting,
+    differences,
+    get_field,
+    note_changes,
+    separate,
+    set_field,
+)
 
 FIRST: Final = 5  # flights of which one at least has to be possible
 Change = tuple[Varied, Value]
@@ -41,7 +49,12 @@ class Plan:
 
     spec: CampaignFile  # the file
     scenario: Scenario  # with the file's changes, and every number of its vehicle, in it
-    one_seed: bool = False  # whether all flights have the scenario's own
+    one_seed: bool = False  # whether all flights have the scenario's own, as in a sweep
+
+    @property
+    def _table(self) -> str:
+        """What messages call its entries."""
+        return "sweep" if self.one_seed else "vary"
 
     @cached_property
     def draws(self) -> Draws:
@@ -107,7 +120,7 @@ class Plan:
         check_ends(
             self.spec.vary,
             lambda entry, value: Assembly(self._varied([(entry, value)], name=self.scenario.name, seed=0)).check(),
-            table="vary",
+            table=self._table,
         )
         refusals = []
         for flight in range(min(FIRST, self.spec.flights)):
@@ -161,7 +174,7 @@ class Plan:
         def parse(data: dict[str, Any]) -> Scenario:
             return parse_scenario({**data, "name": name, "seed": seed}, source=name)
 
-        return changed(self.data, changes, parse, table="vary")
+        return changed(self.data, changes, parse, table=self._table)
 
 
 def read_campaign(name: str, find: Callable[[str], Path] = campaign_path) -> dict[str, Any]:
@@ -261,10 +274,10 @@ def column_type(entry: Varied) -> pa.DataType:
 
 
 def cell(value: Value) -> Value | str:
-    """A drawn value as it stands in the results: lists as texts, whole numbers as numbers."""
+    """A drawn value as it stands in the results: whole numbers as numbers, lists and tables as texts."""
     if isinstance(value, bool | str):
         return value
-    return str(value) if isinstance(value, list) else float(value)
+    return float(value) if isinstance(value, int | float) else str(value)
 
 
 def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *, table: str) -> Scenario:
@@ -280,8 +293,8 @@ def changed(data: Mapping[str, Any], changes: Sequence[Change], parse: Parse, *,
                 data.setdefault("actual", {}).setdefault(name, before["vehicle"][name])
     after = merge(data, {})
     for entry, value in changes:
-        for field in entry.fields:
-            new = _scaled(data, entry, field, value, parse, table) if entry.relative else value
+        for field, single in separate({tuple(entry.fields): value}, source=table).items():
+            new = _scaled(data, entry, field, single, parse, table) if entry.relative else single
             set_field(after, field, new, source=f"{table}.{entry.name}.fields")
     return parse(after)
 

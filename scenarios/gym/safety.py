@@ -88,7 +88,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         if self._vehicle is None:
             raise ResetNeeded("call env.reset() first")
         wanted = self._base.actions.command(action, None, 1).speeds
-        self._filter.wanted = wanted
+        self._filter.requested = wanted
         seen, horizon = self._base.started.observation, self._law.horizon
         preview = seen.preview[:horizon]
         preview = np.concatenate([preview, np.repeat(preview[-1:], horizon - len(preview), axis=0)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, get_args, get_type_hints
 
@@ -32,14 +32,11 @@ from scenarios.schema.controllers import AnyController, changed
 from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
-from scenarios.schema.settings import set_field
+from scenarios.schema.settings import separate, set_field
 from scenarios.schema.writing import to_toml
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from scenarios.flight import Flight
-    from scenarios.progress import Progress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +61,8 @@ class _Modelled(_Overrides):
 
 
 if TYPE_CHECKING:
+    from scenarios.flight import Flight
+
     VehicleTable: TypeAlias = _Modelled
     ActualTable: TypeAlias = _Overrides
 else:
@@ -243,6 +242,10 @@ class Scenario:
         parts = f"{self.duration:g} s of {self.vehicle.file}, {self.reference.type} by {self.controller.type}"
         return f"<Scenario {self.name}: {parts}\n {self.description}>"
 
+    def __dir__(self) -> list[str]:
+        """What a user sets and calls, which is what an interactive session completes to."""
+        return [name for name in super().__dir__() if name in _FOR_USERS or name.startswith("__")]
+
     @property
     def ends_with_course(self) -> bool:
         """Whether its duration is that of its course, and stated nowhere."""
@@ -388,12 +391,13 @@ class Scenario:
         except ValueError as error:
             raise InputError(f"a scenario must be one that can be written: {error}") from error
 
-    def replace(self, changes: Mapping[str, Any]) -> Scenario:
+    def replace(self, changes: Mapping[Any, Any]) -> Scenario:
         """A scenario that differs in some fields; this one stays as it is.
 
         Args:
             changes: new values by dotted path, as for `--set`: an entry of a list of tables by its name, or else its
-                index.  Units as in the file; None for a field that is to be absent.
+                index.  Units as in the file; None for a field that is to be absent.  A tuple of paths gets one value
+                for all, or a tuple with a value for each.
 
         Raises:
             InputError: there is no such field, or a value is not allowed.
@@ -404,35 +408,28 @@ class Scenario:
             >>> longer = scenario.replace({"controller.horizon": 30, "vehicle.mass": 4.2})
             >>> scenario.controller.horizon, longer.controller.horizon
             (50, 30)
+            >>> both = ("controller.output_bounds.roll", "controller.output_bounds.pitch")
+            >>> scenario.replace({both: [-2.0, 2.0]}).controller.output_bounds
+            {'roll': (-2.0, 2.0), 'pitch': (-2.0, 2.0)}
         """
         data = tomllib.loads(self.to_toml())
         if self.ends_with_course:
             del data["duration"]
-        for path, value in changes.items():
+        for path, value in separate(changes, source="replace").items():
             set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, source="replace")
         other = Scenario.parse(data, source=self.name)
         # A reference that was passed in as a function has its rows in memory.
         return other.altered(reference=self.reference) if other.reference == self.reference else other
 
-    def fly(
-        self,
-        *,
-        controller: object = None,
-        forces: Sequence[object] = (),
-        reference: Callable[[float], ArrayLike] | None = None,
-        progress: Progress | bool = True,
-    ) -> Flight:
-        """Fly it: `quadsim.fly`, of which the arguments and errors are.
-
-        Examples:
-            >>> import quadsim
-            >>> quadsim.load("hover").replace({"duration": 1.0}).fly().outcome
-            'satisfied'
-        """
+    def fly(self, **options: Any) -> Flight:
+        """Fly it; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
         from scenarios.app import fly
 
-        return fly(self, controller=controller, forces=forces, reference=reference, progress=progress)
+        return fly(self, **options)
 
     def to_toml(self) -> str:
         """The resolved file: every field, defaults included, with comments; parsing it gives this scenario again."""
         return to_toml(self)
+
+
+_FOR_USERS: Final = {*Scenario.__dataclass_fields__, "replace", "fly", "to_toml"}

@@ -62,6 +62,25 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
     note_change(data, path, value)
 
 
+def separate(changes: Mapping[Any, Any], *, source: str) -> dict[str, Any]:
+    """Changes by field: a tuple of fields shares one value, or has a tuple with a value for each of them.
+
+    Raises:
+        ParameterError: a tuple of values has another length than its fields.
+    """
+    separated: dict[str, Any] = {}
+    for fields, value in changes.items():
+        if isinstance(fields, str):
+            separated[fields] = value
+            continue
+        values = value if isinstance(value, tuple) else (value,) * len(fields)
+        if len(values) != len(fields):
+            rule = f"one value for all, or a tuple of {len(fields)}; a pair for all is a list"
+            raise ParameterError(source, f"({', '.join(fields)})", value, rule)
+        separated |= zip(fields, values, strict=True)
+    return separated
+
+
 def state_bounds(data: dict[str, Any], controller: Any) -> None:
     """Write a controller's bounds into the constraints that take them, where another law without these replaces it."""
     before, after = data.get("controller"), {"type": controller} if isinstance(controller, str) else controller

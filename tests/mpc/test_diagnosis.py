@@ -32,14 +32,14 @@ def posed(seed: int, terms: tuple[str, ...], *, changing: bool, far: float) -> I
     return InfeasiblePeriod(problem=problem, query=query, status="unsolved", time=0.0)
 
 
-def period(unanswered: InfeasiblePeriod) -> ocp_peer.Period:
-    problem, query = unanswered.problem, unanswered.query
+def period(infeasible_period: InfeasiblePeriod) -> ocp_peer.Period:
+    problem, query = infeasible_period.problem, infeasible_period.query
     now = ocp_peer.period(problem, query.state, query.desired, query.u_before, query.equilibrium)
     return now if query.steps is None else replace(now, **dict(zip("ABc", query.steps, strict=True)))
 
 
-def conflict_of(unanswered: InfeasiblePeriod) -> Conflict:
-    conflict = find_conflict(unanswered)
+def conflict_of(infeasible_period: InfeasiblePeriod) -> Conflict:
+    conflict = find_conflict(infeasible_period)
     assert conflict is not None
     return conflict
 
@@ -57,10 +57,10 @@ RANDOM = {
 def test_it_is_zero_where_and_only_where_there_is_an_answer(
     seed: int, terms: tuple[str, ...], changing: bool, far: float
 ) -> None:
-    unanswered = posed(seed, terms, changing=changing, far=far)
-    least = ocp_peer.least_violation(unanswered.problem, period(unanswered))
+    infeasible_period = posed(seed, terms, changing=changing, far=far)
+    least = ocp_peer.least_violation(infeasible_period.problem, period(infeasible_period))
     assume(least is None or least == pytest.approx(0.0, abs=1e-9) or least > NEAR)
-    conflict = conflict_of(unanswered)
+    conflict = conflict_of(infeasible_period)
     feasible = least is not None and least < NEAR
     assert conflict.feasible == feasible
     assert (conflict.total == pytest.approx(0.0, abs=1e-6)) == feasible
@@ -78,10 +78,10 @@ def test_what_is_named_is_a_conflict_by_itself_and_each_part_of_it_is_needed(
     seed: int, terms: tuple[str, ...], changing: bool, far: float
 ) -> None:
     """Of bounds on states: without all others they stay as large, and shrink without any one that is blocking."""
-    unanswered = posed(seed, terms, changing=changing, far=far)
-    problem, now = unanswered.problem, period(unanswered)
+    infeasible_period = posed(seed, terms, changing=changing, far=far)
+    problem, now = infeasible_period.problem, period(infeasible_period)
     assume(ocp_peer.least_violation(problem, now) is not None)
-    conflict = conflict_of(unanswered)
+    conflict = conflict_of(infeasible_period)
     assume(conflict.total > NEAR)
     named = {*conflict.violated, *conflict.blocking}
     assert ocp_peer.least_violation(problem, now, named) == pytest.approx(conflict.total, rel=1e-5)
@@ -100,12 +100,12 @@ def test_the_smallest_widening_is_enough_and_no_less_is(
     seed: int, terms: tuple[str, ...], changing: bool, far: float
 ) -> None:
     """Each violated bound by itself, and all of them together."""
-    unanswered = posed(seed, terms, changing=changing, far=far)
-    problem, query = unanswered.problem, unanswered.query
-    conflict = conflict_of(unanswered)
+    infeasible_period = posed(seed, terms, changing=changing, far=far)
+    problem, query = infeasible_period.problem, infeasible_period.query
+    conflict = conflict_of(infeasible_period)
     assume(conflict.total > NEAR)
     for sides in ({side} for side in conflict.violated):
-        amount = smallest_widening(unanswered, sides)
+        amount = smallest_widening(infeasible_period, sides)
         if amount is None or amount < NEAR:
             continue
         assert has_answer(widened(problem, sides, 1.01 * amount + 1e-4), query)
@@ -144,17 +144,17 @@ BAND = Constraint(name="band", lower=-np.ones(1), upper=np.ones(1), C=np.eye(1))
 
 def test_an_integrator_by_hand() -> None:
     """By one a step, 2, 1, .. violates the bound of 1 once, by 1; the lower bound on inputs is blocking."""
-    unanswered = integrator(BAND)
-    conflict = conflict_of(unanswered)
+    infeasible_period = integrator(BAND)
+    conflict = conflict_of(infeasible_period)
     assert conflict.blocking == (Side(0, 0, False),)
     ((side, found),) = conflict.violated.items()
     assert side == Side(1, 0, True)
     assert (found.amount, found.share, found.first, found.last) == (pytest.approx(1.0), pytest.approx(1.0), 1, 1)
-    assert smallest_widening(unanswered, {side}) == pytest.approx(1.0)
-    assert smallest_widening(unanswered, {Side(0, 0, False)}) == pytest.approx(1.0)
-    assert smallest_widening(unanswered, {Side(0, 0, True)}) is None
-    assert recovery(unanswered, -np.ones((4, 1))) == 1
-    assert recovery(unanswered, np.ones((4, 1))) is None
+    assert smallest_widening(infeasible_period, {side}) == pytest.approx(1.0)
+    assert smallest_widening(infeasible_period, {Side(0, 0, False)}) == pytest.approx(1.0)
+    assert smallest_widening(infeasible_period, {Side(0, 0, True)}) is None
+    assert recovery(infeasible_period, -np.ones((4, 1))) == 1
+    assert recovery(infeasible_period, np.ones((4, 1))) is None
 
 
 def test_bounds_on_inputs_come_first_and_states_give_way_to_what_is_left() -> None:

@@ -101,7 +101,7 @@ def test_on_the_ground_there_is_no_inner_loop(vehicle: Vehicle) -> None:
     preview = np.zeros((law.horizon, 4))
     assert controller.step(StepInputs(phase=Phase.LANDED), make_state(), preview).inner is None
     assert controller.step(StepInputs(), make_state(), preview).inner is not None
-    assert (controller.name, controller.horizon, controller.unanswered) == ("geometric", 10, None)
+    assert (controller.name, controller.horizon, controller.infeasible_period) == ("geometric", 10, None)
 
 
 def test_a_rate_that_is_no_whole_number_of_steps_ends_the_flight(vehicle: Vehicle) -> None:

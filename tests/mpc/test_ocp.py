@@ -69,7 +69,7 @@ def replaced(problem: Problem, **parts: object) -> Problem:
         (lambda p: replaced(p, penalty=Penalty(l1=np.ones(2), l2=np.ones(2))), r"l1 must be of shape \(1,\)"),
         (lambda p: replaced(p, margins=np.zeros((3, 1))), r"outputs\.lower must be of shape \(4, 1\); got \(3, 1\)"),
         (lambda p: replaced(p, margins=np.zeros((4, 2))), r"margins must be finite numbers >= 0 of shape"),
-        (lambda p: replaced(p, margins=np.full((4, 1), 100.0)), r"margins must be less than half of what is between"),
+        (lambda p: replaced(p, margins=np.full((4, 1), 100.0)), r"margins must be less than half of the gap"),
         (lambda p: with_row(p, C=np.ones((1, 2))), r"thrust\.C must be of shape \(1, 3\)"),
         (lambda p: with_row(p, D=np.ones((1, 3))), r"thrust\.D must be of shape \(1, 2\)"),
         (lambda p: with_row(p, E=np.ones((1, 3))), r"thrust\.E must be of shape \(1, 2\)"),

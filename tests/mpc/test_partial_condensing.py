@@ -48,7 +48,7 @@ class Changing:
     backend: Piqp
 
     def qp(self, now: Period) -> QP:
-        return self.form.pose(now.query).qp
+        return self.form.assemble(now.query).qp
 
     def solve(self, now: Period) -> Solution:
         return self.backend.solve(self.qp(now))
@@ -60,7 +60,7 @@ class Changing:
         return self.form.slacks(solution.x)
 
     def states(self, now: Period, solution: Solution) -> Array:
-        return self.form.pose(now.query).states(solution.x)
+        return self.form.assemble(now.query).states(solution.x)
 
 
 def changing(problem: Problem, steps: int) -> Changing:
@@ -79,7 +79,7 @@ def exact(form: Formulation, query: tuple[Array, Array, Array, Equilibrium]) -> 
     """Plan and slacks at a form's optimum, with its KKT residual over the size of its multipliers."""
     backend = Piqp() if isinstance(form, PartiallyCondensed) else Piqp(dense=True)
     backend.setup(form.qp)
-    qp = form.pose(Query(*query)).qp
+    qp = form.assemble(Query(*query)).qp
     solution = backend.solve(qp)
     assert solution.status == SOLVED
     optimum = polish(qp, solution)
@@ -116,7 +116,7 @@ def test_it_has_the_condensed_optimum(
     solver.setup(staged.qp)
     peer = ocp_peer.optimum(problem, ocp_peer.period(problem, *query[:4]))
     if peer.solution.status != SOLVED:
-        assert solver.solve(staged.pose(Query(*query)).qp).status != SOLVED
+        assert solver.solve(staged.assemble(Query(*query)).qp).status != SOLVED
         return
     plan, slacks, residual = exact(staged, query)
     other, others, residual_of_condensed = exact(Condensed(problem), query)

@@ -31,7 +31,7 @@ def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: s
     backend.setup(formulation.qp)
     active = 0
     for query in flight_queries(constrained_flight, problem, stride=20):
-        qp = formulation.pose(Query(*query)).qp
+        qp = formulation.assemble(Query(*query)).qp
         solution = backend.solve(qp)
         assert solution.status == SOLVED
         residuals = kkt_residuals(qp, solution)
@@ -45,7 +45,7 @@ def test_kkt_conditions_hold_over_the_flight(constrained_flight: Flight, name: s
 
 def solved(formulation: Formulation, backend: Backend, query: Query) -> tuple[QP, Solution]:
     backend.setup(formulation.qp)
-    qp = formulation.pose(Query(*query)).qp
+    qp = formulation.assemble(Query(*query)).qp
     return qp, backend.solve(qp)
 
 

@@ -103,10 +103,10 @@ def test_equality_rows_and_multipliers() -> None:
         plans = []
         for formulation in (PartiallyCondensed(problem, steps_per_stage=2), Condensed(problem)):
             backend, peer = DaqpDense(), Piqp(dense=True)
-            qp = formulation.pose(Query(*query)).qp
+            qp = formulation.assemble(Query(*query)).qp
             backend.setup(formulation.qp)
             peer.setup(Condensed(problem).qp)
-            expected = peer.solve(Condensed(problem).pose(Query(*query)).qp)
+            expected = peer.solve(Condensed(problem).assemble(Query(*query)).qp)
             solution = backend.solve(qp)
             assert solution.status == expected.status
             if solution.status != SOLVED:

@@ -56,7 +56,7 @@ def first_inputs(problem: Problem, query: tuple[Array, Array, Array, Equilibrium
     for form in forms:
         backend = Piqp(dense=True) if isinstance(form, Condensed) else Piqp()
         backend.setup(form.qp)
-        qp = form.pose(Query(*query)).qp
+        qp = form.assemble(Query(*query)).qp
         found[type(form).__name__] = form.inputs(polish(qp, backend.solve(qp)).x)[0]
     return found
 

@@ -132,6 +132,7 @@ def test_it_is_drawn(flight: Flight) -> None:
     assert [each.get_ylabel() for each in axes] == ["x [m]", "roll [deg]", "speed [rad/s]"]
     assert len(axes[2].get_lines()) == 4
     assert len(flight.plot()) == 6
+    assert flight.plot("xy")[0].get_xlabel() == "x [m]"
     with pytest.raises(UnknownNameError, match="no signal named 'rol'; did you mean 'roll'"):
         flight.plot("rol")
     page = flight._repr_html_()
@@ -269,6 +270,32 @@ def test_a_sweep_flies_every_combination(hover: Scenario) -> None:
         quadsim.sweep(hover, {"controller.horizon": [0]}, workers=1)
 
 
+def test_fields_are_swept_together(hover: Scenario) -> None:
+    roll, pitch = (f"controller.output_bounds.{name}" for name in ("roll", "pitch"))
+    tried = [[-2.0, 2.0], ([-3.0, 3.0], [-4.0, 4.0])]  # one for both, and one for each
+    found = quadsim.sweep(hover, {(roll, pitch): tried, "vehicle.mass": [4.0, 4.2]}, workers=1, progress=False)
+    swept = [f"{name}.{i}" for name in (roll, pitch) for i in (0, 1)]
+    assert found.table.column_names[:6] == [*swept, "vehicle.mass", "verdict"]
+    assert found[f"{roll}.1"].tolist() == [2.0, 2.0, 3.0, 3.0]
+    assert found[f"{pitch}.0"].tolist() == [-2.0, -2.0, -4.0, -4.0]
+    alone = quadsim.fly(hover.replace({(roll, pitch): tried[1]}), progress=False)
+    for finding in alone.audit:
+        assert found[f"margin.{finding.limit.name}"][2] == finding.worst_margin
+    frame = found.to_pandas()
+    assert frame.shape == (4, len(found.table.column_names))
+    assert frame.groupby("vehicle.mass")["margin.roll"].max().tolist() == pytest.approx([3.0, 3.0], abs=0.01)
+    lines = repr(found).splitlines()
+    assert lines[0].startswith("sweep of hover: 4 flights, 4 satisfied")
+    assert len(lines) <= 10
+    with pytest.raises(ParameterError, match="a tuple of 2; a pair for all is a list; got \\(1, 2, 3\\)"):
+        hover.replace({(roll, pitch): (1, 2, 3)})
+
+
+def test_whole_tables_are_swept(hover: Scenario) -> None:
+    found = quadsim.sweep(hover, {"controller": [{"type": "pid"}, {"type": "lqr"}]}, workers=1, progress=False)
+    assert found["controller.type"].tolist() == ["pid", "lqr"]
+
+
 def test_a_custom_law_is_sent_to_other_processes_by_its_place(
     hover: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -315,3 +342,29 @@ def test_what_is_handed_out_names_itself_in_a_few_lines() -> None:
     name, margin = re.fullmatch(r" worst margin: (\S+) (\S+) .*>", worst).groups()
     assert float(margin) == pytest.approx(min(flight.margins[name]), abs=0.1)
     assert len(repr(quadsim.compare(flight, flight)).splitlines()) <= 10
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered", "withheld"),
+    [
+        ('flight.state["', ["x", "yaw_rate"], []),
+        ('flight.margins["', ["hold_x", "roll"], []),
+        ("flight.", ["outcome", "state", "margins", "to_pandas", "plot"], []),
+        ("scenario.", ["controller", "duration", "replace", "fly", "to_toml"], ["altered", "require_consistent"]),
+        ("quadsim.", ["fly", "sweep", "Scenario"], ["importlib", "TYPE_CHECKING", "annotations"]),
+    ],
+)
+def test_ipython_with_jedi_completes(hover: Scenario, typed: str, offered: list[str], withheld: list[str]) -> None:
+    from IPython.core.completer import IPCompleter, provisionalcompleter
+
+    names = {"flight": quadsim.fly(hover, progress=False), "scenario": hover, "quadsim": quadsim}
+    completer = IPCompleter(namespace=names, use_jedi=True)
+    completer.jedi_compute_type_timeout = 0
+    with provisionalcompleter():
+        found = {completion.text for completion in completer.completions(typed, len(typed))}
+    assert {*offered} <= found
+    assert not found & {*withheld}
+
+
+def test_a_scenario_flies(hover: Scenario) -> None:
+    assert hover.fly(progress=False).outcome == "satisfied"

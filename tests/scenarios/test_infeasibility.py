@@ -117,12 +117,12 @@ class Queried:
     vehicle: Vehicle
     controller: Controller
     status: str
-    unanswered: InfeasiblePeriod | None
+    infeasible_period: InfeasiblePeriod | None
 
     @cached_property
     def found(self) -> dict[str, Any]:
-        assert self.unanswered is not None
-        found = diagnose(self.unanswered, self.scenario, self.vehicle)
+        assert self.infeasible_period is not None
+        found = diagnose(self.infeasible_period, self.scenario, self.vehicle)
         assert found is not None
         return found
 
@@ -153,7 +153,7 @@ def query_case(file: str, case: Case, *more: str) -> Queried:
         vehicle=vehicle,
         controller=controller,
         status=status,
-        unanswered=getattr(controller, "unanswered", None),
+        infeasible_period=getattr(controller, "infeasible_period", None),
     )
 
 
@@ -215,8 +215,8 @@ def entry_of(queried: Queried, name: str) -> dict[str, Any]:
 def test_amounts_in_closed_form(file: str) -> None:
     """By hand, from the model's matrices and the bounds on steps of -10 and 5 rad/s alone."""
     tilted = query_cached(file, "start beyond the tilt bound")
-    assert tilted.unanswered is not None
-    model = tilted.unanswered.problem.model
+    assert tilted.infeasible_period is not None
+    model = tilted.infeasible_period.problem.model
     row = model.B[INDEX["roll"]]
     first = 20.0 + math.degrees(float(np.where(row > 0.0, -10.0, 5.0) @ row))
     entry = entry_of(tilted, "roll")
@@ -248,7 +248,10 @@ def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str)
     case = CASES["start beyond the tilt bound"]
     queried = query_case(file, case)
     after = next(each["after"] for each in queried.found["suggestions"] if "controller.fallback" in each["settings"])
-    guarded, model = query_case(file, case, "controller.fallback={}").controller, queried.unanswered.problem.model  # type: ignore[union-attr]
+    guarded, model = (
+        query_case(file, case, "controller.fallback={}").controller,
+        queried.infeasible_period.problem.model,
+    )  # type: ignore[union-attr]
     assert isinstance(guarded, Guarded)
     state, acting = case.state, np.full(4, queried.vehicle.hover_speed)
     guarded.reset(acting)
@@ -263,8 +266,8 @@ def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str)
 
 def test_a_solver_that_fails_where_all_constraints_can_hold_is_distinguished(file: str) -> None:
     queried = query_case(file, CASES["start beyond the tilt bound"], "controller.output_bounds.roll=[-90.0, 90.0]")
-    assert queried.unanswered is None
-    controller = query_cached(file, "start beyond the tilt bound").unanswered
+    assert queried.infeasible_period is None
+    controller = query_cached(file, "start beyond the tilt bound").infeasible_period
     assert controller is not None
     level = controller.query._replace(state=make_state())
     failed = InfeasiblePeriod(problem=controller.problem, query=level, status="max_iterations", time=1.0)
@@ -329,13 +332,13 @@ class Keeping:
         )
         self.problem = replace(law.problem, horizon=horizon, bounds=roll)
         self.inner = ConstrainedMPC(self.problem, mpc.QPSolver("piqp-multistage", self.problem))
-        self.unanswered: InfeasiblePeriod | None = None
+        self.infeasible_period: InfeasiblePeriod | None = None
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         try:
             return self.inner.step(now, state, reference)
         finally:
-            self.unanswered = self.inner.unanswered
+            self.infeasible_period = self.inner.infeasible_period
 
 
 def test_a_controller_of_the_user_is_diagnosed_in_the_words_of_its_problem() -> None:

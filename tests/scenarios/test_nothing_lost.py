@@ -93,7 +93,7 @@ def test_an_inner_loop_that_raises_ends_the_flight_there() -> None:
 
 def test_a_prediction_or_a_diagnosis_that_raises_loses_that_alone(caplog: pytest.LogCaptureFixture) -> None:
     class Law:
-        unanswered = property(lambda self: 1 / 0)
+        infeasible_period = property(lambda self: 1 / 0)
 
         def __init__(self, vehicle: Vehicle, **settings: object) -> None:
             self.speeds = [vehicle.hover_speed] * 4
@@ -107,7 +107,7 @@ def test_a_prediction_or_a_diagnosis_that_raises_loses_that_alone(caplog: pytest
     flown = quadsim.fly(quadsim.load("hover", {"duration": 1.0}), controller=Law, progress=False)
     assert (flown.outcome, flown.time.size) == ("satisfied", 20)
     assert (flown.log.predicted, flown.diagnosis) == (None, None)
-    assert "no diagnosis: unanswered raised ZeroDivisionError" in caplog.text
+    assert "no diagnosis: infeasible_period raised ZeroDivisionError" in caplog.text
 
 
 def test_a_law_that_raises_as_it_takes_over_ends_the_flight_there(tmp_path: Path) -> None:

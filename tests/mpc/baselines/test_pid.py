@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mpc.baselines.pid import Memory, force_within, velocity_wanted
+from mpc.baselines.pid import Memory, desired_velocity, force_within
 from mpc.baselines.preview import Target
 from quadsim.controller import StepInputs
 from quadsim.flight.log import FlightLog
@@ -31,12 +31,12 @@ def one_period(
     return controller.fly(memory, state, target, np.zeros(4), np.full(4, vehicle.speed_max))
 
 
-def test_the_velocity_wanted_is_limited_and_keeps_its_direction(vehicle: Vehicle, build: Callable[..., Any]) -> None:
+def test_the_desired_velocity_is_limited_and_keeps_its_direction(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     settings = build("pid", vehicle, velocity_max=5.0).settings
     far = replace(REST, position=np.array([300.0, 400.0, -100.0]))
-    np.testing.assert_allclose(velocity_wanted(settings, np.zeros(3), far), [3.0, 4.0, -5.0])
+    np.testing.assert_allclose(desired_velocity(settings, np.zeros(3), far), [3.0, 4.0, -5.0])
     near = replace(REST, position=np.array([1.0, 0.0, 0.0]), velocity=np.array([0.0, 0.5, 0.2]))
-    np.testing.assert_allclose(velocity_wanted(settings, np.zeros(3), near), [settings.bandwidths.position, 0.5, 0.2])
+    np.testing.assert_allclose(desired_velocity(settings, np.zeros(3), near), [settings.bandwidths.position, 0.5, 0.2])
 
 
 @pytest.mark.parametrize("force", [(50.0, 0.0, 39.0), (0.0, -8.0, 90.0), (30.0, 40.0, 60.0), (3.0, 4.0, -20.0)])

@@ -108,10 +108,10 @@ def test_more_iterations_converge_where_one_does_not() -> None:
     assert command.sqp is not None
     assert command.sqp.defect < 1e-6
     assert command.status in OPTIMAL
-    assert often.unanswered is None
+    assert often.infeasible_period is None
     for k in range(3):  # the first period that did not converge is kept, and is solved again as it was posed
         call(once, x0, k * PERIOD)
-    kept = once.unanswered
+    kept = once.infeasible_period
     assert kept is not None
     assert kept.converges is not None
     assert (kept.time, kept.status) == (0.0, NOT_CONVERGED)
@@ -125,8 +125,8 @@ def test_a_qp_without_an_answer_displaces_what_did_not_converge() -> None:
     spinning[W] = 50.0
     refused = call(controller, spinning, PERIOD)
     assert refused.sqp is None
-    assert controller.unanswered is not None
-    assert controller.unanswered.status == refused.status not in ACCEPTED
+    assert controller.infeasible_period is not None
+    assert controller.infeasible_period.status == refused.status not in ACCEPTED
 
 
 # --- its optimum ---------------------------------------------------------------------------------------------------
@@ -360,7 +360,7 @@ def test_numbers_that_are_none_are_refused_and_do_no_harm(number: float) -> None
     assert command.status == "invalid_data"
     np.testing.assert_array_equal(command.speeds, HOVER)
     np.testing.assert_array_equal(call(controller, at_rest()).speeds, call(fresh, at_rest()).speeds)
-    assert controller.unanswered is None
+    assert controller.infeasible_period is None
 
 
 def test_without_attitude_in_the_moment_it_is_taken_from_the_state() -> None:
@@ -381,8 +381,8 @@ def test_an_infeasible_problem_is_reported_with_its_query() -> None:
     command = call(controller, at_rest())
     assert command.status not in ACCEPTED
     np.testing.assert_array_equal(command.speeds, HOVER)
-    assert controller.unanswered is not None
-    conflict = find_conflict(controller.unanswered)
+    assert controller.infeasible_period is not None
+    conflict = find_conflict(controller.infeasible_period)
     assert conflict is not None
     names = [part.name for part in controller.problem.every_constraint]
     assert {names[side.place] for side in conflict.violated} == {"fence"}

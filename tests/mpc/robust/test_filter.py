@@ -13,7 +13,7 @@ from mpc.condensing import Condensed
 from mpc.constraints import Bounds
 from mpc.ocp import Objective, Query
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
-from mpc.robust.filter import STANDING, SafetyFilter
+from mpc.robust.filter import TERMINAL_TOLERANCE, SafetyFilter
 from mpc.solvers import make_backend, make_solver
 from quadsim.controller import UNCONSTRAINED, Command, StepInputs
 from quadsim.state import INDEX, Array
@@ -45,7 +45,7 @@ def make_filter() -> SafetyFilter:
 
 def filtered(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER) -> Command:
     filter_.reset(acting)
-    filter_.wanted = wanted
+    filter_.requested = wanted
     return filter_.step(StepInputs(acting=acting), state, np.zeros((HORIZON, 4)))
 
 
@@ -76,7 +76,7 @@ def test_an_unsafe_one_becomes_the_nearest_whose_plan_keeps_the_bounds(wanted: l
     for speeds in command.plan:
         x = model.A @ x + model.B @ (speeds - HOVER)
         assert np.abs(np.degrees(x[[INDEX["roll"], INDEX["pitch"]]])).max() < 5.0 + 1e-4
-    assert np.abs(x[[INDEX["roll_rate"], INDEX["pitch_rate"]]]).max() < 1.01 * STANDING / PERIOD
+    assert np.abs(x[[INDEX["roll_rate"], INDEX["pitch_rate"]]]).max() < 1.01 * TERMINAL_TOLERANCE / PERIOD
     steps = np.diff(command.plan, axis=0, prepend=HOVER[None])
     assert np.abs(steps).max() < 10.0 + 1e-6
     # Another form of the QP, and another solver of it.
@@ -85,7 +85,7 @@ def test_an_unsafe_one_becomes_the_nearest_whose_plan_keeps_the_bounds(wanted: l
     P[:4, :4] += 2.0 * np.eye(4)
     level = state.copy()
     level[INDEX["yaw"]] = 0.0
-    qp = form.pose(Query(level, np.zeros((HORIZON, 4)), HOVER)).qp
+    qp = form.assemble(Query(level, np.zeros((HORIZON, 4)), HOVER)).qp
     qp.c[:4] -= 2.0 * (HOVER + wanted)
     backend = make_backend("piqp-dense")
     qp = replace(qp, P=np.asfortranarray(P))
@@ -102,7 +102,7 @@ def test_the_plan_of_one_period_is_one_of_the_next() -> None:
     model = filter_.problem.model
     filter_.reset(acting)
     for k in range(60):
-        filter_.wanted = HOVER + rng.uniform(-40.0, 40.0, 4)
+        filter_.requested = HOVER + rng.uniform(-40.0, 40.0, 4)
         command = filter_.step(StepInputs(time=k * PERIOD, acting=acting), state, np.zeros((HORIZON, 4)))
         assert command.status in ("solved", UNCONSTRAINED)
         assert command.slack < 1e-6

@@ -33,7 +33,7 @@ from quadsim.report.flight_figures import effects, inputs, overview, page_figure
 from quadsim.report.to_matplotlib import draw, to_png
 from quadsim.report.to_plotly import thin, to_plot
 from quadsim.space import Cylinder
-from quadsim.state import INDEX, Array
+from quadsim.state import INDEX, POSITION, Array
 
 
 def named(run: Run, scenario: str) -> Run:
@@ -64,6 +64,28 @@ def test_the_papers_scenario_gives_the_papers_figure_numbers(short_run: Run, tmp
         picture = imread(path)[..., :3]
         assert picture.shape[1] >= 1400
         assert 0.01 < np.mean(np.any(picture < 0.95, axis=-1)) < 0.5, "not blank"
+
+
+def test_a_planar_course_is_drawn_from_above(short_run: Run, tmp_path: Path) -> None:
+    control = short_run.log.control
+    angle = np.linspace(0.0, 2.0 * np.pi, control.t.size)
+    reference = np.stack([2.0 * np.cos(angle), np.sin(angle), np.ones_like(angle), 0.0 * angle], axis=1)
+
+    def flown(reference: Array) -> Run:
+        log = dataclasses.replace(short_run.log, control=dataclasses.replace(control, reference=reference))
+        return dataclasses.replace(named(short_run, "circle"), log=log)
+
+    run = flown(reference)
+    assert write_figures(run, tmp_path)[-1].name == "xy.png"
+    ((panel,),) = (figure.panels for figure in flight_figures.xy(run))
+    drawn, position = curves(panel), run.log.plant.state[:, POSITION]
+    assert panel.equal
+    assert [*drawn] == ["reference, filtered", "flight", "start", "end"]
+    assert np.array_equal(drawn["reference, filtered"].y, reference[:, 1])
+    assert np.array_equal(drawn["flight"].x, position[:, 0])
+    assert [drawn[name].x.tolist() for name in ("start", "end")] == [[position[0, 0]], [position[-1, 0]]]
+    for moved in ([0.0, 0.0, 0.1, 0.0], [0.0, -1.0, 0.0, 0.0]):  # it climbs too; it moves along x alone
+        assert flight_figures.xy(flown(reference + np.outer(np.sin(angle), moved))) == []
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -1,0 +1,153 @@
+"""Sweeps: a scenario flown once for every combination of some fields' values, as a tidy table."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+
+from quadsim.errors import InputError, ParameterError, UnknownNameError
+from scenarios.assembly import Assembly
+from scenarios.campaign.campaign_file import CampaignFile, Grid
+from scenarios.campaign.plan import Plan, cell
+from scenarios.campaign.rows import DRAW, make_table
+from scenarios.flight import to_pandas
+from scenarios.progress import Progress, silent
+from scenarios.results import Result, Shown
+from scenarios.schema.scenario import Scenario
+from scenarios.schema.settings import leaves, separate
+
+_FIRST: Final = ("verdict", "worst_margin", "worst_constraint", "reason")  # columns after those of the swept fields
+_SHOWN: Final = ("verdict", "rmse.x", "rmse.y", "rmse.z", "worst_margin", "worst_constraint")
+
+
+@dataclass(frozen=True, repr=False)
+class Sweep(Result):
+    """The flights of a sweep as a tidy table: a row per flight.
+
+    Its columns: each swept field by its dotted path, a list of numbers with a column for each; `verdict`,
+    `worst_margin` and `worst_constraint`; then tracking errors and commands; the audit, as `margin.roll` (the smallest,
+    at the physics rate), `time_violated.roll` and `satisfied.roll`; and step times.  Units are in their metadata.
+    """
+
+    name: str  # of the scenario
+    fields: tuple[str, ...]  # columns that were swept
+    table: pa.Table
+
+    def __getitem__(self, column: str) -> np.ndarray[Any, Any]:
+        """(flights,) of a column by its name.
+
+        Raises:
+            UnknownNameError: there is none.
+        """
+        if column not in self.table.column_names:
+            raise UnknownNameError("column", column, self.table.column_names)
+        return np.asarray(self.table[column].to_numpy())
+
+    def __len__(self) -> int:
+        """Flights."""
+        return int(self.table.num_rows)
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """For notebooks: what can stand in the brackets."""
+        return list(self.table.column_names)
+
+    def to_arrow(self) -> pa.Table:
+        """The table."""
+        return self.table
+
+    def to_pandas(self) -> Any:
+        """The table as a pandas DataFrame.
+
+        Raises:
+            MissingPackageError: pandas is not installed.
+        """
+        return to_pandas(self.table)
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+
+        verdicts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(self["verdict"].tolist()).items())
+        lines = [[_text(row[name]) for name in (*self.fields, *_SHOWN)] for row in self.table.to_pylist()]
+        head = (*map(self._brief, self.fields), *_SHOWN)
+        title = f"sweep of {self.name}: {len(self)} flights, {verdicts}"
+        yield console.table(title, head, lines, left=("verdict", "worst_constraint"))
+
+    def _brief(self, field: str) -> str:
+        """The end of a field's path, where no other field has it."""
+        parts = field.split(".")
+        ends = (".".join(parts[-count:]) for count in range(2 if parts[-1].isdigit() else 1, len(parts)))
+        return next((end for end in ends if sum(f".{name}".endswith(f".{end}") for name in self.fields) == 1), field)
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """A table of columns for each flight."""
+        return [*self.table.to_pylist()]
+
+
+def _text(value: object) -> str:
+    """A cell of the table."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "-" if value is None else str(value)
+
+
+def fly_sweep(
+    scenario: Scenario, values: Mapping[Any, Sequence[Any]], workers: int | None = None, progress: Progress = silent
+) -> Sweep:
+    """Fly every combination of values, by dotted path, the last field varying fastest; see `quadsim.sweep`."""
+    entries = [_grid(fields, tried) for fields, tried in values.items()]
+    count = math.prod(len(entry.values) for entry in entries)
+    try:
+        spec = CampaignFile(name=scenario.name, scenario=scenario.name, flights=count, vary=[*entries])
+    except ValueError as error:
+        raise InputError(f"sweep: {error}") from error
+    plan = Plan(spec, Assembly(scenario).with_vehicle, one_seed=True)
+    plan.check()
+    progress("sweep", 0, count)
+    rows = []
+    with closing(plan.fly_all(range(count), workers=workers)) as flown:
+        for row in flown:
+            rows.append(row)
+            progress("sweep", len(rows), count)
+    swept = _swept(entries)
+    table = make_table(rows, plan.schema)
+    dropped = ("flight", "seed", "failed", *(DRAW + entry.name for entry in entries))
+    results = table.select([*_FIRST, *(name for name in table.column_names if name not in (*_FIRST, *dropped))])
+    schema = pa.schema([*(pa.field(name, column.type) for name, column in swept.items()), *results.schema])
+    columns = [*swept.values(), *results.columns]
+    return Sweep(scenario.name, tuple(swept), pa.Table.from_arrays(columns, schema=schema))
+
+
+def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> Grid:
+    """The values of a field, or of several together, each checked alone."""
+    owner = fields if isinstance(fields, str) else f"({', '.join(fields)})"
+    if isinstance(tried, str) or not hasattr(tried, "__len__") or not len(tried):
+        raise ParameterError("sweep", owner, tried, "a list of values to try")
+    values = [value.tolist() if hasattr(value, "tolist") else value for value in tried]
+    if isinstance(fields, str):
+        values, fields = [list(value) if isinstance(value, tuple) else value for value in values], (fields,)
+    else:
+        values = [tuple(separate({fields: value}, source="sweep").values()) for value in values]
+    try:
+        return Grid(name=owner, fields=[*fields], distribution="grid", values=values)
+    except ValueError as error:
+        raise InputError(f"sweep.{owner}: {error}") from error
+
+
+def _swept(entries: Sequence[Grid]) -> dict[str, pa.Array]:
+    """The columns of what was tried, by the dotted path of each number or text."""
+    rows = []
+    for combination in itertools.product(*(entry.values for entry in entries)):
+        together = {tuple(entry.fields): value for entry, value in zip(entries, combination, strict=True)}
+        changes = leaves(separate(together, source="sweep"), entries=True)
+        rows.append({path: cell(value) for path, value in changes})
+    paths = dict.fromkeys(path for row in rows for path in row)
+    return {path: pa.array([row.get(path) for row in rows]) for path in paths}
