@@ -242,6 +242,11 @@ class Scenario:
         parts = f"{self.duration:g} s of {self.vehicle.file}, {self.reference.type} by {self.controller.type}"
         return f"<Scenario {self.name}: {parts}\n {self.description}>"
 
+    def _repr_html_(self) -> str:
+        from scenarios.scenario_summary import scenario_html
+
+        return scenario_html(self)
+
     def __dir__(self) -> list[str]:
         """What a user sets and calls, which is what an interactive session completes to."""
         return [name for name in super().__dir__() if name in _FOR_USERS or name.startswith("__")]
