@@ -7,7 +7,7 @@ A function under `@app.command` is both.  What it returns is shown by `scenarios
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -23,6 +23,8 @@ from quadsim.errors import FileError, InputError, OutputError, ParameterError
 from scenarios.catalogue import campaign_names, paper_names, scenario_names, tuning_names
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from quadsim.controller import Controller
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
     Flag = bool
     UserCode = object
     UserForces = Sequence[object]
+    UserReference: TypeAlias = Callable[[float], ArrayLike] | None
     Fields: TypeAlias = Mapping[str, Any]
     Draws: TypeAlias = Sequence[Mapping[str, Any]]
     Watched: TypeAlias = Progress | bool
@@ -81,7 +84,7 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
     Changes = Annotated[Sequence[str], Parameter(name="--set")]
     Whole = Annotated[int, Parameter(converter=_whole)]
     Flag = Annotated[bool, Parameter(negative="")]
-    UserCode = UserForces = Fields = Draws = Watched = Annotated[Any, Parameter(parse=False)]
+    UserCode = UserForces = UserReference = Fields = Draws = Watched = Annotated[Any, Parameter(parse=False)]
 
 app: Final = App(
     name="quadsim",
@@ -168,7 +171,12 @@ def make_controller(scenario: ScenarioName) -> Controller:
 
 
 def fly(
-    scenario: ScenarioName, *, controller: object = None, forces: Sequence[object] = (), progress: Watched = True
+    scenario: ScenarioName,
+    *,
+    controller: object = None,
+    forces: Sequence[object] = (),
+    reference: UserReference = None,
+    progress: Watched = True,
 ) -> Flight:
     """Fly a scenario and audit it, in memory; `run` and `Flight.save` write its run directory.
 
@@ -184,16 +192,21 @@ def fly(
         forces: forces of one's own that act on the vehicle, besides the scenario's effects: functions
             `force(time, state)`, called once per physics step, that give force x, y, z in the world frame [N] and
             torque in the body frame [N m]; or classes called as MyForce(vehicle, rng=...) whose objects are called so.
+        reference: replaces the scenario's course and its filter: a function `f(t)` of the time [s] that gives x, y, z
+            [m], yaw [rad] (unwrapped), called before the flight for all control instants to the last preview's end.
+            A run directory keeps these samples in `reference.csv`, and its `scenario.toml` flies to the same bits.
         progress: called with (what, done, total); True for bars on a terminal, False for none.
 
     Raises:
-        InputError: the scenario cannot be flown, or the controller cannot be set up.
+        InputError: the scenario cannot be flown, or the controller or the reference cannot be set up.
 
     Examples:
         >>> import quadsim
         >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
         >>> quadsim.fly(scenario).satisfied
         True
+        >>> quadsim.fly(scenario, reference=lambda t: [0.0, 0.0, 2.0 * t, 0.0]).reference["z"][-1].round(3)
+        np.float64(1.9)
         >>> def full_throttle(now, state, reference):
         ...     return [300.0] * 4
         >>> quadsim.fly(scenario, controller=full_throttle).state["vz"][-1].round()
@@ -202,7 +215,7 @@ def fly(
     from scenarios.progress import reporting
 
     with reporting(progress) as report:
-        return start(scenario, controller=controller, forces=forces).fly(report)
+        return start(scenario, controller=controller, forces=forces, reference=reference).fly(report)
 
 
 @app.command
@@ -219,6 +232,7 @@ def run(
     figures: bool | None = None,
     controller: UserCode = None,
     forces: UserForces = (),
+    reference: UserReference = None,
     progress: Watched = True,
 ) -> Flight:
     """Fly one scenario and write its run directory.
@@ -236,10 +250,11 @@ def run(
         figures: draw it (default: where that can be done).
         controller: as of `fly`.
         forces: as of `fly`.
+        reference: as of `fly`.
         progress: as of `fly`.
 
     Raises:
-        InputError: the scenario cannot be flown, or the controller cannot be set up.
+        InputError: the scenario cannot be flown, or the controller or the reference cannot be set up.
         RenderingUnavailableError: a video is asked for and cannot be made; nothing was flown.
         OutputError: the directory cannot be written; or what was asked for by name: its `result` is the flight then.
 
@@ -257,7 +272,7 @@ def run(
 
     if video:
         require_rendering()
-    parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces)
+    parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces, reference)
     _announce(parts[0], progress)
     products: dict[str, Any] = {"video": video, "recording": recording, "figures": figures}
     with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory, reporting(progress) as report:
@@ -295,6 +310,7 @@ def start(
     *,
     controller: object = None,
     forces: Sequence[object] = (),
+    reference: UserReference = None,
     live: bool = False,
     recorded: bool = True,
 ) -> Rollout:
@@ -304,6 +320,7 @@ def start(
         scenario: what is flown, or its name or file.
         controller: as of `fly`.
         forces: as of `fly`.
+        reference: as of `fly`; beyond the scenario's end and its preview it stays at the last sample.
         live: whether anything may be applied to it that can happen to its vehicle; else what its scenario's events are
             of, and set-points, stalls, rotor losses and lags, and other controllers.
         recorded: whether all periods are recorded, some 10 kB each; without them there is no `Rollout.flight`.
@@ -322,7 +339,7 @@ def start(
     from scenarios import loading, user_code
     from scenarios.rollout import Rollout
 
-    parts = user_code.set_up(loading.assemble(scenario), controller, forces)
+    parts = user_code.set_up(loading.assemble(scenario), controller, forces, reference)
     return Rollout(*parts, live=live, recorded=recorded)
 
 

@@ -29,6 +29,7 @@ from quadsim.sim.estimator import Tally
 from quadsim.sim.sensing import SensorName
 from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
+from scenarios.courses.csv_course import Csv
 from scenarios.feasibility_check import report
 from scenarios.flight_events import story
 from scenarios.limits import audit_notes
@@ -324,6 +325,9 @@ class Flight(Result):
         def write_tables(*, overwrite: bool) -> None:
             with writing(target, overwrite=overwrite) as partial:
                 (partial / rundir.SCENARIO_FILE).write_text(self.scenario.to_toml(), encoding="utf-8")
+                course = self.scenario.reference
+                if isinstance(course, Csv) and course.content is not None:
+                    (partial / course.file).write_bytes(course.content)
                 write_log(partial, self.log, plant_stride=self.scenario.plant_stride, metadata=self.metadata)
                 summary = to_json({**self.summary, "wall_s": wall_s()})
                 (partial / rundir.SUMMARY_FILE).write_text(summary, encoding="utf-8")

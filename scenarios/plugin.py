@@ -151,7 +151,7 @@ class PluginController:
         try:
             return getattr(self._law, "infeasible_period", None)
         except Exception as error:  # after the flight, which is not to be lost by it
-            logging.getLogger("quadsim").warning("no diagnosis: infeasible_period raised %s", _reason(error))
+            logging.getLogger("quadsim").warning("no diagnosis: infeasible_period raised %s", reason_of(error))
             return None
 
     def reset(self, speeds: Array) -> None:
@@ -159,7 +159,7 @@ class PluginController:
         try:
             getattr(self._law, "reset", np.copy)(speeds.copy())
         except (Exception, SystemExit) as error:
-            raise InputError(f"controller: {self.name}.reset cannot be called: {_reason(error)}") from error
+            raise InputError(f"controller: {self.name}.reset cannot be called: {reason_of(error)}") from error
 
     def adopt(self, previous: object) -> None:
         """See `quadsim.controller.Controller`."""
@@ -232,7 +232,7 @@ def _call(call: Any, spec: Plugin | PluginForce, arguments: dict[str, Any], **gi
         raise
     except (Exception, SystemExit) as error:
         called = ", ".join([*arguments, *given, *spec.settings])
-        raise InputError(f"{_table(spec)}: {spec.type} cannot be called with {called}: {_reason(error)}") from error
+        raise InputError(f"{_table(spec)}: {spec.type} cannot be called with {called}: {reason_of(error)}") from error
 
 
 def import_plugin(spec: Plugin | PluginForce) -> Any:
@@ -251,7 +251,7 @@ def import_plugin(spec: Plugin | PluginForce) -> Any:
     except (Exception, SystemExit) as error:
         absent = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
         where = f"; it is looked for among what is installed, and in {', '.join(folders)}" if absent else ""
-        raise InputError(f"{_table(spec)}.type: {module} cannot be imported: {_reason(error)}{where}") from error
+        raise InputError(f"{_table(spec)}.type: {module} cannot be imported: {reason_of(error)}{where}") from error
     finally:
         sys.path[:] = path
     file = getattr(sys.modules[top], "__file__", None) or "Python"
@@ -301,7 +301,7 @@ def _table(spec: Plugin | PluginForce) -> str:
     return "forces" if isinstance(spec, PluginForce) else "controller"
 
 
-def _reason(error: BaseException) -> str:
+def reason_of(error: BaseException) -> str:
     """An exception in one line, with the user's line that raised it."""
     last, text = traceback.extract_tb(error.__traceback__)[-1], " ".join(f"{type(error).__name__}: {error}".split())
     ours = last.filename in (__file__, inspect.__file__, importlib.__file__) or "<frozen" in last.filename

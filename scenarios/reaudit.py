@@ -28,6 +28,7 @@ from quadsim.sim.effects.rotors import LagChange
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly
+from scenarios.courses.csv_course import Csv
 from scenarios.loading import parse_scenario
 from scenarios.plugin import is_plugin
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
@@ -117,7 +118,7 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
 
 
 def stored_scenario(directory: Path) -> Scenario:
-    """The scenario of a run, as its directory has it; no other file is read for it.
+    """The scenario of a run, as its directory has it; no other file is read for it, but for that of its course.
 
     Its controller is not needed: another one replaces that of a package that is not installed here.
 
@@ -131,7 +132,9 @@ def stored_scenario(directory: Path) -> Scenario:
     match data.get("controller"):
         case {"type": str(name), **fields} if name not in LAWS and not is_plugin(name):
             data["controller"] = {**fields, "type": "elsewhere:Controller"}
-    return parse_scenario(data, source=str(path))
+    scenario = parse_scenario(data, source=str(path))
+    course = scenario.reference
+    return scenario.altered(reference=course.located(directory)) if isinstance(course, Csv) else scenario
 
 
 def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> Iterator[str]:

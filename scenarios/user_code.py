@@ -1,14 +1,22 @@
-"""Controllers and forces that a caller passes in, and the scenario that names them by the place of their code."""
+"""Controllers, forces and references that a caller passes in, and the scenario that stands for them in a file.
+
+It names controllers and forces by the place of their code; a reference becomes a table.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from quadsim.controller import Controller
+from quadsim.errors import InputError, ParameterError
 from quadsim.sim.effects import Force
+from quadsim.state import Array
 from scenarios.assembly import Assembly
-from scenarios.plugin import import_plugin, make_force, make_law, refer_to, require_importable
+from scenarios.courses.csv_course import LARGEST, tabulated
+from scenarios.plugin import import_plugin, make_force, make_law, reason_of, refer_to, require_importable
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import plain
 
@@ -40,14 +48,42 @@ def importable(scenario: Scenario, controller: object, forces: Sequence[object] 
     return named(scenario, controller, forces)
 
 
-def set_up(
-    assembly: Assembly, controller: object, forces: Sequence[object]
-) -> tuple[Assembly, Controller | None, list[Force] | None]:
-    """The same, and the controller and the forces as the closed loop takes them.
+def following(assembly: Assembly, reference: object) -> Assembly:
+    """The assembly whose course is a function of the time [s], sampled at t_0 .. t_{K+N}, without a filter.
 
     Raises:
-        InputError: the controller or a force cannot be set up.
+        InputError: it does not give x, y, z [m], yaw [rad], or raised.
     """
+    scenario = assembly.scenario
+    if not callable(reference):
+        raise ParameterError("", "reference", reference, "a function f(t) that gives x, y, z [m], yaw [rad]")
+    specs = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
+    samples = scenario.periods + max(spec.horizon for spec in specs) + 1
+    t = scenario.control_period * np.arange(samples, dtype=np.float64)
+    course = tabulated("reference.csv", t, np.array([_pose(reference, time) for time in t.tolist()]))
+    return Assembly(scenario.altered(reference=course, ends_with_course=False), assembly.vehicle).check()
+
+
+def _pose(reference: Callable[[float], Any], time: float) -> Array:
+    try:
+        pose = np.array(answer := reference(time), float)
+    except (Exception, SystemExit) as error:
+        raise InputError(f"reference: f({time:g}) cannot be used: {reason_of(error)}") from error
+    if pose.shape != (4,) or not (np.abs(pose) <= LARGEST).all():
+        rule = f"four numbers within +-{LARGEST:g}: x, y, z [m], yaw [rad]"
+        raise InputError(f"reference: f({time:g}) must be {rule}; got {answer!r:.200}")
+    return pose
+
+
+def set_up(
+    assembly: Assembly, controller: object, forces: Sequence[object], reference: object = None
+) -> tuple[Assembly, Controller | None, list[Force] | None]:
+    """The scenario's parts with the reference, and the controller and the forces as the closed loop takes them.
+
+    Raises:
+        InputError: the controller, a force or the reference cannot be set up.
+    """
+    assembly = assembly if reference is None else following(assembly, reference)
     scenario, law, acting = assembly.scenario, None, None
     flown = named(scenario, controller, forces)
     if controller is not None and not isinstance(controller, str):

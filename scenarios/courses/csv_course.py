@@ -16,7 +16,7 @@ import numpy as np
 from annotated_types import doc
 from pydantic import StringConstraints
 
-from quadsim.errors import FileError, InputError
+from quadsim.errors import FileError
 from quadsim.state import Array
 from scenarios.courses.course import EXACT, Course, Path, Started, begin
 from scenarios.courses.legs import polyline
@@ -59,9 +59,16 @@ class Csv(Started):
         doc("hash of the file, recorded when it is read; another content is refused"),
     ] = None
 
+    @property
+    def content(self) -> bytes | None:
+        """The file's content of a table made by `tabulated`; None where it is read from the file."""
+        content: bytes | None = vars(self).get("content")
+        return content
+
     def build(self, initial: Array, gravity: float) -> Course:
         """As `Filtered.build`."""
-        table = read_table(FilePath(self.file))
+        path = FilePath(self.file)
+        table = read_table(path) if self.content is None else parse_table(path, self.content)
         if self.sha256 not in (None, table.sha256):
             raise FileError(self.file, f"is not the file of the scenario: its SHA-256 is not {self.sha256}")
         return begin(through_rows(table), start=self.start + float(table.t[0]), initial=initial)
@@ -78,8 +85,36 @@ class Csv(Started):
         return self
 
 
+def tabulated(file: str, t: Array, poses: Array) -> Csv:
+    """A course of poses (n, 4) x, y, z [m], yaw [rad] at times t (n,) [s], its file's content in memory.
+
+    Every digit is written, with an exponent: no column looks rounded.
+    """
+    rows = (",".join(f"{value:.16e}" for value in row) for row in np.column_stack([t, poses]))
+    content = "\n".join([",".join(POSE_HEADER), *rows, ""]).encode()
+    course = Csv(type="csv", file=file, sha256=hashlib.sha256(content).hexdigest())
+    vars(course).update(content=content)
+    return course
+
+
 def read_table(path: FilePath) -> Table:
-    """Read a file with the header `t,x,y,z,yaw` or `t,x,y,z,yaw,vx,vy,vz`, yaw in radians.
+    """Read a file with the header `t,x,y,z,yaw` or `t,x,y,z,yaw,vx,vy,vz`, yaw in radians; see `parse_table`.
+
+    Raises:
+        FileError: it cannot be read, or as of `parse_table`.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise FileError(path, "cannot be read (it is not a file)")
+        if (size := path.stat().st_size) > LARGEST_FILE:
+            raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
+        return parse_table(path, path.read_bytes())
+    except OSError as error:
+        raise FileError(path, f"cannot be read ({error})") from error
+
+
+def parse_table(path: FilePath, content: bytes) -> Table:
+    """The rows of a file's content.
 
     Yaw that changes by more than half a turn between rows is taken as wrapped, and unwrapped.
 
@@ -87,16 +122,9 @@ def read_table(path: FilePath) -> Table:
         FileError: naming the row (the header is row 1) and the column that is wrong.
     """
     try:
-        if path.exists() and not path.is_file():
-            raise FileError(path, "cannot be read (it is not a file)")
-        if (size := path.stat().st_size) > LARGEST_FILE:
-            raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
-        content = path.read_bytes()
         lines = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
         rows = list(islice(lines, MOST_ROWS + 2))
-    except InputError:
-        raise
-    except (OSError, ValueError, csv.Error) as error:
+    except (ValueError, csv.Error) as error:
         raise FileError(path, f"cannot be read ({error})") from error
     while rows and not rows[-1]:
         rows.pop()

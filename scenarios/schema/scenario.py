@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, get_args, get_type_hints
 
@@ -34,6 +34,12 @@ from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.settings import separate, set_field
 from scenarios.schema.writing import to_toml
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from scenarios.flight import Flight
+    from scenarios.progress import Progress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -414,13 +420,28 @@ class Scenario:
             del data["duration"]
         for path, value in separate(changes, source="replace").items():
             set_field(data, path, value.tolist() if hasattr(value, "tolist") else value, source="replace")
-        return Scenario.parse(data, source=self.name)
+        other = Scenario.parse(data, source=self.name)
+        # A reference that was passed in as a function has its rows in memory.
+        return other.altered(reference=self.reference) if other.reference == self.reference else other
 
-    def fly(self, **options: Any) -> Flight:
-        """Fly it; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
+    def fly(
+        self,
+        *,
+        controller: object = None,
+        forces: Sequence[object] = (),
+        reference: Callable[[float], ArrayLike] | None = None,
+        progress: Progress | bool = True,
+    ) -> Flight:
+        """Fly it, with the arguments and errors of `quadsim.fly`.
+
+        Examples:
+            >>> import quadsim
+            >>> quadsim.load("hover").replace({"duration": 1.0}).fly().outcome
+            'satisfied'
+        """
         from scenarios.app import fly
 
-        return fly(self, **options)
+        return fly(self, controller=controller, forces=forces, reference=reference, progress=progress)
 
     def to_toml(self) -> str:
         """The resolved file: every field, defaults included, with comments; parsing it gives this scenario again."""
