@@ -124,10 +124,10 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_doctor_tries_every_solver(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json"]) == EXIT_DONE
-    found = json.loads(capsys.readouterr().out)
-    assert list(found) == ["machine", "packages", "rendering", "viewer", "solvers"]
-    assert list(found["solvers"]) == list(solver_entries())
-    for name, line in found["solvers"].items():
+    result = json.loads(capsys.readouterr().out)
+    assert list(result) == ["machine", "packages", "rendering", "viewer", "solvers"]
+    assert list(result["solvers"]) == list(solver_entries())
+    for name, line in result["solvers"].items():
         installed = solver_entries()[name].installed
         assert line.startswith(("works: ", "fails: ") if installed else ("not installed: ", "not compiled: ")), name
 

@@ -192,12 +192,12 @@ def test_it_is_reproducible_to_the_bit(flight: Flight) -> None:
 
 
 def test_its_numbers_are_the_golden_ones(flight: Flight) -> None:
-    golden, found = read("library")[flight.scenario.name], library_entry(flight)
-    assert found.keys() == golden.keys()
-    assert [found[key] for key in SAME if key in found] == [golden[key] for key in SAME if key in golden]
+    golden, result = read("library")[flight.scenario.name], library_entry(flight)
+    assert result.keys() == golden.keys()
+    assert [result[key] for key in SAME if key in result] == [golden[key] for key in SAME if key in golden]
     for key, tolerance in TOLERANCES.items():
         if key in golden:
-            assert found[key] == pytest.approx(golden[key], abs=tolerance), key
+            assert result[key] == pytest.approx(golden[key], abs=tolerance), key
 
 
 @pytest.mark.parametrize("name", scenario_names())
