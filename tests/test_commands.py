@@ -76,6 +76,7 @@ def workplace(
         tmp_path / "tuning.toml"
     )
     (tmp_path / "mine-vehicle.toml").write_text(quadsim.vehicle_report(template=True).content)
+    (tmp_path / "first.toml").write_text('base = "hover"\n')  # in the place of the one made for that vehicle
     (tmp_path / "push.toml").write_text(
         'duration = 0.2\ninputs = [{ at = 0.1, type = "pull", to = [1.0, 0.0, 1.0] }]\n'
     )

@@ -9,10 +9,12 @@ from pathlib import Path
 from pkgutil import resolve_name
 from types import ModuleType
 
+import drawings
 import matplotlib as mpl
 import pytest
 import remake
 from golden_numbers import PAPER, paper_entry, read
+from test_spine import spine
 
 from scenarios.flight import Flight
 from scenarios.loading import load_scenario
@@ -114,3 +116,14 @@ def test_documents_name_what_exists() -> None:
     assert len(named) > 60
     for name in sorted(named - ENTRY_POINTS):
         resolve_name(name)
+
+
+@pytest.mark.parametrize("name", drawings.DRAWINGS)
+def test_drawings_are_those_of_the_code(name: str) -> None:
+    drawn = (ROOT / "docs/assets" / name).read_text(encoding="utf-8")
+    assert drawn == drawings.DRAWINGS[name](), "python docs/drawings.py"
+
+
+def test_the_architecture_lists_the_spine_in_its_order() -> None:
+    page = (ROOT / "docs/design.md").read_text(encoding="utf-8")
+    assert [ROOT / name for name in re.findall(r"^\d+\. `([^`]+)`", page, re.MULTILINE)] == spine()
