@@ -1,7 +1,7 @@
-"""All that quadsim does: what `import quadsim` hands out, and what the command line is made of.
+"""The functions of quadsim: the API of `import quadsim` and the commands of the command line.
 
-A function under `@app.command` is both.  What it returns is shown by `scenarios.cli`, the only one that prints; see
-`scenarios.results`.  Nothing heavy is imported before a function runs.
+A function under `@app.command` is both.  `scenarios.cli` alone prints, and shows the results (`scenarios.results`).
+No heavy import precedes the call of a function.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def load(name: str | Path, changes: Changes = ()) -> Scenario:
 
 
 def feasibility(scenario: ScenarioName) -> Feasibility:
-    """What a course requires of the vehicle and of the controller's bounds, tightened ones too; nothing is flown.
+    """Compare a course with the vehicle's limits and the controller's bounds, tightened ones too, without a flight.
 
     Args:
         scenario: it, or its name or file.
@@ -211,12 +211,12 @@ def fly(
     reason, and its outcome is `aborted`.
 
     Args:
-        scenario: what is flown, or its name or file.
+        scenario: the scenario, or its name or file.
         controller: flies it, instead of the scenario's: a class, called as MyLaw(vehicle, period=..., horizon=...)
             and with a method `step(now, state, reference)`; a function `law(now, state, reference)` that gives four
             rotor speeds [rad/s]; an object with such a `step`; or a text `package.module:Class`.  Further arguments of
             a class through `functools.partial`.
-        forces: forces of one's own that act on the vehicle, besides the scenario's effects: functions
+        forces: user-defined forces on the vehicle, besides the scenario's effects: functions
             `force(time, state)`, called once per physics step, that give force x, y, z in the world frame [N] and
             torque in the body frame [N m]; or classes called as MyForce(vehicle, rng=...) whose objects are called so.
         reference: replaces the course and its filter; the scenario's constraints stay.  A function `f(t)` of the time
@@ -342,10 +342,10 @@ def start(
     live: bool = False,
     recorded: bool = True,
 ) -> Rollout:
-    """Build everything that a flight needs, for a script of one's own to fly it period by period.
+    """Build everything that a flight needs, for a script that flies it period by period.
 
     Args:
-        scenario: what is flown, or its name or file.
+        scenario: the scenario, or its name or file.
         controller: as of `fly`.
         forces: as of `fly`.
         reference: as of `fly`; beyond the scenario's end and its preview it stays at the last sample.
@@ -423,8 +423,8 @@ def check(
 ) -> Reaudit:
     """Audit a scenario (flown first) or a finished run; exit 1 if it fails.
 
-    A finished run is audited again from its tables, and its summary and its files' hashes are held against that.  It
-    finds damage and mistakes: integrity, not authenticity.  Who writes every file anew can make them agree.
+    A finished run is audited again from its tables, and compared with its summary and its files' hashes.  This
+    finds damage and mistakes: integrity, not authenticity.  Rewriting every file can make them agree.
 
     Args:
         target: library name, TOML file, or run directory.
@@ -687,7 +687,7 @@ def sweep(
     """Fly a scenario once for every combination of some fields' values, all with the scenario's own seed.
 
     Args:
-        scenario: what is flown, or its name or file.
+        scenario: the scenario, or its name or file.
         values: what to try, by dotted path; a tuple of paths varies together, with one value for all of them or a tuple
             of one for each.
         controller: as of `fly`; a class or a function of a module that other processes can import.
@@ -744,7 +744,7 @@ def campaign(
     forces: UserForces = (),
     progress: Watched = True,
 ) -> CampaignResult:
-    """Fly a scenario many times, what may vary drawn at random.
+    """Fly a scenario many times with parameters drawn at random.
 
     Args:
         campaign: a campaign's name, or path to a TOML file; in Python also a scenario, with `vary` and `fields`.
@@ -773,7 +773,7 @@ def campaign(
     Raises:
         InputError: something cannot be flown so.
         OutputError: a campaign is there already, or the directory cannot be written.
-        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` continues it.
+        KeyboardInterrupt: the user stopped it; the flights so far are kept, and `resume` continues it.
 
     Examples:
         >>> import tempfile, quadsim
@@ -892,7 +892,7 @@ def tune(
     report: bool = True,
     progress: Watched = True,
 ) -> TuningResult:
-    """Search fields of a scenario; the answer is held against the start on fresh draws.
+    """Search fields of a scenario; the answer is compared with the start on fresh draws.
 
     Args:
         tuning: name of a tuning that ships, or path to a TOML file.
@@ -914,7 +914,7 @@ def tune(
         InputError: something cannot be flown so.
         MissingPackageError: the extra `tune` is not installed.
         OutputError: a tuning is there already, or the directory cannot be written.
-        KeyboardInterrupt: a person stopped it; what was flown is there, and `resume` continues it.
+        KeyboardInterrupt: the user stopped it; the flights so far are kept, and `resume` continues it.
 
     Examples:
         >>> import quadsim
@@ -946,7 +946,7 @@ def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) 
         with watching(bool(progress)) as watch:
             yield {"directory": directory, "resume": resume, "overwrite": overwrite, "watch": watch}
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"{directory} has what was flown, --resume continues it") from None
+        raise KeyboardInterrupt(f"{directory} has the flights so far, --resume continues it") from None
 
 
 @app.command
