@@ -195,7 +195,8 @@ def fly(
         reference: replaces the scenario's course and its filter: a function `f(t)` of the time [s] that gives x, y, z
             [m], yaw [rad] (unwrapped), called before the flight for all control instants to the last preview's end.
             A run directory keeps these samples in `reference.csv`, and its `scenario.toml` flies to the same bits.
-        progress: called with (what, done, total); True for bars on a terminal, False for none.
+        progress: called with (what, done, total); True for bars on a terminal and elsewhere a line every ten seconds,
+            False for none.
 
     Raises:
         InputError: the scenario cannot be flown, or the controller or the reference cannot be set up.
@@ -541,9 +542,8 @@ def film(
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
     with reporting(progress) as report:
-        render = partial(render_gif, directory, workers=workers)
-        if path.suffix == ".mp4":
-            render = partial(render_video, directory, workers=workers, progress=partial(report, "video"))
+        make = render_video if path.suffix == ".mp4" else render_gif
+        render = partial(make, directory, workers=workers, progress=partial(report, "video"))
         if path.parent != directory:
             render(path, overwrite=overwrite)
         else:  # a product of the run, which its summary lists
@@ -665,7 +665,7 @@ def sweep(
         controller: as of `fly`; a class or a function of a module that other processes can import.
         forces: what acts on it, as of `fly`; the same.
         workers: processes that fly; one per usable core where absent.
-        progress: whether to show a bar on a terminal.
+        progress: as of `fly`.
 
     Returns:
         A table with a row per flight, in the order of the combinations, the last field varying fastest.
@@ -736,7 +736,7 @@ def campaign(
         fields: of a scenario: other fields of a campaign file, as `name`, `failure` or `sampling`.
         controller: of a scenario, as of `sweep`.
         forces: of a scenario, as of `sweep`.
-        progress: whether to show a bar on a terminal, and elsewhere a line now and then.
+        progress: whether to show a bar on a terminal, and elsewhere a line every ten seconds.
 
     Returns:
         The results: `table` (a row per flight), `summary` (estimates with their intervals), `judgements` (of what was
