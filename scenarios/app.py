@@ -98,6 +98,11 @@ app: Final = App(
 _log: Final = logging.getLogger("quadsim")
 
 
+def _examples(*lines: str) -> str:
+    """What the help of a command ends with."""
+    return "\n  ".join(["examples:", *lines])
+
+
 # --- scenarios -----------------------------------------------------------------------------------------------------
 
 
@@ -219,7 +224,11 @@ def fly(
         return start(scenario, controller=controller, forces=forces, reference=reference).fly(report)
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim run paper-constrained", "quadsim run hover --set controller.horizon=30 --out runs/short --no-video"
+    )
+)
 def run(
     scenario: ScenarioName,
     /,
@@ -384,7 +393,11 @@ def read(directory: str | Path) -> Flight:
     )
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim check paper-constrained", "quadsim check runs/paper-constrained --junit verdicts.xml"
+    )
+)
 def check(
     target: ScenarioName,
     /,
@@ -448,7 +461,12 @@ def check(
     return audited
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim compare paper-unconstrained paper-constrained --out runs/comparison",
+        "quadsim compare runs/mine runs/other --markdown",
+    )
+)
 def compare(
     *targets: Target,
     out: File | None = None,
@@ -493,7 +511,12 @@ def compare(
     return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared
 
 
-@app.command(name="video")
+@app.command(
+    name="video",
+    help_epilogue=_examples(
+        "quadsim video runs/paper-constrained", "quadsim video runs/paper-constrained --out flight.gif"
+    ),
+)
 def film(
     directory: File,
     /,
@@ -552,7 +575,9 @@ def film(
     return path
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples("quadsim view runs/paper-constrained", "quadsim view runs/paper-constrained --web")
+)
 def view(run: File, /, *, web: Flag = False) -> None:
     """Open a run's recording in the rerun viewer.
 
@@ -591,7 +616,9 @@ def view(run: File, /, *, web: Flag = False) -> None:
     open_viewer(recording, web=web)
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples("quadsim live paper-constrained", "quadsim live robust --against paper-unconstrained")
+)
 def live(
     scenario: ScenarioName,
     /,
@@ -693,7 +720,12 @@ def sweep(
         return fly_sweep(importable(load_scenario(scenario), controller, forces), values, workers, report)
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim campaign paper-robustness --flights 100",
+        "quadsim campaign mine.toml --resume --require 'P(violation) < 0.01 @ 95%'",
+    )
+)
 def campaign(
     campaign: CampaignName,
     /,
@@ -789,7 +821,12 @@ def campaign(
     return result
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim replay runs/campaigns/paper-robustness --worst",
+        "quadsim replay runs/campaigns/paper-robustness --flight 12 --no-video",
+    )
+)
 def replay(
     campaign: File,
     /,
@@ -849,7 +886,7 @@ def replay(
     return held_against(flown, recorded)
 
 
-@app.command
+@app.command(help_epilogue=_examples("quadsim tune paper-robust", "quadsim tune mine.toml --trials 50 --resume"))
 def tune(
     tuning: TuningName,
     /,
@@ -921,7 +958,7 @@ def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) 
         raise KeyboardInterrupt(f"{directory} has what was flown, --resume continues it") from None
 
 
-@app.command
+@app.command(help_epilogue=_examples("quadsim reproduce", "quadsim reproduce torrente2021 --junit numbers.xml"))
 def reproduce(
     paper: PaperName | None = None, /, *, junit: File | None = None, progress: Watched = True
 ) -> Reproductions:
@@ -960,7 +997,12 @@ def reproduce(
 # --- files, code, and what there is --------------------------------------------------------------------------------
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim export paper-constrained --out exported",
+        "quadsim export paper-constrained --out small --precision float --target cortex-m7",
+    )
+)
 def export(
     scenario: ScenarioName,
     /,
@@ -1005,7 +1047,11 @@ def export(
         return in_the_loop.fly_exported(flown, place, **options)  # type: ignore[arg-type]
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim scenario hover > mine.toml", "quadsim scenario --for hummingbird --course figure-eight > mine.toml"
+    )
+)
 def scenario(
     name: ScenarioName | None = None,
     /,
@@ -1068,7 +1114,12 @@ def scenario(
     return results.ScenarioFile(whole.to_toml())
 
 
-@app.command(name="vehicle")
+@app.command(
+    name="vehicle",
+    help_epilogue=_examples(
+        "quadsim vehicle hummingbird --scenario paper-constrained", "quadsim vehicle --template > mine.toml"
+    ),
+)
 def vehicle_report(
     name: VehicleName | None = None,
     /,
@@ -1151,7 +1202,7 @@ def load_vehicle(name: VehicleName) -> Vehicle:
     return read_vehicle(vehicle_path(str(name)))
 
 
-@app.command(name="list")
+@app.command(name="list", help_epilogue=_examples("quadsim list", "quadsim list --json"))
 def catalogue() -> Catalogue:
     """Scenarios, campaigns, tunings, vehicles, controllers, papers and solvers, one line each.
 
@@ -1172,7 +1223,7 @@ def catalogue() -> Catalogue:
     return read_catalogue()
 
 
-@app.command
+@app.command(help_epilogue=_examples("quadsim doctor", "quadsim doctor --json"))
 def doctor() -> Listing:
     """What this machine can do: cores, packages, rendering, viewer, and every QP solver tried on a step.
 
