@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.linalg
@@ -56,6 +56,18 @@ def condensed_cost(problem: Problem, maps: Prediction) -> CondensedCost:
         H, F_x, F_y = H + 2.0 * last.T @ (Q_end - Q) @ last, F_x + 2.0 * last.T @ (Q_end - Q) @ free, F_y.copy()
         F_y[:, -W.shape[1] :] -= 2.0 * last.T @ (W_end - W)
     return CondensedCost(H=0.5 * (H + H.T), F_x=F_x, F_y=F_y, F_d=F_d)
+
+
+class CondensedQP(NamedTuple):
+    """min 1/2 x' H x + f' x  subject to  lower <= A x <= upper,  x_min <= x <= x_max; see `mpc.ocp.Problem.qp`."""
+
+    H: Array
+    f: Array
+    A: Array
+    lower: Array  # may be -inf
+    upper: Array  # may be inf
+    x_min: Array  # likewise
+    x_max: Array
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -22,7 +22,10 @@ import scipy.linalg
 from mpc.constraints import Bounds, Constraint, Rows, renumbered
 from mpc.model import LinearModel
 from quadsim.errors import ParameterError
-from quadsim.state import REFERENCE_STATES, Array
+from quadsim.state import N_STATES, REFERENCE_STATES, Array
+
+if TYPE_CHECKING:
+    from mpc.condensing import Condensed, CondensedQP
 
 
 class Equilibrium(NamedTuple):
@@ -128,6 +131,79 @@ class Problem:
     def every_constraint(self) -> tuple[Constraint, ...]:
         """The paper's constraints, in the order of `Bounds.constraints`, then the others."""
         return (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
+
+    def condensed(self) -> Condensed:
+        """The QP in the inputs alone: its parts that are the same in all periods.
+
+        Returns:
+            `cost` has H (N nu, N nu) of Eq. (7), F_x (N nu, n) of Eq. (8) and F_y (N nu, N n_r) of Eq. (9); `qp.G` has
+            the rows, time by time; `inputs(x)` takes a solution to the plan (N, nu) [rad/s].
+
+        Examples:
+            >>> import quadsim
+            >>> form = quadsim.problem("paper-constrained").condensed()
+            >>> form.cost.H.shape, form.cost.F_x.shape
+            ((200, 200), (200, 12))
+        """
+        return self._condensed
+
+    @cached_property
+    def _condensed(self) -> Condensed:
+        from mpc.condensing import Condensed
+
+        if self.every_constraint:
+            return Condensed(self)
+        none, anything = np.zeros(0), np.full(self.model.nu, math.inf)
+        free = Bounds(
+            C_c=np.zeros((0, self.model.n)),
+            y_min=none,
+            y_max=none,
+            delta_min=-anything,
+            delta_max=anything,
+            u_min=-anything,
+            u_max=anything,
+        )
+        return Condensed(replace(self, bounds=free))
+
+    def qp(
+        self, state: Array, reference: Array, u_before: Array, equilibrium: Equilibrium | None = None
+    ) -> CondensedQP:
+        """The condensed QP of one period, as new numpy arrays for any solver.  Eqs. (27)-(29).
+
+        The variables x are the inputs u(k), ..., u(k+N-1) [rad/s], so x[:4] is the command, and then the slacks of
+        soft rows.  Tightened bounds are in `lower` and `upper`.
+
+        Args:
+            state: (12,) x(k) [m, m/s, rad, rad/s].  A model with rotor lag has the rotor speeds [rad/s] as well, (16,);
+                (12,) then stands for rotors at `u_before`.
+            reference: (N, 4) x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.
+            u_before: (4,) u(k-1) [rad/s].
+            equilibrium: where the model rests against a disturbance; absent for hover.
+
+        Raises:
+            ParameterError: an array has another shape.
+
+        Examples:
+            >>> import numpy as np
+            >>> import quadsim
+            >>> problem = quadsim.problem("paper-unconstrained")
+            >>> H, f, A, lower, upper, x_min, x_max = problem.qp(np.zeros(12), np.zeros((50, 4)), np.full(4, 200.0))
+            >>> bool(np.allclose(np.linalg.solve(H, -f)[:4], problem.model.u_bar))
+            True
+        """
+        from mpc.condensing import CondensedQP
+
+        state, reference, u_before = (np.asarray(given, float) for given in (state, reference, u_before))
+        n, u_bar = self.model.n, self.model.u_bar
+        _check_shape("u_before", u_before, u_bar.shape)
+        if state.shape == (N_STATES,):
+            state = np.concatenate([state, u_before])[:n]
+        _check_shape("state", state, (n,))
+        _check_shape("reference", reference, (self.horizon, len(REFERENCE_STATES)))
+        hover = Equilibrium(np.concatenate([np.zeros(N_STATES), u_bar])[:n], u_bar)
+        query = Query(state, self.objective.desired(reference), u_before, equilibrium or hover)
+        qp = self._condensed.assemble(query).qp
+        return CondensedQP(*map(np.array, (qp.P, qp.c, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)))
 
     @cached_property
     def rows(self) -> Rows:

@@ -5,7 +5,7 @@
     flight = quadsim.fly("paper-constrained")
     flight.outcome, flight.metrics["rmse.x"], flight.margins["roll"].min()
 
-What is public is named in `__all__` and imported when it is first used (PEP 562), so `import quadsim` costs nothing.
+Public names are in `__all__` and imported on first use (PEP 562), so `import quadsim` costs nothing.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from scenarios.app import load as load
     from scenarios.app import load_vehicle as load_vehicle
     from scenarios.app import make_controller as make_controller
+    from scenarios.app import problem as problem
     from scenarios.app import read as read
     from scenarios.app import replay as replay
     from scenarios.app import reproduce as reproduce
@@ -57,7 +58,7 @@ _MODULES = {
     "quadsim.state": "STATE_NAMES State",
     "quadsim.vehicle": "Vehicle",
     "scenarios.app": "campaign catalogue check compare doctor feasibility film fly live load load_vehicle "
-    "make_controller read replay reproduce run scenario start sweep tune vehicle_report view",
+    "make_controller problem read replay reproduce run scenario start sweep tune vehicle_report view",
     "scenarios.export.exporter": "export",
     "scenarios.export.in_the_loop": "fly_exported",
     "scenarios.flight": "Flight",
@@ -70,7 +71,7 @@ __all__ = [*_PUBLIC]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
+    """Import a public name on first use."""
     if name not in _PUBLIC:
         raise AttributeError(f"module 'quadsim' has no attribute {name!r}")
     return globals().setdefault(name, getattr(importlib.import_module(_PUBLIC[name]), name))

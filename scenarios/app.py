@@ -25,6 +25,7 @@ from scenarios.catalogue import campaign_names, paper_names, scenario_names, tun
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from mpc.ocp import Problem
     from quadsim.controller import Controller
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
@@ -170,6 +171,32 @@ def make_controller(scenario: ScenarioName) -> Controller:
     from scenarios.loading import assemble
 
     return assemble(scenario).controller()
+
+
+def problem(scenario: ScenarioName) -> Problem:
+    """The optimal control problem of a scenario's controller: matrices, weights and constraints as numpy arrays.
+
+    `model` has A (n, n), B (n, 4), u_bar (4,) [rad/s]; `objective` C_r, Q_y, Q_u; `rows` the constraints, lower <=
+    C x + D u + E (u - u_before) <= upper.  `condensed()` and `qp(state, reference, u_before)` give the QP.
+
+    The problem of `robust` has its soft and tightened rows, weights of moves and rotor lag.  It starts where its delay
+    ends, in axes turned by the yaw with `heading`; an estimated disturbance moves its `equilibrium`.  Half-spaces of
+    `controller.avoidance` differ from period to period and are left out.
+
+    Raises:
+        InputError: the controller solves none: `nonlinear`, `lqr`, `pid`, `geometric`, or yours.
+
+    Examples:
+        >>> import quadsim
+        >>> problem = quadsim.problem("paper-constrained")
+        >>> problem.model.A.shape, problem.model.B.shape, problem.horizon
+        ((12, 12), (12, 4), 50)
+        >>> problem.rows.names[0], problem.rows.upper.shape
+        ('outputs', (50, 10))
+    """
+    from scenarios.loading import assemble
+
+    return assemble(scenario).problem()
 
 
 # --- flights -------------------------------------------------------------------------------------------------------

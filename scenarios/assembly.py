@@ -276,7 +276,11 @@ class Assembly:
         """
         spec = self.scenario.controller
         if not isinstance(spec, Weighted):
-            raise ParameterError("controller", "type", spec.type, "one that minimises over a horizon")
+            from scenarios.schema.controllers import TABLES
+
+            linear = [name for name, table in TABLES.items() if issubclass(table, Weighted)]
+            rule = f"one that solves a linear problem over a horizon: {', '.join(linear)}"
+            raise ParameterError("controller", "type", spec.type, rule)
         return spec.problem(self.vehicle, self.scenario.control_period)
 
     @cached_property

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, get_args, get_type_hints
 
@@ -36,10 +36,7 @@ from scenarios.schema.settings import separate, set_field
 from scenarios.schema.writing import to_toml
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from scenarios.flight import Flight
-    from scenarios.progress import Progress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -429,24 +426,11 @@ class Scenario:
         # A reference that was passed in as a function has its rows in memory.
         return other.altered(reference=self.reference) if other.reference == self.reference else other
 
-    def fly(
-        self,
-        *,
-        controller: object = None,
-        forces: Sequence[object] = (),
-        reference: Callable[[float], ArrayLike] | None = None,
-        progress: Progress | bool = True,
-    ) -> Flight:
-        """Fly it, with the arguments and errors of `quadsim.fly`.
-
-        Examples:
-            >>> import quadsim
-            >>> quadsim.load("hover").replace({"duration": 1.0}).fly().outcome
-            'satisfied'
-        """
+    def fly(self, **options: Any) -> Flight:
+        """Fly it; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
         from scenarios.app import fly
 
-        return fly(self, controller=controller, forces=forces, reference=reference, progress=progress)
+        return fly(self, **options)
 
     def to_toml(self) -> str:
         """The resolved file: every field, defaults included, with comments; parsing it gives this scenario again."""
