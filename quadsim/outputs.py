@@ -38,11 +38,7 @@ def absolute(path: Path | str) -> Path:
         real = Path(os.path.realpath(Path(path).expanduser()))
         if real.is_symlink():
             raise ValueError("a symbolic link leads back to itself")
-    except (
-        ValueError,
-        RuntimeError,
-        OSError,
-    ) as error:  # includes null bytes, users without a home, names that are too long
+    except (ValueError, RuntimeError, OSError) as error:  # includes null bytes, unknown users, long names
         raise OutputError(ascii(str(path))[1:-1], getattr(error, "strerror", None) or str(error)) from error
     return real
 

@@ -27,13 +27,13 @@ _PARALLEL: Final = 1e-9  # determinant of three unit normals below which their p
 
 _ROUNDING: Final = 1e-9  # of lengths along a path [m]
 
-Name = Annotated[str, doc("what reports call it")]
+Name = Annotated[str, doc("name in reports")]
 Pair = Annotated[tuple[Number, ...], Len(2, 2)]
 Sizes = Annotated[tuple[Positive, ...], Len(3, 3)]  # along x, y, z
 
 
 def _clearance(kind: str, size: Array, centre: Array, turn: Array, points: Array) -> tuple[Array, Array]:
-    """See `Solid.clearance`; of s solids of a kind, with sizes and centres (s, 1, 3), turns (s, 3, 3), at (s, K, 3)."""
+    """See `Solid.clearance`; s solids of a kind, with sizes and centres (s, 1, 3), turns (s, 3, 3), at (s, K, 3)."""
     over, ways = _excess(kind, size, (points - centre) @ turn)
     outside = np.maximum(over, 0.0)
     far = np.linalg.norm(outside, axis=-1)
@@ -44,7 +44,7 @@ def _clearance(kind: str, size: Array, centre: Array, turn: Array, points: Array
 
 
 def _excess(kind: str, size: Array, local: Array) -> tuple[Array, Array]:
-    """How far points lie beyond each of the surfaces (..., K, j), orthogonal to each other, and the ways out."""
+    """How far points exceed each of the surfaces (..., K, j), orthogonal to each other, and the ways out."""
     a, b = size[..., 0], size[..., 1]
     sides = np.where(local < 0.0, -1.0, 1.0)
     if kind == "box":
@@ -80,7 +80,7 @@ class Solid(NamedTuple):
         return _clearance(self.kind, np.array(self.size), self.centre, self.turn, points)
 
     def support(self, ways: Array) -> Array:
-        """(n, 3) its points farthest along ways (n, 3), relative to the obstacle's position [m]."""
+        """(n, 3) its support points along directions `ways` (n, 3), relative to the obstacle's position [m]."""
         local = ways @ self.turn
         a, b, _ = self.size
         sides = np.where(local < 0.0, -1.0, 1.0)
@@ -99,7 +99,7 @@ class Solid(NamedTuple):
         w = math.sqrt(max(0.0, 1.0 + x[0] + y[1] + z[2]))
         if w > 1e-6:
             return np.array([w * w, y[2] - z[1], z[0] - x[2], x[1] - y[0]]) / (2.0 * w)
-        axis = np.sqrt(np.maximum(0.0, 1.0 + np.array([x[0], y[1], z[2]])) / 2.0)  # a half turn
+        axis = np.sqrt(np.maximum(0.0, 1.0 + np.array([x[0], y[1], z[2]])) / 2.0)  # for half turns
         first = int(axis.argmax())
         signs = np.where(self.turn[first] < 0.0, -1.0, 1.0)
         signs[first] = 1.0
@@ -108,7 +108,7 @@ class Solid(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """Where a moving obstacle is at an instant."""
+    """The position of a moving obstacle at an instant."""
 
     time: Annotated[Number, doc("[s]")]
     position: Annotated[Vector, doc("[m] x, y, z of its centre, world")]
@@ -116,10 +116,10 @@ class Place:
 
 @dataclass(frozen=True, kw_only=True)
 class Obstacle:
-    """What a vehicle must not touch; it stands still, or moves on a stated path without turning."""
+    """An object that the vehicle must not touch; fixed, or moving along a stated path without turning."""
 
     name: Name = field(metadata=_NAME)
-    position: Annotated[Vector, doc("[m] x, y, z of its centre, world; of one that moves until it starts")]
+    position: Annotated[Vector, doc("[m] x, y, z of its centre, world; if it moves, its position until then")]
     start: Annotated[NonNegative, doc("[s] when it starts to move")] = 0.0
     velocity: Annotated[Vector, doc("[m/s] from start on")] = (0.0, 0.0, 0.0)
     acceleration: Annotated[Vector, doc("[m/s^2] from start on, as of a thrown ball")] = (0.0, 0.0, 0.0)
@@ -140,12 +140,12 @@ class Obstacle:
 
     @property
     def moves(self) -> bool:
-        """Whether it ever does."""
+        """Whether it moves."""
         return bool(self.path) or any(self.velocity) or any(self.acceleration)
 
     @cached_property
     def solids(self) -> tuple[Solid, ...]:
-        """What it is made of."""
+        """Its convex parts."""
         raise NotImplementedError
 
     def positions(self, t: Array) -> Array:
@@ -159,16 +159,16 @@ class Obstacle:
         return np.stack([np.interp(t, times, column) for column in positions.T], axis=1)
 
     def clearances(self, t: Array, points: Array) -> tuple[Array, Array]:
-        """Signed distance (s, K) [m] of points (K, 3) at times (K,) to each of its s solids, and normals (s, K, 3)."""
+        """Signed distances (s, K) [m] of points (K, 3) at times (K,) to its s solids, and normals (s, K, 3)."""
         return Solids([self]).clearances(t, points)
 
     def clearance(self, t: Array, points: Array) -> Array:
-        """(K,) signed distance [m]; inside a wall, whose solids overlap, at most that deep."""
+        """(K,) signed distance [m]; inside a wall, whose solids overlap, the depth is a lower bound."""
         return self.clearances(t, points)[0].min(axis=0)
 
 
 class Solids:
-    """The solids of several obstacles, in their order, measured all at once."""
+    """The solids of several obstacles, in their order, evaluated together."""
 
     def __init__(self, obstacles: Sequence[Obstacle]) -> None:
         self._obstacles = tuple(obstacles)
@@ -217,7 +217,7 @@ class Sphere(Obstacle):
 
 @dataclass(frozen=True, kw_only=True)
 class Capsule(Obstacle):
-    """All that is no farther than a radius from a straight axis."""
+    """All points within a radius of a straight axis."""
 
     type: Annotated[Literal["capsule"], doc("kind of obstacle: capsule")] = "capsule"
     axis: Annotated[Vector, doc("[m] from one end of its axis to the other")]
@@ -246,7 +246,7 @@ class Box(Obstacle):
 
     type: Annotated[Literal["box"], doc("kind of obstacle: box")] = "box"
     size: Annotated[Sizes, doc("[m] its edges along its own x, y, z")]
-    yaw: Annotated[Number, doc("[deg] of its x axis, from the world's")] = 0.0
+    yaw: Annotated[Number, doc("[deg] direction of its x axis, from the world's")] = 0.0
 
     @cached_property
     def solids(self) -> tuple[Solid, ...]:

@@ -35,7 +35,7 @@ POSITIONS: Final = slice(0, 6, 2)
 VELOCITIES: Final = slice(1, 6, 2)
 ANGLES: Final = slice(6, 12, 2)
 ANGLE_RATES: Final = slice(7, 12, 2)
-"""The same entries as slices, by which NumPy finds them in a fifth of the time."""
+"""The same entries as slices, which NumPy indexes in a fifth of the time."""
 
 _SHOWN: Final = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
 
@@ -45,7 +45,7 @@ REFERENCE_STATES: Final = tuple(INDEX[name] for name in REFERENCE_NAMES)
 
 
 def shown_unit(unit: str) -> tuple[str, float]:
-    """The unit in which people read an SI quantity, and the factor to it: angles are shown in degrees."""
+    """Return the display unit of an SI quantity, and the factor to it: angles are shown in degrees."""
     return _SHOWN.get(unit, (unit, 1.0))
 
 
@@ -89,17 +89,17 @@ class State(np.ndarray[tuple[int], np.dtype[np.float64]]):
 
 
 class YawTurns:
-    """Keeps count of a yaw's whole turns, sample by sample.
+    """Counts a yaw's whole turns, sample by sample.
 
-    Past the vertical, Euler's yaw turns by 180 deg either way: upside down it is nearest to the last one, and upright
-    again nearest to the last upright one.  A loop so leaves the yaw as it was.
+    Past the vertical, Euler's yaw turns by 180 deg either way: upside down it is unwrapped to the last one, and upright
+    again to the last upright one, so a loop leaves the yaw unchanged.
     """
 
     def __init__(self, yaw: float) -> None:
         self._last = self._upright = yaw
 
     def unwrapped(self, euler: Array) -> float:
-        """The yaw [rad] of roll, pitch, yaw (3,), with its turns; where not finite, as it is."""
+        """Return the unwrapped yaw [rad] of roll, pitch, yaw (3,); a yaw that is not finite is returned unchanged."""
         roll, pitch, yaw = euler.tolist()
         if math.isfinite(roll + pitch + yaw):
             upright = math.cos(roll) * math.cos(pitch) >= 0.0
@@ -122,11 +122,11 @@ def make_state(
 
 
 def all_true(flags: NDArray[np.bool_]) -> bool:
-    """`flags.all()`, of few flags in a third of the time."""
+    """Return `flags.all()`; for few flags in a third of the time."""
     return np.count_nonzero(flags) == flags.size
 
 
 def read_only(array: Array) -> Array:
-    """The same array, marked read-only: what is stored is never changed afterwards."""
+    """Return the same array, marked read-only: stored data never changes."""
     array.flags.writeable = False
     return array

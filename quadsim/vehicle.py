@@ -1,4 +1,4 @@
-"""What a vehicle is: mass, inertia, four rotors and their limits; read from one TOML file."""
+"""A vehicle: mass, inertia, four rotors and their limits, read from one TOML file."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from quadsim.state import Array
 N_ROTORS: Final = 4
 OfRotors = Annotated[tuple[Number, ...], Len(N_ROTORS, N_ROTORS)]
 SMALLEST, LARGEST = 1e-12, 1e6
-"""Magnitudes that a vehicle's numbers may have; MuJoCo refuses smaller inertias, and arithmetic larger ones."""
+"""Allowed magnitudes of a vehicle's numbers; MuJoCo refuses smaller inertias, and larger numbers overflow."""
 SLOWEST_ROTOR: Final = 1.0
 """Longest time constant of a rotor [s]; propellers of 30 inch have some 0.3 s."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Vehicle:
-    """A rigid body carried by four fixed rotors, thrust along body +z; validated when made.
+    """A rigid body carried by four fixed rotors, thrust along body +z; validated on construction.
 
     Body frame: x forward, y left, z up, origin at the centre of mass.  Rotor i gives the thrust
     f_i = b w_i^2 [N] and the reaction torque spin_i d w_i^2 [N m] about body +z (Sec. 2.2).
@@ -36,7 +36,7 @@ class Vehicle:
     not give it.
 
     Raises:
-        ParameterError: a value is not finite or not possible, or the vehicle cannot hover within its rotors' range.
+        ParameterError: a value is not finite or impossible, or the vehicle cannot hover within its rotors' range.
 
     Examples:
         >>> from dataclasses import replace
@@ -113,7 +113,7 @@ class Vehicle:
         self._refuse("rotor_azimuths", rule)
 
     def _layout_problem(self, spins: Sequence[float] | Array) -> str | None:
-        """What the layout should be and is not, with these spins; None where it is."""
+        """Return the missing property of the layout with these spins; None if it is complete."""
         x, y, _ = self.rotor_positions.T / self.arm_length
         unit_allocation = np.stack([np.ones(N_ROTORS), y, -x, np.array(spins, float)])
         if abs(np.linalg.det(unit_allocation)) < 1e-9:
@@ -154,9 +154,9 @@ class Vehicle:
 
     @property
     def enclosing_radius(self) -> float:
-        """Radius of the vehicle's bounding ball among obstacles [m]: its extent, or to the propellers' tips.
+        """Radius of the vehicle's bounding ball [m]: its extent, or the distance to the propellers' tips.
 
-        Without a `rotor_radius` the propellers are as large as can be: neighbours just do not meet.
+        Without a `rotor_radius`, the propellers are assumed as large as possible: neighbours almost touch.
         """
         if self.extent is not None:
             return self.extent
@@ -166,14 +166,14 @@ class Vehicle:
 
     @property
     def allocation(self) -> Array:
-        """(4, 4) matrix taking squared rotor speeds to [U, tau_x, tau_y, tau_z], in N and N m (Sec. 2.2)."""
+        """(4, 4) matrix that maps squared rotor speeds to [U, tau_x, tau_y, tau_z], in N and N m (Sec. 2.2)."""
         b, d = self.thrust_coefficient, self.drag_coefficient
         x, y, _ = self.rotor_positions.T
         return np.stack([np.full(N_ROTORS, b), b * y, -b * x, d * np.array(self.rotor_spins, float)])
 
 
 def _check_number(name: str, value: object, *, positive: bool) -> None:
-    if isinstance(value, int) and abs(value) > LARGEST:  # of any length: more than a float, or a text, can hold
+    if isinstance(value, int) and abs(value) > LARGEST:  # it may be too long for a float, or a text
         value = math.copysign(math.inf, value > 0 or -1)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise ParameterError("vehicle", name, value, "a finite number")
@@ -190,8 +190,8 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
 
     Raises:
         FileError: the file is missing, is not TOML, or lacks or misnames a parameter.
-        ParameterError: a value is not possible.
-        UnknownNameError: an override names no parameter.
+        ParameterError: a value is impossible.
+        UnknownNameError: an override names an unknown parameter.
     """
     texts, entries = _read_entries(path)
     values: dict[str, Any] = {**texts, **{key: entry["value"] for key, entry in entries.items()}}
@@ -206,12 +206,12 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
 
 
 def vehicle_sources(path: Path) -> dict[str, str]:
-    """Where each parameter of a vehicle file is from, in the file's order; arguments and errors as `load_vehicle`."""
+    """Return the source of each parameter, in the vehicle file's order; arguments and errors as `load_vehicle`."""
     return {key: entry["source"] for key, entry in _read_entries(path)[1].items()}
 
 
 def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:
-    """A vehicle file's description and parameters, each with value, unit and source."""
+    """Return a vehicle file's description and parameters, each with value, unit and source."""
     texts: dict[str, str] = {}
     entries: dict[str, dict[str, Any]] = {}
     for key, entry in read_toml(path).items():
@@ -241,7 +241,7 @@ VEHICLE_UNITS: Final[dict[str, str]] = {
 }
 """The parameters of a vehicle file and their units."""
 MEANT: Final[dict[str, tuple[str, ...]]] = {"rotor_lag": ("rotor_rise", "rotor_fall")}
-"""Parameters by what else they are called, where another one is spelt more alike."""
+"""Parameters by other common names, where a spelling guess would name the wrong one."""
 OPTIONAL_PARAMETERS: Final = tuple(field.name for field in fields(Vehicle) if field.default is None)
 """Parameters that a vehicle file may leave out."""
 _LENGTHS: Final = {"inertia": 3, "rotor_azimuths": N_ROTORS, "rotor_spins": N_ROTORS, "body_drag": 3}

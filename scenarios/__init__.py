@@ -1,1 +1,1 @@
-"""What is flown: the scenario library, references, the runner and the command line."""
+"""The application: scenario library, references, the runner and the command line."""

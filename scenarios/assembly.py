@@ -1,4 +1,4 @@
-"""From a scenario to what flies: vehicle, course, controller, plant and sensors, each built once."""
+"""Build the parts of a scenario's flight once each: vehicle, course, controller, plant and sensors."""
 
 from __future__ import annotations
 
@@ -58,49 +58,49 @@ _SIZES: Final = {
     "body_drag": ("air", "body_drag", Air),
     "rotor_radius": ("ground", "rotor_radius", None),
 }
-"""Parameters of vehicles that act in an effect: its table, the field that states it too, and what switches it on."""
+"""Vehicle parameters that act in an effect: its table, the field that also states it, and the switch of the effect."""
 _UNITS: Final = {
     SensorName.POSITION: 1.0,
     SensorName.VELOCITY: 1.0,
     SensorName.ATTITUDE: math.radians(1.0),
     SensorName.RATES: math.radians(1.0),
 }
-"""The scenario file's unit of each sensor in the testbed's."""
+"""SI units per unit of the scenario file, by sensor."""
 _OF_ALL_EVENTS: Final = ("vehicle", "actual", "effects", "course")
-"""Parts that neither events nor the controller nor the duration change."""
+"""Parts that do not depend on events, controller or duration."""
 
 
 class Assembly:
-    """The parts of a scenario; those with a state are made anew by each call of their method.
+    """The parts of a scenario; each call of a method builds a new part if it has a state.
 
     Attributes:
         scenario: the file's content.
     """
 
     def __init__(self, scenario: Scenario, vehicle: Vehicle | None = None) -> None:
-        """Build nothing yet; `vehicle` where it has been loaded already."""
+        """Build nothing yet; `vehicle` saves loading it again."""
         self.scenario = scenario
         if vehicle is not None:
             self.vehicle = vehicle
 
     def __reduce__(self) -> tuple[type[Assembly], tuple[Scenario, Vehicle]]:
-        """Pickled as what it is built from: courses hold functions."""
+        """Pickle the arguments: courses hold functions."""
         return Assembly, (self.scenario, self.vehicle)
 
     def of(self, scenario: Scenario) -> Assembly:
-        """The assembly of a scenario with other events, another controller or duration; vehicle and course stay."""
+        """Return the assembly of a scenario with other events, controller or duration; vehicle and course stay."""
         other = Assembly(scenario)
         vars(other).update({name: part for name, part in vars(self).items() if name in _OF_ALL_EVENTS})
         return other
 
     @property
     def resolved(self) -> Assembly:
-        """That of the scenario with every number that it leaves to its vehicle: its file alone defines the flight."""
+        """The assembly of the scenario with all numbers of its vehicle: its file alone then defines the flight."""
         return self.of(self.with_vehicle.altered(effects=self.effects))
 
     @property
     def with_vehicle(self) -> Scenario:
-        """The scenario with the numbers of its vehicle's file in it; effects go on taking theirs from the vehicle."""
+        """The scenario with the numbers of its vehicle file; effects continue to take theirs from the vehicle."""
         numbers = {name: getattr(self.vehicle, name) for name in VEHICLE_UNITS}
         table = replace(self.scenario.vehicle, **numbers)
         return self.scenario.altered(vehicle=table)
@@ -121,12 +121,12 @@ class Assembly:
 
     @cached_property
     def actual(self) -> Vehicle:
-        """The vehicle as it really is: the modelled one, with `[actual]` in its place.
+        """The actual vehicle: the modelled one with the values of `[actual]`.
 
-        Plant, forces, drawings and audit have it; controller, estimator and reference have the modelled one.
+        Plant, forces, drawings and audit use it; controller, estimator and reference use the modelled one.
 
         Raises:
-            ParameterError: there can be no such vehicle.
+            ParameterError: the vehicle is impossible.
         """
         modelled = self.vehicle
         try:
@@ -136,18 +136,18 @@ class Assembly:
 
     @property
     def _stated(self) -> dict[str, Any]:
-        """The parameters of vehicles that `[actual]` states."""
+        """The vehicle parameters that `[actual]` states."""
         return {} if self.scenario.actual is None else self.scenario.actual.overrides()
 
     @cached_property
     def effects(self) -> Effects:
-        """What acts on the plant: `[effects]`, with every size that it leaves to the vehicle as it really is.
+        """The effects on the plant: `[effects]`, with every size left to the actual vehicle filled in.
 
-        Lag, rotor inertia and drag that `[actual]` states act, whether or not `[effects]` has their table.
+        Lag, rotor inertia and drag that `[actual]` states act even if `[effects]` lacks their table.
 
         Raises:
-            ParameterError: `[effects]` states another size than `[actual]`, or lacks one, or a combination is not
-                possible.
+            ParameterError: `[effects]` contradicts `[actual]`, lacks a size, or combines effects that exclude each
+                other.
         """
         effects = self.scenario.effects
         acting: dict[str, Any] = {}
@@ -163,7 +163,7 @@ class Assembly:
         return replace(effects, **acting).resolved(self.actual)
 
     def initial_state(self, motion: Motion | None = None) -> Array:
-        """(12,) state at t = 0, of the reference motion where the scenario starts on it."""
+        """Return (12,) the state at t = 0, that of the reference motion if the scenario starts on it."""
         initial = self.scenario.initial
         if initial.on_reference and motion is not None:
             physics = np.array(
@@ -186,7 +186,7 @@ class Assembly:
         """The course before its filter.
 
         Raises:
-            InputError: its file is wrong, or it does not suit the initial position.
+            InputError: its file is wrong, or it does not match the initial position.
         """
         return self.scenario.reference.build(self.initial_pose, self.vehicle.gravity)
 
@@ -197,17 +197,17 @@ class Assembly:
         return np.array([*initial.position, math.radians(initial.euler[2])])
 
     def followed(self, course: Course | None = None) -> FollowedCourse:
-        """The filtered reference row by row, with set-points in flight; of another course where one is given."""
+        """Return the filtered reference row by row, with set-points in flight; `course` replaces the scenario's."""
         course, response_time = self.course if course is None else course, self.scenario.reference.response_time
         return FollowedCourse(course, response_time=response_time, period=self.scenario.control_period)
 
     def reference(self, samples: int) -> Array:
-        """(samples, 4) filtered x, y, z [m], yaw [rad] at t_k = k tau_s, but for set-points.  Eqs. (30)-(31)."""
+        """(samples, 4) filtered x, y, z [m], yaw [rad] at t_k = k tau_s, without set-points.  Eqs. (30)-(31)."""
         return self.followed().first(samples)
 
     @cached_property
     def motion(self) -> Motion | None:
-        """The reference motion at t_k = k tau_s, to the course's end; None where the course states positions alone."""
+        """The reference motion at t_k = k tau_s, to the end of the course; None if the course states only positions."""
         course, period = self.course, self.scenario.control_period
         if course.derivatives is None:
             return None
@@ -221,11 +221,11 @@ class Assembly:
     def regions(self) -> tuple[Corridor | Fence, ...]:
         """The corridors, each with a window of time, then the fence.
 
-        The reference is known before the flight, and where it is along its path never falls: a window of the one is a
-        window of the other.
+        The reference is known before the flight and moves forward along its path, so a window of the path is a window
+        of time.
 
         Raises:
-            InputError: the reference's path is over before a window begins, or cannot be built.
+            InputError: the reference's path ends before a window starts, or cannot be built.
         """
         regions = self.scenario.regions
         if all(isinstance(region, Fence) or region.path is None for region in regions):
@@ -238,8 +238,7 @@ class Assembly:
     def course_steps(self) -> tuple[CourseStep, ...]:
         """The steps of the unfiltered course, channel by channel; a start away from the course is a step at 0.
 
-        Only a course of windows has steps whose settling can be watched, and only on axes that no set-point takes from
-        it.
+        Only courses made of windows have steps whose settling is measured, and only on axes without a set-point.
         """
         scenario, initial = self.scenario, self.initial_pose
         if not isinstance(scenario.reference, Steps):
@@ -251,19 +250,19 @@ class Assembly:
         for name, (windows, elsewhere), start in zip(REFERENCE_NAMES, channels, initial.tolist(), strict=True):
             if name in taken:
                 continue
-            flown = [step for step in switches(windows, elsewhere, initial=start) if step[0] < scenario.duration]
-            ends = [*(time - preview for time, _, _ in flown[1:]), scenario.duration]
-            for (time, before, after), until in zip(flown, ends, strict=False):
+            reached = [step for step in switches(windows, elsewhere, initial=start) if step[0] < scenario.duration]
+            ends = [*(time - preview for time, _, _ in reached[1:]), scenario.duration]
+            for (time, before, after), until in zip(reached, ends, strict=False):
                 steps.append(CourseStep(channel=name, time=time, before=before, after=after, until=until))
         return tuple(steps)
 
     # --- controller --------------------------------------------------------------------------------------------------
 
     def controller(self, spec: AnyController | None = None) -> Controller:
-        """The controller, or that of another table, set up and ready to be flown.
+        """Return the controller, or the one of another table, ready to fly.
 
         Raises:
-            InputError: it cannot be made from these numbers, or its code cannot be found or called.
+            InputError: it cannot be built from these numbers, or its code cannot be found or called.
         """
         spec = self.scenario.controller if spec is None else spec
         return spec.build(self.vehicle, self.scenario.control_period, (*self.scenario.obstacles, *self.regions))
@@ -285,16 +284,16 @@ class Assembly:
 
     @cached_property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """The bounds that the controller has on signals of the audit, see `mpc.bounded.ControllerTable.audited`."""
+        """The controller's bounds on signals of the audit, see `mpc.bounded.ControllerTable.audited`."""
         return self.scenario.controller.audited(self.vehicle)
 
     @cached_property
     def limits(self) -> tuple[Limit, ...]:
-        """What the flight is audited against."""
+        """The limits of the audit."""
         return audited(self)
 
     def computation(self, spec: AnyController | None = None) -> Computation | None:
-        """How long commands of a controller take, of the scenario's by default; None where they take no time."""
+        """Return the computation time of a controller, the scenario's by default; None if commands take no time."""
         stalls = tuple(event for event in self.scenario.events if isinstance(event, Stall))
         settings = self.scenario.computation
         if settings is None and not stalls:
@@ -306,14 +305,14 @@ class Assembly:
     # --- plant -------------------------------------------------------------------------------------------------------
 
     def generator(self, purpose: str) -> np.random.Generator:
-        """Random numbers for one purpose, e.g. `wind`, from the scenario's seed, the same whatever else draws any."""
+        """Return a random generator for one purpose, e.g. `wind`, from the seed, independent of other draws."""
         return np.random.default_rng(np.random.SeedSequence([self.scenario.seed, zlib.crc32(purpose.encode())]))
 
     def plant(self, forces: Sequence[Force] | None = None) -> Plant:
-        """The simulated vehicle, and what acts on it; `forces` instead of those that the scenario names.
+        """Return the simulated vehicle with its effects; `forces` replaces those of the scenario.
 
         Raises:
-            InputError: a combination of effects is not possible, or a force cannot be imported.
+            InputError: effects exclude each other, or a force cannot be imported.
         """
         scenario, rng = self.scenario, self.generator("forces")
         if forces is None:
@@ -332,7 +331,7 @@ class Assembly:
         )
 
     def ground(self) -> PhaseMonitor | None:
-        """What knows where the flight stands with the ground and obstacles; None where there are none."""
+        """Return the monitor of contact with ground and obstacles; None if there are none."""
         ground, obstacles = self.scenario.effects.ground, self.scenario.obstacles
         there = ground is not None and ground.contact
         if not there and not obstacles:
@@ -342,10 +341,10 @@ class Assembly:
 
     @property
     def moving_air(self) -> Air | None:
-        """The resolved air where it moves at some time of the flight, or None where it is still throughout.
+        """The resolved air if it moves at some time of the flight, or None if it is always still.
 
         Raises:
-            ParameterError: there is wind, and nothing that it could push.
+            ParameterError: there is wind, but nothing for it to push.
         """
         air = self.effects.air or Air()
         blown = any(isinstance(event, Gust | WindChange) for event in self.scenario.events)
@@ -358,7 +357,7 @@ class Assembly:
         return air
 
     def wind(self) -> WindField | None:
-        """The motion of the air, or None where it is still throughout; raises as `moving_air`."""
+        """Return the wind field, or None if the air is always still; raises as `moving_air`."""
         if (air := self.moving_air) is None:
             return None
         gusts, changes = self.winds
@@ -379,10 +378,10 @@ class Assembly:
         return gusts, tuple(event for event in events if isinstance(event, WindChange))
 
     def changes(self, events: Sequence[Event] | None = None) -> tuple[Change, ...]:
-        """What these events, or else all, do to rotors, mass and payload, and what pushes, in any order.
+        """Return the changes by these events, or by all, to rotors, mass, payload and pushes, in any order.
 
         Raises:
-            ParameterError: rotors with inertia are to change their speed at once.
+            ParameterError: rotors with inertia would change their speed at once.
         """
         events = self.scenario.events if events is None else events
         pushes = _in_force([event for event in events if isinstance(event, Push)])
@@ -397,7 +396,7 @@ class Assembly:
         )
 
     def _losses(self, losses: Sequence[RotorLoss]) -> Iterator[RotorChange]:
-        """Each rotor's share whenever one of its losses begins or ends: the product of what all in force leave."""
+        """Yield each rotor's efficiency whenever a loss starts or ends: the product over the losses in force."""
         rotors = self.scenario.effects.rotors or RotorDynamics()
         for rotor, worn in enumerate(rotors.efficiency, start=1):
             for time, in_force in _in_force([loss for loss in losses if loss.rotor == rotor]):
@@ -407,7 +406,7 @@ class Assembly:
     # --- sensors -----------------------------------------------------------------------------------------------------
 
     def navigation(self) -> Navigation | None:
-        """The source of the controller's state; None where that is the true one.
+        """Return the source of the controller's state; None if it receives the true state.
 
         Raises:
             ParameterError: a fault of a sensor that the estimator does not have.
@@ -420,7 +419,7 @@ class Assembly:
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:
-        """The sensors that the scenario has, in SI units."""
+        """The scenario's sensors in SI units."""
         present = {} if self.scenario.sensors is None else self.scenario.sensors.present()
         return tuple(
             Sensor(
@@ -439,12 +438,12 @@ class Assembly:
     # --- what goes together ------------------------------------------------------------------------------------------
 
     def check(self) -> Assembly:
-        """Refuse, before anything is flown, parts that do not go together.
+        """Reject, before the flight, parts that do not fit together.
 
         Raises:
-            InputError: there is no such vehicle, it cannot hover, an effect is not possible with it or with the
-                integrator, the course cannot be built or does not state the motion that the flight is to start on, or
-                the flight starts below the floor, or in the air with rotors at rest.
+            InputError: the vehicle does not exist or cannot hover, an effect is impossible with it or with the
+                integrator, the course cannot be built or lacks the motion on which the flight starts, or the flight
+                starts below the floor, or in the air with rotors at rest.
         """
         scenario, load = self.scenario, self.effects.load or Load()
         mass_properties(self.actual, load, load.payloads)
@@ -470,7 +469,7 @@ class Assembly:
         return self
 
     def _check_floor(self) -> None:
-        """Refuse a start below the floor, or one in the air with rotors at rest."""
+        """Reject a start below the floor, or one in the air with rotors at rest."""
         initial, shape, state = self.scenario.initial, outline(self.actual), self.initial_state()[None, :]
         feet = float(clearance(state, shape.feet, shape.foot_radius, shape.floor)[0])
         hull = float(clearance(state, shape.hull, 0.0, shape.floor)[0])
@@ -485,7 +484,7 @@ class Assembly:
 
 
 def preferring_core(scenario: Scenario) -> Scenario:
-    """The scenario with `core-or-piqp` in place of `piqp`, the default: for where a step's time matters."""
+    """Replace `piqp`, the default, by `core-or-piqp`, where the time of a step matters."""
     controller = scenario.controller
     if isinstance(controller, Bounded) and controller.solver == "piqp":
         return scenario.replace({"controller.solver": CORE_OR_PIQP})
@@ -514,7 +513,7 @@ _Lasting = TypeVar("_Lasting", RotorLoss, Push)
 
 
 def _in_force(events: Sequence[_Lasting]) -> Iterator[tuple[float, list[_Lasting]]]:
-    """The instants [s] at which events begin or end, and those in force from then on, in their own order."""
+    """Yield the instants [s] at which events start or end, with the events in force from then on, in their order."""
     turns: dict[float, tuple[set[int], set[int]]] = {}
     for i, event in enumerate(events):
         turns.setdefault(event.at, (set(), set()))[0].add(i)

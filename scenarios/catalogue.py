@@ -1,4 +1,4 @@
-"""What ships, by name: scenarios, campaigns, tunings, papers, controllers; found without anything heavy."""
+"""The shipped scenarios, campaigns, tunings, papers and controllers by name; found without heavy imports."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ CONTROLLERS: Final = {
     "pid": "cascaded PID, as autopilots fly it",
     "geometric": "geometric tracking control on SE(3)",
 }
-"""Named here too, so that `quadsim list` need not load them."""
+"""Repeated here, so that `quadsim list` need not import them."""
 _MEANT: Final = {"violated": "  (meant to violate a constraint)", "lost": "  (meant to be lost)"}
-"""The mark of a scenario that is to defeat its controller."""
+"""Marks scenarios that are meant to defeat their controller."""
 
 
 def _names(folder: Path) -> list[str]:
-    """Names of what ships in a folder, sorted."""
+    """Return the names of the files in a folder, sorted."""
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
 def _path(kind: str, folder: Path, name: str) -> Path:
-    """The file of a name that ships, or the path itself where it ends in `.toml`; refused where there is none."""
+    """Return the file of a shipped name, or the path itself if it ends in `.toml`; raise if it does not exist."""
     if name.endswith(".toml"):
         if not Path(name).is_file():
             raise FileError(name, f"no such {kind} file")
@@ -55,19 +55,19 @@ paper_names, paper_path = partial(_names, PAPERS), partial(_path, "paper", PAPER
 
 @dataclass(frozen=True, kw_only=True)
 class LibraryScenario:
-    """A scenario that ships."""
+    """A shipped scenario."""
 
     description: str  # one sentence
-    group: Group  # what it is an example of
-    expect: str  # the verdict that it is meant to have: satisfied, violated or lost
+    group: Group  # its group of examples
+    expect: str  # expected verdict: satisfied, violated or lost
 
 
 @dataclass(frozen=True, kw_only=True)
 class Catalogue(Result):
-    """What ships, by name."""
+    """Everything shipped, by name."""
 
     scenarios: Mapping[str, LibraryScenario]  # for `load` and `fly`
-    campaigns: Mapping[str, str]  # for `campaign`, with a sentence each, as all that follow
+    campaigns: Mapping[str, str]  # for `campaign`; the values here and below are one-line descriptions
     tunings: Mapping[str, str]  # for `tune`
     vehicles: Mapping[str, str]  # for `load_vehicle` and `vehicle.file`
     controllers: Mapping[str, str]  # for `controller.type`
@@ -92,7 +92,7 @@ class Catalogue(Result):
         return console.listing({**groups, **{title: getattr(self, title) for title in others}})
 
     def to_json(self) -> dict[str, Any]:
-        """As plain values, those of scenarios by their field."""
+        """Return plain values; those of scenarios by field."""
         shipped = self.scenarios.items()
         columns = {"scenarios": "description", "groups": "group", "expected": "expect"}
         by_field = {title: {name: getattr(entry, field) for name, entry in shipped} for title, field in columns.items()}
@@ -100,7 +100,7 @@ class Catalogue(Result):
 
 
 def read_catalogue() -> Catalogue:
-    """Everything that ships; files are right, and not checked."""
+    """Read everything shipped, without checking the files."""
     from mpc.solvers import solver_entries
     from quadsim.vehicle import load_vehicle
 

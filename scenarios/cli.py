@@ -1,7 +1,6 @@
-"""The `quadsim` command: parses the line, calls a function of `scenarios.app`, and shows what it returns.
+"""The `quadsim` command: it parses the line, calls a function of `scenarios.app`, and shows the result.
 
-Exit status: 0 done; 1 a required constraint does not hold, or the flight was aborted or interrupted; 2 the input was
-wrong.
+Exit status: 0 done; 1 a required constraint does not hold, or the flight was aborted or interrupted; 2 invalid input.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from scenarios.results import EXIT_FAILED, EXIT_WRONG_INPUT, Document, Result
 _MOST_LINES, _LONGEST_LINE = 21, 1000  # of a message: one with many problems has a line for each
 _HOME: Final = re.compile(r"(--[\w-]+=)?(~.*)", re.DOTALL)
 
-app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False  # or it ends in silence
+app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False  # otherwise Ctrl-C ends it silently
 app.register_install_completion_command(help="Install completion for this shell: commands, options, scenarios.")
 
 
@@ -71,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 command, bound, json = parsed
                 try:
                     status = _show(command(*bound.args, **bound.kwargs), json)
-                except QuadsimError as error:  # what there is of a result where it failed
+                except QuadsimError as error:  # a failure may carry a partial result
                     _show(error.result, json)
                     raise
         sys.stdout.flush()
@@ -82,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except QuadsimError as error:
         print(f"quadsim: {_brief(str(error))}", file=sys.stderr)
         return error.exit_status
-    except SystemExit as error:  # of code that was imported: a flight would have ended by it as aborted
+    except SystemExit as error:  # raised by imported code; in flight it would abort the flight
         if isinstance(error.__context__, BrokenPipeError):  # rich's way to end
             return EXIT_FAILED
         print(f"quadsim: code that was loaded asks Python to exit (status {error.code!r:.80})", file=sys.stderr)
@@ -101,13 +100,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _at_home(word: str) -> str:
-    """A word with `~` expanded as a shell does, but not for `--out=~/x`."""
+    """Expand `~` in a word as a shell does, also in `--out=~/x`."""
     match = _HOME.fullmatch(word)
     return word if match is None else (match[1] or "") + os.path.expanduser(match[2])  # noqa: PTH111
 
 
 def _brief(message: str) -> str:
-    """A message as a terminal takes it, of some twenty lines at most."""
+    """Shorten a message to some twenty lines for a terminal."""
     lines = printable(message, keep="\n").split("\n")
     shown = [line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]} ..." for line in lines[:_MOST_LINES]]
     return "\n".join([*shown, *([f"... and {len(lines) - _MOST_LINES} more"] if len(lines) > _MOST_LINES else [])])
@@ -115,7 +114,7 @@ def _brief(message: str) -> str:
 
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
-    """Show the program's notices on stderr, each once: which code of the user's was imported, and what failed."""
+    """Show notices on stderr, each once: which user code was imported, and what failed."""
     logger, handler, shown = logging.getLogger("quadsim"), logging.StreamHandler(), set[str]()
 
     def shown_first(record: logging.LogRecord) -> bool:

@@ -1,4 +1,4 @@
-"""A console that shows any string as it is, and what tables, listings and progress look like on it."""
+"""A console that prints any string literally, and the layout of tables, listings and progress on it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from rich.text import Text
 from quadsim.errors import printable
 from quadsim.report.table import Cell, Grid, Mark
 
-WIDTH: Final = 120  # characters, where there is no terminal
+WIDTH: Final = 120  # characters, without a terminal
 _STYLES: Final = {Mark.BEST: "bold", Mark.GOOD: "green", Mark.WARN: "yellow", Mark.BAD: "red"}
 
 
 class PlainConsole(Console):
-    """Shows every string as it is, from any source: paths, names, reasons, summaries.
+    """Prints every string literally, whatever its source: paths, names, reasons, summaries.
 
-    What is to have a style is a `rich.text.Text`, made by `styled`.
+    Styled text is a `rich.text.Text`, made by `styled`.
     """
 
     def __init__(self, *, stderr: bool = False, width: int | None = None, file: IO[str] | None = None) -> None:
@@ -38,14 +38,14 @@ class PlainConsole(Console):
 
 
 def styled(*parts: str | tuple[str, str]) -> Text:
-    """Texts in a row, each by itself or with its style."""
+    """Join texts, each plain or with a style."""
     return Text.assemble(
         *(printable(part) if isinstance(part, str) else (printable(part[0]), part[1]) for part in parts)
     )
 
 
 def stdout() -> PlainConsole:
-    """Stdout; wide enough for the tables where it is a file or a pipe."""
+    """Return stdout, wide enough for the tables if it is a file or a pipe."""
     console = PlainConsole()
     return console if console.is_terminal else PlainConsole(width=WIDTH)
 
@@ -56,39 +56,39 @@ def stderr() -> PlainConsole:
 
 
 def show(parts: Iterable[RenderableType], console: PlainConsole | None = None) -> None:
-    """Print sentences, which a terminal may break anywhere, and tables, which fit its width."""
+    """Print sentences, which a terminal may wrap, and tables, which fit its width."""
     console = stdout() if console is None else console
     for part in parts:
         console.print(part, soft_wrap=isinstance(part, str | Text))
 
 
 def to_text(parts: Iterable[RenderableType]) -> str:
-    """The same, without colours."""
+    """Return the same as text without colours."""
     console = PlainConsole(width=WIDTH, file=io.StringIO())
     show(parts, console)
     return console.export_text()
 
 
 def to_html(parts: Iterable[RenderableType]) -> str:
-    """The same, for a notebook."""
+    """Return the same as HTML for a notebook."""
     console = PlainConsole(width=WIDTH, file=io.StringIO())
     show(parts, console)
     return console.export_html(inline_styles=True, code_format='<pre style="line-height: normal">{code}</pre>')
 
 
 def say(text: str) -> None:
-    """Print a message that is no result."""
+    """Print a message that is not a result."""
     show([f"quadsim: {text}"], stderr())
 
 
 def written_to(path: Path) -> Text:
-    """Where something was written."""
+    """Return the line that says where something was written."""
     return styled("written to ", (short_path(path), "bold"))
 
 
 def short_path(path: Path) -> str:
-    """A path for a person: relative to the current directory where it is in there."""
-    with contextlib.suppress(ValueError, OSError):  # it is not in there; the current directory is gone
+    """Shorten a path: relative to the current directory if it is inside."""
+    with contextlib.suppress(ValueError, OSError):  # it is outside, or the current directory is gone
         return str(path.relative_to(Path.cwd()))
     return str(path)
 
@@ -102,7 +102,7 @@ def table(
     left: Collection[str] = (),
     rigid: bool = False,
 ) -> Table:
-    """A table whose first column, and those named in `left`, are of words; in a `rigid` one no cell is wrapped."""
+    """Return a table; its first column and those in `left` hold words; cells of a `rigid` one are not wrapped."""
     table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=0, pad_edge=False)
     table.caption, table.caption_justify = caption, "left"
     for i, name in enumerate(head):
@@ -113,12 +113,12 @@ def table(
 
 
 def cell(cell: Cell) -> Text:
-    """A cell of a report's table."""
+    """Return a cell of a report's table."""
     return styled((cell.text, _STYLES.get(cell.mark, "")))
 
 
 def grids(grids: Iterable[Grid], *, left: Collection[str] = ()) -> Iterator[RenderableType]:
-    """Tables of a report, each with what a reader has to know of it; `left` names columns of words."""
+    """Return tables of a report with their notes; `left` names columns of words."""
     for grid in grids:
         lines = [[cell(value) for value in line] for line in grid.lines]
         yield table(grid.title, grid.head, lines, caption=grid.note.replace("`", "") or None, left=left)
@@ -126,7 +126,7 @@ def grids(grids: Iterable[Grid], *, left: Collection[str] = ()) -> Iterator[Rend
 
 
 def listing(sections: Mapping[str, Mapping[str, str]]) -> Iterator[RenderableType]:
-    """Names with one line each, by section."""
+    """Return names with one line each, by section."""
     for title, entries in sections.items():
         table = Table(
             title=title, title_justify="left", title_style="bold", box=None, show_header=False, padding=(0, 2)

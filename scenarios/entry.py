@@ -1,6 +1,7 @@
-"""The process of the `quadsim` command: its environment, set before anything else is imported, its signals and streams.
+"""The process of the `quadsim` command: its environment, set before any other import, its signals and streams.
 
-Ctrl-C, SIGTERM and SIGHUP all are `KeyboardInterrupt`, unless the process was started with them ignored, as by `nohup`.
+Ctrl-C, SIGTERM and SIGHUP all raise `KeyboardInterrupt`, unless the process was started with them ignored, as by
+`nohup`.
 """
 
 from __future__ import annotations
@@ -43,22 +44,22 @@ def main() -> int:
         from scenarios.cli import main as run
 
         return run()
-    except (KeyboardInterrupt, ImportError, SystemError):  # a compiled module, imported, makes the latter of the first
+    except (KeyboardInterrupt, ImportError, SystemError):  # a compiled module may turn the first into others
         if not stopped:
             raise
         with contextlib.suppress(OSError):  # the terminal may be gone
             print("quadsim: interrupted (Ctrl-C); nothing half written was left behind", file=sys.stderr)
         return 1
     finally:
-        for stop in heard:  # what is done is done, and the status reports how
+        for stop in heard:  # the work is done, and the status reports how
             signal.signal(stop, signal.SIG_IGN)
 
 
 def _set_environment() -> str | None:
-    """Set what this process and its children need; returns what is wrong with what was there, or None."""
-    os.environ["PYTHONSAFEPATH"] = "1"  # mujoco's import starts `python -c`, which else imports from this directory
-    os.environ.update(dict.fromkeys(_THREADS, "1"))  # results do not depend on the number of cores
-    renderer = os.environ.pop("MUJOCO_GL", "")  # with a library that is missing, mujoco's import fails
+    """Set the environment of this process and its children; return what was wrong with it, or None."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # mujoco's import starts `python -c`, which would import from this directory
+    os.environ.update(dict.fromkeys(_THREADS, "1"))  # results must not depend on the number of cores
+    renderer = os.environ.pop("MUJOCO_GL", "")  # with a missing library, mujoco's import fails
     os.environ["QUADSIM_GL"] = renderer.strip().lower()
     if os.environ["QUADSIM_GL"] not in _RENDERERS:
         return f"MUJOCO_GL must be one of {', '.join(filter(None, _RENDERERS))}, or unset; got {renderer!r:.100}"
@@ -69,7 +70,7 @@ def _set_environment() -> str | None:
 
 
 def _open_what_is_closed() -> None:
-    """Take the numbers of streams that are closed, or the next file would get them, and what is printed with them."""
+    """Open the numbers of closed streams, or the next file would receive them and whatever is printed."""
     for number in range(3):
         try:
             os.fstat(number)

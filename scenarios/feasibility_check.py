@@ -1,4 +1,4 @@
-"""Whether a scenario's course can be flown, reported before the flight."""
+"""Check before the flight whether a scenario's course can be flown."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ Range = tuple[float, float]
 
 
 def report(assembly: Assembly) -> Feasibility:
-    """What the filtered course requires, up to a set-point, against the vehicle's limits and the controller's bounds.
+    """Compare the filtered course's demands, up to a set-point, with the vehicle's limits and the controller's bounds.
 
-    A table that was rounded is taken for the smoothest one within its last decimal: differences of the fourth order
-    would make of 0.1 mm steps of tens of rad/s, which no controller flies.
+    A rounded table is replaced by the smoothest one within its last decimal: fourth differences would turn 0.1 mm into
+    steps of tens of rad/s, which no controller flies.
 
     Raises:
         InputError: the course cannot be built.
@@ -42,13 +42,13 @@ def report(assembly: Assembly) -> Feasibility:
 
 
 def fitting(assembly: Assembly) -> str:
-    """At which speed, size or response time a course that is beyond limits or bounds would be within them.
+    """Find the speed, size or response time at which a course that exceeds limits or bounds would be within them.
 
-    The course is flown more slowly, made smaller about its start, or filtered more, to the nearest percent; jumps count
-    as in `report`, which leaves them out.
+    The course is flown more slowly, made smaller about its start, or filtered more, to the nearest percent; jumps are
+    excluded as in `report`.
 
     Returns:
-        A sentence; empty where the course fits as it is, or at none of them down to a tenth.
+        A sentence; empty if the course fits as it is, or not even at a tenth.
     """
     scenario, course = assembly.scenario, assembly.course
     duration, filtered_by = _followed(scenario), scenario.reference.response_time
@@ -77,13 +77,13 @@ def fitting(assembly: Assembly) -> str:
 
 
 def _followed(scenario: Scenario) -> float:
-    """How long the course is followed [s]: up to the first set-point."""
+    """Time for which the course is followed [s]: up to the first set-point."""
     until = min((event.at for event in scenario.events if isinstance(event, SetpointEvent)), default=scenario.duration)
     return max(until, scenario.control_period)
 
 
 def _largest(fits: Callable[[float], bool]) -> float | None:
-    """The largest whole percentage at which something fits, as a share, by halving; None where a tenth does not."""
+    """Return the largest whole percentage that fits, as a share, by bisection; None if a tenth does not fit."""
     low, high = 10, 100
     if not fits(0.01 * low):
         return None
@@ -94,7 +94,7 @@ def _largest(fits: Callable[[float], bool]) -> float | None:
 
 
 def _scaled(course: Course, *, pace: float = 1.0, size: float = 1.0) -> Course:
-    """A course flown at a share of its speed, or of a share of its size about its start."""
+    """Return a course at a share of its speed, or of its size about its start."""
     scale = np.array([size, size, size, 1.0])
 
     def sample(t: Array) -> Array:
@@ -110,12 +110,12 @@ def _scaled(course: Course, *, pace: float = 1.0, size: float = 1.0) -> Course:
 
 
 def _required(course: Course, assembly: Assembly, *, duration: float) -> Feasibility:
-    """What a course, in place of the scenario's and for this duration [s], requires."""
+    """Return the demands of a course that replaces the scenario's for this duration [s]."""
     scenario, vehicle = assembly.scenario, assembly.vehicle
     period = scenario.control_period
     samples = round(duration / period) + 1
-    flown = assembly.followed(course).first(samples + STENCIL)
-    poses = np.vstack([np.tile(course.initial, (STENCIL, 1)), flown])  # before the flight the vehicle is at rest
+    poses_along = assembly.followed(course).first(samples + STENCIL)
+    poses = np.vstack([np.tile(course.initial, (STENCIL, 1)), poses_along])  # the vehicle is at rest before the flight
     t: Array = period * np.arange(-STENCIL, samples + STENCIL, dtype=np.float64)
     raw = np.vstack([np.tile(course.initial, (STENCIL, 1)), course.sample(t[STENCIL:])])
     changes = np.any(raw[1:] != raw[:-1], axis=1)
@@ -130,7 +130,7 @@ def _required(course: Course, assembly: Assembly, *, duration: float) -> Feasibi
 
 
 def _touched(t: Array, instants: ArrayLike) -> Mask:
-    """(M - 1,) whether one of the instants is in the interval between a time and the next, its ends included."""
+    """Return (M - 1,) whether an instant lies in the interval between successive times, ends included."""
     at = np.sort(np.asarray(instants, dtype=np.float64))
     before = np.searchsorted(at, np.round(t[:-1], 9), side="left")
     after = np.searchsorted(at, np.round(t[1:], 9), side="right")
@@ -138,14 +138,14 @@ def _touched(t: Array, instants: ArrayLike) -> Mask:
 
 
 def _isolated(kinks: Sequence[float], period: float) -> Array:
-    """Kinks but those with others as close as a control period on both sides: these are rows of something smooth."""
+    """Drop kinks with neighbours within a control period on both sides: they are samples of a smooth curve."""
     at = np.unique(kinks)
     gaps = np.concatenate([[math.inf], np.diff(at), [math.inf]])
     return at[np.maximum(gaps[1:], gaps[:-1])[: at.size] > period * (1.0 + 1e-6)]
 
 
 def _bounds(scenario: Scenario, vehicle: Vehicle) -> tuple[dict[str, Range], dict[str, Range]]:
-    """The controller's bounds, and what tightening leaves of those on outputs at the end of the horizon; SI."""
+    """Return the controller's bounds, and those on outputs after tightening at the end of the horizon; SI."""
     spec = scenario.controller
     if not isinstance(spec, Bounded):
         return {}, {}
@@ -154,7 +154,7 @@ def _bounds(scenario: Scenario, vehicle: Vehicle) -> tuple[dict[str, Range], dic
     whole = dict(zip(names, zip(bounds.y_min.tolist(), bounds.y_max.tolist(), strict=True), strict=True))
     inputs = {"speed": (u_min, u_max), "slew": (delta_min, delta_max)}
     margins = None
-    with contextlib.suppress(ParameterError):  # which is reported where the controller is made
+    with contextlib.suppress(ParameterError):  # reported when the controller is built
         margins = spec.margins(vehicle, scenario.control_period) if isinstance(spec, Robust) else None
     if margins is None:
         return whole | inputs, {}

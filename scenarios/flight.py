@@ -1,4 +1,4 @@
-"""A flown scenario in memory: named arrays, numbers, pictures, and the run directory that it is saved to."""
+"""A flown scenario in memory: named arrays, numbers, pictures, and its run directory."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from scenarios.assembly import Assembly
     from scenarios.schema.scenario import Verdict  # only here: Jedi completes no object with a property of a Literal
 
-_LONGEST: Final = 500  # characters of why a product failed
+_LONGEST: Final = 500  # characters kept of why a product failed
 _log: Final = logging.getLogger("quadsim")
 
 
@@ -55,20 +55,20 @@ class Flight(Result):
     """A flown scenario.
 
     Arrays with one row per control period k, taken at t_k, are `time`, `state`, `measured`, `reference`, `command` and
-    `margins`; `plant` has the vehicle between them, at the physics rate (from a directory: at the scenario's
-    `log_rate`).  Angles are in rad, world frame z up, Euler angles roll, pitch, yaw (Z-Y-X).
+    `margins`; `plant` has the vehicle in between, at the physics rate (when read from a directory: at the scenario's
+    `log_rate`). Angles are in rad; `docs/conventions.md` defines states, frames and margins.
 
     Attributes:
-        assembly: the parts of its scenario, which is resolved, with every number of its vehicle in it.
+        assembly: the parts of its scenario, which is resolved: it contains every number of its vehicle.
         log: the flight as stacked arrays.
         findings: the audit, one per constraint of the scenario.
         controller: name of the control law.
         solver: name of its QP solver; empty for a closed form.
         simulate_s: wall time of the closed loop alone [s].
-        tallies: what became of each sensor's samples in the estimator; empty without one.
-        directory: where it was read from or written to; None where it is in memory alone.
-        recorded: `summary.json` of one that was read; None for one that was flown.
-        infeasible_period: the first period whose QP had no answer; None where all had, there is no QP, or it was read.
+        tallies: counts of each sensor's samples in the estimator; empty without one.
+        directory: where it was read from or written to; None if it is only in memory.
+        recorded: `summary.json` of a flight that was read; None for a new flight.
+        infeasible_period: the first period whose QP had no answer; None if there is none, or the flight was read.
 
     Examples:
         >>> import quadsim
@@ -92,24 +92,24 @@ class Flight(Result):
 
     @property
     def scenario(self) -> Scenario:
-        """What was flown, with every number of its vehicle in it."""
+        """The scenario flown, with every number of its vehicle."""
         return self.assembly.scenario
 
     @property
     def vehicle(self) -> Vehicle:
-        """As modelled, what the controller knows."""
+        """The modelled vehicle, as the controller knows it."""
         return self.assembly.vehicle
 
     @property
     def actual(self) -> Vehicle:
-        """The vehicle as it was flown: the modelled one, but for what the scenario's `[actual]` states."""
+        """The actual vehicle: the modelled one with the values of the scenario's `[actual]`."""
         return self.assembly.actual
 
     @property
     def satisfied(self) -> bool:
         """Whether the flight was completed, without a crash or permanent fallback, and every required constraint held.
 
-        What permanent fallback is: `quadsim.flight.metrics.unrecovered`.
+        `quadsim.flight.metrics.unrecovered` defines permanent fallback.
         """
         return self.outcome == "satisfied"
 
@@ -122,8 +122,8 @@ class Flight(Result):
     def outcome(self) -> Verdict:
         """The verdict in one word.
 
-        `aborted`: by Ctrl-C or code that raised; `lost`: anything else ended it; `incomplete`: it ended before a
-        required constraint was reached, and did nothing wrong up to there.
+        `aborted`: ended by Ctrl-C or an exception; `lost`: ended by anything else; `incomplete`: it ended before a
+        required constraint was reached, with no violation until then.
         """
         if self.log.aborted:
             return "aborted"
@@ -136,11 +136,11 @@ class Flight(Result):
 
     @cached_property
     def diagnosis(self) -> Mapping[str, Any] | None:
-        """Why the first QP without an answer had none, and what would help; None where all QPs had one.
+        """Why the first QP without an answer had none, and what would help; None if all QPs had one.
 
-        Where all had one, and a constraint does not hold: the first whose SQP did not converge, if any.
+        If all had one and a constraint does not hold, it explains the first SQP that did not converge, if any.
 
-        `sentence` and `advice` are for people; the other entries are explained in `docs/controllers.md`.
+        `sentence` and `advice` are for users; `docs/controllers.md` explains the other entries.
         """
         if self.recorded is not None:
             return self.recorded.get("diagnosis")
@@ -149,12 +149,12 @@ class Flight(Result):
         from scenarios.infeasibility import diagnose
 
         spec = self.scenario.controller_at(self.infeasible_period.time)
-        posed = self.scenario.altered(controller=spec, events=())
-        return diagnose(self.infeasible_period, posed, self.vehicle)
+        scenario = self.scenario.altered(controller=spec, events=())
+        return diagnose(self.infeasible_period, scenario, self.vehicle)
 
     @property
     def audit(self) -> tuple[Finding, ...]:
-        """What the audit found at the physics rate, one entry per constraint of the scenario."""
+        """The audit at the physics rate, one finding per constraint of the scenario."""
         return self.findings
 
     @property
@@ -164,12 +164,12 @@ class Flight(Result):
 
     @cached_property
     def state(self) -> dict[str, Array]:
-        """(K,) of each true state by its name [m, m/s, rad, rad/s]; names as in `quadsim.state.STATE_NAMES`."""
+        """(K,) of each true state, by name [m, m/s, rad, rad/s]; names as in `quadsim.state.STATE_NAMES`."""
         return dict(zip(STATE_NAMES, self.log.control.truth.T, strict=True))
 
     @cached_property
     def measured(self) -> dict[str, Array]:
-        """(K,) of each state as the controller received it; the same as `state` where measurement is perfect."""
+        """(K,) of each state as the controller received it; equal to `state` if measurement is perfect."""
         return dict(zip(STATE_NAMES, self.log.control.state.T, strict=True))
 
     @cached_property
@@ -196,10 +196,10 @@ class Flight(Result):
 
     @cached_property
     def margins(self) -> dict[str, Array]:
-        """(K,) of each constraint by its name: its smallest signed margin within the period; negative = violated.
+        """(K,) of each constraint, by name: its smallest signed margin within the period; negative = violated.
 
         At the rate of `plant`, in the constraint's unit; NaN outside its time window.  The smallest of all is the
-        audit's `worst_margin`.
+        audit's `worst_margin`. See `docs/conventions.md`.
         """
         plant, t = self.log.plant, self.time
         starts = np.minimum(np.searchsorted(plant.t, t - 1e-9), max(plant.t.size - 1, 0))
@@ -215,7 +215,7 @@ class Flight(Result):
 
     @cached_property
     def summary(self) -> Mapping[str, Any]:
-        """Everything in numbers: the content of `summary.json`."""
+        """All numbers: the content of `summary.json`."""
         return self.recorded if self.recorded is not None else summarise(self)
 
     @cached_property
@@ -228,7 +228,7 @@ class Flight(Result):
 
     @property
     def run(self) -> rundir.Run:
-        """The flight as the figures and pages of reports take it."""
+        """The flight in the form that figures and pages use."""
         limits = tuple(finding.limit for finding in self.findings)
         directory = self.directory or Path(self.scenario.name)
         return rundir.Run(
@@ -350,7 +350,7 @@ class Flight(Result):
         return summary_tables(self.to_json(), self.directory)
 
     def to_json(self) -> dict[str, Any]:
-        """`summary.json`, as it is on disk where the flight is."""
+        """Return `summary.json`, the recorded one if the flight is on disk."""
         return dict(self.summary) if self.directory is None else rundir.read_summary(self.directory)
 
     def small_plot(self) -> Figure | None:
@@ -380,7 +380,7 @@ class Flight(Result):
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What each of its tables keeps in its schema."""
+        """The metadata of its tables' schemas."""
         return {"scenario": self.scenario.name, "seed": str(self.scenario.seed)}
 
 
@@ -410,10 +410,10 @@ def worst_margin(findings: Iterable[Finding]) -> str:
 
 
 def require_rendering() -> None:
-    """Refuse a video that is asked for by name and cannot be made here, before anything is flown.
+    """Raise if a requested video cannot be made here, before the flight.
 
     Raises:
-        RenderingUnavailableError: so it is.
+        RenderingUnavailableError: this machine cannot render.
     """
     from quadsim.report.film.video import rendering_backend
 
@@ -421,7 +421,7 @@ def require_rendering() -> None:
 
 
 def summarise(flight: Flight) -> dict[str, Any]:
-    """`summary.json` of a flight, but for the hashes of its files and the total wall time."""
+    """Return `summary.json` of a flight, without the hashes of its files and the total wall time."""
     scenario, log = flight.scenario, flight.log
     ground = scenario.effects.ground
     flown = log.control.t.size > 0
@@ -470,14 +470,14 @@ def summarise(flight: Flight) -> dict[str, Any]:
 
 
 def _add_products(
-    flight: Flight, directory: Path, asked: Mapping[str, bool | None], progress: Progress
+    flight: Flight, directory: Path, requested: Mapping[str, bool | None], progress: Progress
 ) -> dict[str, str]:
-    """Recording, figures and video, each made from the files that are there; of those asked for, which failed and why.
+    """Add recording, figures and video, made from the files; return which requested ones failed, and why.
 
-    Ctrl-C ends the one that is being made, and skips the others.
+    Ctrl-C stops the current one and skips the rest.
     """
     run, failed = rundir.load_run(directory), dict[str, str]()
-    flown, interrupted = bool(run.log.control.t.size), flight.log.interrupted
+    has_periods, interrupted = bool(run.log.control.t.size), flight.log.interrupted
 
     @contextlib.contextmanager
     def product(name: str, demanded: bool | None) -> Iterator[Path]:
@@ -498,22 +498,22 @@ def _add_products(
         amend(directory, {"products": {name: problem}})
         _log.warning("%s %s", name, problem)
 
-    if asked["recording"] is not False:
-        with product(rundir.RECORDING_FILE, asked["recording"]) as folder:
+    if requested["recording"] is not False:
+        with product(rundir.RECORDING_FILE, requested["recording"]) as folder:
             from quadsim.report.recording import write_recording
 
             progress("recording", 0, 1)
             write_recording(run, folder / rundir.RECORDING_FILE)
         progress("recording", 1, 1)
-    if asked["figures"] is not False and flown and (not interrupted or flight.log.interrupted):
-        with product(rundir.FIGURES_DIR, asked["figures"]) as folder:
+    if requested["figures"] is not False and has_periods and (not interrupted or flight.log.interrupted):
+        with product(rundir.FIGURES_DIR, requested["figures"]) as folder:
             from quadsim.report.flight_figures import write_figures
 
             progress("figures", 0, 1)
             write_figures(run, folder / rundir.FIGURES_DIR)
             progress("figures", 1, 1)
-    if asked["video"] is not False and flown and not interrupted:
-        with product(rundir.VIDEO_FILE, asked["video"]) as folder:
+    if requested["video"] is not False and has_periods and not interrupted:
+        with product(rundir.VIDEO_FILE, requested["video"]) as folder:
             from quadsim.report.film.video import render_video
 
             render_video(

@@ -1,4 +1,4 @@
-"""Flights side by side: what is compared is found, flown where it has to be, and laid out on a page."""
+"""Compare flights: find the targets, fly those not yet flown, and lay them out on a page."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 _log: Final = logging.getLogger("quadsim")
 _FIRST: Final = 4  # flights of which its repr has two lines
 _BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "answered by", "statuses", "whole step, m")
-"""How the labels begin of the rows that are shown; the page and its `comparison.md` have them all."""
+"""Starts of the row labels to show; the page and its `comparison.md` have all rows."""
 
 Target = Flight | Scenario | str | Path
-"""What can be compared: a flight, a run directory, or a scenario to fly, by itself or by its name."""
+"""A flight, a run directory, or a scenario to fly, as an object or by name."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -43,8 +43,8 @@ class FlightComparison(Result):
 
     runs: tuple[rundir.Run, ...]  # the flights
     rows: list[Row]  # the table, a row per quantity
-    names: tuple[str, ...]  # of its columns, one per flight
-    page: Path | None  # `index.html`, where it was written
+    names: tuple[str, ...]  # column names, one per flight
+    page: Path | None  # `index.html`, if it was written
 
     def __repr__(self) -> str:
         flights = []
@@ -84,7 +84,7 @@ class FlightComparison(Result):
             yield console.styled("every number, plots and films: ", (console.short_path(self.page), "bold"))
 
     def to_json(self) -> list[dict[str, Any]]:
-        """A row per quantity, with a text for each flight."""
+        """Return one row per quantity, with a text for each flight."""
         return [
             {
                 "group": row.group,
@@ -103,10 +103,10 @@ def compare_flights(
     *,
     overwrite: bool = False,
 ) -> FlightComparison:
-    """Compare flights, and write the page to `out`; what has to be flown is saved beside it, in `OUT-runs`.
+    """Compare flights, and write the page to `out`; scenarios are flown and saved beside it, in `OUT-runs`.
 
     Raises:
-        InputError: something is no flight and no scenario; nothing was flown.
+        InputError: a target is neither a flight nor a scenario; nothing was flown.
         OutputError: the directory cannot be written.
     """
     from quadsim.report.comparison import comparison_rows, run_names
@@ -125,7 +125,7 @@ def compare_flights(
 
 
 def _check(target: Target) -> None:
-    """Refuse what cannot be compared, before anything is flown."""
+    """Reject targets that cannot be compared, before any flight."""
     if isinstance(target, Flight | Scenario):
         return
     if Path(target).is_dir():
@@ -136,7 +136,7 @@ def _check(target: Target) -> None:
 
 
 def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool) -> rundir.Run:
-    """A target as a run, flown and written beside the page where it is none yet."""
+    """Return a target as a run; fly and save it beside the page if necessary."""
     if isinstance(target, Flight):
         if target.directory is not None or not pictures:
             return target.run
@@ -145,16 +145,18 @@ def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool)
     if not isinstance(target, Scenario) and Path(target).is_dir():
         return rundir.load_run(Path(target))
     scenario = target if isinstance(target, Scenario) else load_scenario(str(target))
-    wanted = None if pictures else False
+    products = None if pictures else False
     with reserving(beside / scenario.name, free=True) as place:
         flight = Rollout(scenario).fly(progress)
-        return rundir.load_run(flight.save(place, video=wanted, recording=wanted, figures=wanted, progress=progress))
+        return rundir.load_run(
+            flight.save(place, video=products, recording=products, figures=products, progress=progress)
+        )
 
 
 def compare_campaigns(
     directories: Sequence[Path], out: Path | None = None, *, overwrite: bool = False
 ) -> PairedComparison:
-    """Compare two campaigns flight by flight, and write the report where a directory is given.
+    """Compare two campaigns flight by flight, and write the report if a directory is given.
 
     Raises:
         InputError: they are not two finished campaigns.

@@ -1,8 +1,8 @@
-"""What happens in a flight besides the course and the controller that it starts with, known in advance or not.
+"""The events of a flight, scheduled in its scenario or applied during it.
 
-A model is compiled, sensors are sampled and forces are evaluated in one way where something may happen to them, and in
-another where nothing can, with other last bits.  An event that changes nothing decides: it is in the scenario of a
-live flight and in the one that is saved of it, whether or not anything of its kind happened.
+Where an event may occur, the model is compiled, sensors are sampled and forces are evaluated in another way than
+without events, with other last bits.  A neutral event, which changes nothing, selects that way: it is in the scenario
+of a live flight and in the scenario saved from it, whether or not an event of its kind occurred.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
 
 _DEPENDENT: Final = (ControllerEvent, PayloadDrop, PayloadPickup, SensorFaultEvent)
-"""The events that depend on what else the scenario has."""
-_MOST: Final = 3  # events of one kind in a row that are reported one by one; more of them in one entry
+"""The events that depend on other parts of the scenario."""
+_MOST: Final = 3  # longest run of events of one kind that is reported singly; longer runs become one entry
 _LONGEST: Final = 200
 
 
 @dataclass(frozen=True, kw_only=True)
 class Successor:
-    """A controller that is ready to take over, and the table of a scenario file that it is made of."""
+    """A controller that is ready to take over, and its table in a scenario file."""
 
     spec: AnyController
     controller: Controller
@@ -58,17 +58,17 @@ class Successor:
 
 @dataclass(frozen=True, kw_only=True)
 class _Listed:
-    """A table that has events, for messages to name them."""
+    """A table of events, for messages to name them."""
 
     events: list[Event]
 
 
 class FlightEvents:
-    """The events of a flight, those of its scenario and those that are applied, each put to what it acts on.
+    """The events of a flight, scheduled and applied, each passed to the part that it affects.
 
     Attributes:
-        assembly: of what is flown, with the events that were applied.
-        infeasible_period: the first period whose QP had no answer, of the controllers before the one that flies now.
+        assembly: parts of the scenario flown, with the events applied.
+        infeasible_period: the first period whose QP had no answer, of the controllers before the present one.
     """
 
     def __init__(
@@ -81,12 +81,12 @@ class FlightEvents:
         loop: ClosedLoop,
         build: Callable[[AnyController], Controller] | None,
     ) -> None:
-        """Set up, before the first period; `build` makes a controller, None where the user's own one flies."""
+        """Prepare for the first period; `build` makes a controller, None if the user's own controller flies."""
         self.assembly, scenario = assembly, assembly.scenario
         self._spec = scenario.controller
         self._plant, self._navigation, self._reference, self._loop = plant, navigation, reference, loop
         self._build = build
-        self._recent: list[Event] = [*scenario.events]  # those that the plant may still have to do with, and others
+        self._recent: list[Event] = [*scenario.events]  # those still pending in the plant, and others
         self.infeasible_period: InfeasiblePeriod | None = None
         self._due: list[tuple[int, float, SetpointEvent | ControllerEvent, Successor | None]] = []
         for event in scenario.events:
@@ -94,12 +94,12 @@ class FlightEvents:
         loop.before = self._begin
 
     def close(self) -> None:
-        """Let go of what refers back here, so that nothing of the flight stays in a cycle."""
+        """Drop references to this object, so that nothing of the flight stays in a cycle."""
         self._loop.before = self._build = None
 
     @property
     def scenario(self) -> Scenario:
-        """What is flown, with the events that were applied."""
+        """The scenario flown, with the events applied."""
         return self.assembly.scenario
 
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
@@ -138,7 +138,7 @@ class FlightEvents:
         return self._built(changed(self._spec, fields))
 
     def flown(self) -> Scenario:
-        """The scenario up to now, unless the flight has ended otherwise, or nothing has been flown."""
+        """Return the scenario up to now, unless the flight has ended otherwise, or nothing has been flown."""
         scenario, k = self.scenario, self._loop.k
         if k in (0, scenario.periods) or self._loop.reason is not None:
             return scenario
@@ -151,19 +151,19 @@ class FlightEvents:
         return scenario.altered(duration=duration, events=events)
 
     def _stamped(self, event: Event | Mapping[str, Any]) -> Event:
-        """An event with the time at which it happens, to act from the first period on that is not observed yet."""
+        """Return an event with its time, effective from the first period not yet observed."""
         step, first = self.scenario.plant.timestep, self._loop.k + self._loop.observed
         at = round(first * self.scenario.control_period, 9)
         if isinstance(event, Mapping):
             event = parse_table(_Listed, {"events": [{**event, "at": at}]}, "event").events[0]
-        if isinstance(event, SensorFaultEvent):  # what is sensed at the period's begin has been sensed
+        if isinstance(event, SensorFaultEvent):  # this period has been sensed already
             at = round(at + step, 9)
-        if isinstance(event, Stall) and self._loop.answered >= at:  # a command that has come was not held up
+        if isinstance(event, Stall) and self._loop.answered >= at:  # a command that has arrived was not delayed
             at = round(self._loop.answered + step, 9)
         return replace(event, at=at)
 
     def _with(self, event: Event) -> Scenario:
-        """The scenario with one event more, and as long as that takes."""
+        """Return the scenario with one more event, extended to its time."""
         before, events = self.scenario, [*self.scenario.events, event]
         if len(events) > MOST_EVENTS:
             raise ParameterError("scenario", "events", len(events), f"of {MOST_EVENTS} or fewer entries")
@@ -181,13 +181,13 @@ class FlightEvents:
         return scenario
 
     def _schedule(self, event: Event, ready: Successor | None = None) -> None:
-        """Note what happens when a period begins, the first one from its time on, and not within the plant."""
+        """Schedule an event outside the plant for the first period from its time on."""
         if isinstance(event, SetpointEvent | ControllerEvent):
             first = math.ceil(event.at / self.scenario.control_period - 1e-6)
             insort(self._due, (first, event.at, event, ready), key=itemgetter(0, 1))
 
     def _begin(self, k: int) -> None:
-        """Let happen what is due when a period begins."""
+        """Apply the events due at the start of a period."""
         while self._due and self._due[0][0] <= k:
             _, _, event, ready = self._due.pop(0)
             if isinstance(event, SetpointEvent):
@@ -197,7 +197,7 @@ class FlightEvents:
                 self._switch(changed(self._spec, event.fields), ready)
 
     def first_infeasible_period(self) -> InfeasiblePeriod | None:
-        """Of all controllers so far: the first QP without an answer, or else the first SQP that did not converge."""
+        """Return, over all controllers so far, the first QP without an answer, or else the first SQP not converged."""
         periods = [
             period
             for period in (self.infeasible_period, infeasible_period_of(self._loop.controller))
@@ -213,7 +213,7 @@ class FlightEvents:
         self._loop.computation = self.assembly.computation(spec)
 
     def _succeed(self, event: ControllerEvent, scenario: Scenario, ready: Successor | None) -> None:
-        """Schedule a change of the controller, once it and later ones of the file are known to be possible."""
+        """Schedule a change of the controller, after checking it and later changes in the file."""
         specs = [spec for at, spec in scenario.controller_changes if at >= event.at]
         before = sum(at == event.at for at, _ in self.scenario.controller_changes)
         succeeding, *later = specs[before:]
@@ -225,18 +225,18 @@ class FlightEvents:
 
     def _built(self, spec: AnyController) -> Successor:
         if self._build is None:
-            raise ParameterError("event", "type", "controller", "another one where the controller is one's own")
+            raise ParameterError("event", "type", "controller", "another type of event with your own controller")
         return Successor(spec=spec, controller=self._build(spec))
 
 
 def infeasible_period_of(controller: Controller) -> InfeasiblePeriod | None:
-    """The first period whose QP had no answer; None where all had, or there is none."""
-    period = getattr(controller, "infeasible_period", None)  # a controller of another kind has none
+    """Return the first period whose QP had no answer; None if there is none."""
+    period = getattr(controller, "infeasible_period", None)  # not every controller has it
     return period if isinstance(period, InfeasiblePeriod) else None
 
 
 def _lasting(event: Event) -> float:
-    """For how long an event counts [s]."""
+    """Return the time for which an event counts [s]."""
     duration: float | None = getattr(event, "duration", 0.0)
     return math.inf if duration is None else duration
 
@@ -247,10 +247,9 @@ def _not_started_for(event: Event) -> InputError:
 
 
 def prepared(assembly: Assembly) -> Scenario:
-    """A scenario in whose flight anything may happen that can happen to its vehicle.
+    """Return a scenario whose flight is prepared for every event that its vehicle allows.
 
-    Wind needs drag to push; with the integrator rk4 the mass is fixed, and with an estimator there are the sensors that
-    it has.
+    Wind needs drag to push; the integrator rk4 needs a fixed mass, and an estimator a fixed set of sensors.
     """
     scenario, air = assembly.scenario, assembly.effects.air
     sensed = {} if scenario.sensors is None else scenario.sensors.present()
@@ -262,11 +261,11 @@ def prepared(assembly: Assembly) -> Scenario:
         *(_fault(scenario, name) for name in get_args(SensorText) if name in names),
     ]
     added = [event for event in possible if event not in scenario.events]
-    return scenario.altered(events=[*added, *scenario.events])  # what the file has at 0 comes after
+    return scenario.altered(events=[*added, *scenario.events])  # events of the file at time 0 come after
 
 
 def neutral(scenario: Scenario, event: Event) -> Event | None:
-    """An event at the start that changes nothing, and prepares a flight for one; None where it needs no preparing."""
+    """Return a neutral event that prepares a flight for one; None if no preparation is needed."""
     if isinstance(event, Push):
         return _push(scenario)
     if isinstance(event, LOADING):
@@ -294,9 +293,9 @@ def _fault(scenario: Scenario, sensor: SensorText) -> SensorFaultEvent:
 
 
 def story(scenario: Scenario, duration: float) -> list[dict[str, Any]]:
-    """`events` of a summary: `time` [s] and `text` of what happened in so long [s], in order of time.
+    """Return `events` of a summary: `time` [s] and `text` of the events within a duration [s], in order of time.
 
-    What changes nothing, as at a live flight's beginning, is left out.
+    Neutral events, as at the start of a live flight, are omitted.
     """
     events = sorted((event for event in scenario.events if event.at < duration), key=lambda event: event.at)
     happened = [event for event in events if event != neutral(scenario, event)]

@@ -1,7 +1,7 @@
-"""Why a flight's QP had no answer, in the words and units of the scenario file, and what to try.
+"""Explain why a flight's QP had no answer, in the terms and units of the scenario file, and suggest remedies.
 
-What is suggested is a change of the file, and each was tried: the problem is built anew from the changed file, and
-solved for the same period.  It predicts nothing about the flight that would follow.
+Each suggestion is a change of the file that was tried: the problem is rebuilt from the changed file and solved for the
+same period.  It predicts nothing about the flight that would follow.
 """
 
 from __future__ import annotations
@@ -31,34 +31,34 @@ from scenarios.schema.settings import get_field, set_field
 
 Settings = dict[str, Any]
 WIDER: Final = (1.0, 1.02, 1.1, 1.5)
-"""The smallest widening, rounded outwards, and what is tried after it: next to infeasible, solvers give up, and a wider
-bound may be tightened by more."""
+"""The smallest widening, rounded outwards, and larger trials: close to infeasible, solvers give up, and a wider bound
+may be tightened by more."""
 SOFT: Final[tuple[dict[str, float], ...]] = ({}, {"linear": 1e4}, {"linear": 1e3}, {"linear": 1e2})
-"""Prices of softness, the usual one first; far from feasible, a solver gives up at high ones."""
+"""Penalties of softness, the usual one first; far from feasible, a solver gives up at high ones."""
 ITERATIONS: Final = (2, 3, 5, 10, 20, 50, 100)
-"""Numbers of iterations that are tried where sequential quadratic programming did not converge."""
+"""Numbers of iterations to try if sequential quadratic programming did not converge."""
 _ROTORS: Final = {1: "slew", 2: "speed"}
-"""Fields of `input_bounds` by their constraint's place, as `mpc.constraints.Bounds.constraints` has them."""
+"""Fields of `input_bounds` by the index of their constraint in `mpc.constraints.Bounds.constraints`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Bound:
-    """A side of a row, as the file has it."""
+    """A side of a row, in terms of the file."""
 
-    name: str  # what reports call it, without its rotor
+    name: str  # name in reports, without its rotor
     side: str  # `lower` or `upper`
-    entry: int  # which number of its field
+    entry: int  # index in its field
     rotor: int = 0  # 1 to 4, or 0
-    unit: str = "-"  # of the bound in the file
-    factor: float = 1.0  # from the row's unit to that
-    field: str = ""  # of the file, a list of numbers
+    unit: str = "-"  # unit of the bound in the file
+    factor: float = 1.0  # file units per unit of the row
+    field: str = ""  # field of the file, a list of numbers
 
 
 def diagnose(infeasible_period: InfeasiblePeriod, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:
-    """`diagnosis` of a flight's summary.
+    """Return `diagnosis` of a flight's summary.
 
-    Where the controller is one's own, its bounds are not a scenario file's: they are named by the problem, and the
-    advice is by how much one of them alone would have to be wider.
+    The bounds of a user's own controller are not in a scenario file: the problem names them, and the advice states by
+    how much a single one would have to be wider.
     """
     if infeasible_period.converges is not None:
         return _unconverged(
@@ -81,7 +81,7 @@ def diagnose(infeasible_period: InfeasiblePeriod, scenario: Scenario, vehicle: V
 
 
 def _unconverged(infeasible_period: InfeasiblePeriod, converges: Callable[[int], bool], before: int) -> dict[str, Any]:
-    """`diagnose` where the QPs were solved, and sequential quadratic programming did not converge."""
+    """Return the diagnosis of a period whose QPs were solved but whose SQP did not converge."""
     enough = next((count for count in ITERATIONS if count > before and converges(count)), None)
     suggestions = [] if enough is None else [{"settings": {"controller.iterations": enough}, "after": None}]
     more = f"to try: controller.iterations = {enough}, which takes up to {enough} times as long"
@@ -99,14 +99,14 @@ def _unconverged(infeasible_period: InfeasiblePeriod, converges: Callable[[int],
 
 
 class _Case:
-    """One period's problem and the file that it is of."""
+    """One period's problem and its scenario file."""
 
     def __init__(self, infeasible_period: InfeasiblePeriod, scenario: Scenario, spec: Any, vehicle: Vehicle) -> None:
         self._infeasible_period, self._spec, self._vehicle = infeasible_period, spec, vehicle
         self._period, self._file = scenario.control_period, scenario.to_toml()
 
     def bound(self, side: Side) -> _Bound:
-        """A side in the words of the file."""
+        """Return a side in terms of the file."""
         which, entry = ("lower", "upper")[side.upper], int(side.upper)
         if side.place in _ROTORS:
             name = _ROTORS[side.place]
@@ -119,7 +119,7 @@ class _Case:
         polytope, name = self._polytope(side), self._infeasible_period.problem.every_constraint[side.place].name
         if self._is_space(side):
             return _Bound(name=name, side=which, unit="m", entry=side.row)
-        if polytope is None:  # of a kind that this module has no words for
+        if polytope is None:  # of an unknown kind
             return _Bound(name=f"{name}, row {side.row + 1},", side=which, entry=side.row)
         row = zip(polytope.of, polytope.rows[side.row], strict=True)
         unit = sum_signal(tuple((of, factor) for of, factor in row if factor)).unit
@@ -131,12 +131,12 @@ class _Case:
         return next((polytope for polytope in self._spec.polytopes if polytope.name == name), None)
 
     def _is_space(self, side: Side) -> bool:
-        """Whether it is a half-space of an obstacle or region."""
+        """Return whether it is a half-space of an obstacle or region."""
         C = self._infeasible_period.problem.every_constraint[side.place].C
         return C is not None and C.ndim == 3
 
     def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
-        """What is violated, the largest share first, and what blocks it, each with its times and amount."""
+        """Yield the violated bounds, the largest share first, and the blocking ones, with times and amounts."""
         delay, period = self._infeasible_period.delay, self._period
         for side, violation in sorted(conflict.violated.items(), key=lambda item: -item[1].share):
             bound = self.bound(side)
@@ -146,7 +146,7 @@ class _Case:
             yield {**_named(self.bound(side)), "by": 0.0, "start": None, "stop": None}
 
     def suggestions(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
-        """Changes of the file that give the period an answer: of one bound, the least first; softness; the fallback."""
+        """Yield changes of the file that make the period feasible: single bounds, smallest first; softness."""
         giving = {self.bound(side).field for side in conflict.violated}
         fields: dict[str, set[Side]] = {}
         for side in (*conflict.violated, *conflict.blocking):
@@ -169,7 +169,7 @@ class _Case:
         yield from self._fallback()
 
     def _softened(self, conflict: Conflict) -> list[Settings]:
-        """Making soft what is violated, one constraint, or else all, at the largest price that is answered."""
+        """Return changes that soften one violated constraint, or all of them, at the largest penalty that works."""
         polytopes = (self._polytope(side) for side in conflict.violated if side.place not in (0, *_ROTORS))
         tables = ["controller.soft"] if any(side.place == 0 for side in conflict.violated) else []
         tables += dict.fromkeys(f"controller.polytopes.{each.name}.soft" for each in polytopes if each is not None)
@@ -185,7 +185,7 @@ class _Case:
         return next(filter(self._helps, ({**law, **dict.fromkeys(tables, soft)} for soft in SOFT)), None)
 
     def _widened(self, amounts: Mapping[str, tuple[set[Side], float]]) -> Settings | None:
-        """Fields with bounds moved outwards by at least these amounts, if that helps."""
+        """Return fields with bounds moved outwards by at least these amounts, if that helps."""
         table = tomllib.loads(self._file)
         for more in WIDER:
             settings: Settings = {}
@@ -200,7 +200,7 @@ class _Case:
         return None
 
     def _helps(self, settings: Settings) -> bool:
-        """Whether the period has an answer with these fields."""
+        """Return whether the period has an answer with these fields."""
         spec = self._changed(settings)
         if spec is None or spec.input_bounds.speed[1] > max(self._vehicle.speed_max, self._spec.input_bounds.speed[1]):
             return False
@@ -216,7 +216,7 @@ class _Case:
         return has_answer(replace(problem, constraints=(*problem.constraints, *space)), self._infeasible_period.query)
 
     def _changed(self, settings: Settings) -> Constrained | Robust | None:
-        """The controller with other fields; None where the file would be refused."""
+        """Return the controller with other fields; None if the file would be rejected."""
         table = tomllib.loads(self._file)
         for field, value in settings.items():
             set_field(table, field, value, source="diagnosis")
@@ -231,7 +231,7 @@ class _Case:
         return changed
 
     def _fallback(self) -> Iterator[dict[str, Any]]:
-        """The fallback, where there is none: after what time of its level hover the problem has an answer again."""
+        """Yield the fallback, if there is none yet, with the time in level hover until the problem has an answer."""
         fallback = getattr(self._spec, "fallback", None)
         if fallback is not None and fallback.enabled:
             return
@@ -250,10 +250,10 @@ class _Case:
 
 
 class _OwnCase(_Case):
-    """The same of a controller that no file describes."""
+    """The same for a user's own controller, which no file describes."""
 
     def bound(self, side: Side) -> _Bound:
-        """A side in the words of the problem."""
+        """Return a side in terms of the problem."""
         problem = self._infeasible_period.problem
         name, rotor, factor, unit = problem.every_constraint[side.place].name, 0, 1.0, "-"
         if problem.bounds is not None and side.place in _ROTORS:
@@ -266,11 +266,11 @@ class _OwnCase(_Case):
         return _Bound(name=name, rotor=rotor, side=which, unit=unit, factor=factor, entry=side.row)
 
     def suggestions(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
-        """No changes of a file."""
+        """Yield nothing: there is no file to change."""
         yield from ()
 
     def widenings(self, conflict: Conflict | None) -> str:
-        """By how much each side alone, that of all rotors together, would have to be wider."""
+        """Return by how much each single side, for all rotors together, would have to be wider."""
         if conflict is None or conflict.feasible:
             return ""
         sides: dict[tuple[str, str], set[Side]] = {}
@@ -293,7 +293,7 @@ def _named(bound: _Bound) -> dict[str, Any]:
 
 
 def _merged(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The same side of several rotors as one entry, with the largest amount and from the first time to the last."""
+    """Merge the same side of several rotors into one entry, with the largest amount and the whole time span."""
     merged: dict[tuple[Any, ...], dict[str, Any]] = {}
     for entry in entries:
         key = (entry["name"], entry["side"], entry["by"] > 0.0)
@@ -310,24 +310,24 @@ def _merged(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _outwards(bound: float, amount: float, *, upper: bool) -> float:
-    """A bound moved outwards by an amount, which is rounded up to three digits."""
+    """Move a bound outwards by an amount, rounded up to three digits."""
     digits = 2 - math.floor(math.log10(amount)) if amount > 0.0 else 0
     moved = math.ceil(round(amount * 10.0**digits, 6)) / 10.0**digits
     return round(bound + moved if upper else bound - moved, max(digits, 0) + 3)
 
 
 def _sentence(report: Mapping[str, Any]) -> str:
-    """When, and what cannot hold together."""
-    begin = f"no answer at t = {report['time']:.2f} s ({report['status']})"
+    """Return when it happened, and which bounds conflict."""
+    opening = f"no answer at t = {report['time']:.2f} s ({report['status']})"
     if report["feasible"] is None:
-        return f"{begin}, nor to its elastic problem: its numbers are beyond what can be solved"
+        return f"{opening}, nor to its elastic problem: its numbers are beyond what can be solved"
     if report["feasible"]:
-        return f"{begin}, though all constraints can hold together: it is the solver that failed"
-    return f"{begin}; cannot hold together: {'; '.join(map(_phrase, report['conflict']))}"
+        return f"{opening}, though all constraints can hold together: it is the solver that failed"
+    return f"{opening}; cannot hold together: {'; '.join(map(_phrase, report['conflict']))}"
 
 
 def _phrase(entry: Mapping[str, Any]) -> str:
-    """One bound, e.g. `roll upper at +0.15 s .. +0.40 s by 0.8 deg`, or `slew of rotor 3 lower`."""
+    """Describe one bound, e.g. `roll upper at +0.15 s .. +0.40 s by 0.8 deg`, or `slew of rotor 3 lower`."""
     rotors = entry["rotors"]
     which = f" of rotor{'s' if len(rotors) > 1 else ''} {', '.join(map(str, rotors))}" if rotors else ""
     name = f"{entry['name']}{which} {entry['side']}"
@@ -338,7 +338,7 @@ def _phrase(entry: Mapping[str, Any]) -> str:
 
 
 def _advice(report: Mapping[str, Any]) -> str:
-    """What to try."""
+    """Return the advice."""
     if report["feasible"] is not False:
         return ""
     tried = [
@@ -351,7 +351,7 @@ def _advice(report: Mapping[str, Any]) -> str:
 
 
 def _toml(value: object) -> str:
-    """Text, a list of numbers, or a table of numbers, as a scenario file has it."""
+    """Format a text, a list of numbers, or a table of numbers as in a scenario file."""
     if not isinstance(value, dict):
         return json.dumps(value)
     return f"{{ {', '.join(f'{name} = {number:g}' for name, number in value.items())} }}" if value else "{}"

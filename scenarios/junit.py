@@ -24,7 +24,7 @@ _HEAD: Final = b"<?xml version='1.0' encoding='utf-8'?>\n<testsuite name=\"quads
 
 
 def junit_file(path: str | Path) -> Path:
-    """The absolute path of a file for verdicts, which may hold earlier ones of quadsim's, and nothing else.
+    """Return the absolute path of a verdict file; it may replace earlier verdicts of quadsim, but nothing else.
 
     Raises:
         OutputError: it cannot be written, or holds something else.
@@ -54,14 +54,14 @@ def write_junit(result: Reaudit | CampaignResult | Sequence[Reproduction], path:
         OutputError: it cannot be written.
     """
     if isinstance(result, Sequence):
-        numbers = [(each.paper.name, number) for each in result for number in each.numbers]
-        held = [(f"{paper}: {number.spec.name}", number.within, number.sentence) for paper, number in numbers]
-        return write_cases("reproduce", held, Path(path))
+        numbers = [(entry.paper.name, number) for entry in result for number in entry.numbers]
+        test_cases = [(f"{paper}: {number.spec.name}", number.within, number.sentence) for paper, number in numbers]
+        return write_cases("reproduce", test_cases, Path(path))
     summary = result.summary
     if "campaign" in summary:
         judged: Sequence[Judgement] = getattr(result, "judgements", ())
-        held = [(each.requirement.text, each.holds, each.sentence) for each in judged]
-        return write_cases(summary["campaign"], held, Path(path))
+        test_cases = [(entry.requirement.text, entry.holds, entry.sentence) for entry in judged]
+        return write_cases(summary["campaign"], test_cases, Path(path))
     text = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
     whole = summary["status"] == "completed" and not summary["controller"].get("unrecovered")
     cases = [("flight", whole, text), *map(_case, summary["constraints"])]

@@ -1,8 +1,8 @@
-"""What a flight is audited against: the bounds of its controller, and its `[[constraints]]`, obstacles and regions.
+"""The limits of the audit: the bounds of the controller, and `[[constraints]]`, obstacles and regions.
 
-The controller's bounds are audited without being named.  An entry of `[[constraints]]` without bounds takes the
-controller's, for a tolerance or a window of its own.  One with bounds stands for the controller's on the same signal
-where it holds throughout the flight; `audit_notes` says where they differ.
+The controller's bounds are audited automatically.  An entry of `[[constraints]]` without bounds takes the controller's,
+with its own tolerance or window.  One with bounds replaces the controller's on the same signal if it applies throughout
+the flight; `audit_notes` reports differences.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 COMMANDED: Final = ("speed", "slew")
 SHARE, SHARE_SAMPLED, ROUNDING = 0.01, 0.002, 1e-6
-"""Tolerances of bounds that no entry names: shares of half the band, and of commands their rounding [rad/s]."""
+"""Default tolerances: shares of half the band, and for commands their rounding [rad/s]."""
 
 
 def audited(assembly: Assembly) -> tuple[Limit, ...]:
-    """What the flight is audited against: its constraints, the bounds of its controller, obstacles and regions."""
+    """Return the limits of the audit: constraints, controller bounds, obstacles and regions."""
     scenario, bounds = assembly.scenario, assembly.bounds
     return (
         *_stated(scenario, bounds),
@@ -37,13 +37,13 @@ def audited(assembly: Assembly) -> tuple[Limit, ...]:
 
 
 def with_bounds_stated(assembly: Assembly) -> Scenario:
-    """The scenario with its controller's bounds as constraints, for another controller to be held to the same."""
+    """Return the scenario with its controller's bounds as constraints, to apply them to another controller."""
     scenario, bounds = assembly.scenario, assembly.bounds
     return scenario.altered(constraints=[*_stated(scenario, bounds), *_unnamed(scenario, bounds)])
 
 
 def audit_notes(assembly: Assembly) -> list[str]:
-    """What a reader of the audit has to know: bounds that no constraint names, and others than the controller's."""
+    """Return notes on the audit: bounds without a constraint, and constraints that differ from the controller's."""
     scenario, vehicle, bounds = assembly.scenario, assembly.vehicle, assembly.bounds
     unnamed = [limit.name for limit in _unnamed(scenario, bounds)]
     absent = [entry.name for entry in scenario.constraints if not (entry.has_bounds or entry.signal in bounds)]
@@ -71,7 +71,7 @@ def audit_notes(assembly: Assembly) -> list[str]:
 
 
 def _stated(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit]:
-    """The entries of `[[constraints]]` with their bounds; those without any to take are left out."""
+    """Return the entries of `[[constraints]]` with their bounds; those without any available are dropped."""
     return [
         entry if entry.has_bounds else replace(entry, lower=bounds[entry.signal][0], upper=bounds[entry.signal][1])
         for entry in scenario.constraints
@@ -80,7 +80,7 @@ def _stated(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit]:
 
 
 def _unnamed(scenario: Scenario, bounds: Mapping[str, Range]) -> Iterator[Limit]:
-    """A limit for each bound of the controller that no entry stands for."""
+    """Yield a limit for each controller bound without an entry."""
     named = {
         entry.signal
         for entry in scenario.constraints
@@ -110,7 +110,7 @@ def _range(lower: float, upper: float) -> str:
 
 
 def space_limits(assembly: Assembly) -> tuple[SpaceLimit, ...]:
-    """The obstacles to keep clear of, then the regions to stay in."""
+    """Return the obstacles, then the regions, as limits."""
     obstacles, regions = assembly.scenario.obstacles, assembly.regions
     if not obstacles and not regions:
         return ()

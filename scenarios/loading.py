@@ -1,4 +1,4 @@
-"""Scenario files found, read, changed field by field, and checked."""
+"""Find, read, change and check scenario files."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from scenarios.schema.settings import apply_setting
 def load_scenario(
     source: Scenario | str | Path, changes: Mapping[str, Any] | Sequence[str] = (), seed: int | None = None
 ) -> Scenario:
-    """The scenario of `assemble`; see `scenarios.app.load`."""
+    """Return the scenario of `assemble`; see `scenarios.app.load`."""
     return assemble(source, changes, seed).scenario
 
 
 def assemble(
     source: Scenario | str | Path, changes: Mapping[str, Any] | Sequence[str] = (), seed: int | None = None
 ) -> Assembly:
-    """A scenario, by itself or by its name or file, with some fields changed, and its vehicle and course, all checked.
+    """Return a scenario, given as an object, name or file, with changed fields, its vehicle and course, all checked.
 
     Args:
-        source: a file is merged over its `base` where it has one.
+        source: a scenario, name or file; a file is merged over its `base`, if any.
         changes: values by dotted path, or `dotted.path=value` texts, values as in TOML, that replace or add fields.
         seed: replaces the scenario's.
 
     Raises:
-        InputError: the file is missing or malformed, a field is not allowed, or what it names cannot be flown so.
+        InputError: the file is missing or malformed, a field is invalid, or a part that it names cannot be flown.
     """
     if not isinstance(source, str | Path) and not changes:
         changes = {}
@@ -67,7 +67,7 @@ def _read(name: str, settings: Sequence[str]) -> Scenario:
 
 
 def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data: Mapping[str, Any]) -> Iterator[str]:
-    """Why fields of a table are missing, or are too many: another type was requested than `read` from the file."""
+    """Explain why a table lacks fields or has too many: its type differs from that in the file."""
     unfit = (problem for problem in problems if problem.endswith(" is missing") or " is not a field of " in problem)
     wrong = {problem.partition(".")[0] for problem in unfit}
     types_before = retyped(read, data)
@@ -85,11 +85,11 @@ def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data
 def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directory: Path | None = None) -> Scenario:
     """Check a scenario given as nested tables, called `source` in messages.
 
-    Relative paths of vehicles and courses, and modules of plug-ins, are looked up in `directory` too.
+    Relative paths of vehicles and courses, and modules of plug-ins, are also looked up in `directory`.
 
     Raises:
-        ScenarioError: naming every field that is wrong.
-        FileError: the course's table is wrong.
+        ScenarioError: names every invalid field.
+        FileError: the course's table is invalid.
     """
     if directory is not None:
         data = {name: {**value} if isinstance(value, dict) else value for name, value in data.items()}

@@ -1,4 +1,4 @@
-"""The machine: the packages that numbers depend on, its cores, and what it can do."""
+"""The machine: versions of numerically relevant packages, cores, and capabilities."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PACKAGES: Final = ("mujoco", "numpy", "scipy", "piqp", "rerun-sdk", "imageio", "
 
 
 def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
+    """Return the versions of packages that affect numbers."""
     return {"quadsim": __version__, "python": platform.python_version(), **_packages()}
 
 
@@ -28,13 +28,13 @@ def _packages() -> dict[str, str]:
 
 
 def machine() -> dict[str, Any]:
-    """What a reader of timings has to know."""
+    """Return what a reader of timings must know."""
     return {"system": platform.platform(), "processor": processor_name(), "cores": os.cpu_count()}
 
 
 @cache
 def processor_name() -> str:
-    """The processor's model, as far as the system reports it."""
+    """Return the processor's model, if the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -44,12 +44,12 @@ def processor_name() -> str:
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def capabilities() -> dict[str, dict[str, str]]:
-    """What this machine can do, by section; every installed QP solver is tried on a step of the constrained MPC."""
+    """Return this machine's capabilities by section; every installed QP solver solves one constrained step."""
     from mpc.solvers import solver_entries
     from quadsim.report.recording import viewer_problem
 

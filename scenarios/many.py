@@ -1,7 +1,7 @@
-"""Many flights: a map over them on processes of this machine, or beside the workers of a Dask cluster.
+"""Many flights: a map over processes of this machine, or beside the workers of a Dask cluster.
 
-Each flight gives one row, whatever it does: one that raises, hangs, dies or takes too much memory costs itself alone.
-A worker is a process with a pipe of its own, forked in milliseconds from a server that has the libraries loaded.
+Each flight gives one row, whatever happens: a flight that raises, hangs, dies or takes too much memory affects only
+itself.  A worker is a process with its own pipe, forked in milliseconds from a server with preloaded libraries.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ Row = dict[str, Any]
 Rows = Generator[tuple[int, Row]]
 Fly = Callable[[Any], Row]
 ERROR, TIMEOUT, MEMORY, DIED = "error", "timeout", "memory", "died"
-"""Verdicts of flights that gave no row: it raised, took too long or too much memory, or its process died."""
+"""Verdicts of flights without a row: an exception, a timeout, too much memory, or a dead process."""
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _PRELOAD: Final = ("scenarios.campaign.plan", "mpc.constrained", "mpc.robust.controller", "mpc.unconstrained")
-"""Loaded once, by the server that workers are forked from."""
+"""Preloaded by the server that workers are forked from."""
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
-_START_S: Final = 60.0  # at most, for a worker, or the first one of a cluster, to start; no part of a flight's time
+_START_S: Final = 60.0  # longest start of a worker, or of the first one of a cluster; not counted as flight time
 _CONNECT_S: Final = 10.0
 
 
 class ClusterError(QuadsimError):
-    """A cluster cannot fly, or no longer; the rows that it gave stand."""
+    """A cluster cannot fly, or no longer; its earlier rows remain valid."""
 
 
 def fly_many(
@@ -56,21 +56,21 @@ def fly_many(
     isolate: bool = False,
     cluster: str | None = None,
 ) -> Rows:
-    """The row of each flight with its place among them, as they come; closing the iterator, or Ctrl-C, ends all work.
+    """Yield the row of each flight with its index, as flights finish; closing the iterator, or Ctrl-C, stops all work.
 
-    The row of a flight that has none of its own has a `verdict` (error, timeout, memory, died) and a `reason`.
+    The row of a flight that failed has a `verdict` (error, timeout, memory, died) and a `reason`.
 
     Args:
-        flights: what to fly, anything that pickles: scenarios, or numbers of a plan.
-        fly: gives a flight's row; it pickles as well.
-        workers: processes; one per usable core where absent.
-        timeout: wall clock of one flight [s].
-        memory: that a worker may take beyond what it starts with [MB].
-        isolate: whether each flight gets a fresh process: for code of users, whose flights could change each other.
+        flights: what to fly, any picklable objects: scenarios, or numbers of a plan.
+        fly: returns a flight's row; picklable as well.
+        workers: number of processes; by default one per usable core.
+        timeout: wall time limit per flight [s].
+        memory: limit on a worker's memory beyond that at its start [MB].
+        isolate: whether each flight gets a fresh process: for user code, whose flights could affect each other.
         cluster: address of a Dask scheduler; a process beside each of its workers flies.
 
     Raises:
-        ParameterError: no worker is wanted, or the address is none.
+        ParameterError: the number of workers or the address is invalid.
         MissingPackageError: the extra `cluster` is not installed.
         ClusterError: the scheduler does not answer, or its workers cannot fly.
     """
@@ -81,7 +81,7 @@ def fly_many(
 
 
 def count_workers(workers: int | None, cluster: str | None) -> int:
-    """How many flights `fly_many` flies at the same time; what it refuses is refused here."""
+    """Return how many flights `fly_many` flies at a time; invalid arguments raise as they do there."""
     _require(workers, cluster)
     if cluster is None:
         return workers or usable_cores()
@@ -115,7 +115,7 @@ def _here(flights: Iterable[Any], fly: bytes, count: int, timeout: float, memory
                 workers[-1].hand(*flight)
                 flight = next(todo, None)
             left, rows = min(worker.deadline for worker in workers) - clock.monotonic(), []
-            ready = connection.wait([end for each in workers for end in each.ends], max(left, 0.0))
+            ready = connection.wait([end for running in workers for end in running.ends], max(left, 0.0))
             for worker in workers[:]:
                 if (row := worker.row(ready)) is None:
                     continue
@@ -139,13 +139,15 @@ class _Worker:
         self._timeout, self.place, self.usable, self.deadline = timeout, -1, True, 0.0
         self._start_s = _START_S
         context = multiprocessing.get_context("forkserver")
-        draws = [name for name in ("scipy.stats",) if name in sys.modules]  # half a second; draws of some campaigns
+        draws = [
+            name for name in ("scipy.stats",) if name in sys.modules
+        ]  # slow to import; some campaigns draw with it
         context.set_forkserver_preload([*_PRELOAD, *draws])
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, fly, memory), daemon=True)
         with closing(theirs), _starting():
             self.process.start()
-        self.ends = (self.pipe, self.process.sentinel)  # either is ready when there is something to know
+        self.ends = (self.pipe, self.process.sentinel)  # either becomes ready when there is news
 
     def hand(self, place: int, flight: Any) -> None:
         self.place, self.deadline = place, clock.monotonic() + self._timeout + self._start_s
@@ -153,9 +155,9 @@ class _Worker:
             self.pipe.send(flight)
 
     def row(self, ready: Sequence[object]) -> Row | None:
-        """What came of its flight; None while it flies."""
+        """Return the row of its flight; None while it flies."""
         if self.pipe in ready:
-            with suppress(Exception):  # it died while it sent it
+            with suppress(Exception):  # it died while sending it
                 row = self.pipe.recv()
                 if row is None:  # it has started: its first flight begins now
                     self._start_s, self.deadline = 0.0, clock.monotonic() + self._timeout
@@ -175,8 +177,8 @@ class _Worker:
         return None
 
     def end(self) -> None:
-        """End it, and what it started in its process group."""
-        for kill in (os.killpg, os.kill):  # the second where it has no group yet
+        """Kill it, and its process group."""
+        for kill in (os.killpg, os.kill):  # the second if it has no group yet
             with suppress(OSError):
                 kill(self.process.pid or 0, signal.SIGKILL)
         self.process.join(5.0)
@@ -185,9 +187,9 @@ class _Worker:
 
 @contextmanager
 def _starting() -> Iterator[None]:
-    """What starts here has one thread for linear algebra, does not see Ctrl-C, nor runs the caller's script again."""
+    """Start processes with one linear-algebra thread, without Ctrl-C, and without rerunning the caller's script."""
     with _STARTING:
-        resource_tracker.ensure_running()  # it lets signals through when it starts
+        resource_tracker.ensure_running()  # it unblocks signals when it starts
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         before = {name: os.environ.get(name) for name in _ONE_THREAD}
         os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
@@ -202,10 +204,10 @@ def _starting() -> Iterator[None]:
 
 
 def _serve(pipe: connection.Connection, fly: bytes, memory: float) -> None:
-    """Fly what comes, until the caller goes."""
-    os.setpgid(0, 0)  # Ctrl-C is for the caller alone; and all that a flight starts ends with one signal
+    """Fly what arrives until the caller exits."""
+    os.setpgid(0, 0)  # Ctrl-C is for the caller; one signal ends everything that a flight starts
     _die_with_caller()
-    os.dup2(2, 1)  # what controllers print is no part of the caller's output
+    os.dup2(2, 1)  # output of controllers must not mix with the caller's
     _limit_memory(memory)
     load = functools.cache(pickle.loads)
     with suppress(EOFError, OSError):
@@ -216,7 +218,7 @@ def _serve(pipe: connection.Connection, fly: bytes, memory: float) -> None:
 
 
 def _die_with_caller() -> None:
-    """Have the system kill this group once the caller is gone, even while a controller holds the interpreter."""
+    """Ask the system to kill this group when the caller exits, even while a controller holds the interpreter."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     fcntl.fcntl(parent.sentinel, fcntl.F_SETOWN, -os.getpgrp())
@@ -227,20 +229,20 @@ def _die_with_caller() -> None:
 
 
 def _row(fly: Fly, flight: Any, memory: float) -> bytes:
-    """The pickled row of a flight, whatever it raises."""
+    """Return the pickled row of a flight, whatever it raises."""
     try:
         return pickle.dumps(fly(flight))
     except MemoryError as error:
         return pickle.dumps({"verdict": MEMORY, "reason": f"{describe(error)} (it may take {memory:g} MB)"})
-    except BaseException as error:  # a user's controller may exit, too
+    except BaseException as error:  # a user's controller may call exit, too
         return pickle.dumps({"verdict": ERROR, "reason": describe(error)})
 
 
 def _limit_memory(megabytes: float) -> None:
-    """Have the system refuse this process more than so much memory; where the machine has none left, it goes first."""
+    """Limit this process's memory; if the machine runs out of memory, the system kills it first."""
     status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
-    held = next(1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith("VmData:"))
-    most = int(held + megabytes * 1e6)
+    bytes_held = next(1024 * int(line.split()[1]) for line in status.splitlines() if line.startswith("VmData:"))
+    most = int(bytes_held + megabytes * 1e6)
     resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
@@ -255,7 +257,7 @@ def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float
         work = distributed.as_completed(loop=client.loop)
 
         def submit() -> None:
-            """Two flights for each thread there is by now, so that none waits for its next one."""
+            """Submit two flights per thread, so that no thread waits for its next one."""
             for place, flight in todo:
                 future = client.submit(_beside, fly, flight, timeout, memory, _code(), pure=False)
                 places[future.key] = place
@@ -267,7 +269,7 @@ def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float
         for future in work:
             try:
                 row = future.result()
-            except distributed.KilledWorker as error:  # several Dask workers died with it
+            except distributed.KilledWorker as error:  # several Dask workers died with the flight
                 row = {"verdict": DIED, "reason": describe(error)}
             except distributed.CancelledError as error:
                 raise ClusterError(f"the scheduler at {address} is gone; continue with --resume") from error
@@ -280,7 +282,7 @@ def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float
 
 
 def _beside(fly: bytes, flight: Any, timeout: float, memory: float, code: Mapping[str, str]) -> Row:
-    """In a Dask worker: fly in a process beside it, so that no flight can harm it."""
+    """In a Dask worker, fly in a child process, so that no flight can harm the worker."""
     other = [f"{name} {value}, not {code.get(name)}" for name, value in _code().items() if code.get(name) != value]
     if other:
         raise ClusterError(f"it has {', '.join(other)}")
@@ -299,7 +301,7 @@ def _distributed() -> Any:
 
 @contextmanager
 def _client(address: str) -> Iterator[Any]:
-    """A client of a scheduler that has a worker."""
+    """Yield a client of a scheduler with at least one worker."""
     distributed = _distributed()
     try:
         client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
@@ -319,7 +321,7 @@ def _threads(client: Any) -> int:
 
 @functools.cache
 def _code() -> dict[str, str]:
-    """Versions of the packages that decide a flight's numbers, our own by the digest of its code."""
+    """Return the versions of packages that determine a flight's numbers, and the digest of our code."""
     from scenarios.campaign.store import code_digest
 
     return {name: versions()[name] for name in ("mujoco", "numpy", "scipy", "piqp")} | {"quadsim": code_digest()[:19]}

@@ -1,4 +1,4 @@
-"""Controllers and forces of the user's own: named by the place of their code, imported, called, fitted to the protocol.
+"""User-defined controllers and forces: located by name, imported, called, and adapted to the protocol.
 
 `controller = "my_package.my_module:MyController"`
 """
@@ -35,9 +35,9 @@ from quadsim.sim.effects import Force
 from quadsim.state import Array, State
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-FORM: Final = "package.module:Class"  # what the text that names a controller looks like
+FORM: Final = "package.module:Class"  # form of a controller's name
 ENTRY_POINTS: Final = "quadsim.controllers"
-"""The group under which installed packages announce controllers by short names."""
+"""Entry-point group under which installed packages announce controllers by short names."""
 _NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _STEP: Final = (
     "a class or an object with a method step(now, state, reference), or a function law(now, state, reference)"
@@ -51,11 +51,9 @@ _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "pure
 class _Code:
     folder: Annotated[
         str | None,
-        doc("where its module is looked for first, from the scenario file; absent: beside that"),
+        doc("folder searched first for its module, relative to the scenario file; absent: beside that file"),
     ] = None
-    settings: Annotated[dict[str, Any], doc("what else it is called with, by the arguments' names")] = field(
-        default_factory=dict
-    )
+    settings: Annotated[dict[str, Any], doc("further arguments of the call, by name")] = field(default_factory=dict)
 
 
 def _name_no_law(schema: dict[str, Any]) -> None:
@@ -66,12 +64,12 @@ def _name_no_law(schema: dict[str, Any]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Plugin(ControllerTable, _Code):
-    """A controller of one's own, called as MyController(vehicle, period=..., horizon=..., **settings)."""
+    """A user-defined controller, called as MyController(vehicle, period=..., horizon=..., **settings)."""
 
     type: Annotated[
         str, doc("its code, as package.module:Class, or its name among the entry points quadsim.controllers")
     ] = field(metadata={"json_schema_extra": _name_no_law})
-    horizon: Annotated[Horizon, doc("[periods] N, samples of the reference that a step is given")] = 50
+    horizon: Annotated[Horizon, doc("[periods] N, samples of the reference passed to a step")] = 50
 
     def __post_init__(self) -> None:
         _check_code(self.type, self.settings, ("vehicle", "period", "horizon"))
@@ -83,7 +81,7 @@ class Plugin(ControllerTable, _Code):
 
 @dataclass(frozen=True, kw_only=True)
 class PluginForce(_Code):
-    """A force of one's own, called once per physics step; see `quadsim.sim.effects.Force`.
+    """A user-defined force, called once per physics step; see `quadsim.sim.effects.Force`.
 
     A function force(time, state, **settings), or a class called as MyForce(vehicle, rng=..., **settings).
     """
@@ -97,7 +95,7 @@ class PluginForce(_Code):
 
 
 def _check_code(place: str, settings: Mapping[str, Any], arguments: tuple[str, ...]) -> None:
-    """Refuse a place that is none, and settings that are no arguments or cannot be written."""
+    """Reject a malformed place, and settings that are not arguments or cannot be written to a file."""
     if ":" in place and not re.fullmatch(f"{_NAME}:{_NAME}", place):
         raise ParameterError("", "type", place, f"of the form {FORM}")
     for name, value in settings.items():
@@ -109,31 +107,31 @@ def _check_code(place: str, settings: Mapping[str, Any], arguments: tuple[str, .
 
 
 def is_plugin(name: str) -> bool:
-    """Whether a text names code, or an entry point that there is."""
+    """Return whether a text names code or an existing entry point."""
     return ":" in name or name in metadata.entry_points(group=ENTRY_POINTS).names
 
 
 def located(controller: Any, beside: Path) -> Any:
-    """A `[controller]` as a file gives it, its folder made independent of the file's, `beside`.
+    """Return a `[controller]` from a file in the folder `beside`, with its own folder made absolute.
 
-    That is its folder too, where none is given and the module is there.
+    `beside` is the default folder if the module is there.
     """
     table = {"type": controller} if isinstance(controller, str) else controller
     name = table.get("type") if isinstance(table, Mapping) else None
     if not isinstance(name, str) or ":" not in name:
         return controller
-    given = table.get("folder")
-    if isinstance(given, str) and (beside / given).is_dir():
-        return {**table, "folder": str((beside / given).resolve())}
+    folder = table.get("folder")
+    if isinstance(folder, str) and (beside / folder).is_dir():
+        return {**table, "folder": str((beside / folder).resolve())}
     first = beside / name.partition(":")[0].partition(".")[0]
-    found = "folder" not in table and (first.is_dir() or first.with_suffix(".py").is_file())
-    return {**table, "folder": str(beside.resolve())} if found else controller
+    is_beside = "folder" not in table and (first.is_dir() or first.with_suffix(".py").is_file())
+    return {**table, "folder": str(beside.resolve())} if is_beside else controller
 
 
 class PluginController:
-    """A law whose `step` gives four speeds or a `Command`; `predict`, `reset` and `adopt` where it has them.
+    """Adapts a law whose `step` returns four speeds or a `Command`, with optional `predict`, `reset` and `adopt`.
 
-    The law gets copies; its commands are checked and copied.
+    The law receives copies; its commands are checked and copied.
     """
 
     def __init__(self, law: Any, horizon: int) -> None:
@@ -147,15 +145,15 @@ class PluginController:
 
     @property
     def infeasible_period(self) -> object:
-        """The first problem without an answer, an `mpc.InfeasiblePeriod`, where the law keeps one."""
+        """The first problem without an answer, an `mpc.InfeasiblePeriod`, if the law keeps one."""
         try:
             return getattr(self._law, "infeasible_period", None)
-        except Exception as error:  # after the flight, which is not to be lost by it
+        except Exception as error:  # the flight is complete and must not be lost
             logging.getLogger("quadsim").warning("no diagnosis: infeasible_period raised %s", reason_of(error))
             return None
 
     def reset(self, speeds: Array) -> None:
-        """See `quadsim.controller.Controller.reset`; raises InputError where the law's raises."""
+        """See `quadsim.controller.Controller.reset`; raises InputError if the law's raises."""
         try:
             getattr(self._law, "reset", np.copy)(speeds.copy())
         except (Exception, SystemExit) as error:
@@ -166,7 +164,7 @@ class PluginController:
         hand_over(self._law, previous._law if isinstance(previous, PluginController) else previous)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """See `quadsim.controller.Controller.step`; raises CommandError where the answer is no command."""
+        """See `quadsim.controller.Controller.step`; raises CommandError if the answer is not a command."""
         acting = None if now.acting is None else now.acting.copy()
         named = state.copy().view(State)
         answer: Any = self._law.step(replace(now, acting=acting), named, reference.copy())
@@ -187,15 +185,15 @@ class PluginController:
             raise CommandError(problem, time=now.time) from error
 
 
-def _numbers(given: Any, shape: tuple[int, ...], name: str) -> Array:
-    array = np.array(given, float)
+def _numbers(numbers: Any, shape: tuple[int, ...], name: str) -> Array:
+    array = np.array(numbers, float)
     if array.shape != shape:
         raise InputError(f"{name} must have shape {shape}; got {array.shape}")
     return array
 
 
 def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginController:
-    """The controller of a function law(now, state, reference), a class, an object, or what makes one of a vehicle."""
+    """Return the controller of a function law(now, state, reference), a class, an object, or a factory of one."""
     if (code := _code_of(law)) is not type(law):
         if isinstance(code, type) or "vehicle" in inspect.signature(code).parameters:
             law = _call(code, spec, {"vehicle": vehicle}, period=period, horizon=spec.horizon)
@@ -213,7 +211,7 @@ def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginC
 
 
 def make_force(force: Any, spec: PluginForce, vehicle: Vehicle, rng: np.random.Generator) -> Force:
-    """The force of a function force(time, state), an object called so, or a class of such; see `make_law`."""
+    """Return the force of a function force(time, state), a callable object, or a class of such; see `make_law`."""
     if isinstance(code := _code_of(force), type):
         force = force if code is type(force) else _call(code, spec, {"vehicle": vehicle}, rng=rng)
     else:
@@ -225,7 +223,7 @@ def make_force(force: Any, spec: PluginForce, vehicle: Vehicle, rng: np.random.G
 
 
 def _call(call: Any, spec: Plugin | PluginForce, arguments: dict[str, Any], **given: Any) -> Any:
-    """What a call gives with these arguments and the settings; what it raises is a message about them."""
+    """Call with these arguments and the settings; an exception becomes a message about them."""
     try:
         return call(*arguments.values(), **given, **spec.settings)
     except InputError:
@@ -236,18 +234,18 @@ def _call(call: Any, spec: Plugin | PluginForce, arguments: dict[str, Any], **gi
 
 
 def import_plugin(spec: Plugin | PluginForce) -> Any:
-    """Import what a scenario names, from what is installed, the spec's folder or the working directory; log from where.
+    """Import a scenario's code from installed packages, the spec's folder or the working directory; log its source.
 
     Raises:
-        InputError: there is no such thing, or its module cannot be imported.
+        InputError: it does not exist, or its module cannot be imported.
     """
     place = spec.type if ":" in spec.type else metadata.entry_points(group=ENTRY_POINTS)[spec.type].value
     (module, _, attribute), path = place.partition(":"), list(sys.path)
     folders, top = [*filter(None, [spec.folder]), str(Path.cwd())], module.partition(".")[0]
     try:
-        sys.path += folders  # last: nothing there is taken for a module that is installed
+        sys.path += folders  # last, so that installed modules take precedence
         importlib.invalidate_caches()
-        found = importlib.import_module(module)
+        imported = importlib.import_module(module)
     except (Exception, SystemExit) as error:
         absent = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
         where = f"; it is looked for among what is installed, and in {', '.join(folders)}" if absent else ""
@@ -256,20 +254,22 @@ def import_plugin(spec: Plugin | PluginForce) -> Any:
         sys.path[:] = path
     file = getattr(sys.modules[top], "__file__", None) or "Python"
     files = [Path(folder, name) for folder in folders for name in (f"{top}.py", f"{top}/__init__.py")]
-    own = next(filter(Path.is_file, files), None)
-    if own is not None and own.resolve() != Path(file).resolve():
-        raise InputError(f"{_table(spec)}.type: {own} is hidden by another module {top}, from {file}; rename it")
-    logging.getLogger("quadsim").info("imported %s from %s", module, getattr(found, "__file__", None) or file)
+    hidden_file = next(filter(Path.is_file, files), None)
+    if hidden_file is not None and hidden_file.resolve() != Path(file).resolve():
+        raise InputError(
+            f"{_table(spec)}.type: {hidden_file} is hidden by another module {top}, from {file}; rename it"
+        )
+    logging.getLogger("quadsim").info("imported %s from %s", module, getattr(imported, "__file__", None) or file)
     for part in attribute.split("."):
-        if not hasattr(found, part):
-            names = [name for name, value in vars(found).items() if callable(value) and not name.startswith("_")]
-            raise UnknownNameError(f"{_table(spec)}.type in {getattr(found, '__name__', module)}", part, names)
-        found = getattr(found, part)
-    return found
+        if not hasattr(imported, part):
+            names = [name for name, value in vars(imported).items() if callable(value) and not name.startswith("_")]
+            raise UnknownNameError(f"{_table(spec)}.type in {getattr(imported, '__name__', module)}", part, names)
+        imported = getattr(imported, part)
+    return imported
 
 
 def refer_to(law: object, horizon: int = 1) -> Plugin:
-    """How a scenario file names a controller or force that was passed in: by the place of its code."""
+    """Return how a scenario file names a controller or force object: by the place of its code."""
     code: Any = _code_of(law)
     file, folder = getattr(sys.modules.get(code.__module__), "__file__", None), None
     if file is not None and not file.startswith(_INSTALLED):
@@ -279,18 +279,18 @@ def refer_to(law: object, horizon: int = 1) -> Plugin:
 
 
 def require_importable(law: object, what: str = "controller") -> None:
-    """Refuse a controller or force that other processes cannot import by its place."""
+    """Reject a controller or force that other processes cannot import by its place."""
     code: Any = _code_of(law)
-    found: Any = sys.modules.get(code.__module__)
+    resolved: Any = sys.modules.get(code.__module__)
     for part in code.__qualname__.split("."):
-        found = getattr(found, part, None)
-    if code is type(law) or code.__module__ == "__main__" or found is not code:
+        resolved = getattr(resolved, part, None)
+    if code is type(law) or code.__module__ == "__main__" or resolved is not code:
         rule = "a class or a function at the top of a module other than the script, for workers to import"
         raise ParameterError("", what, law, rule)
 
 
 def _code_of(law: Any) -> Any:
-    """The class or function that was passed in, by itself or in a partial; an object's class."""
+    """Return the class or function of a law, directly or in a partial; the class of an object."""
     code = law.func if isinstance(law, functools.partial) else law
     if getattr(law, "args", ()) and code is not law:
         raise ParameterError("", "controller", law, "a partial with named arguments alone")
@@ -302,7 +302,7 @@ def _table(spec: Plugin | PluginForce) -> str:
 
 
 def reason_of(error: BaseException) -> str:
-    """An exception in one line, with the user's line that raised it."""
+    """Format an exception in one line, with the user's line that raised it."""
     last, text = traceback.extract_tb(error.__traceback__)[-1], " ".join(f"{type(error).__name__}: {error}".split())
     ours = last.filename in (__file__, inspect.__file__, importlib.__file__) or "<frozen" in last.filename
     return text if ours or isinstance(error, SyntaxError) else f"{text} ({last.filename}, line {last.lineno})"

@@ -1,10 +1,10 @@
-"""A finished run held against itself: its files as they were written, its verdict as its tables give it again.
+"""Audit a finished run again: compare its files with their hashes, and its verdict with its tables.
 
-It finds damage and mistakes, ours too: integrity, not authenticity.  The tables have to be consistent among themselves.
-Nothing in `summary.json` about the verdict is relied on.  The limits come from the run's `scenario.toml`, the values
-from `flight.parquet` and `plant.parquet`.  The recorded audit saw every physics step, the tables have the plant at the
-log rate, so at the physics rate the recorded margin may be the smaller one, and never the larger.  At the control
-samples both saw the same numbers.
+It finds damage and mistakes, ours included: integrity, not authenticity.  The tables must be mutually consistent.
+Nothing in `summary.json` about the verdict is trusted.  The limits come from the run's `scenario.toml`, the values from
+`flight.parquet` and `plant.parquet`. The recorded audit used every physics step, but the tables have the plant at the
+log rate, so at the physics rate the recorded margin may be smaller, but never larger.  At the control samples both use
+the same numbers.
 """
 
 from __future__ import annotations
@@ -41,28 +41,28 @@ TABLES: Final = (FLIGHT_FILE, PLANT_FILE, TIMING_FILE)
 OURS: Final = {*TABLES, HORIZON_FILE, rundir.SCENARIO_FILE, rundir.RECORDING_FILE, rundir.VIDEO_FILE}
 """Files that only a run writes under these names."""
 ROUNDING: Final = 1e-9
-"""By how much numbers may differ that another machine's arithmetic made, of 1 or of the larger number."""
-ROUNDING_TILT: Final = 1e-6  # the same for the tilt: near level an arc cosine has half of a number's digits
+"""Tolerance for another machine's arithmetic, relative to 1 or to the larger number."""
+ROUNDING_TILT: Final = 1e-6  # the same for the tilt: near level, an arc cosine has half of a number's digits
 MOST_REPORTED: Final = 6  # differences that one message names
 _HOLDING: Final = ("unconstrained", "constrained", "robust", "nonlinear", "lqr", "geometric")
-"""Laws that command rotor speeds for a whole period, unless INDI goes between."""
+"""Laws that command rotor speeds for a whole period, unless INDI modifies them."""
 _COMMANDED: Final = tuple(f"u{i}" for i in range(1, N_ROTORS + 1))
 _TURNING: Final = tuple(f"w{i}" for i in range(1, N_ROTORS + 1))
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Reaudit(Result):
-    """The audit from a run's tables, or of a flight as it was flown."""
+    """The audit from a run's tables, or of a flight in memory."""
 
     summary: dict[str, Any]  # `summary.json`
     findings: tuple[Finding, ...]  # the audit, from tables at the control samples and at the log rate
-    satisfied: bool  # the verdict on the flight that follows from it
-    rate: float | None = None  # rows per second of `plant.parquet` [Hz]; None of a flight as it was flown
-    notes: tuple[str, ...] = ()  # what a person should know, and what is no error
+    satisfied: bool  # the verdict on the flight that follows
+    rate: float | None = None  # rows per second of `plant.parquet` [Hz]; None for a flight in memory
+    notes: tuple[str, ...] = ()  # remarks for the user that are not errors
 
     @property
     def exit_status(self) -> int:
-        """See `Result.exit_status`; 1 where a constraint was not reached too: not all were shown to hold."""
+        """See `Result.exit_status`; also 1 if a constraint was not reached, since it was not shown to hold."""
         return EXIT_DONE if self.satisfied and self.summary["satisfied"] else EXIT_FAILED
 
     def shown(self) -> Shown:
@@ -72,7 +72,7 @@ class Reaudit(Result):
         return summary_tables(self.to_json())
 
     def to_json(self) -> dict[str, Any]:
-        """The summary; under `reaudit` the audit that was made again."""
+        """Return the summary, with the new audit under `reaudit`."""
         if self.rate is None:
             return self.summary
         entries = [limit_to_json(finding) for finding in self.findings]
@@ -81,13 +81,13 @@ class Reaudit(Result):
 
 
 def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
-    """Audit a finished run again from its tables, and hold its summary against that.
+    """Audit a finished run again from its tables, and compare the result with its summary.
 
-    Film, recording and figures have to be there where `products` is true; they can be made again.
+    Film, recording and figures must be present if `products` is true; they can be made again.
 
     Raises:
-        FileError: a file is missing, changed or damaged, or the summary contradicts the tables; the message names
-            what differs.
+        FileError: a file is missing, changed or damaged, or the summary contradicts the tables; the message names the
+            differences.
     """
     summary = rundir.read_summary(directory)
     differing = list(_changed(directory, summary, products=products))
@@ -118,9 +118,9 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
 
 
 def stored_scenario(directory: Path) -> Scenario:
-    """The scenario of a run, as its directory has it; no other file is read for it, but for that of its course.
+    """Return the scenario of a run from its directory, without reading any other file.
 
-    Its controller is not needed: another one replaces that of a package that is not installed here.
+    Its controller is not needed: a controller of a package that is not installed here is replaced.
 
     Raises:
         InputError: it is missing or malformed.
@@ -138,7 +138,7 @@ def stored_scenario(directory: Path) -> Scenario:
 
 
 def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> Iterator[str]:
-    """Files that are not as they were written."""
+    """Yield the files that differ from those written."""
     needed = (*TABLES, rundir.SCENARIO_FILE)
     for name in rundir.damaged_files(directory, summary):
         if (directory / name).is_file():
@@ -152,13 +152,13 @@ def _changed(directory: Path, summary: Mapping[str, Any], *, products: bool) -> 
 
 
 def _unlisted(directory: Path, summary: Mapping[str, Any]) -> list[str]:
-    """Files in a run's directory that its summary does not list, sorted."""
+    """Return files in a run's directory that its summary does not list, sorted."""
     files = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
     return sorted(files - {rundir.SUMMARY_FILE, *summary["files"]})
 
 
 def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
-    """Where a run's tables contradict each other, or the scenario's rates."""
+    """Yield contradictions among a run's tables, or with the scenario's rates."""
     control, timing, plant = run.log.control, run.log.timing, run.log.plant
     for name, columns, rows, t in (
         (FLIGHT_FILE, STATE_NAMES, control.truth, control.t),
@@ -178,7 +178,7 @@ def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
         if t.size != expected or (np.abs(t - spacing * np.arange(t.size)) > ROUNDING).any():
             yield f"{name} does not have the {expected} times k * {spacing:g} s"
             return
-    both = np.flatnonzero(np.arange(count) * steps % stride == 0)  # control periods that begin with a row of the plant
+    both = np.flatnonzero(np.arange(count) * steps % stride == 0)  # control periods that start with a row of the plant
     apart = control.truth[both] - plant.state[both * steps // stride]
     apart[:, ANGLES] = (apart[:, ANGLES] + np.pi) % (2.0 * np.pi) - np.pi
     yield from _where(
@@ -195,29 +195,31 @@ def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
 
 
 def _where(wrong: np.ndarray[Any, np.dtype[np.bool_]], columns: Sequence[str], t: Array, what: str) -> Iterator[str]:
-    """The columns in which anything is wrong, each with its first time."""
+    """Yield the columns with errors, each with the first time of one."""
     for i in np.flatnonzero(wrong.any(axis=0)).tolist():
         yield f"{columns[i]} at t = {t[np.argmax(wrong[:, i])]:g} s {what}"
 
 
 def _holds_commands(scenario: Scenario) -> bool:
-    """Whether the rotors turn at the commanded speeds throughout each period that begins with its command."""
+    """Return whether the rotors turn at the commanded speeds throughout each period."""
     laws = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
-    held = all(spec.type in _HOLDING and getattr(spec, "indi", None) is None for spec in laws)
-    return held and scenario.effects.rotors is None and not any(isinstance(e, LagChange) for e in scenario.events)
+    commands_held = all(spec.type in _HOLDING and getattr(spec, "indi", None) is None for spec in laws)
+    return (
+        commands_held and scenario.effects.rotors is None and not any(isinstance(e, LagChange) for e in scenario.events)
+    )
 
 
 def _differences(
     summary: Mapping[str, Any], scenario: Scenario, log: FlightLog, findings: Sequence[Finding]
 ) -> Iterator[str]:
-    """Where a summary differs from the run's scenario and tables."""
-    flown, completed, reason = log.control.t.size, summary["status"] == "completed", summary["reason"]
-    duration = round(flown * scenario.control_period, 9)
+    """Yield differences of a summary from the run's scenario and tables."""
+    periods, completed, reason = log.control.t.size, summary["status"] == "completed", summary["reason"]
+    duration = round(periods * scenario.control_period, 9)
     stated = {"scenario": scenario.name, "seed": scenario.seed, "expected": scenario.expect, "duration": duration}
     for key, again in stated.items():
         yield from _recorded(key, summary.get(key, again), again, "the run's files give")
-    if completed and flown != scenario.periods:
-        yield f"status is recorded as 'completed', and {flown} of {scenario.periods} periods were flown"
+    if completed and periods != scenario.periods:
+        yield f"status is recorded as 'completed', and {periods} of {scenario.periods} periods were flown"
     if completed != (reason is None):
         yield f"status is recorded as {summary['status']!r:.40}, and reason as {reason!r:.80}"
     deadline_ms = 1e3 * scenario.control_period
@@ -226,15 +228,15 @@ def _differences(
     for key, again in leaves(numbers):
         yield from _recorded(key, before.get(key, again), again, "the tables give", ROUNDING)
     entries = summary["constraints"]
-    names, wanted = [entry["name"] for entry in entries], [finding.limit.name for finding in findings]
-    if names != wanted:
-        yield f"the constraints recorded are {', '.join(names) or 'none'}, and the scenario's {', '.join(wanted)}"
+    names, expected = [entry["name"] for entry in entries], [finding.limit.name for finding in findings]
+    if names != expected:
+        yield f"the constraints recorded are {', '.join(names) or 'none'}, and the scenario's {', '.join(expected)}"
         return
     for entry, finding in zip(entries, findings, strict=True):
         yield from (f"{finding.limit.name}: {what}" for what in _constraint_differences(entry, finding, scenario, log))
-        held = constraint_verdict(entry)
-        if entry["satisfied"] != (held == "satisfied") or entry.get("verdict", held) != held:
-            yield f"{entry['name']}: satisfied is {entry['satisfied']}, and its worst margins say {held}"
+        implied = constraint_verdict(entry)
+        if entry["satisfied"] != (implied == "satisfied") or entry.get("verdict", implied) != implied:
+            yield f"{entry['name']}: satisfied is {entry['satisfied']}, and its worst margins say {implied}"
     required = all(entry["satisfied"] for entry in entries if entry["required"])
     satisfied = reason is None and required and not (log.control.crashed or metrics.unrecovered(log.control))
     yield from _recorded("satisfied", summary["satisfied"], satisfied, "its audit and outcome make it")
@@ -245,7 +247,7 @@ def _differences(
 
 
 def _recorded(key: str, before: Any, again: Any, source: str, rounding: float = 0.0) -> Iterator[str]:
-    """That a value is recorded otherwise, where numbers differ by more than the rounding."""
+    """Yield a message if a recorded value differs by more than rounding."""
     numbers = isinstance(before, int | float) and isinstance(again, int | float)
     if before != again and not (numbers and math.isclose(before, again, rel_tol=rounding, abs_tol=rounding)):
         yield f"{key} is recorded as {before!r:.80}, and {source} {again!r:.80}"
@@ -261,14 +263,14 @@ _DEMANDS: Final = (
 def _constraint_differences(
     entry: Mapping[str, Any], finding: Finding, scenario: Scenario, log: FlightLog
 ) -> Iterator[str]:
-    """Where a summary differs from the tables in one constraint."""
+    """Yield differences of a summary from the tables in one constraint."""
     again, limit = limit_to_json(finding), finding.limit
     for key in _DEMANDS:
         if entry.get(key) != again.get(key):
             yield f"{key} is recorded as {entry.get(key)!r:.80}, and is {again.get(key)!r:.80} in the scenario"
     rounding = ROUNDING_TILT if limit.signal == "tilt" else ROUNDING
     sampled = limit.source.plant is None
-    whole = sampled or scenario.plant_stride == 1 or not log.control.t.size  # the tables have all that the audit saw
+    whole = sampled or scenario.plant_stride == 1 or not log.control.t.size  # the tables are complete
     alike = ("peak_sampled", "worst_margin_sampled", *(("peak_plant", "worst_margin", "worst_time") if whole else ()))
     for key in alike:
         yield from _recorded(key, entry[key], again[key], "the tables give", rounding)
@@ -287,9 +289,9 @@ def _constraint_differences(
 
 
 def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[float, float]:
-    """The least and the most time beyond a bound and its tolerance that the tables leave possible [s].
+    """Return the least and the most time beyond a bound and its tolerance that the tables allow [s].
 
-    Rows at the log rate cover one physics step each at least, and the last of them may come before the end.
+    Rows at the log rate cover at least one physics step each, and the last of them may come before the end.
     """
     signal, limit, seen = finding.limit.source, finding.limit, finding.time_violated
     row = 1.0 / scenario.log_rate if scenario.plant_stride > 1 else 0.0

@@ -1,4 +1,4 @@
-"""From a scenario to its flight: the one loop that batches, live sessions, learning environments and scripts step."""
+"""From a scenario to its flight: the one loop for batches, live sessions, learning environments and scripts."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def closed_loop(
     navigation: Navigation | None,
     recorded: bool = True,
 ) -> ClosedLoop:
-    """The loop of a scenario, at t = 0; the reference is (K + N, 4), or an object (see `Assembly.followed`)."""
+    """Return the loop of a scenario, at t = 0; the reference is (K + N, 4), or an object (see `Assembly.followed`)."""
     scenario = assembly.scenario
     return ClosedLoop(
         plant,
@@ -59,14 +59,14 @@ def closed_loop(
 
 
 def needs_quaternions(scenario: Scenario) -> bool:
-    """Whether one of its controllers flies at any attitude."""
+    """Return whether one of its controllers flies at any attitude."""
     specs = (scenario.controller, *(spec for _, spec in scenario.controller_changes))
     return any(spec.any_attitude for spec in specs)
 
 
 @contextlib.contextmanager
 def _staying() -> Iterator[None]:
-    """Come back to the working directory, even if it is gone by then."""
+    """Restore the working directory, even if it has been removed."""
     here = os.open(os.curdir, getattr(os, "O_PATH", os.O_RDONLY))
     try:
         yield
@@ -78,16 +78,16 @@ def _staying() -> Iterator[None]:
 class Rollout:
     """A scenario's flight, period by period; everything is built and checked before the first.
 
-    What happens in flight comes from the scenario's events, and from `apply`.  A period depends on these and on the
-    seed alone, never on a clock: the scenario of `flight` flies to the same bits.  Linear algebra is held to one
-    thread in the whole process from then on.  It is for one thread at a time, but for `successor`; it owns native
-    memory: `close` it, or use it as a context manager.
+    Events come from the scenario and from `apply`. A period depends on these and on the seed, never on a clock: flying
+    the scenario of `flight` gives the same bits.  Linear algebra is limited to one thread in the whole process from
+    then on.  Use it in one thread at a time, except for `successor`. It owns native memory: `close` it, or use it as a
+    context manager.
 
     Attributes:
         vehicle: the modelled vehicle.
-        actual: the vehicle as it really is, which flies.
-        limits: what the flight is audited against.
-        loop: the closed loop; its `controller` is what flies now.
+        actual: the actual vehicle, which flies.
+        limits: the limits of the audit.
+        loop: the closed loop; its `controller` is the one in command.
 
     Examples:
         >>> import quadsim
@@ -116,11 +116,11 @@ class Rollout:
         """Set up at t = 0.
 
         Args:
-            scenario: what is flown, or what has been built of it.
-            law: flies it in place of the scenario's controller.
-            forces: act in place of the scenario's forces.
-            live: as of `scenarios.app.start`.
-            recorded: as of `scenarios.app.start`.
+            scenario: the scenario to fly, or its assembly.
+            law: replaces the scenario's controller.
+            forces: replace the scenario's forces.
+            live: see `scenarios.app.start`.
+            recorded: see `scenarios.app.start`.
 
         Raises:
             InputError: something cannot be built.
@@ -129,12 +129,12 @@ class Rollout:
         assembly = assembly.of(prepared(assembly)) if live else assembly
         self.vehicle, self.actual, self.limits = assembly.vehicle, assembly.actual, assembly.limits
         self._started = scenario = assembly.scenario
-        threadpool_limits(limits=1)  # the matrices are small, and results do not depend on the number of cores
+        threadpool_limits(limits=1)  # the matrices are small, and results must not depend on the number of cores
         if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
             raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
         controller = assembly.controller() if law is None else law
         for _, spec in scenario.controller_changes:
-            assembly.controller(spec)  # to be refused before anything is flown; one by one, as each may take megabytes
+            assembly.controller(spec)  # checked before the flight, one by one, as each may take megabytes
         self._law = controller.name, controller.solver
         self._plant, self._navigation = assembly.plant(forces), assembly.navigation()
         started = clock.perf_counter()
@@ -160,13 +160,13 @@ class Rollout:
         self.close()
 
     def close(self) -> None:
-        """Give back what the plant holds; what was flown stays, and nothing more is."""
+        """Release the plant's memory; the flight so far stays, and cannot continue."""
         self._events.close()
         self._plant.close()
 
     @property
     def scenario(self) -> Scenario:
-        """What is flown, with the events that were applied."""
+        """The scenario flown, with the events applied."""
         return self._events.scenario
 
     @property
@@ -176,12 +176,12 @@ class Rollout:
 
     @property
     def done(self) -> bool:
-        """Whether it has come to its scenario's end, or ended before; without an early end it may be flown on."""
+        """Whether it has reached its scenario's end, or ended early; without an early end it may continue."""
         return self.loop.reason is not None or self.k >= self.scenario.periods
 
     @property
     def observation(self) -> Observation:
-        """What the period that starts now begins with; what is applied from then on acts in the one after it.
+        """The data at the start of this period; events applied from now on act in the next one.
 
         Raises:
             FlightError: the vehicle is lost; the flight has ended.
@@ -192,8 +192,8 @@ class Rollout:
         """Fly one control period.
 
         Args:
-            command: what to hold instead of the controller's answer: a command, or (4,) rotor speeds [rad/s].  Its
-                scenario does not know of it, and flies without.
+            command: replaces the controller's answer: a command, or (4,) rotor speeds [rad/s]. The scenario does not
+                record it, and flies without it.
 
         Raises:
             FlightError: the flight has ended in this period, which is not part of it.
@@ -216,9 +216,9 @@ class Rollout:
 
     @_staying()
     def fly(self, progress: Progress = silent) -> Flight:
-        """Fly on to the scenario's end, audit it and close; a flight error or Ctrl-C ends it early, in order.
+        """Fly to the scenario's end, audit the flight and close; a flight error or Ctrl-C ends it early, in order.
 
-        A controller that changes the working directory changes it for the flight alone.
+        A change of the working directory by a controller lasts only for the flight.
         """
         with self:
             started, periods = clock.perf_counter(), self.scenario.periods
@@ -228,14 +228,14 @@ class Rollout:
             return self.flight()
 
     def apply(self, event: Event | Mapping[str, Any], successor: Successor | None = None) -> Event:
-        """Let something happen from the next period on that is not observed yet, as an event of the file would.
+        """Apply an event from the next period on that is not yet observed, like an event of the file.
 
         Args:
-            event: an entry of `events`; its `at` follows.
-            successor: of an event `controller`, what `successor` gave for its fields; else it is built here.
+            event: an entry of `events`; `at` is set here.
+            successor: for an event `controller`, the result of `successor` for its fields; built here by default.
 
         Returns:
-            The event with its time, as the scenario has it now.
+            The event with its time, as the scenario now has it.
 
         Raises:
             InputError: it is not allowed, or the flight was not started for events of its kind; nothing has changed.
@@ -243,10 +243,10 @@ class Rollout:
         return self._events.apply(event, successor)
 
     def successor(self, fields: Mapping[str, Any]) -> Successor:
-        """A controller of which some fields of `[controller]` are other than now, built; from any thread.
+        """Build a controller with some fields of `[controller]` changed; callable from any thread.
 
         Args:
-            fields: as of an event `controller`.
+            fields: as in an event `controller`.
 
         Raises:
             InputError: it cannot be built.
@@ -254,12 +254,12 @@ class Rollout:
         return self._events.successor(fields)
 
     def margins(self, sample: FlownPeriod | None = None) -> dict[str, float]:
-        """The signed margin of each constraint at its worst within one period; negative = violated.
+        """Return the smallest signed margin of each constraint within one period; negative = violated.
 
-        At the physics rate, begin and end included, in the constraint's unit; NaN outside its time window.
+        At the physics rate, both ends included, in the constraint's unit; NaN outside its time window.
 
         Args:
-            sample: which period; the last one flown where absent.
+            sample: the period; by default the last one.
         """
         sample = self.loop.last if sample is None else sample
         if sample is None:
@@ -267,19 +267,19 @@ class Rollout:
         return smallest_margins(one_period(sample, self._plant.timestep), self.limits)
 
     def violations(self, sample: FlownPeriod | None = None) -> dict[str, float]:
-        """How far each constraint is exceeded beyond its tolerance within one period: g <= 0 where it holds.
+        """Return how far each constraint is exceeded beyond its tolerance within one period: g <= 0 if it holds.
 
         In its unit, at its worst; minus infinity outside its time window.
 
         Args:
-            sample: which period; the last one flown where absent.
+            sample: the period; by default the last one.
         """
         margins = self.margins(sample)
         beyond = {limit.name: -(margins[limit.name] + limit.tolerance) for limit in self.limits}
         return {name: -math.inf if math.isnan(value) else value for name, value in beyond.items()}
 
     def flight(self) -> Flight:
-        """What has been flown so far, audited; its scenario is as long, and flies to the same bits."""
+        """Return the flight so far, audited; its scenario has the same length and flies to the same bits."""
         scenario = self._events.flown()
         self.loop.quaternions = needs_quaternions(scenario)
         log = self.loop.log()

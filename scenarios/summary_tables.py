@@ -28,9 +28,9 @@ _NAMED: Final = 3  # violated constraints that the first line names
 
 
 def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) -> Iterator[RenderableType]:
-    """All of it, and where it was written."""
-    flown = console.styled(f"  {summary['duration']:.2f} s flown")
-    yield console.styled((summary["scenario"], "bold"), "  ") + outcome_line(summary) + flown
+    """Yield all of it, and where it was written."""
+    simulated = console.styled(f"  {summary['duration']:.2f} s flown")
+    yield console.styled((summary["scenario"], "bold"), "  ") + outcome_line(summary) + simulated
     if summary.get("description"):
         yield summary["description"]
     yield from summary.get("traceback", ())
@@ -54,7 +54,7 @@ def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) ->
 
 
 def outcome_line(summary: Mapping[str, Any]) -> Text:
-    """Completed, lost or aborted, with the reason or the verdict on the required constraints, and what was expected."""
+    """Return the outcome with its reason, or the verdict on the required constraints, and the expected verdict."""
     expected, as_expected = summary.get("expected", "satisfied"), summary.get("as_expected", True)
     remark = ""
     if expected != "satisfied":
@@ -87,7 +87,7 @@ def _violations(constraints: Sequence[Mapping[str, Any]]) -> str:
 
 
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
-    """Every constraint with its bounds, peaks, margin, tolerances and verdict."""
+    """Return every constraint with its bounds, peaks, margin, tolerances and verdict."""
     caption = (
         "margin: the one that decides, negative = violated, s: at the samples; tolerance: its own; beyond: seconds; "
         "-: no value there"
@@ -148,7 +148,7 @@ def _controller_lines(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """What a flight's effects did, where it has them: events, ground, late commands, errors of the estimate."""
+    """Yield the effects of a flight, if any: events, ground, late commands, errors of the estimate."""
     if events := summary.get("events"):
         yield f"events: {'; '.join(event_sentences(events))}"
     if "ground" in summary:

@@ -62,8 +62,8 @@ class Host:
     def step(self, state: Array, reference: Array, acting: Array) -> Reply:
         self.inputs[:12], self.inputs[12:16], self.inputs[16:] = state, acting, reference.ravel()
         self._call(self.library.host_step, self.inputs, self.answers)
-        found = self.answers.copy()
-        return Reply(int(found[0]), int(found[1]), found[2:6], found[6:].reshape(-1, 4))
+        result = self.answers.copy()
+        return Reply(int(result[0]), int(result[1]), result[2:6], result[6:].reshape(-1, 4))
 
     def _call(self, function: object, *arrays: Array) -> None:
         function(*(ctypes.c_void_p(array.ctypes.data) for array in (self.memory, *arrays)))  # type: ignore[operator]

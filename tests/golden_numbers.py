@@ -48,13 +48,13 @@ def library_entry(flight: Flight) -> dict[str, Any]:
         "flown": round(log.control.t.size * flight.scenario.control_period, 6),
     }
     if flight.outcome != "lost":
-        rmse, found = tracking(log.control)["rmse"], nearest(flight)
+        rmse, result = tracking(log.control)["rmse"], nearest(flight)
         entry["rmse"] = [round(rmse[axis], 4) for axis in "xyz"]
         entry["tilt"] = round(peak_tilt(log.plant.state), 2)
         entry["qps"] = round(100.0 * log.control.status.count(SOLVED) / log.control.t.size, 1) if flight.solver else 0
-        entry["nearest"] = found.limit.name
-        entry["margin"] = round(min(found.worst_margin, found.worst_margin_sampled), 3)
-        entry["unit"] = found.limit.unit
+        entry["nearest"] = result.limit.name
+        entry["margin"] = round(min(result.worst_margin, result.worst_margin_sampled), 3)
+        entry["unit"] = result.limit.unit
     return entry
 
 

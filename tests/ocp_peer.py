@@ -88,23 +88,23 @@ def constraints(problem: Problem) -> tuple[Constraint, ...]:
 def values(constraint: Constraint, given: Period, plan: Array) -> Array:
     """(N, m) the values of a constraint's rows along the rolled out plan."""
     states, steps = trajectory(given, plan), moves(given, plan)
-    found = np.zeros((*plan.shape[:-1], constraint.lower.shape[-1]))
-    for row in range(found.shape[-1]):
+    result = np.zeros((*plan.shape[:-1], constraint.lower.shape[-1]))
+    for row in range(result.shape[-1]):
         of_inputs = [
             part @ matrix[row]
             for matrix, part in ((constraint.D, plan), (constraint.E, steps))
             if matrix is not None and matrix[row].any()
         ]
-        found[..., row] = sum(of_inputs, np.zeros(plan.shape[:-1]))
+        result[..., row] = sum(of_inputs, np.zeros(plan.shape[:-1]))
         if constraint.C is not None:
-            found[..., row] += (states[..., :-1, :] if of_inputs else states[..., 1:, :]) @ constraint.C[row]
-    return found
+            result[..., row] += (states[..., :-1, :] if of_inputs else states[..., 1:, :]) @ constraint.C[row]
+    return result
 
 
 def violation(constraint: Constraint, given: Period, plan: Array) -> Array:
     """(N, m) by how much a rolled out plan violates a constraint; 0 where it does not."""
-    found = values(constraint, given, plan)
-    return np.maximum(np.maximum(constraint.lower - found, found - constraint.upper), 0.0)
+    result = values(constraint, given, plan)
+    return np.maximum(np.maximum(constraint.lower - result, result - constraint.upper), 0.0)
 
 
 def residuals(problem: Problem, given: Period, plan: Array) -> Array:
@@ -117,8 +117,8 @@ def residuals(problem: Problem, given: Period, plan: Array) -> Array:
         parts.append((moves(given, plan), objective.Q_d))
     if objective.P is not None:
         x_s, inverse = given.equilibrium.x, np.linalg.pinv(objective.C_r)
-        wanted = x_s + inverse @ (given.desired[-1] - objective.C_r @ x_s)
-        parts.append((states[..., -1:, :] - wanted, objective.P))
+        desired = x_s + inverse @ (given.desired[-1] - objective.C_r @ x_s)
+        parts.append((states[..., -1:, :] - desired, objective.P))
     return np.concatenate([_flat(part @ _root(weight)) for part, weight in parts], axis=-1)
 
 
@@ -205,15 +205,15 @@ def least_violation(
                     weights.append((half if math.isfinite(half) else size) if free else 0.0)
     slack = np.diag(weights)[:, np.flatnonzero(weights)]
     for method in ("highs-ipm", "highs-ds"):  # the first finds some that do have an answer infeasible
-        found = linprog(
+        result = linprog(
             np.concatenate([np.zeros(N * nu), np.ones(slack.shape[1])]),
             A_ub=np.hstack([rows, -slack]),
             b_ub=bounds,
             bounds=[(None, None)] * (N * nu) + [(0.0, None)] * slack.shape[1],
             method=method,
         )
-        if found.status == 0:
-            return float(found.fun)
+        if result.status == 0:
+            return float(result.fun)
     return None
 
 

@@ -84,9 +84,9 @@ def imports_of(importer: str, source: str, ours: set[str]) -> Iterator[Import]:
 @pytest.fixture(scope="module")
 def imports() -> list[Import]:
     ours = modules()
-    found = [item for name, path in ours.items() for item in imports_of(name, path.read_text(), set(ours))]
-    assert {item.importer.partition(".")[0] for item in found} == set(PACKAGES)
-    return found
+    result = [item for name, path in ours.items() for item in imports_of(name, path.read_text(), set(ours))]
+    assert {item.importer.partition(".")[0] for item in result} == set(PACKAGES)
+    return result
 
 
 def loaded_by(code: str) -> set[str]:
@@ -106,9 +106,9 @@ def declared() -> set[str]:
 
 def test_the_testbed_imports_nothing_of_ours(imports: list[Import]) -> None:
     """But for `import quadsim` and `import quadsim.gym`, which hand out what users call, late."""
-    found = [i for i in imports if i.importer.startswith("quadsim") and i.library in {"mpc", "scenarios", "piqp"}]
-    assert {i.importer for i in found} == {"quadsim", "quadsim.gym"}
-    assert not [i for i in found if i.at_start]
+    result = [i for i in imports if i.importer.startswith("quadsim") and i.library in {"mpc", "scenarios", "piqp"}]
+    assert {i.importer for i in result} == {"quadsim", "quadsim.gym"}
+    assert not [i for i in result if i.at_start]
 
 
 def test_controllers_know_vehicle_state_errors_and_protocol_alone(imports: list[Import]) -> None:
@@ -190,7 +190,7 @@ def removals(source: str) -> Iterator[str]:
 
 
 def test_one_module_alone_removes_and_replaces_files() -> None:
-    found = {name: [*removals(path.read_text())] for name, path in modules().items()}
-    assert found.pop(OUTPUTS).count("shutil.rmtree") == 1
-    assert found.pop("mpc.core.build") == ["partial.replace", "partial.unlink"]  # run without quadsim
-    assert {name: calls for name, calls in found.items() if calls} == {}
+    result = {name: [*removals(path.read_text())] for name, path in modules().items()}
+    assert result.pop(OUTPUTS).count("shutil.rmtree") == 1
+    assert result.pop("mpc.core.build") == ["partial.replace", "partial.unlink"]  # run without quadsim
+    assert {name: calls for name, calls in result.items() if calls} == {}

@@ -32,15 +32,15 @@ ENTRY_POINTS = {"quadsim.controllers"}
 @pytest.mark.parametrize("name", PAPER)
 def test_the_papers_flights_give_their_golden_numbers(name: str, fly_once: Callable[..., Flight]) -> None:
     """Of errors [m, deg], margins [deg, rad/s] and seconds; counts are exact."""
-    found, golden = paper_entry(fly_once(name)), read("paper")[name]
-    assert found["rmse"] == pytest.approx(golden["rmse"], abs=1e-3)
-    assert found["final_error"] == pytest.approx(golden["final_error"], abs=1e-5)
+    result, golden = paper_entry(fly_once(name)), read("paper")[name]
+    assert result["rmse"] == pytest.approx(golden["rmse"], abs=1e-3)
+    assert result["final_error"] == pytest.approx(golden["final_error"], abs=1e-5)
     for bound, numbers in golden["bounds"].items():
-        assert found["bounds"][bound]["satisfied"] == numbers["satisfied"]
-        assert found["bounds"][bound] == pytest.approx(numbers, abs=0.01), bound
+        assert result["bounds"][bound]["satisfied"] == numbers["satisfied"]
+        assert result["bounds"][bound] == pytest.approx(numbers, abs=0.01), bound
     for key in ("highest_speed", "largest_step", "total_variation"):
-        assert found[key] == pytest.approx(golden[key], rel=1e-3), key
-    assert (found["optima"], found["periods"]) == (golden["optima"], golden["periods"])
+        assert result[key] == pytest.approx(golden[key], rel=1e-3), key
+    assert (result["optima"], result["periods"]) == (golden["optima"], golden["periods"])
 
 
 @pytest.mark.parametrize("document", ["README.md", "docs/gallery.md"])

@@ -93,9 +93,9 @@ def test_wheel_flies_alone(installed: Path, tmp_path: Path) -> None:
         "print(quadsim.__file__, mpc.__file__, scenarios.__file__); "
         f"sys.exit(main({flight}) or main({comparison}))"
     )
-    found = run_alone([installed / "python", "-c", code], tmp_path).partition("\n")[0].split()
-    assert len(found) == 3
-    assert all(Path(place).is_relative_to(installed.parent) for place in found), found
+    result = run_alone([installed / "python", "-c", code], tmp_path).partition("\n")[0].split()
+    assert len(result) == 3
+    assert all(Path(place).is_relative_to(installed.parent) for place in result), result
     summary = json.loads((tmp_path / "runs" / "hover" / "summary.json").read_text())
     assert summary["status"] == "completed"
     assert summary["satisfied"]

@@ -106,8 +106,8 @@ def living(pids: Iterable[int]) -> set[int]:
 
 def below() -> set[int]:
     """The workers of this process: what a process that it started has started."""
-    found = set()
+    result = set()
     for each in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.NoSuchProcess):
-            found |= {each.pid} if each.ppid() != os.getpid() else set()
-    return found
+            result |= {each.pid} if each.ppid() != os.getpid() else set()
+    return result

@@ -302,9 +302,7 @@ def _find(log: FlightLog, limit: Limit) -> Finding:
         t, values = limit.source.finest(log)
         peak, margin, time = _worst(limit, t, values)
     beyond = limit.holds_at(t) & (limit.margin(values) < -limit.tolerance)
-    durations = np.diff(
-        t, append=log.plant.t[-1:]
-    )  # each value lasts until the next, the last one until the flight's end
+    durations = np.diff(t, append=log.plant.t[-1:])  # a value lasts until the next, or until the flight's end
     return Finding(
         limit=limit,
         peak_sampled=sampled[0],

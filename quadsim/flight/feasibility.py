@@ -54,9 +54,7 @@ class Feasibility:
     rotor_min: float  # lowest rotor speed [rad/s]; 0 where a rotor's thrust is negative
     rotor_max: float  # highest rotor speed [rad/s]
     thrust_to_weight: float  # largest
-    thrust_min: (
-        float  # least thrust of a rotor [N]; if negative, the course is not flyable, whatever the rotors' limits
-    )
+    thrust_min: float  # least thrust of a rotor [N]; negative: not flyable, whatever the rotors' limits
     jumps: tuple[float, ...]  # times of jumps of the course [s]; the peaks exclude them
     problems: tuple[str, ...]
     """One line per exceeded limit or bound; empty for a course that can be flown exactly."""

@@ -1,1 +1,1 @@
-"""What a person looks at: figures, plots, films, recordings and pages made from flights."""
+"""Reports for people: figures, plots, films, recordings and pages made from flights."""

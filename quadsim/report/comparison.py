@@ -1,6 +1,6 @@
 """Several runs -> the rows of one table.
 
-Plain data from the runs' summaries: the terminal, the page and the Markdown table all show these rows.
+Plain data from the runs' summaries, shown by the terminal, the page and the Markdown table.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from quadsim.flight.rundir import Run
 
 Summary = Mapping[str, Any]
-_MOST_EVENTS: Final = 12  # of a flight that are named
+_MOST_EVENTS: Final = 12  # most events of a flight that are named
 _Line = tuple[str, str, Callable[[Summary], Cell]]  # a row's label, its unit, and the cell of a summary
 
 
 def nested(data: Any, *keys: str) -> Any:
-    """A nested value, or None where a key is missing: a run that ended at once has no numbers."""
+    """Return a nested value, or None if a key is missing: a run that ended at once has no numbers."""
     for key in keys:
         data = data.get(key) if isinstance(data, Mapping) else None
     return data
@@ -43,7 +43,7 @@ def run_names(runs: Sequence[Run]) -> tuple[str, ...]:
 
 
 def distinct_courses(runs: Sequence[Run]) -> list[Run]:
-    """One run for each filtered reference: of those whose references agree as far as both flew, the longest."""
+    """Return one run per filtered reference; of runs with equal references as far as both flew, the longest."""
     chosen: list[Run] = []
     for run in sorted(runs, key=lambda run: run.log.control.t.size, reverse=True):
         course = run.log.control.reference
@@ -77,7 +77,7 @@ def comparison_rows(runs: Sequence[Run]) -> list[Row]:
 
 
 def outcome(summary: Summary) -> Cell:
-    """Completed, or aborted with its reason."""
+    """Return completed, or aborted with its reason."""
     if summary["status"] == "completed":
         return Cell(text="completed", mark=Mark.GOOD)
     return Cell(text=f"aborted: {summary.get('reason')}", mark=Mark.BAD)
@@ -95,7 +95,7 @@ def verdict(summary: Summary) -> str:
 
 
 def violated_by_fallback(summary: Summary) -> bool:
-    """Whether a completed flight held its required constraints and is violated by its permanent fallback alone."""
+    """Return whether a completed flight met its required constraints and is violated only by permanent fallback."""
     return bool(summary["controller"].get("unrecovered")) and "violated" not in _required_verdicts(summary)
 
 
@@ -104,12 +104,12 @@ def _required_verdicts(summary: Summary) -> set[str]:
 
 
 def fallback_sentence(periods: int) -> str:
-    """That a flight ended in fallback, after so many periods of it."""
+    """Say that a flight ended in fallback, after so many periods of it."""
     return f"{periods} periods in fallback, never recovered"
 
 
 def crash(summary: Summary) -> str | None:
-    """That the vehicle crashed, and the obstacles that it touched; None where it did not."""
+    """Say that the vehicle crashed, and which obstacles it touched; None if it did not."""
     if Phase.CRASHED not in summary["controller"].get("statuses", ()):
         return None
     shapes = [entry for entry in summary["constraints"] if entry.get("shape")]
@@ -119,20 +119,20 @@ def crash(summary: Summary) -> str | None:
 
 
 def failure_sentences(summary: Summary) -> list[str]:
-    """What prevented the optimum: permanent fallback, and why the first QP without an answer had none."""
+    """Return why there was no optimum: permanent fallback, and the reason for the first QP without an answer."""
     periods, diagnosis = summary["controller"].get("unrecovered"), summary.get("diagnosis")
     sentences = [fallback_sentence(periods)] if periods else []
     return sentences + ([] if diagnosis is None else [diagnosis["sentence"], *filter(None, [diagnosis["advice"]])])
 
 
 def event_sentences(events: Sequence[Summary]) -> list[str]:
-    """What happened when, the first of them where there are many."""
+    """Return the events with their times, only the first ones if there are many."""
     sentences = [f"{event['text']} at {format_number(event['time'])} s" for event in events[:_MOST_EVENTS]]
     return sentences + ([f"{len(events) - _MOST_EVENTS} more"] if len(events) > _MOST_EVENTS else [])
 
 
 def verdict_cell(summary: Summary) -> Cell:
-    """The verdict, and whether it is the one that the scenario states; a run of an older version states none."""
+    """Return the verdict, and whether the scenario expects it; runs of older versions state no expectation."""
     word, expected = verdict(summary), summary.get("expected")
     if expected is None:
         return Cell(text=word)
@@ -169,7 +169,7 @@ def _present_keys(summaries: Sequence[Summary], *path: str) -> list[str]:
 
 
 def _bounds(entry: Summary) -> str:
-    """Bounds of a constraint and the times it holds for, e.g. `-5 .. 5`, `at least -0.5` or `0 .. 1, from 59 s`."""
+    """Format the bounds of a constraint and its window, e.g. `-5 .. 5`, `at least -0.5` or `0 .. 1, from 59 s`."""
     lower, upper = entry["lower"], entry["upper"]
     bounds = f"{format_number(lower)} .. {format_number(upper)}"
     if lower is None or upper is None:
@@ -196,7 +196,7 @@ def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
 
 def _step_time_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
     measures = {"p50": "median", "p95": "95th percentile", "p99": "99th percentile", "max": "maximum"}
-    for clock, part in {"step_ms": "whole step", "solve_ms": "optimum alone, by whoever answered"}.items():
+    for clock, part in {"step_ms": "whole step", "solve_ms": "optimum alone, by any answerer"}.items():
         for measure, label in measures.items():
             values = [nested(summary, "controller", clock, measure) for summary in summaries]
             yield _best_smallest("Time", f"{part}, {label}", "ms", summaries, values)
@@ -205,7 +205,7 @@ def _step_time_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
 def _best_smallest(
     group: str, label: str, unit: str, summaries: Sequence[Summary], values: Sequence[float | None]
 ) -> Row:
-    """A row with the value nearest to zero marked, among the flights that were completed and when they differ."""
+    """Return a row with its smallest magnitude marked, among completed flights and if they differ."""
     texts = [format_number(value) for value in values]
     eligible = {
         i: abs(value)
@@ -234,7 +234,7 @@ def _constraint_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
 
 
 def _verdict(entry: Summary) -> Cell:
-    """The verdict on a constraint, the margin that decides and its tolerance.
+    """Return the verdict on a constraint, the margin that decides and its tolerance.
 
     For example `holds (margin -0.0376 deg, tolerance 0.05)`.
     """
@@ -270,14 +270,14 @@ def _violation(entry: Summary) -> Cell:
 
 
 def _lowest_speed(summary: Summary) -> Cell:
-    """The lowest rotor speed that the course requires; none where it requires a negative thrust."""
+    """Return the lowest rotor speed that the course requires; none if it requires a negative thrust."""
     if any(problem.startswith("not flyable") for problem in nested(summary, "course", "problems") or ()):
         return Cell(text="not flyable", mark=Mark.BAD)
     return _number("course", "rotor_min")(summary)
 
 
 def mismatch(summary: Summary) -> tuple[str, ...]:
-    """The numbers of the vehicle that the controller has wrong, as one text; none where it has none wrong."""
+    """Return the vehicle parameters that the controller has wrong, as one text; none if there are none."""
     actual, modelled = summary.get("actual", {}), summary["vehicle"]
     wrong = [f"{name} {modelled[name]} for {value}" for name, value in actual.items() if value != modelled[name]]
     return (", ".join(wrong),) if wrong else ()
@@ -288,7 +288,7 @@ def _text(value: Callable[[Summary], object]) -> Callable[[Summary], Cell]:
 
 
 def _number(*keys: str, unit: str = "", wrong: Mark = Mark.NONE) -> Callable[[Summary], Cell]:
-    """The number at a path, in degrees where that is its unit; marked as wrong where it is not zero."""
+    """Return the number at a path, in degrees if that is its unit; marked as wrong unless zero."""
 
     def cell(summary: Summary) -> Cell:
         value = nested(summary, *keys)
@@ -350,7 +350,7 @@ _FLIGHT: Final[tuple[_Line, ...]] = (
     ("events", "", _text(lambda summary: "; ".join(event_sentences(summary.get("events", ()))) or ABSENT)),
     ("time flown", "s", _number("duration")),
     ("controller", "", _text(lambda summary: law_name(summary["controller"].get("name", ABSENT)))),
-    ("QP solver, where a QP is left to one", "", _text(lambda summary: summary["controller"].get("solver") or ABSENT)),
+    ("QP solver", "", _text(lambda summary: summary["controller"].get("solver") or ABSENT)),
     ("horizon", "periods", _text(lambda summary: summary["controller"].get("horizon", ABSENT))),
     ("vehicle", "", _text(lambda summary: ", modelled with ".join([summary["vehicle"]["name"], *mismatch(summary)]))),
     ("mass", "kg", _text(lambda summary: format_number(summary.get("actual", summary["vehicle"])["mass"]))),
@@ -409,7 +409,7 @@ _TIMES: Final[tuple[_Line, ...]] = (
     ("simulated in", "s", _number("wall_s", "simulate")),
     ("with all files", "s", _number("wall_s", "total")),
 )
-_OWN: Final = "own"  # in place of a row's unit: the constraint's own
+_OWN: Final = "own"  # stands for the constraint's own unit
 _CONSTRAINT: Final[tuple[_Line, ...]] = (
     ("verdict", "", _verdict),
     ("bounds", _OWN, lambda entry: Cell(text=_bounds(entry))),

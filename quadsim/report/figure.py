@@ -1,8 +1,8 @@
 """A figure as plain data: panels of curves, bounds, bands and areas, and their colours.
 
-`quadsim.report.to_matplotlib` draws it for files and notebooks, `quadsim.report.to_plotly` for pages.  Colours are
-distinct for colour-blind readers as well: runs and rotors take theirs from Okabe and Ito's palette (2008), its blue
-made lighter for dark pages, and less its vermilion, which is too near the red of the bounds.
+`quadsim.report.to_matplotlib` draws it for files and notebooks, `quadsim.report.to_plotly` for pages.  Colours remain
+distinct for colour-blind readers: runs and rotors use Okabe and Ito's palette (2008), with its blue lightened for dark
+pages, and without its vermilion, which is too close to the red of the bounds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ REFERENCE: Final = "#7a7f87"
 BOUND: Final = "#dc2f38"
 OBSTACLE: Final = "#b85c48"
 LEAST_SPANS: Final = {"m": 0.01, "deg": 0.1, "m/s": 0.01, "deg/s": 0.1, "rad/s": 1.0}
-"""Span of an axis, by its unit, below which there is nothing to see but rounding."""
+"""Span of an axis, by unit, below which only rounding would be visible."""
 _HALF_TURN: Final = 180.0
 
 
@@ -34,7 +34,7 @@ def line_colour(i: int) -> str:
 
 
 def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | None:
-    """Ends of an axis for curves that stand still; None where it may fit itself to them, or has no least span.
+    """Return the axis range for constant curves; None if the axis may fit itself to them, or has no least span.
 
     Numbers that are not finite do not count.
     """
@@ -56,7 +56,7 @@ def reference_curve(log: ControlLog, name: str) -> Array:
 
 
 def bounds_of(limits: Iterable[Limit], signal: str, end: float) -> list[tuple[float, float, float]]:
-    """Each distinct bound on a signal, once, and from when to when it holds in a flight that ends at `end` [s]."""
+    """Return each distinct bound on a signal, with its start and stop in a flight that ends at `end` [s]."""
     bounds = {
         (bound, limit.start, min(limit.stop, end)): None
         for limit in limits
@@ -76,7 +76,7 @@ def break_at_wraps(t: Array, values: Array, unit: str) -> tuple[Array, Array]:
 
 
 _VISIBLE_SPEED: Final = 1e-3
-"""Difference between commanded and acting rotor speeds from which on they are two curves [rad/s]."""
+"""Difference between commanded and acting rotor speeds above which both are drawn [rad/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +90,7 @@ class EffectCurves:
 
 
 def effect_curves(log: FlightLog) -> list[EffectCurves]:
-    """External force and torque, and the wind, each where it is not zero throughout."""
+    """Return external force, torque and wind, unless zero throughout."""
     wrench = np.zeros((1, 6)) if log.plant.wrench is None else log.plant.wrench
     wind = np.zeros((1, 3)) if log.plant.wind is None else log.plant.wind
     curves = (
@@ -102,7 +102,7 @@ def effect_curves(log: FlightLog) -> list[EffectCurves]:
 
 
 def commanded_speeds(log: FlightLog) -> Array | None:
-    """(M, 4) the commands in force at the plant's instants [rad/s]; None where the rotors turn just as commanded.
+    """Return (M, 4) the commands in force at the plant's instants [rad/s]; None if the rotors always match them.
 
     They differ where rotors lag or saturate, and where commands take time to compute.
     """
@@ -123,7 +123,7 @@ class Series:
     colour: str
     style: Literal["line", "steps", "points", "bars"] = "line"  # steps are held until the next x; bars centred on x
     label: str = ""  # entry in the legend; series of the same label share one
-    group: str = ""  # what a toggle of the page switches, e.g. `run0`
+    group: str = ""  # toggled by the page, e.g. `run0`
     dashed: bool = False
     width: float = 1.3  # of a line, or diameter of a marker [pt]
     marker: str = "circle"  # by plotly's name
@@ -144,7 +144,7 @@ class Bound:
 
 @dataclass(frozen=True, kw_only=True)
 class Band:
-    """What lies between `low` and `high`, (K,) over x (K,)."""
+    """The area between `low` and `high`, (K,) over x (K,)."""
 
     x: Array
     low: Array
@@ -166,7 +166,7 @@ class Area:
 
 @dataclass(frozen=True, kw_only=True)
 class Panel:
-    """Axes with what is drawn in them.
+    """Axes and their content.
 
     An axis of a known unit has a least span, below which there is only rounding.
     """
@@ -183,19 +183,19 @@ class Panel:
     y_range: tuple[float, float] | None = None  # ends of the axis; None fits it to what is drawn
     x_names: tuple[str, ...] = ()  # names of 0, 1, ... on the axis, in place of numbers
     equal: bool = False  # whether both axes have one scale
-    whole: bool = False  # whether y counts things
+    whole: bool = False  # whether y is a count
     legend: bool = False  # whether the labels are explained in the panel, not in the legend of all panels
     height: float = 1.0  # of its row, relative to others
 
     @property
     def heading(self) -> str:
         """Title and unit."""
-        unit = self.unit.replace(" ", "\u00a0")  # no line ends within it
+        unit = self.unit.replace(" ", "\u00a0")  # no line break within it
         return f"{self.title} [{unit}]" if unit else self.title
 
     @property
     def least_range(self) -> tuple[float, float] | None:
-        """Ends of y that curves and bounds which all stand still need; None where the axis fits itself."""
+        """The range of y for constant curves and bounds; None if the axis fits itself."""
         curves = [series.y for series in self.series] + [np.array([bound.value]) for bound in self.bounds]
         return least_range([*curves, *(edge for band in self.bands for edge in (band.low, band.high))], self.unit)
 
@@ -232,8 +232,8 @@ class Scene:
     solids: tuple[tuple[Array, str], ...] = ()  # points (K, 3) [m] whose convex hull is a solid, and its name
 
 
-_ROUND: float = 1.5  # how far beyond course and path regions without an end are drawn [m]
-_LONG: float = 40.0  # how far a path is followed from the middle of the course [m]: a lost vehicle leaves the picture
+_ROUND: float = 1.5  # distance beyond course and path up to which unbounded regions are drawn [m]
+_LONG: float = 40.0  # distance from the middle of the course up to which a path is drawn [m]; lost vehicles go farther
 
 
 def obstacles_in(limits: Iterable[Limit]) -> list[AnyObstacle]:

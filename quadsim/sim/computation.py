@@ -21,7 +21,7 @@ class Stall:
     duration: Annotated[Positive, doc("[s] length of the stall")]
 
     def text(self) -> str:
-        """What happens, in words."""
+        """Describe the event."""
         return "the computer stalls"
 
 

@@ -137,9 +137,9 @@ def poses_of(points: Sequence[Point], initial: Array) -> Array:
 def require_one(**fields: object) -> None:
     """Refuse two fields of which not exactly one is given."""
     first, second = fields
-    given = {name: value for name, value in fields.items() if value is not None}
-    if len(given) != 1:
-        raise ParameterError("", first, given, f"given, or {second}, but not both")
+    present = {name: value for name, value in fields.items() if value is not None}
+    if len(present) != 1:
+        raise ParameterError("", first, present, f"given, or {second}, but not both")
 
 
 def require_apart(points: Sequence[Point], advice: str) -> None:

@@ -108,9 +108,12 @@ def read_table(path: FilePath) -> Table:
             raise FileError(path, "cannot be read (it is not a file)")
         if (size := path.stat().st_size) > LARGEST_FILE:
             raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
-        return parse_table(path, path.read_bytes())
-    except OSError as error:
+        content = path.read_bytes()
+    except FileError:
+        raise
+    except (OSError, ValueError) as error:  # the latter for a null byte
         raise FileError(path, f"cannot be read ({error})") from error
+    return parse_table(path, content)
 
 
 def parse_table(path: FilePath, content: bytes) -> Table:

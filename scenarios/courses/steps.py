@@ -80,7 +80,7 @@ def switches(windows: Sequence[Window], elsewhere: float, *, initial: float) -> 
     Of windows that overlap, the last holds; the first step is counted from `initial`, where the output is at time 0.
     """
     instants = sorted({max(0.0, instant) for window in windows for instant in (window.start, window.stop)} | {0.0})
-    held = [[window.value for window in windows if window.start <= t < window.stop] for t in instants]
-    values = [initial, *(values[-1] if values else elsewhere for values in held)]
+    values_in_force = [[window.value for window in windows if window.start <= t < window.stop] for t in instants]
+    values = [initial, *(values[-1] if values else elsewhere for values in values_in_force)]
     steps = zip(instants, itertools.pairwise(values), strict=True)
     return [(time, before, after) for time, (before, after) in steps if before != after]

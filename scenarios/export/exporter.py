@@ -90,16 +90,16 @@ def reach(problem: Problem, room: int, changes: int) -> Reach:
     whole, limited = _Search(shared, shared.struct.room, shared.struct.changes), _Search(shared, room, changes)
     rest, speeds = np.zeros(problem.model.n), np.array(problem.model.u_bar)
     rest[N_STATES:] = (shared.tables.modes @ speeds)[: rest.size - N_STATES]
-    wanted, moving = np.zeros((problem.horizon, len(problem.objective.C_r))), [*POSITION, *VELOCITY]
+    target, moving = np.zeros((problem.horizon, len(problem.objective.C_r))), [*POSITION, *VELOCITY]
     reached = Reach(distance=0.0, drawn=0, feasible=0)
     for distance in DISTANCES:
         feasible = lost = 0
         for offset in rng.uniform(-distance, distance, (DRAWS, len(moving))):
             state = rest.copy()
             state[moving] += offset
-            if whole.solves(state, wanted, rest, speeds, speeds):
+            if whole.solves(state, target, rest, speeds, speeds):
                 feasible += 1
-                lost += not limited.solves(state, wanted, rest, speeds, speeds)
+                lost += not limited.solves(state, target, rest, speeds, speeds)
         if lost:
             return replace(reached, beyond=distance, lost=lost)
         reached = Reach(distance=distance, drawn=reached.drawn + DRAWS, feasible=reached.feasible + feasible)

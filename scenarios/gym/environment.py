@@ -215,7 +215,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             reward,
             terminated,
             truncated,
-            self._info(*_margins(self.limits, period, begin=1)),
+            self._info(*_margins(self.limits, period, first=1)),
         )
 
     def controller_action(self) -> Action:
@@ -334,12 +334,12 @@ class Agent:
         raise NotImplementedError
 
 
-def _margins(limits: Sequence[Limit], log: FlightLog, begin: int = 0) -> tuple[Array, Array]:
+def _margins(limits: Sequence[Limit], log: FlightLog, first: int = 0) -> tuple[Array, Array]:
     """(m,) smallest margins of a log, from this row of the plant on, and at its end; inf where there is none."""
     smallest = np.full((2, len(limits)), np.inf)
     for i, limit in enumerate(limits):
         t, values = limit.source.finest(log)
-        margins = np.where(limit.holds_at(t), limit.margin(values), np.inf)[begin * (limit.source.plant is not None) :]
+        margins = np.where(limit.holds_at(t), limit.margin(values), np.inf)[first * (limit.source.plant is not None) :]
         if margins.size:
             smallest[:, i] = margins.min(), margins[-1]
     return smallest[0], smallest[1]
@@ -375,9 +375,11 @@ def register_library() -> None:
         gymnasium.registry.setdefault(environment_id(name), _specification(scenario, scenario=name))
 
 
-def _specification(flown: Scenario, **kwargs: Any) -> EnvSpec:
+def _specification(flown_scenario: Scenario, **kwargs: Any) -> EnvSpec:
     entry_point = f"{__name__}:{QuadrotorEnv.__name__}"
-    return EnvSpec(environment_id(flown.name), entry_point, max_episode_steps=flown.periods, kwargs=kwargs)
+    return EnvSpec(
+        environment_id(flown_scenario.name), entry_point, max_episode_steps=flown_scenario.periods, kwargs=kwargs
+    )
 
 
 def make_env(scenario: Scenario | str | Path, **options: Any) -> gymnasium.Env[Any, Any]:

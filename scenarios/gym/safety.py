@@ -87,13 +87,13 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         """
         if self._vehicle is None:
             raise ResetNeeded("call env.reset() first")
-        wanted = self._base.actions.command(action, None, 1).speeds
-        self._filter.requested = wanted
+        requested = self._base.actions.command(action, None, 1).speeds
+        self._filter.requested = requested
         seen, horizon = self._base.started.observation, self._law.horizon
         preview = seen.preview[:horizon]
         preview = np.concatenate([preview, np.repeat(preview[-1:], horizon - len(preview), axis=0)])
         command = self._law.step(seen.moment, seen.state, preview)
-        correction = float(np.abs(command.speeds - wanted).max())
+        correction = float(np.abs(command.speeds - requested).max())
         intervened = command.status != UNCONSTRAINED
         self.steps += 1
         self.interventions += intervened

@@ -57,8 +57,8 @@ class Actions:
             self.space = Box(low, high, dtype=np.float64)
             return
         if not low.max() < hover < high.min():
-            given = [float(low[0]), float(high[0])]
-            raise ParameterError(owner, "speed", given, f"below and above the hover speed, {hover:.4g} rad/s")
+            hover_bounds = [float(low[0]), float(high[0])]
+            raise ParameterError(owner, "speed", hover_bounds, f"below and above the hover speed, {hover:.4g} rad/s")
         self.space = Box(-1.0, 1.0, (N_ROTORS,), dtype=np.float32)
         self._hover, self._down, self._up = hover, hover - low, high - hover
         if kind == "rates":

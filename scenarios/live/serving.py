@@ -70,14 +70,14 @@ class Pace:
 
     def drive(self, session: Session, view: Page, until: Callable[[Frame], bool] = lambda frame: False) -> None:
         """Fly until `stop`, or until a frame is the last one; a flight that has ended waits for a reset."""
-        due, flown = self._now(), deque[float](maxlen=round(2.0 / session.period) + 1)  # two seconds
+        due, recent = self._now(), deque[float](maxlen=round(2.0 / session.period) + 1)  # two seconds
         while not self._stop.is_set():
             while self._orders:
                 self._orders.popleft()(session)
             if session.reason is not None or (self.paused and not self._single.acquire(blocking=False)):
                 self._stop.wait(_IDLE)
                 due = self._now()
-                flown.clear()
+                recent.clear()
                 continue
             try:
                 frame = session.advance()
@@ -85,9 +85,9 @@ class Pace:
                 session.reason = str(error)
                 view.ended(session.reason)
                 continue
-            flown.append(self._now())
-            span = flown[-1] - flown[0]
-            view.show(frame, (len(flown) - 1) * session.period / span if span > 0.0 else self.speed)
+            recent.append(self._now())
+            span = recent[-1] - recent[0]
+            view.show(frame, (len(recent) - 1) * session.period / span if span > 0.0 else self.speed)
             for share in range(1, POSES + 1):
                 view.pose(frame, share / POSES)
                 due += session.period / self.speed / POSES
@@ -210,11 +210,11 @@ def fly_live(
                     console.say(f"refused: {reason}")
         except KeyboardInterrupt:  # what was flown is saved
             print(file=sys.stderr)
-        text, flown = "", session.k * session.period
+        text, seconds = "", session.k * session.period
         if session.k:
-            text = f"{save(session)}: {flown:.2f} s, {session.flight().outcome}\n"
+            text = f"{save(session)}: {seconds:.2f} s, {session.flight().outcome}\n"
         status = EXIT_DONE if session.reason is None else EXIT_FAILED
-        return Document(text, {"directory": str(directory), "duration": flown, "reason": session.reason}, status)
+        return Document(text, {"directory": str(directory), "duration": seconds, "reason": session.reason}, status)
 
 
 def _require_server(host: str, port: int) -> None:

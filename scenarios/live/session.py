@@ -124,7 +124,7 @@ class Session:
         scenarios = [self.scenario]
         if self._against is not None:
             scenarios.append(with_bounds_stated(Assembly(self.scenario)).altered(controller=self._against))
-        self.flights = tuple(Rollout(flown, live=True) for flown in scenarios)
+        self.flights = tuple(Rollout(scenarios_flown, live=True) for scenarios_flown in scenarios)
         self._held = _Hand()
         self.reason: str | None = None
 

@@ -39,8 +39,8 @@ def fields_of(table: type[Any]) -> dict[str, FieldInfo]:
 def _declared(table: Any) -> dict[str, FieldInfo]:
     """The fields of a dataclass."""
     hints = get_type_hints(table, include_extras=True)
-    found = {}
+    declared = {}
     for field in sorted(dataclasses.fields(table), key=lambda field: _FIRST.get(field.name, len(_FIRST))):
-        found[field.name] = info = FieldInfo.from_annotated_attribute(hints[field.name], field)
+        declared[field.name] = info = FieldInfo.from_annotated_attribute(hints[field.name], field)
         info.description = next((note.documentation for note in info.metadata if isinstance(note, DocInfo)), None)
-    return found
+    return declared

@@ -23,10 +23,10 @@ from scenarios.schema.writing import plain
 
 def _law(controller: object) -> str | None:
     """Which of the laws below a table is of; anything else is left for the message."""
-    given = controller.get("type") if isinstance(controller, Mapping) else getattr(controller, "type", None)
-    if not isinstance(given, str):
+    law_name = controller.get("type") if isinstance(controller, Mapping) else getattr(controller, "type", None)
+    if not isinstance(law_name, str):
         return None
-    return given if given in LAWS or not is_plugin(given) else FORM
+    return law_name if law_name in LAWS or not is_plugin(law_name) else FORM
 
 
 class _OrName:

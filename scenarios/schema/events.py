@@ -45,9 +45,9 @@ class SetpointEvent:
     @property
     def values(self) -> dict[str, float]:
         """What is given, by the names of the axes; [m] and [rad]."""
-        given = {name: getattr(self, name) for name in REFERENCE_NAMES}
+        values = {name: getattr(self, name) for name in REFERENCE_NAMES}
         scales = {"yaw": math.radians(1.0)}
-        return {name: scales.get(name, 1.0) * value for name, value in given.items() if value is not None}
+        return {name: scales.get(name, 1.0) * value for name, value in values.items() if value is not None}
 
     def text(self) -> str:
         """What happens, in words."""

@@ -40,12 +40,12 @@ class _SchemaOfToml(GenerateJsonSchema):
 
     def dataclass_schema(self, schema: core_schema.DataclassSchema) -> dict[str, Any]:
         """The same with a settings dataclass's description of its fields; see `quadsim.fields`."""
-        found, table = super().dataclass_schema(schema), schema["cls"]
-        found["description"] = f"{headline(table)}."
+        json_schema, table = super().dataclass_schema(schema), schema["cls"]
+        json_schema["description"] = f"{headline(table)}."
         for name, field in fields_of(table).items():
             if field.description:
-                found["properties"][name]["description"] = field.description
-        return found
+                json_schema["properties"][name]["description"] = field.description
+        return json_schema
 
     def field_is_required(self, field: Any, total: bool) -> bool:
         """Whether a table has to state a field: its type too, although Python's default is its only value."""

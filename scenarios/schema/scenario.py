@@ -275,9 +275,9 @@ class Scenario:
                 steps_per_period(value, unit)
             except ParameterError as error:
                 what = "the control period" if name == "duration" else "the physics step plant.timestep"
-                given = self.log_rate if name == "log_rate" else value
+                rate = self.log_rate if name == "log_rate" else value
                 period = "have a period that is" if name == "log_rate" else "be"
-                raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {given}") from error
+                raise ValueError(f"{name} must {period} a whole multiple of {what} = {unit} s; got {rate}") from error
         self._check_events()
         specs = [self.controller, *(spec for _, spec in self.controller_changes)]
         for spec in specs:
@@ -344,19 +344,19 @@ class Scenario:
     @property
     def controller_changes(self) -> list[tuple[float, AnyController]]:
         """Each controller that takes over from the one before it, and when [s], in order of time."""
-        found: list[tuple[float, AnyController]] = []
+        changes: list[tuple[float, AnyController]] = []
         events = (event for event in self.events if isinstance(event, ControllerEvent))
         for event in sorted(events, key=lambda event: event.at):
-            found.append((event.at, changed(found[-1][1] if found else self.controller, event.fields)))
-        return found
+            changes.append((event.at, changed(changes[-1][1] if changes else self.controller, event.fields)))
+        return changes
 
     def controller_at(self, time: float) -> AnyController:
         """The controller that flies at a time [s]."""
-        found = self.controller
+        controller = self.controller
         for at, spec in self.controller_changes:
             if at <= time + 1e-9:
-                found = spec
-        return found
+                controller = spec
+        return controller
 
     @property
     def regions(self) -> tuple[Corridor | Fence, ...]:

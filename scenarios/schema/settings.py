@@ -163,17 +163,17 @@ def get_field(data: dict[str, Any], path: str) -> Any:
 
 def _holder(data: dict[str, Any], through: list[str], *, source: str, given: str) -> dict[str, Any] | list[Any]:
     """The table or list at the end of a path."""
-    held: Any = data
+    holder: Any = data
     for depth, key in enumerate(through):
-        if isinstance(held, list):
-            held = held[_index(held, ".".join(through[:depth]), key)]
+        if isinstance(holder, list):
+            holder = holder[_index(holder, ".".join(through[:depth]), key)]
         else:
-            if key == "controller" and isinstance(held.get(key), str):  # its name alone
-                held[key] = {"type": held[key]}
-            held = held.setdefault(key, {})
-        if not isinstance(held, dict | list) or held == []:
+            if key == "controller" and isinstance(holder.get(key), str):  # its name alone
+                holder[key] = {"type": holder[key]}
+            holder = holder.setdefault(key, {})
+        if not isinstance(holder, dict | list) or holder == []:
             raise ParameterError("", source, given, f"a path to a field; {key} has none")
-    return held
+    return holder
 
 
 def _index(entries: list[Any], where: str, key: str) -> int:

@@ -265,14 +265,14 @@ def tables(summary: Summary) -> tuple[Grid, Grid]:
         for each in summary["search"]
     ]
     head = ("objective", "start, search", "best, search", "promised", "start, fresh", "best, fresh", "confirmed")
-    found = Grid(
+    grid = Grid(
         key="objectives",
         title="The draws that chose it, and fresh ones",
         head=(*head, "mean difference, 95 %"),
         lines=tuple(objectives),
         note=f"Search: {summary['search_flights']} flights, each on the first of the same {summary['draws']} draws.",
     )
-    return found, Grid(key="values", title="Values", head=("name", "fields", "start", "best"), lines=tuple(values))
+    return grid, Grid(key="values", title="Values", head=("name", "fields", "start", "best"), lines=tuple(values))
 
 
 def write_page(directory: Path, *, study: Study, summary: Summary) -> None:

@@ -87,7 +87,7 @@ def test_both_precisions_have_the_same_numbers() -> None:
     assert [re.sub(r"(\d)F\b", r"\1", word) for word in numbers[1]] == numbers[0]
 
 
-def test_room_is_what_was_asked_for_and_its_reach_is_stated(tmp_path: Path) -> None:
+def test_capacity_is_as_requested_and_its_reach_is_stated(tmp_path: Path) -> None:
     """More rows take more memory and reach farther."""
     facts = []
     for rows in (40, 128):
@@ -131,7 +131,7 @@ def test_the_licence_is_the_project_s() -> None:
         ("pillar", NOT_EXPORTED["avoidance"]),
     ],
 )
-def test_what_cannot_be_exported_is_refused_with_its_reason(
+def test_unexportable_controllers_are_refused_with_a_reason(
     name: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["export", name, "--out", str(tmp_path / "c")]) == 2
@@ -156,13 +156,13 @@ def test_a_problem_with_too_many_numbers_is_refused() -> None:
 @pytest.mark.parametrize(
     ("value", "text"), [(1.5, "1.5"), (-0.1, "-0.1"), (1e-39, "0.0"), (-5e-324, "0.0"), (1.2e-38, "1.2e-38")]
 )
-def test_numbers_are_exact_and_none_is_denormal(value: float, text: str) -> None:
+def test_numbers_are_exact_and_never_denormal(value: float, text: str) -> None:
     assert CText("double").number(value) == text
     assert CText("float").number(value) == f"{text}F"
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_numbers_that_are_none_are_refused(value: float) -> None:
+def test_nan_and_infinity_are_refused(value: float) -> None:
     with pytest.raises(ValueError, match="cannot be written in C"):
         CText("double").number(value)
 
@@ -188,32 +188,32 @@ def optimum(axis: AxisTables, start: Array, reference: Array) -> Array:
 def test_dynamic_programming_finds_the_free_optimum(settings: list[str]) -> None:
     scenario = load_scenario("paper-constrained", settings)
     problem = Assembly(scenario).problem()
-    found, rng = tables(problem), np.random.default_rng(0)
+    result, rng = tables(problem), np.random.default_rng(0)
     state, reference = rng.normal(size=12), rng.normal(size=(problem.horizon, 4))
     query = Query(1e-6 * state, problem.objective.desired(1e-6 * reference), problem.model.u_bar)
     answer = Core(problem).solve(query)
     assert answer.method is Method.FREE
-    wanted = found.T_inverse @ (answer.plan[0] - problem.model.u_bar) / 1e-6
-    for axis in found.axes:
+    desired = result.T_inverse @ (answer.plan[0] - problem.model.u_bar) / 1e-6
+    for axis in result.axes:
         w = optimum(axis, state[axis.states], reference)
-        np.testing.assert_allclose(w[0], wanted[axis.first : axis.first + axis.inputs], rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(w[0], desired[axis.first : axis.first + axis.inputs], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["paper-constrained", "robust", "polytopes"])
 def test_responses_are_those_of_the_condensed_problem(name: str) -> None:
     scenario = load_scenario(name, ["controller.horizon=8"])
     problem = exported_law(scenario).problem
-    found, form = tables(problem), Condensed(problem)
-    N, m = problem.horizon, len(found.rows)
+    result, form = tables(problem), Condensed(problem)
+    N, m = problem.horizon, len(result.rows)
     inputs = N * problem.model.nu
     rows = form._values.of_inputs  # of the general rows; those of single inputs are a box
     H_inverse = np.linalg.inv(np.asarray(form.cost.H))
     general = {key: i for i, key in enumerate(zip(*_keys(form._rows), strict=True))}
-    for r, row in enumerate(found.rows):
+    for r, row in enumerate(result.rows):
         if row.axis >= 0 and not row.terms:
             G = rows[:, general[_key(problem.rows.C[r], problem.rows.D[r], problem.rows.E[r])]].reshape(N, inputs)
             size = np.sqrt(np.einsum("ij,jk,ik->i", G, H_inverse, G))
-            np.testing.assert_allclose(1.0 / found.scale[:, r], size, rtol=1e-6)
+            np.testing.assert_allclose(1.0 / result.scale[:, r], size, rtol=1e-6)
     assert m == problem.rows.l1.size
 
 
@@ -229,10 +229,10 @@ def test_inputs_fall_into_axes_without_loss() -> None:
     """Also where some inputs move nothing that costs."""
     scenario = load_scenario("paper-constrained")
     law = exported_law(scenario.replace({"controller.output_weights": {"x": 10.0, "y": 10.0, "z": 100.0}}))
-    found = tables(law.problem)
-    H = found.T.T @ law.problem.objective.Q_u @ found.T
+    result = tables(law.problem)
+    H = result.T.T @ law.problem.objective.Q_u @ result.T
     np.testing.assert_allclose(H, scipy.linalg.block_diag(*np.diag(H)), atol=1e-12)
-    np.testing.assert_allclose(found.T @ found.T_inverse, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(result.T @ result.T_inverse, np.eye(4), atol=1e-12)
 
 
 def test_recorded_windows_are_of_one_path() -> None:

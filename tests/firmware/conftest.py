@@ -49,8 +49,8 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Export:
 
     @functools.cache
     def write(target: str, precision: Precision, *settings: str, scenario: str = "paper-constrained") -> Path:
-        found = load_scenario(scenario, list(settings))
-        return export(found, tmp_path_factory.mktemp("export") / "c", precision=precision, target=target)
+        result = load_scenario(scenario, list(settings))
+        return export(result, tmp_path_factory.mktemp("export") / "c", precision=precision, target=target)
 
     return write
 
@@ -87,9 +87,9 @@ def measured(record_property: Callable[[str, object], None]) -> Measured:
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Save what was measured, once every board was."""
     reports = terminalreporter.getreports("passed")
-    found = [value for report in reports for name, value in report.user_properties if name == "measured"]
+    result = [value for report in reports for name, value in report.user_properties if name == "measured"]
     boards: dict[tuple[str, str], dict[str, Any]] = {}
-    for numbers in found:
+    for numbers in result:
         boards.setdefault((numbers["target"], numbers["precision"]), {}).update(numbers)
     if boards and all({"flash", "p50"} <= numbers.keys() for numbers in boards.values()):
         MEASURED.parent.mkdir(parents=True, exist_ok=True)

@@ -55,25 +55,25 @@ def replies(name: str, precision: Precision) -> list[Reply]:
 @pytest.mark.parametrize("precision", TOLERANCE)
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_all_recorded_periods_have_the_same_status_and_the_exact_command(name: str, precision: Precision) -> None:
-    wanted, found = recording(name), replies(name, precision)
-    status = np.array([min(reply.status, REFUSED) for reply in found])
-    np.testing.assert_array_equal(status, wanted.status)
-    optimal = wanted.status < REFUSED
-    commands = np.array([reply.command for reply in found])
-    assert np.abs(commands - wanted.command)[optimal].max() <= TOLERANCE[precision]
+    desired, result = recording(name), replies(name, precision)
+    status = np.array([min(reply.status, REFUSED) for reply in result])
+    np.testing.assert_array_equal(status, desired.status)
+    optimal = desired.status < REFUSED
+    commands = np.array([reply.command for reply in result])
+    assert np.abs(commands - desired.command)[optimal].max() <= TOLERANCE[precision]
 
 
 @pytest.mark.parametrize("precision", TOLERANCE)
 @pytest.mark.parametrize("name", OTHERS)
 def test_other_flights_too(name: str, precision: Precision) -> None:
     """In float rounding may make a bound active, which changes the status; the rows of `polytopes` are hard on it."""
-    wanted, found = recording(name), replies(name, precision)
-    status, optimal = np.array([min(reply.status, REFUSED) for reply in found]), wanted.status < REFUSED
+    desired, result = recording(name), replies(name, precision)
+    status, optimal = np.array([min(reply.status, REFUSED) for reply in result]), desired.status < REFUSED
     np.testing.assert_array_equal(status < REFUSED, optimal)
     if precision == "double":
-        np.testing.assert_array_equal(status, wanted.status)
+        np.testing.assert_array_equal(status, desired.status)
     allowed = 6e-2 if (name, precision) == ("polytopes", "float") else TOLERANCE[precision]
-    assert np.abs(np.array([reply.command for reply in found]) - wanted.command)[optimal].max() <= allowed
+    assert np.abs(np.array([reply.command for reply in result]) - desired.command)[optimal].max() <= allowed
 
 
 def test_recorded_flights_have_every_way() -> None:
@@ -102,12 +102,12 @@ def drawn(name: str = "paper-constrained") -> list[tuple[Array, Array, Array]]:
     rng = np.random.default_rng(3)
     flight, N = recording(name), load_scenario(name).controller.horizon
     spread = 0.75 * np.array([0.3, 0.5, 0.3, 0.5, 0.3, 0.5, 0.02, 0.15, 0.02, 0.15, 0.2, 0.3])
-    found = []
+    result = []
     for k in rng.integers(0, len(flight.state), 1000):
         state = flight.state[k] + spread * rng.normal(size=12)
         acting = np.clip(flight.acting[k] + 10.0 * rng.normal(size=4), 0.0, 250.0)
-        found.append((state, flight.path[k : k + N], acting))
-    return found
+        result.append((state, flight.path[k : k + N], acting))
+    return result
 
 
 PRECISIONS: tuple[Precision, ...] = ("double", "float")

@@ -49,7 +49,7 @@ def test_arbitrary_bytes_lead_to_commands_within_bounds(name: str, exported: Exp
     assert int(steps) > 100
 
 
-def test_a_command_out_of_bounds_is_found(exported: Export, run: Run, tmp_path: Path) -> None:
+def test_a_command_out_of_bounds_is_detected(exported: Export, run: Run, tmp_path: Path) -> None:
     """The target can fail: with a controller that does not clip, it does at once."""
     directory = exported("posix", "double", "controller.horizon=10", "duration=5")
     text = (directory / "quadsim_mpc.c").read_text()

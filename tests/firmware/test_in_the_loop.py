@@ -33,10 +33,10 @@ def test_a_flight_by_the_target_is_the_flight_by_python(name: str) -> None:
         pytest.skip(f"{compiler} is not installed: make firmware")
     short = load_scenario(scenario, ["duration=6.0"])
     exact = short if scenario == "paper-unconstrained" else short.replace({"controller.solver": "core"})
-    found, wanted = fly_exported(short, target=target, precision=precision, progress=False), Rollout(exact).fly()
-    assert found.log.control.status == wanted.log.control.status
-    assert np.abs(found.command - wanted.command).max() <= apart
-    assert [finding.satisfied for finding in found.findings] == [finding.satisfied for finding in wanted.findings]
+    result, desired = fly_exported(short, target=target, precision=precision, progress=False), Rollout(exact).fly()
+    assert result.log.control.status == desired.log.control.status
+    assert np.abs(result.command - desired.command).max() <= apart
+    assert [finding.satisfied for finding in result.findings] == [finding.satisfied for finding in desired.findings]
 
 
 def test_the_command_flies_and_writes_a_run(
@@ -57,7 +57,7 @@ def test_a_program_that_ends_ends_the_flight(tmp_path: Path) -> None:
             law.step(0.5, np.zeros(12), np.zeros((2, 4)), np.zeros(4))
 
 
-def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_tools_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     with pytest.raises(MissingProgramError, match=r"needs 'make': apt-get install .* qemu-system-arm"):
         require_programs(TARGETS["cortex-m7"], "to fly an exported controller")

@@ -36,9 +36,9 @@ def recorded() -> Recording:
 @pytest.fixture
 def terminal(exported: Export, run: Run) -> Iterator[Terminal]:
     run("make", "--version"), run("cc", "--version")
-    found = Terminal(build(exported("posix", "double", SHORT), "serial.elf"))
-    yield found
-    found.close()
+    result = Terminal(build(exported("posix", "double", SHORT), "serial.elf"))
+    yield result
+    result.close()
 
 
 class Autopilot:
@@ -98,7 +98,7 @@ def test_a_doubled_question_is_solved_once_and_answered_twice(terminal: Terminal
         assert np.abs(first.command - recorded.command[k]).max() <= 1e-8  # a second step would have moved the window on
 
 
-def test_corrupt_and_cut_frames_are_dropped_and_the_next_is_found(terminal: Terminal, recorded: Recording) -> None:
+def test_corrupt_and_truncated_frames_are_dropped(terminal: Terminal, recorded: Recording) -> None:
     """Bits turned, ends missing, noise between frames, and noise that begins as a frame does."""
     pilot, draw = Autopilot(terminal, recorded), random.Random(1)
     pilot.start()
@@ -145,13 +145,13 @@ def test_without_a_fresh_state_the_last_command_is_repeated(terminal: Terminal, 
     assert terminal.receive(1, 0.4) == b""  # not before the first
     pilot = Autopilot(terminal, recorded)
     pilot.start()
-    wanted = pilot.send(pilot.period(0))
+    desired = pilot.send(pilot.period(0))
     heard, started = [pilot.hear()], clock.monotonic()
     while len(heard) < 5:
         heard.append(pilot.hear())
     assert 0.35 <= clock.monotonic() - started <= 3.0  # 0.4 s, and a busy machine
-    assert {(reply.number, reply.status) for reply in heard} == {(wanted.number, BEFORE)}
-    assert all(np.array_equal(reply.command, wanted.command) for reply in heard)
+    assert {(reply.number, reply.status) for reply in heard} == {(desired.number, BEFORE)}
+    assert all(np.array_equal(reply.command, desired.command) for reply in heard)
     assert pilot.send(pilot.period(1)).status == recorded.status[1]
 
 

@@ -105,7 +105,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_planted_is_found(fault: str, exported: Export, run: Run, tmp_path: Path) -> None:
+def test_planted_faults_are_detected(fault: str, exported: Export, run: Run, tmp_path: Path) -> None:
     """Each trap that exported C could fall into: recursion, allocation, doubles, numbers too small and others."""
     tool, body, finding = FAULTS[fault]
     source, header = tmp_path / "planted.c", exported("cortex-m4f", "float")

@@ -55,10 +55,10 @@ def test_a_board_starts_counts_and_stops(board: str, exported: Export, run: Run,
 @pytest.mark.parametrize("other", OTHERS)
 def test_every_target_answers_the_same_bits(other: str, precision: str, answers: Answers) -> None:
     target, *make = OTHERS[other]
-    host, found = answers("posix", precision), answers(target, precision, *make)
+    host, result = answers("posix", precision), answers(target, precision, *make)
     assert len(host) == 1200
     assert {int(answer[1], 16) for answer in host} == {0, 1, 2}  # every way to an optimum
-    assert bits(found) == bits(host)
+    assert bits(result) == bits(host)
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_the_robust_controller_too(other: str, precision: str, answers: Answers)
     assert bits(answers(target, precision, *make, scenario="robust")) == bits(host)
 
 
-def test_contraction_is_what_would_change_bits(answers: Answers) -> None:
+def test_contraction_would_change_bits(answers: Answers) -> None:
     """The flag is there for a reason: with it on, an aarch64 fuses products and sums."""
     assert bits(answers("posix", "double", *AARCH64, CONTRACTED)) != bits(answers("posix", "double"))
 
@@ -83,12 +83,12 @@ def test_contraction_is_what_would_change_bits(answers: Answers) -> None:
 def test_a_step_takes_few_instructions(board: str, precision: str, answers: Answers, measured: Measured) -> None:
     """Instructions, not cycles: the emulator has neither caches nor wait states."""
     steps = np.array([int(answer[7], 16) * TICK for answer in answers(board, precision)])
-    found = {"p50": np.median(steps), "p99": np.percentile(steps, 99), "warm": steps[1:].max(), "first": steps[0]}
-    measured(board, precision, **found)
-    assert found["p50"] <= MEDIAN
-    assert found["p99"] <= RARE
-    assert found["warm"] <= WARM
-    assert found["first"] <= COLD
+    result = {"p50": np.median(steps), "p99": np.percentile(steps, 99), "warm": steps[1:].max(), "first": steps[0]}
+    measured(board, precision, **result)
+    assert result["p50"] <= MEDIAN
+    assert result["p99"] <= RARE
+    assert result["warm"] <= WARM
+    assert result["first"] <= COLD
 
 
 @pytest.mark.parametrize(

@@ -17,12 +17,12 @@ QUADROTOR = {("x", "vx", "pitch", "pitch_rate"), ("y", "vy", "roll", "roll_rate"
 
 def names(problem: Problem) -> set[tuple[str, ...]]:
     """The states of the axes that have bounds; of none, where there is one axis only."""
-    found = axes(problem)
-    if len(found) == 1:
-        np.testing.assert_array_equal(found[0].T, np.eye(problem.model.nu))
-        np.testing.assert_array_equal(found[0].states, np.arange(problem.model.n))
+    result = axes(problem)
+    if len(result) == 1:
+        np.testing.assert_array_equal(result[0].T, np.eye(problem.model.nu))
+        np.testing.assert_array_equal(result[0].states, np.arange(problem.model.n))
         return set()
-    return {tuple(STATE_NAMES[i] for i in axis.states) for axis in found if axis.outputs.size}
+    return {tuple(STATE_NAMES[i] for i in axis.states) for axis in result if axis.outputs.size}
 
 
 def inverse(problem: Problem, axis: Axis) -> Array:
@@ -36,11 +36,11 @@ def test_a_hovering_quadrotor_falls_into_four_axes_and_tilts_in_two(vehicle: str
     """Whether its arms point along its axes or between them."""
     problem = paper_problem("paper-constrained", f"vehicle.file={vehicle}")
     assert names(problem) == QUADROTOR
-    found = axes(problem)
-    assert sorted(np.concatenate([axis.states for axis in found])) == list(range(12))
-    assert [axis.T.shape for axis in found] == [(4, 1)] * 4
-    every = np.hstack([axis.T for axis in found])
-    np.testing.assert_allclose(np.vstack([inverse(problem, axis) for axis in found]) @ every, np.eye(4), atol=1e-12)
+    result = axes(problem)
+    assert sorted(np.concatenate([axis.states for axis in result])) == list(range(12))
+    assert [axis.T.shape for axis in result] == [(4, 1)] * 4
+    every = np.hstack([axis.T for axis in result])
+    np.testing.assert_allclose(np.vstack([inverse(problem, axis) for axis in result]) @ every, np.eye(4), atol=1e-12)
 
 
 def test_every_axis_with_a_bound_counts() -> None:
@@ -118,7 +118,7 @@ def test_an_unbounded_axis_without_a_set_point_is_left_out() -> None:
     assert len(axes(problem)) == 3
 
 
-def test_a_row_of_nothing_leaves_one_piece() -> None:
+def test_an_empty_row_prevents_separation() -> None:
     """By a weight on it with another row, its set-point would count."""
     problem = paper_problem()
     C_r = problem.objective.C_r.copy()
@@ -141,10 +141,10 @@ def test_costs_and_outputs_fall_apart() -> None:
     rng = np.random.default_rng(3)
     problem = random_axes(rng, horizon=5, room=1.0)
     assert problem.bounds is not None
-    found = axes(problem)
-    assert sorted(axis.states.size for axis in found) == [2, 2, 3]
+    result = axes(problem)
+    assert sorted(axis.states.size for axis in result) == [2, 2, 3]
     state, desired, moves = rng.normal(size=7), rng.normal(size=(5, 7)), rng.normal(size=(5, 4))
-    for axis in found:
+    for axis in result:
         own = (axis.problem, state[axis.states], desired[:, axis.regulated])
         w, change = moves @ inverse(problem, axis).T, rng.normal(size=(5, axis.T.shape[1]))
         whole = cost(problem, state, desired, moves + change @ axis.T.T) - cost(problem, state, desired, moves)

@@ -47,7 +47,7 @@ def corrupted(now: Period, part: str, number: float) -> Period:
 
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, -1.1 * LARGEST])
-def test_data_that_is_not_finite_or_of_no_vehicle_is_refused(part: str, number: float) -> None:
+def test_implausible_data_is_refused(part: str, number: float) -> None:
     """With answers of the usual shapes, and without harm to what is solved next."""
     problem = soft_problem()
     now, solver = changing_period(np.random.default_rng(2), problem), changing(problem)

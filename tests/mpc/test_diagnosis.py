@@ -54,7 +54,7 @@ RANDOM = {
 
 @given(**RANDOM)
 @settings(max_examples=40)
-def test_it_is_zero_where_and_only_where_there_is_an_answer(
+def test_violation_is_zero_if_and_only_if_the_qp_is_feasible(
     seed: int, terms: tuple[str, ...], changing: bool, far: float
 ) -> None:
     infeasible_period = posed(seed, terms, changing=changing, far=far)
@@ -89,9 +89,9 @@ def test_what_is_named_is_a_conflict_by_itself_and_each_part_of_it_is_needed(
         less = ocp_peer.least_violation(problem, now, named - {side})
         assert less is not None
         assert less < conflict.total * (1.0 - 1e-7)
-    shares = [found.share for found in conflict.violated.values()]
+    shares = [result.share for result in conflict.violated.values()]
     assert max(shares) <= conflict.total * (1.0 + 1e-6)
-    assert all(found.first <= found.last <= problem.horizon for found in conflict.violated.values())
+    assert all(result.first <= result.last <= problem.horizon for result in conflict.violated.values())
 
 
 @given(**RANDOM)
@@ -147,9 +147,9 @@ def test_an_integrator_by_hand() -> None:
     infeasible_period = integrator(BAND)
     conflict = conflict_of(infeasible_period)
     assert conflict.blocking == (Side(0, 0, False),)
-    ((side, found),) = conflict.violated.items()
+    ((side, result),) = conflict.violated.items()
     assert side == Side(1, 0, True)
-    assert (found.amount, found.share, found.first, found.last) == (pytest.approx(1.0), pytest.approx(1.0), 1, 1)
+    assert (result.amount, result.share, result.first, result.last) == (pytest.approx(1.0), pytest.approx(1.0), 1, 1)
     assert smallest_widening(infeasible_period, {side}) == pytest.approx(1.0)
     assert smallest_widening(infeasible_period, {Side(0, 0, False)}) == pytest.approx(1.0)
     assert smallest_widening(infeasible_period, {Side(0, 0, True)}) is None
@@ -175,7 +175,7 @@ def test_soft_constraints_are_never_in_conflict() -> None:
     assert (conflict.total, conflict.blocking) == (pytest.approx(0.0), ())
 
 
-def test_what_is_stored_of_a_period_is_a_copy() -> None:
+def test_stored_periods_are_copies() -> None:
     state, before = np.zeros(1), np.zeros(1)
     problem = integrator().problem
     stored = InfeasiblePeriod(

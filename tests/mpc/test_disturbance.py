@@ -65,14 +65,14 @@ def test_a_force_that_changes_steadily_is_foreseen_without_lag(vehicle: Vehicle,
 def test_torque_that_spins_the_rotors_up_is_no_disturbance(vehicle: Vehicle) -> None:
     lag, heavy = 0.03, replace(vehicle, rotor_inertia=0.005 * vehicle.inertia[2])
     settings, angular = RampSettings(rotor_lag=lag), np.zeros(3)
-    found = []
+    result = []
     for modelled in (heavy, vehicle):
         observer = RampObserver(settings, modelled, PERIOD)
         observer.reset(np.full(4, vehicle.hover_speed))
         fly(heavy, observer, lambda t, R, v: np.zeros(3), angular, 60, lag=lag)
-        found.append(np.abs(observer.foreseen(0.0)[2]).max())
-    assert found[0] < 0.02
-    assert found[1] > 0.2
+        result.append(np.abs(observer.foreseen(0.0)[2]).max())
+    assert result[0] < 0.02
+    assert result[1] > 0.2
 
 
 def test_rotors_that_lag_after_a_large_step_are_no_disturbance(vehicle: Vehicle) -> None:
@@ -92,7 +92,7 @@ def test_rotors_that_lag_after_a_large_step_are_no_disturbance(vehicle: Vehicle)
         np.testing.assert_allclose(observer.foreseen(0.0)[0], 0.0, atol=1e-4)
 
 
-def test_a_constant_torque_is_found(vehicle: Vehicle) -> None:
+def test_a_constant_torque_is_estimated(vehicle: Vehicle) -> None:
     angular = np.array([0.2, -0.1, 0.15])
     observer = RampObserver(RampSettings(), vehicle, PERIOD)
     fly(vehicle, observer, lambda t, R, v: np.zeros(3), angular, 60)

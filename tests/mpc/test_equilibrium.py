@@ -16,7 +16,7 @@ from quadsim.state import INDEX
 from quadsim.vehicle import Vehicle
 
 
-def test_undisturbed_it_is_hover(vehicle: Vehicle) -> None:
+def test_the_undisturbed_equilibrium_is_hover(vehicle: Vehicle) -> None:
     rest = equilibrium(nonlinear_model(vehicle, 0.05))
     np.testing.assert_array_equal(rest.state(), 0.0)
     np.testing.assert_allclose(rest.speeds, vehicle.hover_speed, rtol=1e-12)
@@ -61,7 +61,7 @@ def test_a_twisted_model_turns_as_its_thrust_pushes(vehicle: Vehicle) -> None:
     np.testing.assert_allclose(turned[1:], twist * (plain.effectiveness[0] @ speeds**2), rtol=1e-9)
 
 
-def test_what_thrust_twists_is_held_at_rest(vehicle: Vehicle) -> None:
+def test_torque_caused_by_thrust_is_balanced_at_rest(vehicle: Vehicle) -> None:
     acceleration, twist = np.array([0.5, -1.0, 2.0]), np.array([0.3, -0.2, 0.1])
     plain = nonlinear_model(vehicle, 0.05)
     rest = equilibrium(plain, acceleration=acceleration, twist=twist)

@@ -86,8 +86,8 @@ def test_the_log_has_the_law_s_commands_and_the_speeds_that_rotors_had(vehicle: 
     within = log.plant.speeds[500:550]
     np.testing.assert_array_equal(within[0::5], within[4::5])
     assert len(np.unique(within[:, 0])) > 5
-    wanted = (vehicle.allocation @ within[-1] ** 2 - vehicle.allocation @ log.control.speeds[10] ** 2)[1:]
-    np.testing.assert_allclose(wanted, -np.array(OFFSET), atol=0.05 * max(OFFSET))
+    desired = (vehicle.allocation @ within[-1] ** 2 - vehicle.allocation @ log.control.speeds[10] ** 2)[1:]
+    np.testing.assert_allclose(desired, -np.array(OFFSET), atol=0.05 * max(OFFSET))
 
 
 def test_an_undisturbed_flight_is_nearly_the_one_without(vehicle: Vehicle) -> None:

@@ -75,7 +75,7 @@ def test_defaults_find_nine_tenths_in_the_time_that_they_claim() -> None:
     np.testing.assert_allclose(times, [2.4, 2.4, 2.4, 1.25, 1.25, 1.25])
 
 
-def test_what_was_expected_changes_nothing() -> None:
+def test_expected_motion_leaves_the_estimate_unchanged() -> None:
     observer = DisturbanceObserver(ObserverSettings(), PERIOD)
     state = np.arange(12.0) / 10.0
     observer.update(state, state)
@@ -136,7 +136,7 @@ def test_thrust_that_is_other_than_believed_pushes_along_its_axis() -> None:
     np.testing.assert_allclose(np.delete(observer.estimate, 2), 0.0, atol=1e-12)
 
 
-def test_a_force_sideways_is_found_in_world_axes() -> None:
+def test_a_lateral_force_is_estimated_in_world_axes() -> None:
     before = make_state(euler=(0.2, -0.3, 2.0))
     after = before.copy()
     after[list(VELOCITY)] += 0.01 * np.array([1.0, -2.0, 0.0])

@@ -99,7 +99,7 @@ numbers = st.floats(-2.0, 2.0)
     axis=st.tuples(numbers, numbers, st.floats(0.3, 1.0)),
     points=st.lists(st.tuples(numbers, numbers, numbers), min_size=5, max_size=5),
 )
-def test_what_satisfies_the_half_space_keeps_clear(
+def test_positions_in_the_half_space_are_clear(
     at: tuple[float, ...], axis: tuple[float, float, float], points: list[tuple[float, ...]]
 ) -> None:
     log = Capsule(name="log", position=(0.2, 0.1, 0.0), axis=axis, radius=0.3)
@@ -124,13 +124,13 @@ def test_regions_are_exact_and_hold_in_their_window() -> None:
 
 def test_the_optimum_is_that_of_a_dense_qp(problem: Problem) -> None:
     among, posed = space(PILLAR, FENCE, rows=7), query(problem)
-    found = clearing(problem, among).solve(0.0, posed)
-    assert found[0].status == SOLVED
+    result = clearing(problem, among).solve(0.0, posed)
+    assert result[0].status == SOLVED
     free = clearing(problem, space(Sphere(name="far", position=(50.0, 0.0, 0.0), radius=1.0))).solve(0.0, posed)
-    assert np.abs(found[0].plan - free[0].plan).max() > 1.0
+    assert np.abs(result[0].plan - free[0].plan).max() > 1.0
     normals, bounds = among.half_spaces(PERIOD * np.arange(1, N + 1), free[0].states[:, list(POSITION)])
-    np.testing.assert_allclose(found[0].plan, by_dense_qp(problem, posed, normals, bounds), atol=2e-3)
-    room = (normals * found[0].states[:, list(POSITION)]).sum(axis=2) - bounds
+    np.testing.assert_allclose(result[0].plan, by_dense_qp(problem, posed, normals, bounds), atol=2e-3)
+    room = (normals * result[0].states[:, list(POSITION)]).sum(axis=2) - bounds
     assert room.min() > -1e-5
     assert room.min() < 1e-3  # active
 
@@ -159,17 +159,17 @@ def test_a_moving_obstacle_counts_where_it_will_be(problem: Problem) -> None:
     """At t = 0 one ball is in the way and gone in time, the other is not yet there."""
     calls: list[Answer] = []
     gone = Sphere(name="gone", position=(1.0, 0.0, 0.0), radius=0.2, velocity=(0.0, 8.0, 0.0))
-    found = clearing(problem, space(gone), calls).solve(0.0, query(problem))
-    assert found[0].plan is calls[0].plan
+    result = clearing(problem, space(gone), calls).solve(0.0, query(problem))
+    assert result[0].plan is calls[0].plan
     meeting = 22
-    x = float(found[0].states[meeting - 1, INDEX["x"]])
+    x = float(result[0].states[meeting - 1, INDEX["x"]])
     start = (x, 3.0 * meeting * PERIOD + 0.4, 0.0)
     comes = Sphere(name="comes", position=start, radius=0.2, velocity=(0.0, -3.0, 0.0))
-    found = clearing(problem, space(replace(comes, velocity=(0.0, 0.0, 0.0))), calls).solve(0.0, query(problem))
-    assert found[0].plan is calls[1].plan
-    found = clearing(problem, space(comes, soft=True, iterations=20), calls).solve(0.0, query(problem))
-    assert found[0].plan is not calls[2].plan
-    t, positions = PERIOD * np.arange(1, N + 1), found[0].states[:, list(POSITION)]
+    result = clearing(problem, space(replace(comes, velocity=(0.0, 0.0, 0.0))), calls).solve(0.0, query(problem))
+    assert result[0].plan is calls[1].plan
+    result = clearing(problem, space(comes, soft=True, iterations=20), calls).solve(0.0, query(problem))
+    assert result[0].plan is not calls[2].plan
+    t, positions = PERIOD * np.arange(1, N + 1), result[0].states[:, list(POSITION)]
     assert comes.clearance(t, positions).min() > RADIUS - 1e-3
 
 
@@ -202,7 +202,7 @@ def test_soft_half_spaces_give_way_and_hard_ones_are_named(problem: Problem) -> 
     assert hard[1].constraints[0].C.shape == (N, 1, 12)
 
 
-def test_what_takes_rows_for_the_same_at_all_steps_refuses(problem: Problem) -> None:
+def test_solvers_that_need_equal_rows_refuse_varying_ones(problem: Problem) -> None:
     among = space(PILLAR)
     normals, bounds = among.half_spaces(np.zeros(N), np.zeros((N, 3)))
     constrained = replace(problem, constraints=among.constraints(normals, bounds, 12))

@@ -97,7 +97,7 @@ def exact(form: Formulation, query: tuple[Array, Array, Array, Equilibrium]) -> 
     terms=st.sets(st.sampled_from(["soft", "margins", "Q_d", "P", "constraints"])),
     elsewhere=st.booleans(),
 )
-def test_it_has_the_condensed_optimum(
+def test_the_optimum_equals_the_condensed_one(
     seed: int, horizon: int, n: int, nu: int, steps: int, terms: set[str], elsewhere: bool
 ) -> None:
     """Of random problems with every term that there is, at rest in the origin or elsewhere; feasible by their start."""

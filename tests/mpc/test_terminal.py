@@ -51,14 +51,14 @@ def first_inputs(problem: Problem, query: tuple[Array, Array, Array, Equilibrium
     """By the free optimum, the condensed QP and the staged one."""
     answer = QPSolver("piqp-multistage", problem, free_first=True).solve(Query(*query))
     assert answer.method is Method.FREE
-    found = {"free": answer.plan[0]}
+    result = {"free": answer.plan[0]}
     forms: tuple[Formulation, ...] = (Condensed(problem), PartiallyCondensed(problem, steps_per_stage=3))
     for form in forms:
         backend = Piqp(dense=True) if isinstance(form, Condensed) else Piqp()
         backend.setup(form.qp)
         qp = form.assemble(Query(*query)).qp
-        found[type(form).__name__] = form.inputs(polish(qp, backend.solve(qp)).x)[0]
-    return found
+        result[type(form).__name__] = form.inputs(polish(qp, backend.solve(qp)).x)[0]
+    return result
 
 
 @pytest.mark.parametrize("horizon", [1, 2, 5, 20])
@@ -71,8 +71,8 @@ def test_the_first_input_is_the_infinite_horizons(horizon: int, elsewhere: bool)
         rest = Equilibrium(rng.normal(size=4), rng.normal(size=2)) if elsewhere else problem.equilibrium
         state, desired = rest.x + rng.normal(size=4), np.tile(rest.x, (horizon, 1))
         expected = rest.u - gain(problem) @ (state - rest.x)
-        for name, found in first_inputs(problem, (state, desired, problem.model.u_bar, rest)).items():
-            np.testing.assert_allclose(found, expected, atol=1e-8 * max(1.0, np.abs(expected).max()), err_msg=name)
+        for name, result in first_inputs(problem, (state, desired, problem.model.u_bar, rest)).items():
+            np.testing.assert_allclose(result, expected, atol=1e-8 * max(1.0, np.abs(expected).max()), err_msg=name)
 
 
 @pytest.mark.parametrize("horizon", [1, 7, 50])
@@ -89,8 +89,8 @@ def test_the_papers_vehicle_flies_to_a_set_point_as_by_the_infinite_horizons_law
     for rest in (problem.equilibrium, Equilibrium(tilted, u_bar + 1.0)):
         expected = rest.u - K @ (state - rest.x - goal)
         desired = problem.objective.desired(np.tile(reference, (horizon, 1)))
-        for name, found in first_inputs(problem, (state, desired, u_bar, rest)).items():
-            np.testing.assert_allclose(found, expected, rtol=1e-8, err_msg=name)
+        for name, result in first_inputs(problem, (state, desired, u_bar, rest)).items():
+            np.testing.assert_allclose(result, expected, rtol=1e-8, err_msg=name)
 
 
 def test_without_it_a_short_horizon_is_not_infinite() -> None:
@@ -102,7 +102,7 @@ def test_without_it_a_short_horizon_is_not_infinite() -> None:
     assert np.abs(answer.plan[0] - problem.model.u_bar + gain(problem) @ state).max() > 0.1
 
 
-def test_it_is_the_cost_to_come_to_rest() -> None:
+def test_it_equals_the_cost_to_come_to_rest() -> None:
     problem = random_problem(np.random.default_rng(4), horizon=3)
     P, K, model = lqr_terminal_weight(problem.model, problem.objective), gain(problem), problem.model
     closed = model.A - model.B @ K
@@ -116,9 +116,9 @@ def test_it_is_the_cost_to_come_to_rest() -> None:
 def test_the_axes_of_a_quadrotor_stay_apart() -> None:
     """Rounding in the Riccati equation's solution ties none of them."""
     problem = paper_problem()
-    found, with_weight = axes(problem), axes(terminated(problem))
-    assert [axis.states.tolist() for axis in with_weight] == [axis.states.tolist() for axis in found]
-    assert len(found) == 4
+    result, with_weight = axes(problem), axes(terminated(problem))
+    assert [axis.states.tolist() for axis in with_weight] == [axis.states.tolist() for axis in result]
+    assert len(result) == 4
 
 
 @pytest.mark.parametrize("weights", ["{z=1.0}", "{y=1.0, z=1.0, yaw=1.0}", "{x=1.0, y=1.0, z=1.0}"])
@@ -128,7 +128,7 @@ def test_a_state_that_costs_nothing_and_does_not_come_to_rest_is_refused(weights
         lqr_terminal_weight(problem.model, problem.objective)
 
 
-def test_an_unstable_state_that_nothing_moves_is_refused() -> None:
+def test_an_uncontrollable_unstable_state_is_refused() -> None:
     problem = random_problem(np.random.default_rng(0), horizon=3)
     A, B = np.diag([1.1, 0.5, 0.5]), problem.model.B.copy()
     B[0] = 0.0

@@ -151,8 +151,8 @@ def optima(case: Case, peer: Peer | DoMPC) -> Iterator[tuple[Found, Array]]:
     for k in rng.integers(0, len(course.motion) - 50, STATES[case]).tolist():
         question = course.question(k, rng, None, None)
         law.reset(course.speeds(question.before))
-        found = peer.optimum(question.state, question.states, question.inputs, question.before)
-        yield found, course.plan(law, question, 0.0)
+        result = peer.optimum(question.state, question.states, question.inputs, question.before)
+        yield result, course.plan(law, question, 0.0)
 
 
 def steps(case: Case) -> Iterator[tuple[Found, Array]]:
@@ -170,9 +170,9 @@ def steps(case: Case) -> Iterator[tuple[Found, Array]]:
             speeds = np.concatenate([question.inputs, question.inputs[-1:]])
             start = np.hstack([question.states, speeds]) if case.lag else question.states
             plan = start, np.clip(question.inputs, 0.0, 1.0)
-        found = peer.step(plan, question.state, question.states, question.inputs, before)
-        yield found, course.plan(law, question, PERIOD[case] * i)
-        plan, before = found[:2], found.inputs[0]
+        result = peer.step(plan, question.state, question.states, question.inputs, before)
+        yield result, course.plan(law, question, PERIOD[case] * i)
+        plan, before = result[:2], result.inputs[0]
 
 
 def measure(case: Case) -> Agreement:
@@ -182,14 +182,14 @@ def measure(case: Case) -> Agreement:
         ArithmeticError: IPOPT did not solve a problem.
     """
     whole, each = list(optima(case, Peer(case))), list(steps(case))
-    if not all(found.solved for found, _ in (*whole, *each)):
+    if not all(result.solved for result, _ in (*whole, *each)):
         raise ArithmeticError(f"{case.name}: IPOPT did not solve every problem")
-    differences = [np.array([np.abs(found.inputs - ours).max() for found, ours in pairs]) for pairs in (whole, each)]
+    differences = [np.array([np.abs(result.inputs - ours).max() for result, ours in pairs]) for pairs in (whole, each)]
     return Agreement(
         case=case,
         optima=differences[0],
         steps=differences[1],
-        bounded=sum(_bounded(case, found) for found, _ in (*whole, *each)),
+        bounded=sum(_bounded(case, result) for result, _ in (*whole, *each)),
     )
 
 

@@ -42,8 +42,8 @@ class Qpoases:
 
     def solve(self, qp: QP) -> Solution:
         """See `mpc.qp.Backend.solve`."""
-        found = self._solver(h=qp.P, g=qp.c, a=qp.G, lba=qp.h_l, uba=qp.h_u, lbx=qp.x_l, ubx=qp.x_u)
+        result = self._solver(h=qp.P, g=qp.c, a=qp.G, lba=qp.h_l, uba=qp.h_u, lbx=qp.x_l, ubx=qp.x_u)
         stats = self._solver.stats()
-        x, z_box, z = (found[name].full().ravel() for name in ("x", "lam_x", "lam_a"))
+        x, z_box, z = (result[name].full().ravel() for name in ("x", "lam_x", "lam_a"))
         status = SOLVED if stats["success"] else str(stats["return_status"])
         return Solution(x, np.zeros(0), z, z_box, status=status, iterations=int(stats["iter_count"]))

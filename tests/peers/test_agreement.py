@@ -15,7 +15,7 @@ from mpc.ocp import Problem
 
 
 @pytest.mark.parametrize("name", agreement.PACKAGES)
-def test_what_a_solver_calls_solved_is_optimal(
+def test_solved_answers_are_optimal(
     name: str, problem: Problem, queries: tuple[Query, ...], against_qpmpc: ConstrainedQP, hold: Callable[[Check], None]
 ) -> None:
     verdict = agreement.measure(name, problem, queries, against_qpmpc.speeds)

@@ -25,8 +25,8 @@ def test_optima_and_real_time_iterations_are_the_same(case: Case, hold: Callable
 def test_optima_are_those_of_do_mpc(hold: Callable[[Check], None]) -> None:
     pairs = list(optima(PAPER, DoMPC(PAPER)))
     assert len(pairs) == STATES[PAPER]
-    assert all(found.solved for found, _ in pairs)
-    apart = max(np.abs(found.inputs - ours).max() for found, ours in pairs)
+    assert all(result.solved for result, _ in pairs)
+    apart = max(np.abs(result.inputs - ours).max() for result, ours in pairs)
     hold(Check(what="converged inputs, as shares of the largest", peer="do-mpc", measured=apart, allowed=ALLOWED))
 
 
@@ -37,20 +37,20 @@ def test_do_mpc_is_given_the_same_problem() -> None:
     for k in (300, 400):
         question = course.question(k, rng, None, None)
         of = question.state, question.states, question.inputs, question.before
-        found, other = whole.optimum(*of), by_do_mpc.optimum(*of)
-        assert found.solved
+        result, other = whole.optimum(*of), by_do_mpc.optimum(*of)
+        assert result.solved
         assert other.solved
-        assert np.abs(found.inputs - other.inputs).max() < ALLOWED
-        assert np.abs(found.states - other.states).max() < ALLOWED
+        assert np.abs(result.inputs - other.inputs).max() < ALLOWED
+        assert np.abs(result.states - other.states).max() < ALLOWED
 
 
-def test_a_weight_that_is_another_is_seen() -> None:
+def test_a_changed_weight_is_detected() -> None:
     """A hundredth more on the velocity: two thousand times what is allowed."""
     course, other = Course(PAPER), Peer(replace(PAPER, velocity=1.01 * PAPER.velocity))
     question = course.question(300, np.random.default_rng(1), None, None)
     law = course.law(iterations=100, tolerance=1e-8)
     law.reset(course.speeds(question.before))
     ours = course.plan(law, question, PERIOD[PAPER])
-    found = other.optimum(question.state, question.states, question.inputs, question.before)
-    assert found.solved
-    assert np.abs(found.inputs - ours).max() > 1e-4
+    result = other.optimum(question.state, question.states, question.inputs, question.before)
+    assert result.solved
+    assert np.abs(result.inputs - ours).max() > 1e-4

@@ -107,8 +107,8 @@ def test_yaw_is_unwrapped_along_a_flight() -> None:
 @given(a=vectors, b=vectors)
 def test_products_are_those_of_scipy(a: Vector, b: Vector) -> None:
     expected = (Rotation.from_rotvec(a) * Rotation.from_rotvec(b)).as_quat(scalar_first=True)
-    found = np.array(multiply(exponential(a), exponential(b)))
-    assert abs(found @ expected) == pytest.approx(1.0, abs=1e-14)
+    result = np.array(multiply(exponential(a), exponential(b)))
+    assert abs(result @ expected) == pytest.approx(1.0, abs=1e-14)
 
 
 @given(vector=vectors)

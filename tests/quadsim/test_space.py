@@ -183,9 +183,9 @@ def test_a_window_of_the_path_is_one_of_time() -> None:
         (1.0, 2.0): (2.0, 5.0),
         (3.0, 9.0): (5.5, math.inf),
     }.items():
-        found = Corridor(name="c", position=(0, 0, 0), size=(1, 1, 1), path=path).timed(t, positions)
-        assert (found.start, found.stop) == pytest.approx(window)
-        assert found.path is None
+        result = Corridor(name="c", position=(0, 0, 0), size=(1, 1, 1), path=path).timed(t, positions)
+        assert (result.start, result.stop) == pytest.approx(window)
+        assert result.path is None
     with pytest.raises(InputError, match=r"corridors.c.path must be within the 4 m of the reference's path"):
         Corridor(name="c", position=(0, 0, 0), size=(1, 1, 1), path=(4.5, 5.0)).timed(t, positions)
 
@@ -194,12 +194,12 @@ def test_a_window_of_the_path_is_one_of_time() -> None:
 @given(shapes=st.lists(obstacles, min_size=1, max_size=5))
 def test_many_are_measured_as_each_alone(shapes: list[AnyObstacle]) -> None:
     t, p = np.linspace(0.0, 3.0, 9), np.random.default_rng(0).normal(scale=2.0, size=(9, 3))
-    for found, wanted in zip(
+    for result, desired in zip(
         Solids(shapes).clearances(t, p),
         map(np.concatenate, zip(*(each.clearances(t, p) for each in shapes), strict=True)),
         strict=True,
     ):
-        np.testing.assert_allclose(found, wanted, atol=1e-14)
+        np.testing.assert_allclose(result, desired, atol=1e-14)
 
 
 @settings(max_examples=40, deadline=None)

@@ -79,11 +79,11 @@ def test_shipped_vehicles_hover_as_published(name: str, hover: float, thrust_to_
 )
 def test_rotors_turn_as_published(name: str, turning: dict[tuple[int, int], str]) -> None:
     vehicle = load_vehicle(vehicle_path(name))
-    found = {
+    result = {
         (round(float(np.sign(x))), round(float(np.sign(y)))): "cw" if spin > 0 else "ccw"  # torque opposes turning
         for (x, y, _), spin in zip(vehicle.rotor_positions, vehicle.rotor_spins, strict=True)
     }
-    assert found == turning
+    assert result == turning
     np.testing.assert_allclose(np.hypot(*vehicle.rotor_positions[:, :2].T), vehicle.arm_length)
 
 

@@ -74,7 +74,7 @@ def test_infeasibility_is_the_largest_violation_of_a_row_step_by_step() -> None:
         steps = np.diff(answer.plan, axis=0, prepend=query.u_before[None])
         values = states @ rows.C.T + answer.plan @ rows.D.T + steps @ rows.E.T
         expected = max(float(np.maximum(values - rows.upper, rows.lower - values).max()), 0.0)
-        for found in (check, other):
-            checked, refused = found(problem, query, answer, None)
+        for result in (check, other):
+            checked, refused = result(problem, query, answer, None)
             assert checked.infeasibility == pytest.approx(expected, rel=1e-9, abs=1e-11)
             assert (refused == "infeasible_answer") == (expected > INFEASIBLE)

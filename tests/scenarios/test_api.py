@@ -250,20 +250,20 @@ def test_a_force_that_fails_ends_the_flight_with_its_reason(hover: Scenario) -> 
 
 
 def test_a_sweep_flies_every_combination(hover: Scenario) -> None:
-    found = quadsim.sweep(
+    result = quadsim.sweep(
         hover,
         {"controller.horizon": [20, 30], "vehicle.mass": np.array([4.0, 4.5, 5.0])},
         workers=2,
         progress=False,
     )
-    assert len(found) == 6
-    assert found["controller.horizon"].tolist() == [20.0] * 3 + [30.0] * 3
-    assert found["vehicle.mass"].tolist() == [4.0, 4.5, 5.0] * 2
+    assert len(result) == 6
+    assert result["controller.horizon"].tolist() == [20.0] * 3 + [30.0] * 3
+    assert result["vehicle.mass"].tolist() == [4.0, 4.5, 5.0] * 2
     alone = quadsim.fly(hover.replace({"controller.horizon": 30, "vehicle.mass": 4.5}), progress=False)
-    assert found["rmse.z"][4] == alone.metrics["rmse.z"]
-    assert found.to_arrow().schema.field("rmse.z").metadata == {b"unit": b"m"}
+    assert result["rmse.z"][4] == alone.metrics["rmse.z"]
+    assert result.to_arrow().schema.field("rmse.z").metadata == {b"unit": b"m"}
     with pytest.raises(UnknownNameError, match="no column named 'rmse'"):
-        found["rmse"]
+        result["rmse"]
     with pytest.raises(ParameterError, match="a list of values to try"):
         quadsim.sweep(hover, {"controller.horizon": []})
     with pytest.raises(InputError, match="horizon"):
@@ -273,18 +273,18 @@ def test_a_sweep_flies_every_combination(hover: Scenario) -> None:
 def test_fields_are_swept_together(hover: Scenario) -> None:
     roll, pitch = (f"controller.output_bounds.{name}" for name in ("roll", "pitch"))
     tried = [[-2.0, 2.0], ([-3.0, 3.0], [-4.0, 4.0])]  # one for both, and one for each
-    found = quadsim.sweep(hover, {(roll, pitch): tried, "vehicle.mass": [4.0, 4.2]}, workers=1, progress=False)
+    result = quadsim.sweep(hover, {(roll, pitch): tried, "vehicle.mass": [4.0, 4.2]}, workers=1, progress=False)
     swept = [f"{name}.{i}" for name in (roll, pitch) for i in (0, 1)]
-    assert found.table.column_names[:6] == [*swept, "vehicle.mass", "verdict"]
-    assert found[f"{roll}.1"].tolist() == [2.0, 2.0, 3.0, 3.0]
-    assert found[f"{pitch}.0"].tolist() == [-2.0, -2.0, -4.0, -4.0]
+    assert result.table.column_names[:6] == [*swept, "vehicle.mass", "verdict"]
+    assert result[f"{roll}.1"].tolist() == [2.0, 2.0, 3.0, 3.0]
+    assert result[f"{pitch}.0"].tolist() == [-2.0, -2.0, -4.0, -4.0]
     alone = quadsim.fly(hover.replace({(roll, pitch): tried[1]}), progress=False)
     for finding in alone.audit:
-        assert found[f"margin.{finding.limit.name}"][2] == finding.worst_margin
-    frame = found.to_pandas()
-    assert frame.shape == (4, len(found.table.column_names))
+        assert result[f"margin.{finding.limit.name}"][2] == finding.worst_margin
+    frame = result.to_pandas()
+    assert frame.shape == (4, len(result.table.column_names))
     assert frame.groupby("vehicle.mass")["margin.roll"].max().tolist() == pytest.approx([3.0, 3.0], abs=0.01)
-    lines = repr(found).splitlines()
+    lines = repr(result).splitlines()
     assert lines[0].startswith("sweep of hover: 4 flights, 4 satisfied")
     assert len(lines) <= 10
     with pytest.raises(ParameterError, match="a tuple of 2; a pair for all is a list; got \\(1, 2, 3\\)"):
@@ -292,8 +292,8 @@ def test_fields_are_swept_together(hover: Scenario) -> None:
 
 
 def test_whole_tables_are_swept(hover: Scenario) -> None:
-    found = quadsim.sweep(hover, {"controller": [{"type": "pid"}, {"type": "lqr"}]}, workers=1, progress=False)
-    assert found["controller.type"].tolist() == ["pid", "lqr"]
+    result = quadsim.sweep(hover, {"controller": [{"type": "pid"}, {"type": "lqr"}]}, workers=1, progress=False)
+    assert result["controller.type"].tolist() == ["pid", "lqr"]
 
 
 def test_a_custom_law_is_sent_to_other_processes_by_its_place(
@@ -305,9 +305,9 @@ def test_a_custom_law_is_sent_to_other_processes_by_its_place(
     steady = importlib.import_module("my_laws").steady
 
     def swept(law: object) -> list[float]:
-        found = quadsim.sweep(hover, {"vehicle.mass": [4.0, 5.0]}, controller=law, workers=1, progress=False)
-        assert found["reason"].tolist() == [None, None]
-        return found["speed_max"].tolist()
+        result = quadsim.sweep(hover, {"vehicle.mass": [4.0, 5.0]}, controller=law, workers=1, progress=False)
+        assert result["reason"].tolist() == [None, None]
+        return result["speed_max"].tolist()
 
     assert swept(steady) == [210.0, 210.0]
     assert swept(functools.partial(steady, speed=190.0)) == [190.0, 190.0]
@@ -323,10 +323,10 @@ def test_a_custom_law_is_sent_to_other_processes_by_its_place(
 @pytest.mark.usefixtures("undrawn")
 def test_flights_are_compared(hover: Scenario, flight: Flight, tmp_path: Path) -> None:
     other = quadsim.fly(hover, progress=False)
-    found = quadsim.compare(flight, other, progress=False)
-    assert found.names == ("paper-constrained", "hover")
-    assert found.page is None
-    assert found.to_markdown().startswith("|")
+    result = quadsim.compare(flight, other, progress=False)
+    assert result.names == ("paper-constrained", "hover")
+    assert result.page is None
+    assert result.to_markdown().startswith("|")
     saved = other.save(tmp_path / "hover", video=False, recording=False)
     page = quadsim.compare(saved, out=tmp_path / "page", progress=False).page
     assert page == tmp_path / "page" / "index.html"
@@ -378,9 +378,9 @@ def test_ipython_with_jedi_completes(hover: Scenario, typed: str, offered: list[
     completer = IPCompleter(namespace=names, use_jedi=True)
     completer.jedi_compute_type_timeout = 0
     with provisionalcompleter():
-        found = {completion.text for completion in completer.completions(typed, len(typed))}
-    assert {*offered} <= found
-    assert not found & {*withheld}
+        result = {completion.text for completion in completer.completions(typed, len(typed))}
+    assert {*offered} <= result
+    assert not result & {*withheld}
 
 
 def test_a_scenario_flies(hover: Scenario) -> None:

@@ -125,10 +125,10 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_doctor_tries_every_solver(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json"]) == EXIT_DONE
-    found = json.loads(capsys.readouterr().out)
-    assert list(found) == ["machine", "packages", "rendering", "viewer", "solvers"]
-    assert list(found["solvers"]) == list(solver_entries())
-    for name, line in found["solvers"].items():
+    result = json.loads(capsys.readouterr().out)
+    assert list(result) == ["machine", "packages", "rendering", "viewer", "solvers"]
+    assert list(result["solvers"]) == list(solver_entries())
+    for name, line in result["solvers"].items():
         installed = solver_entries()[name].installed
         assert line.startswith(("works: ", "fails: ") if installed else ("not installed: ", "not compiled: ")), name
 
@@ -326,5 +326,5 @@ def test_a_file_that_is_nested_too_deep_is_refused_before_it_takes_memory(
         finally:
             tracemalloc.stop()
         assert peak < 50e6
-        message = "quadsim: deep.toml: must have at most 20 tables and lists within one another\n"
+        message = "quadsim: deep.toml: must nest tables and lists at most 20 deep\n"
         assert capsys.readouterr().err == message

@@ -79,10 +79,10 @@ def test_a_rounded_table_of_a_smooth_course_requires_what_the_course_does(
     """Fourth differences of 0.1 mm of rounding are steps of tens of rad/s: no controller has to follow those."""
     eight = scenario({"type": "figure_eight", "length": 6.0, "period": 12.0, "turns": 1.5, "ramp": 4.0})
     smooth = report(Assembly(eight, vehicle))
-    found = report(Assembly(scenario(rounded(tmp_path / "eight.csv", poses_of(eight), decimals)), vehicle))
-    assert not any("change of rotor speed" in problem for problem in found.problems)
-    assert found.tilt == pytest.approx(smooth.tilt, abs=0.05)
-    assert (found.rotor_min, found.rotor_max) == pytest.approx((smooth.rotor_min, smooth.rotor_max), abs=0.2)
+    result = report(Assembly(scenario(rounded(tmp_path / "eight.csv", poses_of(eight), decimals)), vehicle))
+    assert not any("change of rotor speed" in problem for problem in result.problems)
+    assert result.tilt == pytest.approx(smooth.tilt, abs=0.05)
+    assert (result.rotor_min, result.rotor_max) == pytest.approx((smooth.rotor_min, smooth.rotor_max), abs=0.2)
 
 
 def poses_of(made: Scenario) -> Array:

@@ -122,9 +122,9 @@ class Queried:
     @cached_property
     def found(self) -> dict[str, Any]:
         assert self.infeasible_period is not None
-        found = diagnose(self.infeasible_period, self.scenario, self.vehicle)
-        assert found is not None
-        return found
+        result = diagnose(self.infeasible_period, self.scenario, self.vehicle)
+        assert result is not None
+        return result
 
 
 @pytest.fixture(scope="session")
@@ -179,16 +179,16 @@ def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, 
     case = CASES[name]
     queried = query_cached(file, name)
     assert queried.status not in ACCEPTED
-    found = queried.found
-    assert found["feasible"] is False
-    assert names([entry for entry in found["conflict"] if entry["by"]]) == set(case.violated)
-    assert names([entry for entry in found["conflict"] if not entry["by"]]) >= set(case.blocking)
+    result = queried.found
+    assert result["feasible"] is False
+    assert names([entry for entry in result["conflict"] if entry["by"]]) == set(case.violated)
+    assert names([entry for entry in result["conflict"] if not entry["by"]]) >= set(case.blocking)
     for part in (*case.violated, *case.blocking):
         word, side = part.split()
-        assert re.search(rf"\b{word}\b[^;]*\b{side}\b", found["sentence"])
-    widened = [each["settings"] for each in found["suggestions"] if len(each["settings"]) == 1 and not each["after"]]
+        assert re.search(rf"\b{word}\b[^;]*\b{side}\b", result["sentence"])
+    widened = [each["settings"] for each in result["suggestions"] if len(each["settings"]) == 1 and not each["after"]]
     assert any(f"controller.{case.field}" in settings for settings in widened)
-    for suggestion in found["suggestions"]:
+    for suggestion in result["suggestions"]:
         if suggestion["after"] is None:
             changed = [setting(*item) for item in suggestion["settings"].items()]
             assert query_case(file, case, *changed).status in ACCEPTED, changed
@@ -271,10 +271,10 @@ def test_a_solver_that_fails_where_all_constraints_can_hold_is_distinguished(fil
     assert controller is not None
     level = controller.query._replace(state=make_state())
     failed = InfeasiblePeriod(problem=controller.problem, query=level, status="max_iterations", time=1.0)
-    found = diagnose(failed, queried.scenario, queried.vehicle)
-    assert found is not None
-    assert (found["feasible"], found["conflict"], found["suggestions"], found["advice"]) == (True, [], [], "")
-    assert found["sentence"].endswith("it is the solver that failed")
+    result = diagnose(failed, queried.scenario, queried.vehicle)
+    assert result is not None
+    assert (result["feasible"], result["conflict"], result["suggestions"], result["advice"]) == (True, [], [], "")
+    assert result["sentence"].endswith("it is the solver that failed")
 
 
 def test_a_flight_whose_sqp_does_not_converge_says_so_and_what_helps() -> None:
@@ -294,13 +294,18 @@ def test_a_flight_whose_sqp_does_not_converge_says_so_and_what_helps() -> None:
     assert summary["controller"]["fallbacks"] == {"0": 75}
     assert flight.log.control.sqp is not None
     assert flight.log.control.sqp[:, 0].min() > CONVERGED
-    found = flight.diagnosis
-    assert found is not None
-    assert (found["time"], found["status"], found["feasible"], found["conflict"]) == (0.0, "not_converged", True, [])
-    assert "the SQP did not converge" in found["sentence"]
+    result = flight.diagnosis
+    assert result is not None
+    assert (result["time"], result["status"], result["feasible"], result["conflict"]) == (
+        0.0,
+        "not_converged",
+        True,
+        [],
+    )
+    assert "the SQP did not converge" in result["sentence"]
     text = (Path(__file__).resolve().parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
-    assert f"{found['sentence']}\n{found['advice']}\n" in text
-    helped = quadsim.fly(tumble.replace(found["suggestions"][0]["settings"]))
+    assert f"{result['sentence']}\n{result['advice']}\n" in text
+    helped = quadsim.fly(tumble.replace(result["suggestions"][0]["settings"]))
     assert helped.summary["controller"]["statuses"].get("not_converged", 0) == 0
     last = slice(-20, None)  # one sample of a tumble may be level
     assert np.abs(helped.state["roll"][last]).max() < 0.1 < np.abs(flight.state["roll"][last]).max()
@@ -344,9 +349,9 @@ class Keeping:
 def test_a_controller_of_the_user_is_diagnosed_in_the_words_of_its_problem() -> None:
     tilted = load_scenario("hover", ["duration=0.5", "initial.euler=[10.0, 0.0, 0.0]"])
     flight = quadsim.fly(tilted, controller=Keeping)
-    found = flight.diagnosis
-    assert found is not None
-    assert found["conflict"][0] | {"by": 0.0} == {
+    result = flight.diagnosis
+    assert result is not None
+    assert result["conflict"][0] | {"by": 0.0} == {
         "name": "roll",
         "rotors": [],
         "side": "upper",
@@ -354,8 +359,8 @@ def test_a_controller_of_the_user_is_diagnosed_in_the_words_of_its_problem() -> 
         "field": "",
         "by": 0.0,
         "start": 0.05,
-        "stop": found["conflict"][0]["stop"],
+        "stop": result["conflict"][0]["stop"],
     }
-    assert re.search(r"has an answer with roll upper wider by \S+ deg", found["advice"])
+    assert re.search(r"has an answer with roll upper wider by \S+ deg", result["advice"])
     enough = quadsim.fly(tilted, controller=partial(Keeping, largest=12.0))
     assert enough.diagnosis is None

@@ -138,8 +138,8 @@ def incomplete() -> Scenario:
 
 
 def entry_of(summary: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    (found,) = (entry for entry in summary["constraints"] if entry["name"] == name)
-    return found
+    (result,) = (entry for entry in summary["constraints"] if entry["name"] == name)
+    return result
 
 
 def test_a_required_constraint_that_the_flight_does_not_reach_makes_it_incomplete() -> None:

@@ -156,7 +156,7 @@ def test_ctrl_c_while_a_film_is_made_keeps_what_was_flown(tmp_path: Path) -> Non
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGINT)
         process.communicate(timeout=120)
-    found = summary_of(summary.parent)
+    result = summary_of(summary.parent)
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["hover"]
-    assert (process.returncode, found["verdict"]) == (0, "satisfied")
-    assert found["products"]["flight.mp4"].startswith(("interrupted (Ctrl-C)", "failed: "))
+    assert (process.returncode, result["verdict"]) == (0, "satisfied")
+    assert result["products"]["flight.mp4"].startswith(("interrupted (Ctrl-C)", "failed: "))

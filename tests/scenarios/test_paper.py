@@ -20,14 +20,14 @@ def findings(flight: Flight) -> dict[str, Finding]:
 
 
 def assert_constrained_flight_holds(flight: Flight, *, plant_tolerance: float) -> None:
-    control, found = flight.log.control, findings(flight)
+    control, result = flight.log.control, findings(flight)
     assert flight.log.status == "completed"
     assert len(control.status) == 1200
     assert set(control.status) <= ACCEPTED
     assert control.fallback.max() == 0
     for angle in ("roll", "pitch"):
-        assert found[angle].worst_margin_sampled >= -SAMPLED
-        assert found[angle].worst_margin >= -plant_tolerance
+        assert result[angle].worst_margin_sampled >= -SAMPLED
+        assert result[angle].worst_margin >= -plant_tolerance
     assert control.speeds.min() >= -1e-6
     assert control.speeds.max() <= 250.0 + 1e-6
     assert control.slews.min() >= -10.0 - 1e-6
@@ -56,14 +56,14 @@ def test_it_holds_over_the_parameters_the_paper_leaves_out(
 
 
 def test_unconstrained_flight_tracks_and_leaves_every_bound(unconstrained_flight: Flight) -> None:
-    control, found = unconstrained_flight.log.control, findings(unconstrained_flight)
+    control, result = unconstrained_flight.log.control, findings(unconstrained_flight)
     error = control.state[:, [0, 2, 4, 10]] - control.reference
     assert np.abs(error[-1]).max() < 0.01
     assert np.sqrt(np.mean(error[:, :3] ** 2, axis=0)).max() < 0.5
     for name in ("roll", "pitch", "speed", "slew"):
-        assert not found[name].satisfied
-        assert not found[name].limit.required
-        assert found[name].time_violated > 0.0
+        assert not result[name].satisfied
+        assert not result[name].limit.required
+        assert result[name].time_violated > 0.0
     assert unconstrained_flight.satisfied  # it promised none of them
     entries = {entry["name"]: entry for entry in summarise(unconstrained_flight)["constraints"]}
     assert entries["roll"]["worst_margin"] == pytest.approx(-4.48, abs=0.01)

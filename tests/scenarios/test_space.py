@@ -184,16 +184,16 @@ def test_a_corridor_along_the_path_holds_where_the_reference_is(law: str, speed:
         "nonlinear": {"controller": {"type": "nonlinear", "horizon": 30, "terminal": "lqr", "avoidance": {}}},
     }
     unaware = blind(speed)
-    (found,) = [each for each in unaware.findings if each.limit.name == "offset"]
+    (result,) = [each for each in unaware.findings if each.limit.name == "offset"]
     reference = unaware.log.control.reference[:, :3]
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(reference, axis=0), axis=1))])
-    inside = found.limit.holds_at(unaware.log.control.t)
+    inside = result.limit.holds_at(unaware.log.control.t)
     np.testing.assert_array_equal(inside, (gone >= 0.9) & (gone <= 1.3))
     assert inside.any()
-    assert not found.satisfied
+    assert not result.satisfied
     flight = Rollout(scenario({**offset_at(speed), **laws[law]})).fly()
-    (found,) = [each for each in flight.findings if each.limit.name == "offset"]
-    assert found.satisfied
+    (result,) = [each for each in flight.findings if each.limit.name == "offset"]
+    assert result.satisfied
     assert abs(flight.state["y"][[0, -1]]).max() < 0.1  # offset there alone
 
 

@@ -65,13 +65,13 @@ def cut(name: str) -> Scenario:
 
 def assert_same_bits(one: Flight, other: Flight) -> None:
     for table in ("control", "plant"):
-        for name, found in vars(getattr(one.log, table)).items():
-            wanted = getattr(getattr(other.log, table), name)
-            assert type(found) is type(wanted), name
-            if isinstance(found, np.ndarray):
-                np.testing.assert_array_equal(found, wanted, err_msg=name)
+        for name, result in vars(getattr(one.log, table)).items():
+            desired = getattr(getattr(other.log, table), name)
+            assert type(result) is type(desired), name
+            if isinstance(result, np.ndarray):
+                np.testing.assert_array_equal(result, desired, err_msg=name)
             else:
-                assert found == wanted, name
+                assert result == desired, name
     assert one.log.reason == other.log.reason
     if one.log.predicted is None:
         assert other.log.predicted is None
@@ -108,12 +108,12 @@ def test_what_was_applied_flies_again_to_the_bit(name: str, inputs: list[tuple[i
                         assert started.observation.k == k
                     before = started.scenario
                     try:
-                        found = started.apply(event)
+                        result = started.apply(event)
                     except InputError:
                         assert started.scenario is before
                     else:
                         applied += 1
-                        assert found.at >= k * before.control_period - 1e-9
+                        assert result.at >= k * before.control_period - 1e-9
                 started.step()
         except FlightError:
             assert started.done
@@ -192,18 +192,18 @@ def test_given_commands_fly_instead_of_the_controller() -> None:
 def test_margins_of_a_period_are_those_of_the_audit() -> None:
     """The smallest of all periods' is the audit's, and each is that of its rows at the physics rate."""
     scenario = load_scenario("paper-constrained", ["duration=4.0"])
-    found: list[dict[str, float]] = []
+    result: list[dict[str, float]] = []
     with Rollout(scenario) as started:
         while not started.done:
             sample = started.step()
-            found.append(started.margins())
+            result.append(started.margins())
             beyond = started.violations(sample)
             for limit in started.limits:
-                margin = found[-1][limit.name]
+                margin = result[-1][limit.name]
                 assert beyond[limit.name] == (-np.inf if np.isnan(margin) else -margin - limit.tolerance)
         flight = started.flight()
     for finding in flight.findings:
-        per_period = np.array([margins[finding.limit.name] for margins in found])
+        per_period = np.array([margins[finding.limit.name] for margins in result])
         np.testing.assert_array_equal(np.nanmin([*per_period, np.inf]), np.nanmin([finding.worst_margin, np.inf]))
         starts = flight.margins[finding.limit.name]
         if finding.limit.source.plant is None:

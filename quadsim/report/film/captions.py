@@ -1,4 +1,4 @@
-"""The captions of a film: what the flight's numbers are at this frame, and which limits it breaks.  Pillow alone."""
+"""The captions of a film: the flight's numbers at a frame, and the limits that it breaks.  Pillow alone."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MOST_MARGINS: Final = 6
 
 _LAST: Final = 1.0
 """Time at a film's end [s] in which it states why a QP had no answer, or that the flight stayed in fallback."""
-_SHOWN: Final = 2.0  # time [s] for which it shows what has happened
+_SHOWN: Final = 2.0  # time [s] for which an event is shown
 _MOST_EVENTS: Final = 3
 _MOST_LINES: Final = 10  # of that: more would reach the strip at the bottom
 _WIDEST: Final = 140  # letters of a line of that, between the frame's edge and the legend
@@ -47,7 +47,7 @@ class Overlay:
         controller = run.summary.get("controller", {})
         self._subtitle = law_name(controller.get("name", ""))
         self._grounded = any(phase != Phase.FLYING for phase in run.log.control.phase)
-        self._ranked = sorted(footage.margins, key=lambda track: track.rank)  # of the whole flight: rows stay in place
+        self._ranked = sorted(footage.margins, key=lambda track: track.rank)  # fixed, so that rows keep their place
 
     def draw(self, frame: Picture, i: int) -> Picture:
         """Frame `i` (height, width, 3) with its captions; `frame` itself is changed."""
@@ -134,7 +134,7 @@ class Overlay:
             columns = (118, now, ink.WHITE), (192, target, ink.AMBER), (262, now - target, ink.GREY)
             for right, value, colour in columns:
                 shown = f"{round(value, digits) + 0.0:+.{digits}f}"  # no "-0.00"
-                text = ABSENT if unknown and colour is not ink.AMBER else shown  # upside down none is to be held
+                text = ABSENT if unknown and colour is not ink.AMBER else shown  # no value is bounded upside down
                 painter.text(x + right, row, text, colour=colour, anchor="ra")
 
     def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:

@@ -1,4 +1,4 @@
-"""What the frames of a film show: a flight and its margins at frame times, and where the camera looks.  Plain numpy."""
+"""The content of a film's frames: a flight and its margins at frame times, and the camera's aim.  Plain numpy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _TOLERANCE: Final = 0.03  # how far a drawn path may be from the real one, in ar
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """Which frames to film, and in which size."""
+    """The frames to film, and their size."""
 
     run: str  # the run directory
     width: int = 1280  # [pixels], even
@@ -138,7 +138,7 @@ def _row_before(t: Array, times: Array) -> np.ndarray[Any, np.dtype[np.intp]]:
 def _track(run: Run, limit: Limit, times: Array) -> MarginTrack:
     t, values = limit.source.finest(run.log)
     margin = margins_at(limit, t, values)
-    if limit.source.plant is not None:  # what a command violates, rotors that saturate do not show
+    if limit.source.plant is not None:  # a violating command does not show in saturated rotors
         sampled = margins_sampled(limit, run.log)
         broken = np.flatnonzero(sampled < -limit.tolerance_sampled)
         np.fmin.at(margin, _row_before(t, run.log.control.t[broken]), sampled[broken])
@@ -148,7 +148,7 @@ def _track(run: Run, limit: Limit, times: Array) -> MarginTrack:
 
 
 def _smooth(t: Array, values: Array) -> Array:
-    """First-order low-pass, forward then backward, so that the picture neither lags nor leads."""
+    """Filter by a first-order low-pass, forward then backward, so that the picture neither lags nor leads."""
     if t.size < 2:
         return values
     keep = float(np.exp(-(t[-1] - t[0]) / (t.size - 1) / _CAMERA_MEMORY))

@@ -1,4 +1,4 @@
-"""What the captions of films are drawn with, and in which colours.  Pillow alone."""
+"""Drawing primitives and colours of the captions.  Pillow alone."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def _place(
 
 
 class Stage:
-    """A vehicle in its scene, rendered off screen; use as a context manager, it owns an OpenGL context.
+    """A vehicle in its scene, rendered off screen; use it as a context manager, it owns an OpenGL context.
 
     Besides the airframe and obstacles, frames show the regions in force, the reference path, the path flown in the last
     seconds, the predicted horizon, one thrust arrow per rotor (red beyond the speed limit) and a shadow with a plumb
@@ -125,7 +125,7 @@ class Stage:
         shown = self._footage
         pose = [*shown.position[i], *shown.quaternion[i]]
         _place(self._data, self._run.vehicle, self._obstacles, pose, shown.turned[i], shown.times[i])
-        # Aimed a little low, so that the vehicle stands above the captions.
+        # The camera aims a little low, so that the vehicle appears above the captions.
         self._camera.lookat = shown.aim[i] - (0.0, 0.0, 0.55 * self._arm)
         self._renderer.update_scene(self._data, self._camera)
         self._draw_path(shown.course, 0.018, _COURSE_COLOUR)
@@ -167,7 +167,7 @@ class Stage:
 
     def _draw_horizon(self, i: int) -> None:
         k = self._footage.period[i]
-        # A prediction knows no ground: from there it would fall through it.
+        # A prediction ignores the ground: below it, it would fall on.
         if self._run.log.predicted is None or self._run.log.control.phase[k] != Phase.FLYING:
             return
         predicted = self._run.log.predicted[k].astype(float)

@@ -27,7 +27,7 @@ from quadsim.outputs import writing_file
 from quadsim.report.film.frames import Shot, film_end
 from quadsim.vehicle import Vehicle
 
-BACKENDS: Final = ("egl", "osmesa")  # what can render without a screen, in the order tried
+BACKENDS: Final = ("egl", "osmesa")  # off-screen back ends, in the order tried
 _WORKER: Final = (sys.executable, "-P", "-m", "quadsim.report.film.render_worker")
 _PROBE: Final = (
     "import mujoco\n"
@@ -42,7 +42,7 @@ _PROBE: Final = (
 """Renders one tiny picture, and fails unless there is something in it."""
 _PROBE_SECONDS: Final = 60.0
 _LEAST_FREE_BYTES: Final = 1024 * 1024
-_FEWEST_FRAMES: Final = 30  # A further worker is not worth its start for fewer frames than these
+_FEWEST_FRAMES: Final = 30  # smallest number of frames that justifies a further worker
 
 Progress = Callable[[int, int], None]
 
@@ -69,7 +69,7 @@ def rendering_backend() -> str:
     raise RenderingUnavailableError(tried)
 
 
-@functools.cache  # a working one is not tried again by this process; one that raises is
+@functools.cache  # a success is cached for this process; an exception is not
 def _probe(backend: str) -> None:
     command = (sys.executable, "-P", "-c", _PROBE)
     subprocess.run(command, env=_environment(backend), check=True, capture_output=True, timeout=_PROBE_SECONDS)

@@ -1,4 +1,4 @@
-"""What is seen in the plots and what is read: sent to a recording, each with the view that shows it."""
+"""The plots and texts of a recording, each with its view."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ACTIVE: Final = 0.002  # A limit is active where its margin is below this fract
 
 
 def send_plots(recording: rr.RecordingStream, run: Run) -> rrb.Tabs:
-    """All that is shown over time, at the log rate where it exists between the control samples; the views of it."""
+    """Send all signals over time, at the log rate where it exists between control samples; return their views."""
     signals, events = _send_signals(recording, run), rrb.TextLogView(name="Events", origin="/events")
     margins, effects = _send_limits(recording, run), _send_effects(recording, run)
     times, *solver = _send_solver(recording, run)
@@ -151,7 +151,7 @@ def _send_solver(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeries
 
 
 def _send_effects(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
-    """Commands that rotors do not follow at once, external force and torque, wind: what there is of it."""
+    """Send commands that rotors do not follow at once, external force and torque, and wind, where they exist."""
     t, views = run.log.plant.t, []
     commanded = commanded_speeds(run.log)
     if commanded is not None:

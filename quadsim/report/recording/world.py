@@ -1,4 +1,4 @@
-"""What is seen in the 3-D views, and how a recording looks: timeline, which signals share a plot, colours."""
+"""The 3-D views of a recording, and its look: timeline, grouping of signals into plots, colours."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     if control.t.size and run.log.predicted is not None:
         horizons = np.concatenate([control.state[:, None, POSITION], run.log.predicted], axis=1)
         flying = np.array([phase == Phase.FLYING for phase in control.phase])
-        # A prediction knows no ground: from there it would fall through it.
+        # A prediction ignores the ground: below it, it would fall on.
         shown = [horizon if aloft else horizon[:0] for horizon, aloft in zip(horizons, flying, strict=True)]
         _log_lines(recording, "world/horizon", PREDICTED, 2.5)
         recording.send_columns("world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=shown))

@@ -1,4 +1,4 @@
-"""What acts on the plant beyond the paper's model; each effect is off unless a scenario sizes it."""
+"""The effects on the plant beyond the paper's model; each is off unless a scenario sizes it."""
 
 from __future__ import annotations
 
@@ -20,25 +20,22 @@ from quadsim.vehicle import Vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class Push:
-    """Something pushes the vehicle.
-
-    It is a constant force that acts at a point of the body, with the torque r x R' F that follows.
-    """
+    """A push on the vehicle: a constant force at a point of the body, with its torque r x R' F."""
 
     at: Instant
     type: Annotated[Literal["push"], doc("kind of event: push")] = "push"
-    duration: Annotated[Positive, doc("[s] how long")]
+    duration: Annotated[Positive, doc("[s] length of the push")]
     force: Annotated[Vector, doc("[N] world frame")]
     point: Annotated[Vector, doc("[m] where it acts, body frame")] = (0.0, 0.0, 0.0)
 
     def text(self) -> str:
-        """What happens, in words."""
+        """Describe the event."""
         return f"a push of {math.hypot(*self.force):.3g} N"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ground:
-    """A floor at the height at which the vehicle at z = 0 stands on its feet."""
+    """A floor at the height at which the vehicle at z = 0 rests on its feet."""
 
     contact: Annotated[bool, doc("whether feet and hull meet the floor")] = True
     effect: Annotated[bool, doc("whether thrust grows near the floor (Cheeseman and Bennett)")] = False
@@ -47,7 +44,7 @@ class Ground:
     )
 
     def resolved(self, vehicle: Vehicle) -> Ground:
-        """With the radius that is left to the vehicle, where there is a ground effect.
+        """Fill in the vehicle's rotor radius, if the ground effect needs it.
 
         Raises:
             ParameterError: neither states it.
@@ -75,7 +72,7 @@ class ThrustNoise:
     ] = 0.0
 
     def applied(self, thrusts: Array, largest: float, rng: np.random.Generator) -> Array:
-        """The thrusts (M, 4) [N] over M steps that result where these are commanded, of `largest` [N] at most."""
+        """Return the actual thrusts (M, 4) [N] over M steps for commanded ones, at most `largest` [N]."""
         share = thrusts / largest
         lost = self.loss * np.square(share) + self.deviation * np.sqrt(share) * rng.standard_normal(share.shape)
         remaining: Array = largest * np.clip(share - lost, 0.0, 1.0)
@@ -84,7 +81,7 @@ class ThrustNoise:
 
 @dataclass(frozen=True, kw_only=True)
 class Disturbance:
-    """An unmodelled force and torque, constant and random."""
+    """An unmodelled force and torque, with a constant and a random part."""
 
     force: Annotated[Vector, doc("[N] world frame")] = (0.0, 0.0, 0.0)
     torque: Annotated[Vector, doc("[N m] body frame")] = (0.0, 0.0, 0.0)
@@ -105,34 +102,34 @@ class Disturbance:
 
 @dataclass(frozen=True, kw_only=True)
 class PushChange:
-    """From `at` [s] on, these pushes act and no others."""
+    """From `at` [s] on, exactly these pushes act."""
 
     at: float
     pushes: tuple[Push, ...]
 
 
 Change = RotorChange | PayloadPickup | PayloadDrop | MassChange | LagChange | PushChange
-"""What happens to the vehicle on the way."""
+"""The changes of a vehicle in flight."""
 LOADING = (PayloadPickup, PayloadDrop, MassChange)
-"""The changes of what the vehicle weighs, for which its model is compiled another way."""
+"""The changes of mass, for which the model is compiled differently."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Effects:
-    """What acts on the plant beyond the paper's model; a table that is absent is an effect that is off."""
+    """The effects on the plant beyond the paper's model; an absent table means that the effect is off."""
 
     rotors: Annotated[RotorDynamics | None, doc("rotor lag, limits, inertia, wear")] = None
     air: Annotated[Air | None, doc("drag and wind")] = None
     ground: Annotated[Ground | None, doc("a floor")] = None
     load: Annotated[Load | None, doc("errors of mass and inertia, payload")] = None
     disturbance: Annotated[Disturbance | None, doc("unmodelled force and torque")] = None
-    thrust_noise: Annotated[ThrustNoise | None, doc("thrust that is lost and fluctuates")] = None
+    thrust_noise: Annotated[ThrustNoise | None, doc("loss and fluctuation of thrust")] = None
 
     def resolved(self, vehicle: Vehicle) -> Effects:
-        """With every size that is left to the vehicle.
+        """Fill in every size left to the vehicle.
 
         Raises:
-            ParameterError: a size is needed that neither gives, or a combination is not possible.
+            ParameterError: a required size is missing in both, or a combination is impossible.
         """
         return replace(
             self,
@@ -143,7 +140,7 @@ class Effects:
 
     @property
     def follows_state(self) -> bool:
-        """Whether a force depends on how the vehicle moves, so that each physics step has to be taken by itself."""
+        """Whether a force depends on the motion, so that physics steps are taken one by one."""
         spinning = self.rotors is not None and bool(self.rotors.inertia)
         dragged = self.air is not None and self.air.drags
         lifted = self.ground is not None and self.ground.effect
@@ -151,9 +148,9 @@ class Effects:
 
 
 class Force(Protocol):
-    """A user-defined force on the vehicle: called once per physics step, at its begin.
+    """A user-defined force on the vehicle: called once per physics step, at its start.
 
-    What has memory may have a method `reset()`, called before a flight.
+    An object with state may have a method `reset()`, called before a flight.
     """
 
     def __call__(self, time: float, state: Array) -> Array:

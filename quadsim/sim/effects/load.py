@@ -1,4 +1,4 @@
-"""What the vehicle really weighs: errors of mass and inertia, a shifted centre of mass, payloads."""
+"""The actual mass properties: errors of mass and inertia, a shifted centre of mass, payloads."""
 
 from __future__ import annotations
 
@@ -26,26 +26,26 @@ class Payload:
 
 @dataclass(frozen=True, kw_only=True)
 class PayloadPickup(Payload):
-    """The vehicle takes up a point mass, which moves with it from then on."""
+    """The vehicle picks up a point mass, which moves with it from then on."""
 
     at: Instant
     type: Annotated[Literal["payload_pickup"], doc("kind of event: payload_pickup")] = "payload_pickup"
 
     def text(self) -> str:
-        """What happens, in words."""
-        return f"{self.mass:g} kg are taken up"
+        """Describe the event."""
+        return f"{self.mass:g} kg are picked up"
 
 
 @dataclass(frozen=True, kw_only=True)
 class PayloadDrop:
-    """The vehicle lets go of all it carries."""
+    """The vehicle drops its payloads."""
 
     at: Instant
     type: Annotated[Literal["payload_drop"], doc("kind of event: payload_drop")] = "payload_drop"
 
     def text(self) -> str:
-        """What happens, in words."""
-        return "what is carried is dropped"
+        """Describe the event."""
+        return "the payloads are dropped"
 
 
 Factor = Annotated[float, Ge(0.05), Le(20.0)]
@@ -53,27 +53,27 @@ Factor = Annotated[float, Ge(0.05), Le(20.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class MassChange:
-    """The vehicle's mass becomes another one, whatever it carries besides."""
+    """The vehicle's own mass changes; payloads stay."""
 
     at: Instant
     type: Annotated[Literal["mass"], doc("kind of event: mass")] = "mass"
     factor: Annotated[Factor, doc("[-] mass over the vehicle's from then on, instead of load.mass_factor")]
 
     def text(self) -> str:
-        """What happens, in words."""
+        """Describe the event."""
         return f"the mass is {self.factor:g} times the file's"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Load:
-    """How the vehicle that flies differs from its file, which the controller still assumes."""
+    """Differences of the actual vehicle from its file, which the controller still assumes."""
 
     mass_factor: Annotated[Factor, doc("[-] real mass over that of [actual], or else of [vehicle]")] = 1.0
     inertia_factor: Annotated[
-        tuple[Factor, ...], Len(3, 3), doc("[-] the same of the moments of inertia about body x, y, z")
+        tuple[Factor, ...], Len(3, 3), doc("[-] same for the moments of inertia about body x, y, z")
     ] = (1.0, 1.0, 1.0)
-    centre_of_mass: Annotated[Vector, doc("[m] where it really is, body frame")] = (0.0, 0.0, 0.0)
-    payloads: Annotated[tuple[Payload, ...], MaxLen(1000), doc("what it carries from the start")] = ()
+    centre_of_mass: Annotated[Vector, doc("[m] its actual position, body frame")] = (0.0, 0.0, 0.0)
+    payloads: Annotated[tuple[Payload, ...], MaxLen(1000), doc("payloads from the start")] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,13 +86,13 @@ class MassProperties:
 
 
 def mass_properties(vehicle: Vehicle, load: Load, payloads: Sequence[Payload]) -> MassProperties:
-    """The vehicle with its errors, and what it carries, as one body.
+    """Return the vehicle with its errors and payloads as one body.
 
-    The parallel-axis theorem: I = sum_i (I_i + m_i (|r_i|^2 1 - r_i r_i')), r_i from the common centre of mass to each
-    part's.
+    The parallel-axis theorem: I = sum_i (I_i + m_i (|r_i|^2 1 - r_i r_i')), r_i from the common centre of mass to that
+    of each part.
 
     Raises:
-        ParameterError: the moments of inertia are those of no rigid body.
+        ParameterError: no rigid body has these moments of inertia.
     """
     moments = np.diag(np.array(vehicle.inertia) * load.inertia_factor)
     if 2.0 * moments.max() > np.trace(moments) * (1.0 + 1e-12):
@@ -109,7 +109,7 @@ def mass_properties(vehicle: Vehicle, load: Load, payloads: Sequence[Payload]) -
 
 
 def apply_mass(model: mujoco.MjModel, body: str, properties: MassProperties) -> None:
-    """Give a body of a compiled model its mass; velocities are those of the moment, as if it had been so all along."""
+    """Set the mass of a body in a compiled model; velocities stay those of the moment."""
     i = model.body(body).id
     moments, axes = np.linalg.eigh(properties.inertia)
     axes[:, 2] *= np.sign(np.linalg.det(axes))  # a rotation, not a reflection

@@ -1,4 +1,4 @@
-"""Rotors that take time: lag, limited acceleration, and the angular momentum they carry."""
+"""Rotor dynamics: lag, limited acceleration, and angular momentum."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 @dataclass(frozen=True, kw_only=True)
 class RotorDynamics:
-    """Rotors that take time and may be worn; see `quadsim.sim.effects.rotors`.
+    """Rotor lag and wear; see `quadsim.sim.effects.rotors`.
 
-    Speeds follow as a first-order lag whose slope is limited, dw/dt = clip((w_cmd - w) / tau, -a, a): the model of
-    RotorS (Furrer et al. 2016, "RotorS - A Modular Gazebo MAV Simulator Framework", Eq. (18)) with its separate time
-    constants for speeding up and slowing down, tau = `rise` and `fall`, and a = `acceleration`.  A rotor pushes w_cmd
-    from one side and never passes it, so that the answer to a held command is a straight line followed by an
+    Speeds follow a first-order lag with limited slope, dw/dt = clip((w_cmd - w) / tau, -a, a): the model of RotorS
+    (Furrer et al.  2016, "RotorS - A Modular Gazebo MAV Simulator Framework", Eq.  (18)) with its separate time
+    constants for speeding up and slowing down, tau = `rise` and `fall`, and a = `acceleration`. A speed approaches
+    w_cmd from one side and never passes it, so the response to a held command is a straight line followed by an
     exponential: no integration, no step size.
     """
 
@@ -51,7 +51,7 @@ class RotorDynamics:
         return not (self.rise or self.fall or self.acceleration or self.inertia)
 
     def resolved(self, vehicle: Vehicle) -> RotorDynamics:
-        """With the sizes that are left to the vehicle.
+        """Fill in the sizes left to the vehicle.
 
         Raises:
             ParameterError: rotors with inertia change their speed at once.
@@ -62,7 +62,7 @@ class RotorDynamics:
         return rotors
 
     def lagging(self, change: LagChange) -> RotorDynamics:
-        """With other time constants.
+        """Return the same rotors with other time constants.
 
         Raises:
             ParameterError: rotors with inertia change their speed at once.
@@ -88,7 +88,7 @@ class RotorDynamics:
         sign, distance = np.sign(gap), np.abs(gap)
         lag, steepest = np.where(gap >= 0.0, self.rise or 0.0, self.fall or 0.0), self.acceleration or math.inf
         eased = distance if math.isinf(steepest) else np.minimum(distance, steepest * lag)
-        ramp_end = (distance - eased) / steepest  # until then the slope is at its limit; 0 without one
+        ramp_end = (distance - eased) / steepest  # the slope is limited until then; 0 without a limit
         t = elapsed[:, None]
         ramping = t < ramp_end
         rate = np.divide(1.0, lag, out=np.zeros_like(lag), where=lag > 0.0)
@@ -110,15 +110,15 @@ class RotorLoss:
     duration: Annotated[Positive | None, doc("[s] after which the rotor is whole again; absent: never")] = None
 
     def text(self) -> str:
-        """What happens, in words."""
+        """Describe the event."""
         return f"rotor {self.rotor} loses {100.0 * self.loss:.3g} %"
 
 
 @dataclass(frozen=True, kw_only=True)
 class RotorChange:
-    """From `at` [s] on, a rotor gives the share `efficiency` of the thrust and torque that its speed would give.
+    """From `at` [s] on, a rotor has the share `efficiency` of the thrust and torque of its speed.
 
-    It is what all losses in force leave.  At 0 it has lost its propeller: it drags no more either, and carries no
+    It is the product over all losses in force.  At 0 the rotor has lost its propeller: it has neither drag nor
     momentum.
     """
 
@@ -129,7 +129,7 @@ class RotorChange:
 
 @dataclass(frozen=True, kw_only=True)
 class LagChange:
-    """The rotors follow their commands more quickly or more slowly."""
+    """The rotor time constants change."""
 
     at: Instant
     type: Annotated[Literal["rotor_lag"], doc("kind of event: rotor_lag")] = "rotor_lag"
@@ -137,6 +137,6 @@ class LagChange:
     fall: Annotated[NonNegative | None, doc("[s] time constant while slowing down; absent: the same")] = None
 
     def text(self) -> str:
-        """What happens, in words."""
+        """Describe the event."""
         fall = "" if self.fall in (None, self.rise) else f", {self.fall:g} s downwards"
         return f"rotors lag by {self.rise:g} s{fall}"

@@ -86,7 +86,7 @@ class Gust:
     velocity: Annotated[Vector, doc("[m/s] in its middle, world frame")]
 
     def text(self) -> str:
-        """What happens, in words."""
+        """Describe the event."""
         return f"a gust of {math.hypot(*self.velocity):.3g} m/s"
 
 
@@ -109,7 +109,7 @@ class WindChange:
     velocity: Annotated[Vector, doc("[m/s] from then on, world frame")]
 
     def text(self) -> str:
-        """What happens, in words."""
+        """Describe the event."""
         return f"the mean wind is {math.hypot(*self.velocity):.3g} m/s"
 
 

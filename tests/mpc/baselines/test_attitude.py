@@ -47,7 +47,7 @@ def test_the_error_function_is_a_distance_and_e_r_its_gradient(seed: int) -> Non
     assert float(e_R @ e_R) == pytest.approx(psi * (2.0 - psi), abs=1e-9)
 
 
-def test_half_a_turn_is_as_far_as_it_goes_and_has_no_gradient() -> None:
+def test_half_a_turn_is_the_largest_error_and_has_no_gradient() -> None:
     R = np.diag([1.0, -1.0, -1.0])
     assert psi_of(R, np.eye(3)) == pytest.approx(2.0)
     np.testing.assert_allclose(attitude_error(R, np.eye(3)), 0.0, atol=1e-15)
@@ -73,9 +73,9 @@ def test_small_errors_of_all_axes_count_alike_whatever_the_weight(weight: float)
 
 def test_tilt_goes_the_shortest_way_before_heading() -> None:
     """Half a turn of heading wanted and 60 deg of roll: a weight near zero leaves the rotation of body z alone."""
-    wanted = Rotation.from_euler("ZYX", [math.pi - 0.01, 0.0, 0.0]).as_matrix()
+    desired = Rotation.from_euler("ZYX", [math.pi - 0.01, 0.0, 0.0]).as_matrix()
     R = Rotation.from_euler("ZYX", [0.0, 0.0, math.radians(60.0)]).as_matrix()
-    error = prioritised_error(R, wanted, 1e-6)
+    error = prioritised_error(R, desired, 1e-6)
     np.testing.assert_allclose(error[:2], [-2.0 * math.sin(math.radians(30.0)), 0.0], atol=1e-5)
 
 

@@ -50,8 +50,8 @@ def flat(vehicle: Vehicle, drag: Array, t: float) -> tuple[float, DesiredAttitud
     momentum = m * target.velocity, m * target.acceleration, m * target.jerk
     c, s = np.cos(target.yaw), np.sin(target.yaw)
     heading = np.array([[c, s, 0.0], [-0.4 * s, 0.4 * c, 0.0], [-0.16 * c, -0.16 * s, 0.0]])
-    wanted = desired_attitude(force, momentum, drag, heading)
-    return float(wanted.attitude[:, 2] @ (force[0] + drag[2] * momentum[0])), wanted
+    desired = desired_attitude(force, momentum, drag, heading)
+    return float(desired.attitude[:, 2] @ (force[0] + drag[2] * momentum[0])), desired
 
 
 @pytest.mark.parametrize("drag", DRAGS)
@@ -63,9 +63,9 @@ def test_open_loop_along_the_flat_inputs_the_vehicle_stays_on_the_trajectory(
     D, J, m = np.array(drag), np.array(vehicle.inertia), vehicle.mass
 
     def slope(t: float, x: Array) -> Array:
-        thrust, wanted = flat(vehicle, D, t)
+        thrust, desired = flat(vehicle, D, t)
         R, v, Omega = x[3:12].reshape(3, 3), x[12:15], x[15:]
-        torque = J * wanted.acceleration + np.cross(wanted.rates, J * wanted.rates)
+        torque = J * desired.acceleration + np.cross(desired.rates, J * desired.rates)
         acceleration = thrust / m * R[:, 2] - np.array([0.0, 0.0, vehicle.gravity]) - R @ (D * (R.T @ v))
         turning = (torque - np.cross(Omega, J * Omega)) / J
         return np.concatenate([v, (R @ hat(Omega)).ravel(), acceleration, turning])
@@ -74,8 +74,8 @@ def test_open_loop_along_the_flat_inputs_the_vehicle_stays_on_the_trajectory(
     x0 = np.concatenate([begin.position, start.attitude.ravel(), begin.velocity, start.rates])
     times = np.linspace(0.0, 3.0, 31)
     flown = solve_ivp(slope, (0.0, 3.0), x0, method="DOP853", t_eval=times, rtol=1e-11, atol=1e-12)
-    wanted = np.array([sine(t)[0] for t in times])
-    np.testing.assert_allclose(flown.y[:3].T, wanted, atol=1e-7)
+    desired = np.array([sine(t)[0] for t in times])
+    np.testing.assert_allclose(flown.y[:3].T, desired, atol=1e-7)
 
 
 @pytest.mark.parametrize("drag", DRAGS)
@@ -85,18 +85,18 @@ def test_on_the_trajectory_the_law_gives_the_flat_torque(vehicle: Vehicle, drag:
     law = GeometricController(vehicle, settings)
     J = np.array(vehicle.inertia)
     for t in (0.0, 0.7, 1.9):
-        _, wanted = flat(vehicle, np.array(drag), t)
+        _, desired = flat(vehicle, np.array(drag), t)
         target = target_at(t)
         on_it = Measured(
             position=target.position,
             velocity=target.velocity,
-            attitude=wanted.attitude,
-            rates=wanted.rates,
+            attitude=desired.attitude,
+            rates=desired.rates,
             yaw=target.yaw,
         )
         wrench, commanded = law.wrench(on_it, target, NONE)
-        np.testing.assert_allclose(commanded.attitude, wanted.attitude, atol=1e-12)
-        torque = J * wanted.acceleration + np.cross(wanted.rates, J * wanted.rates)
+        np.testing.assert_allclose(commanded.attitude, desired.attitude, atol=1e-12)
+        torque = J * desired.acceleration + np.cross(desired.rates, J * desired.rates)
         np.testing.assert_allclose(wrench[1:], torque, atol=1e-9 * np.abs(torque).max())
         later, before = (flat(vehicle, np.array(drag), t + ahead)[0] for ahead in (0.5 * PERIOD, 0.0))
         assert wrench[0] == pytest.approx(later, abs=0.05 * abs(later - before))  # of half a period on, to first order
@@ -107,17 +107,17 @@ def test_a_motion_s_samples_give_its_derivatives_and_near_its_end_as_many_as_the
     samples = [sine(period * k)[:3] for k in range(40)]
     motion = motion_along(*np.array(samples).transpose(1, 0, 2), period=period, vehicle=vehicle)
     yaw = np.zeros(3)
-    found, wanted = target_of_motion(motion.after(10), yaw, period), sine(10 * period)
+    result, desired = target_of_motion(motion.after(10), yaw, period), sine(10 * period)
     for value, exact, share in zip(
-        (found.position, found.velocity, found.acceleration, found.jerk, found.snap),
-        wanted,
+        (result.position, result.velocity, result.acceleration, result.jerk, result.snap),
+        desired,
         (1e-12, 1e-7, 1e-5, 1e-3, 2e-2),
         strict=True,
     ):
         np.testing.assert_allclose(value, exact, atol=share * np.abs(exact).max())
-    assert found.heading is not None
+    assert result.heading is not None
     w, x, y, z = motion.attitude[10]
-    np.testing.assert_allclose(found.heading[0], Rotation.from_quat([x, y, z, w]).as_matrix()[:, 0], atol=1e-12)
+    np.testing.assert_allclose(result.heading[0], Rotation.from_quat([x, y, z, w]).as_matrix()[:, 0], atol=1e-12)
     for left in (1, 2, 3, 6):
         near_end = target_of_motion(motion.after(40 - left), yaw, period)
         np.testing.assert_allclose(near_end.position, motion.position[-left], atol=1e-12)

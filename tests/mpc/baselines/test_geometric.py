@@ -55,8 +55,8 @@ def wanted_after(law: GeometricController, vehicle: Vehicle, h: float) -> tuple[
         yaw=TARGET.yaw + h * TARGET.yaw_rate,
         yaw_rate=TARGET.yaw_rate + h * TARGET.yaw_acceleration,
     )
-    _, wanted = law.wrench(motion, target, NONE)
-    return wanted.attitude, wanted
+    _, desired = law.wrench(motion, target, NONE)
+    return desired.attitude, desired
 
 
 def test_the_desired_rates_and_their_change_are_those_of_the_wanted_attitude(
@@ -82,23 +82,23 @@ def test_thrust_lies_along_the_body_and_torque_leads_to_the_wanted_attitude(
         here = replace(
             TARGET, position=0.1 * rng.normal(size=3), velocity=np.zeros(3), acceleration=np.zeros(3), yaw_rate=0.0
         )
-        wrench, wanted = law.wrench(motion, here, NONE)
-        at_rest = vee(wanted.attitude.T @ attitude)
-        ahead = -attitude.T @ wanted.attitude @ wanted.acceleration
+        wrench, desired = law.wrench(motion, here, NONE)
+        at_rest = vee(desired.attitude.T @ attitude)
+        ahead = -attitude.T @ desired.attitude @ desired.acceleration
         turning = wrench[1:] / np.array(vehicle.inertia)
-        rates_wanted = attitude.T @ wanted.attitude @ wanted.rates
+        rates_wanted = attitude.T @ desired.attitude @ desired.rates
         np.testing.assert_allclose(turning, -law.k_R * at_rest + law.k_Omega * rates_wanted - ahead, atol=1e-9)
 
 
-def test_a_wanted_force_beyond_the_tilt_limit_is_held_and_counts_as_at_rest(
+def test_a_force_beyond_the_tilt_limit_is_limited_and_counts_as_constant(
     vehicle: Vehicle, build: Callable[..., Any]
 ) -> None:
     law = build("geometric", vehicle, tilt_max=20.0)
     far = replace(TARGET, position=np.array([50.0, 0.0, 0.0]), yaw_rate=0.0, yaw_acceleration=0.0)
-    _, wanted = law.wrench(MOTION, far, NONE)
-    assert math.degrees(math.acos(wanted.attitude[2, 2])) == pytest.approx(20.0)
-    np.testing.assert_allclose(wanted.rates, 0.0, atol=1e-12)
-    np.testing.assert_allclose(wanted.acceleration, 0.0, atol=1e-12)
+    _, desired = law.wrench(MOTION, far, NONE)
+    assert math.degrees(math.acos(desired.attitude[2, 2])) == pytest.approx(20.0)
+    np.testing.assert_allclose(desired.rates, 0.0, atol=1e-12)
+    np.testing.assert_allclose(desired.acceleration, 0.0, atol=1e-12)
 
 
 def test_a_heading_half_a_turn_away_is_sought_a_quarter_turn_away(vehicle: Vehicle, build: Callable[..., Any]) -> None:
@@ -114,8 +114,8 @@ def test_a_heading_half_a_turn_away_is_sought_a_quarter_turn_away(vehicle: Vehic
 def test_integrals_stop_at_their_limits(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     law, integrals = build("geometric", vehicle, integral=True, sigma=0.5, sigma_R=0.25), NONE
     for _ in range(200):
-        _, wanted = law.wrench(MOTION, TARGET, integrals)
-        integrals = law.integrate(integrals, MOTION, TARGET, wanted)
+        _, desired = law.wrench(MOTION, TARGET, integrals)
+        integrals = law.integrate(integrals, MOTION, TARGET, desired)
     np.testing.assert_allclose(np.abs(integrals.translation), 0.5)
     np.testing.assert_allclose(np.abs(integrals.rotation), 0.25)
 
@@ -140,8 +140,8 @@ def test_it_recovers_from_large_angles(
     controller = build("geometric", craft)
     log = fly_from(controller, craft, state, periods=360, course=np.array([0.0, 0.0, 100.0, yaw]))
     assert log.reason is None
-    wanted = Rotation.from_euler("Z", yaw).as_matrix()
-    psi = [0.5 * (3.0 - np.trace(wanted.T @ motion_of(row).attitude)) for row in log.control.truth]
+    desired = Rotation.from_euler("Z", yaw).as_matrix()
+    psi = [0.5 * (3.0 - np.trace(desired.T @ motion_of(row).attitude)) for row in log.control.truth]
     assert psi[0] > 0.8
     assert psi[-1] < 1e-3
     assert tilt(log.control.truth)[60:].max() < math.radians(75.0)
@@ -150,7 +150,7 @@ def test_it_recovers_from_large_angles(
     assert abs(log.control.truth[-1, 4] - 100.0) < 0.5
 
 
-def test_a_spinning_body_is_held_against_its_own_gyroscopic_torque(
+def test_the_gyroscopic_torque_of_a_spinning_body_is_compensated(
     hummingbird_like: Vehicle, build: Callable[..., Any]
 ) -> None:
     """Upright, with errors of rate alone, J Omega' is -J k_Omega Omega and nothing else."""
@@ -159,9 +159,9 @@ def test_a_spinning_body_is_held_against_its_own_gyroscopic_torque(
     motion = Measured(position=np.zeros(3), velocity=np.zeros(3), attitude=np.eye(3), rates=rates, yaw=0.0)
     rest = {"position": np.zeros(3), "velocity": np.zeros(3), "acceleration": np.zeros(3)}
     target = Target(**rest, yaw=0.0, yaw_rate=0.0, yaw_acceleration=0.0)
-    wrench, wanted = law.wrench(motion, target, NONE)
+    wrench, desired = law.wrench(motion, target, NONE)
     resulting = (wrench[1:] - np.cross(rates, inertia * rates)) / inertia
-    np.testing.assert_allclose(resulting, wanted.acceleration - law.k_Omega * rates, atol=1e-9)
+    np.testing.assert_allclose(resulting, desired.acceleration - law.k_Omega * rates, atol=1e-9)
 
 
 def test_integrals_rest_while_the_rotors_have_no_more(vehicle: Vehicle, build: Callable[..., Any]) -> None:

@@ -149,9 +149,7 @@ def test_any_state_gets_a_command_within_speeds_and_slews(
 
 
 @pytest.mark.parametrize("size", [1e2, 1e4, 1e6])
-def test_without_bounds_of_its_own_it_commands_what_the_rotors_hold(
-    law: str, craft: Vehicle, build: Build, size: float
-) -> None:
+def test_default_bounds_are_the_vehicles(law: str, craft: Vehicle, build: Build, size: float) -> None:
     rng, controller = np.random.default_rng(0), build(law, craft)
     extremes = []
     for _ in range(30):
@@ -162,7 +160,7 @@ def test_without_bounds_of_its_own_it_commands_what_the_rotors_hold(
     assert np.max(extremes) > 1.1 * craft.hover_speed
 
 
-def test_the_command_in_force_is_what_slews_count_from(law: str, vehicle: Vehicle, build: Build) -> None:
+def test_slews_count_from_the_command_in_force(law: str, vehicle: Vehicle, build: Build) -> None:
     controller = build(law, vehicle, bounds=ActuatorBounds.alike((0.0, 250.0), (-10.0, 5.0)))
     late = StepInputs(acting=np.full(4, 100.0))
     speeds = controller.step(late, make_state(), held(controller, [0.0, 0.0, 5.0, 0.0])).speeds

@@ -115,7 +115,7 @@ def test_a_rate_integral_stops_where_the_mixer_has_no_more(vehicle: Vehicle, bui
     assert after.rate_integral[0] < 0.0
 
 
-def test_the_lqr_plans_what_its_model_goes_on_to_do(vehicle: Vehicle, build: Callable[..., Any]) -> None:
+def test_the_lqr_plan_matches_its_models_rollout(vehicle: Vehicle, build: Callable[..., Any]) -> None:
     """Each planned command is the law's at the state predicted for it, for a target at rest."""
     controller = build("lqr", vehicle)
     state = make_state(position=(-0.1, 0.05, 0.02), euler=(0.0, 0.0, 0.3))

@@ -207,7 +207,7 @@ def tilted(problem: Problem) -> Query:
     return Query(state, np.zeros((problem.horizon, 4)), problem.model.u_bar)
 
 
-def test_piqp_answers_what_is_infeasible_given_up_or_no_number(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_piqp_answers_infeasible_abandoned_and_invalid_problems(monkeypatch: pytest.MonkeyPatch) -> None:
     """From a warm start as from a cold one, and no back end is set up before."""
     problem = paper_problem()
     core = Core(problem)
@@ -250,14 +250,14 @@ def with_rows(count: int, *, shared: bool = False) -> Problem:
         (lambda: paper_problem("paper-constrained", "controller.horizon=900"), "at most 1048576 numbers; they have "),
     ],
 )
-def test_what_has_no_place_in_the_core_is_refused_with_the_number(made: Any, rule: str) -> None:
+def test_problems_too_large_for_the_core_are_refused_with_the_number(made: Any, rule: str) -> None:
     with pytest.raises(ParameterError) as caught:
         make_solver(CORE, made())
     assert "controller.solver must be a QP solver such as 'piqp' for this problem" in str(caught.value)
     assert rule in str(caught.value)
 
 
-def test_equal_problems_share_their_tables_and_none_lives_for_ever() -> None:
+def test_equal_problems_share_tables_with_a_finite_lifetime() -> None:
     problem = paper_problem()
     first = core_problem(problem)
     assert core_problem(paper_problem()) is first

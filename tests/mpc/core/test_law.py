@@ -41,7 +41,7 @@ def test_a_compiled_flight_is_the_flight(name: str) -> None:
     assert c.log.control.slack == pytest.approx(python.log.control.slack, abs=1e-6)
 
 
-def test_what_there_is_no_optimum_for_is_answered_as_on_the_target() -> None:
+def test_without_an_optimum_it_answers_as_on_the_target() -> None:
     flight = quadsim.fly(quadsim.load("paper-constrained-lag20", COMPILED), progress=False)
     assert {"clipped", "shifted"} & set(flight.summary["controller"]["statuses"])
     assert max(flight.log.control.fallback) >= 1
@@ -73,7 +73,7 @@ def test_a_reset_forgets_all(mpc: CompiledMPC) -> None:
     assert np.array_equal(answers(mpc, seed=1), first)
 
 
-def test_controllers_share_nothing_that_changes(mpc: CompiledMPC) -> None:
+def test_controllers_share_no_mutable_state(mpc: CompiledMPC) -> None:
     alone = [answers(mpc, seed) for seed in range(5)]
     law = exported_law(quadsim.load(mpc.name.replace("constrained", "paper-constrained")))
     many = [CompiledMPC(law) for _ in alone]
@@ -81,7 +81,7 @@ def test_controllers_share_nothing_that_changes(mpc: CompiledMPC) -> None:
     assert np.array_equal(np.swapaxes(together, 0, 1), alone)
 
 
-def test_it_says_who_answered(mpc: CompiledMPC) -> None:
+def test_the_answerer_is_reported(mpc: CompiledMPC) -> None:
     hover = mpc.problem.model.u_bar
     at_rest, target = np.zeros(N_STATES), np.zeros((mpc.horizon, 4))
     free = mpc.step(StepInputs(time=0.0, phase=Phase.FLYING), at_rest, target)
@@ -100,12 +100,12 @@ def test_without_an_optimum_the_last_plan_is_flown_to_its_end() -> None:
     planned, tumbled = ask(mpc, 0, np.zeros(N_STATES)), np.zeros(N_STATES)
     tumbled[INDEX["roll"]] = 1.0  # beyond a hard bound
     for k in range(1, 10):
-        found = ask(mpc, k, tumbled)
-        assert (found.status, found.answered_by, found.fallback) == ("shifted", FALLBACK, 2)
-        assert found.speeds == pytest.approx(planned.plan[k], abs=1e-9)
+        result = ask(mpc, k, tumbled)
+        assert (result.status, result.answered_by, result.fallback) == ("shifted", FALLBACK, 2)
+        assert result.speeds == pytest.approx(planned.plan[k], abs=1e-9)
     after = ask(mpc, 10, tumbled)
     assert (after.status, after.fallback) == ("before", 3)
-    assert np.array_equal(after.speeds, found.speeds)
+    assert np.array_equal(after.speeds, result.speeds)
     assert ask(mpc, 11, np.zeros(N_STATES)).fallback == 0
     mpc.reset(planned.speeds)
     assert ask(mpc, 0, tumbled).status == "before"
@@ -118,16 +118,16 @@ def test_numbers_out_of_hand_are_answered_with_the_command_in_force(mpc: Compile
         broken = state.copy()
         broken[INDEX[name]] = wrong
         mpc.reset(hover)
-        found = ask(mpc, 0, broken)
-        assert found.fallback >= 1
-        assert np.isfinite(found.speeds).all()
-        assert np.isfinite(found.plan).all()
+        result = ask(mpc, 0, broken)
+        assert result.fallback >= 1
+        assert np.isfinite(result.speeds).all()
+        assert np.isfinite(result.plan).all()
     mpc.reset(hover)
-    found = ask(mpc, 0, state, np.array([wrong, *hover[1:]]))
-    assert np.isfinite(found.speeds).all()
+    result = ask(mpc, 0, state, np.array([wrong, *hover[1:]]))
+    assert np.isfinite(result.speeds).all()
     if not np.isfinite(wrong):
-        assert found.status == "before"
-        assert np.array_equal(found.speeds, hover)
+        assert result.status == "before"
+        assert np.array_equal(result.speeds, hover)
     assert ask(mpc, 1, state, hover).fallback == 0
 
 
@@ -157,18 +157,18 @@ def test_the_struct_has_all_numbers_in_place() -> None:
         assert np.array_equal(np.ravel(value), np.ravel(getattr(mpc._shared._robust, name)))
 
 
-def test_it_is_not_copied(mpc: CompiledMPC) -> None:
+def test_copying_is_refused(mpc: CompiledMPC) -> None:
     with pytest.raises(TypeError, match="cannot be copied or pickled"):
         copy.deepcopy(mpc)
 
 
-def test_without_a_library_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_gives_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "_load", lambda: "it was not compiled: install a C compiler")
     message = r"there is no core here: it was not compiled: install a C compiler; or leave out controller\.compiled"
     with pytest.raises(MissingCoreError, match=message):
         quadsim.fly(quadsim.load("hover", {**COMPILED, "duration": 0.2}), progress=False)
 
 
-def test_what_cannot_be_exported_cannot_be_compiled() -> None:
+def test_unexportable_controllers_cannot_be_compiled() -> None:
     with pytest.raises(ExportError, match="half-spaces around obstacles"):
         quadsim.fly(quadsim.load("pillar", COMPILED), progress=False)

@@ -34,7 +34,7 @@ def complete(states: Array, speeds: Array, missing: Sequence[int], *, value: flo
     return np.array(known)
 
 
-def test_what_is_measured_passes_unchanged() -> None:
+def test_measured_channels_pass_unchanged() -> None:
     states, speeds = moving(20)
     np.testing.assert_array_equal(complete(states, speeds, []), states)
 
@@ -54,7 +54,7 @@ def test_implausible_numbers_are_missing_ones(value: float) -> None:
     np.testing.assert_allclose(complete(states, speeds, POSITION, value=value), states, atol=1e-9)
 
 
-def test_the_channels_that_are_there_correct_what_is_missing() -> None:
+def test_available_channels_correct_missing_ones() -> None:
     states, speeds = moving(20, acceleration=1.0)
     x, vx = INDEX["x"], INDEX["vx"]
     blind = complete(states, speeds, (x, vx))
@@ -90,7 +90,7 @@ def test_a_vehicle_at_rest_or_on_the_ground_is_not_frozen() -> None:
     assert completion.unseen.any()
 
 
-def test_what_was_missing_for_long_is_found_again_from_the_rest() -> None:
+def test_channels_missing_for_long_are_recovered_from_the_rest() -> None:
     completion = StateCompletion(model())
     for _ in range(4000):
         completion.complete(np.full(12, math.nan), model().u_bar, level())

@@ -91,7 +91,7 @@ def test_rounding_beyond_the_bounds_is_taken_away() -> None:
 
 
 @pytest.mark.parametrize("reference", [np.full((30, 4), math.nan), np.full((30, 4), 1e9), np.zeros((29, 4))])
-def test_a_reference_that_is_none_is_not_passed_on(reference: Array) -> None:
+def test_an_invalid_reference_is_not_passed_on(reference: Array) -> None:
     inner = Scripted()
     command = guard(inner).step(StepInputs(), np.zeros(12), reference)
     assert (command.status, command.fallback) == ("invalid_reference", 2)

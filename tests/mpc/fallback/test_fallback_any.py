@@ -41,7 +41,7 @@ STEPS = st.tuples(ANSWERS, STATES, ACTING, st.sampled_from([*Phase]), CHANNEL)
 
 @settings(max_examples=100)
 @given(steps=st.lists(STEPS, min_size=1, max_size=8), hover=st.sampled_from([0.1, 5.0]))
-def test_nothing_bad_ever_leaves(steps: list[Any], hover: float) -> None:
+def test_no_invalid_command_leaves(steps: list[Any], hover: float) -> None:
     class Adversary(Scripted):
         answer: Any = None
         foreseen: float = 0.0
@@ -59,9 +59,9 @@ def test_nothing_bad_ever_leaves(steps: list[Any], hover: float) -> None:
     inner = Adversary(horizon=5)
     guarded = guard(inner, settings=FallbackSettings(hover=hover))
     before = model().u_bar
-    for inner.answer, state, acting, phase, wanted in steps:
-        inner.foreseen = wanted
-        command = guarded.step(StepInputs(phase=phase, acting=acting), state, np.full((5, 4), wanted))
+    for inner.answer, state, acting, phase, desired in steps:
+        inner.foreseen = desired
+        command = guarded.step(StepInputs(phase=phase, acting=acting), state, np.full((5, 4), desired))
         usable = acting is not None and np.isfinite(acting).all() and np.abs(acting).max() <= 1e5
         lower, upper = bounds().reach(acting if usable else before)
         assert command.speeds.shape == (4,)

@@ -15,7 +15,7 @@ from quadsim.state import INDEX
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
-def test_every_level_holds_what_presses_the_vehicle(yaw: float) -> None:
+def test_every_level_compensates_the_disturbance(yaw: float) -> None:
     guarded = guard(Pressed(failing(range(1, 200))))
     guarded.reset(pressed().speeds)
     state, levels = at_rest(yaw), []
@@ -39,7 +39,7 @@ def test_height_pulls_beside_what_holds_the_vehicle() -> None:
     assert (law.slope @ pulled)[0] == pytest.approx(LARGEST_CLIMB)
 
 
-def test_missing_channels_follow_what_presses_the_vehicle() -> None:
+def test_missing_channels_follow_the_disturbance() -> None:
     inner = Pressed()
     guarded = guard(inner)
     guarded.reset(pressed().speeds)
@@ -50,7 +50,7 @@ def test_missing_channels_follow_what_presses_the_vehicle() -> None:
         state = advance(state, pressed().speeds, pressed())
 
 
-def test_what_was_believed_last_holds_while_nothing_is_measured() -> None:
+def test_the_last_trim_holds_while_nothing_is_measured() -> None:
     inner = Pressed()
     guarded = guard(inner)
     guarded.reset(pressed().speeds)

@@ -92,8 +92,8 @@ def test_its_residual_is_that_of_the_plan_that_is_commanded() -> None:
     states, inputs = controller._plan
     np.testing.assert_allclose(controller._speeds(inputs)[0], command.plan[0])
     np.testing.assert_array_equal(states[0], x0)
-    found = np.abs(states[1:] - advance_nodes(controller._model, states[:-1], inputs)).max()
-    assert command.sqp.defect == pytest.approx(found, rel=1e-9)
+    result = np.abs(states[1:] - advance_nodes(controller._model, states[:-1], inputs)).max()
+    assert command.sqp.defect == pytest.approx(result, rel=1e-9)
     assert command.sqp.defect > CONVERGED
     assert command.sqp.step > 1.0
     assert command.status == NOT_CONVERGED
@@ -118,7 +118,7 @@ def test_more_iterations_converge_where_one_does_not() -> None:
     assert [kept.converges(count) for count in (1, 50)] == [False, True]
 
 
-def test_a_qp_without_an_answer_displaces_what_did_not_converge() -> None:
+def test_an_infeasible_qp_takes_precedence_over_an_unconverged_sqp() -> None:
     controller = law(horizon=20, largest_rates=(1.0, 1.0, 1.0))
     call(controller, at_rest((0.0, 1.0, 0.0, 0.0)))
     spinning = at_rest()
@@ -170,7 +170,7 @@ def test_converged_it_is_the_optimum_of_an_independent_solver(error: AttitudeErr
         steps = 1e-6 * np.eye(16)
         return (costs(flat + steps) - costs(flat - steps)) / 2e-6
 
-    found = minimize(
+    result = minimize(
         cost,
         np.tile(hover, 4),
         jac=gradient,
@@ -179,8 +179,8 @@ def test_converged_it_is_the_optimum_of_an_independent_solver(error: AttitudeErr
         options={"ftol": 1e-15, "maxiter": 500},
     )
     ours = model.shares(VEHICLE.thrust_coefficient * np.square(command.plan[::2]))
-    assert cost(ours.ravel()) <= found.fun * (1.0 + 1e-9)
-    np.testing.assert_allclose(ours, found.x.reshape(4, 4), atol=1e-4)
+    assert cost(ours.ravel()) <= result.fun * (1.0 + 1e-9)
+    np.testing.assert_allclose(ours, result.x.reshape(4, 4), atol=1e-4)
     assert ours.min() < 1e-6 or ours.max() > 1.0 - 1e-6  # a bound is active
 
 
@@ -336,7 +336,7 @@ def test_velocities_and_slews_are_bounded() -> None:
     assert np.abs(first.speeds - HOVER).max() > 59.0
 
 
-def test_what_is_not_linear_in_the_model_is_refused() -> None:
+def test_rows_not_linear_in_the_model_are_refused() -> None:
     angle, speed = np.zeros((1, N_STATES)), np.array([[1.0, 0.0, 0.0, 0.0]])
     angle[0, INDEX["roll"]] = 1.0
     one = {"name": "mine", "lower": np.array([-1.0]), "upper": np.array([1.0])}
@@ -352,7 +352,7 @@ def test_what_is_not_linear_in_the_model_is_refused() -> None:
 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, 1e7])
-def test_numbers_that_are_none_are_refused_and_do_no_harm(number: float) -> None:
+def test_invalid_numbers_are_refused_without_side_effects(number: float) -> None:
     controller, fresh = law(), law()
     wrong = at_rest()
     wrong[0] = number
@@ -395,18 +395,18 @@ def test_grounded_rotors_stop() -> None:
 
 
 @pytest.mark.parametrize("observer", [None, ObserverSettings()])
-def test_what_it_predicts_is_what_the_model_does(observer: ObserverSettings | None) -> None:
+def test_predictions_match_the_model(observer: ObserverSettings | None) -> None:
     """With the disturbance that is estimated: here the vehicle stays where it should have risen."""
     controller = law(observer=observer)
     x = at_rest((0.9, 0.3, 0.0, 0.1))
     for k in range(3):
         command = call(controller, x, k * PERIOD)
-    found = np.zeros(6) if observer is None else controller.disturbance
-    assert found.any() == (observer is not None)
+    result = np.zeros(6) if observer is None else controller.disturbance
+    assert result.any() == (observer is not None)
     state = np.zeros((1, N_STATES))
     state[0, 6::2] = quaternion_to_euler(x[Q])
     predicted = controller.predict(state, command.plan[None])
-    disturbed = {"acceleration": found[:3], "angular_acceleration": found[3:]}
+    disturbed = {"acceleration": result[:3], "angular_acceleration": result[3:]}
     model = rigid_body(VEHICLE, PERIOD, inputs=Inputs.SPEED, **disturbed)
     for i in range(command.plan.shape[0]):
         x = advance_nodes(model, x, command.plan[i] / VEHICLE.speed_max)

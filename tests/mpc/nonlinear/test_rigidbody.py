@@ -61,14 +61,14 @@ def test_derivatives_are_those_of_the_map(
     A, B, end = linearise_nodes(model, x, u)
     np.testing.assert_allclose(end, advance_nodes(model, x, u), rtol=1e-12, atol=1e-12)
     step = 1e-6
-    for found, width, moved in (
+    for result, width, moved in (
         (A, model.n, lambda d: (advance_nodes(model, x + d, u), advance_nodes(model, x - d, u))),
         (B, 4, lambda d: (advance_nodes(model, x, u + d), advance_nodes(model, x, u - d))),
     ):
         for j in range(width):
             above, below = moved(step * np.eye(width)[j])
             expected = (above - below) / (2.0 * step)
-            np.testing.assert_allclose(found[:, :, j], expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max() + 1e-9)
+            np.testing.assert_allclose(result[:, :, j], expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max() + 1e-9)
 
 
 def test_derivatives_in_frames_are_those_of_multiplied_quaternions() -> None:
@@ -87,7 +87,7 @@ def test_derivatives_in_frames_are_those_of_multiplied_quaternions() -> None:
 
 
 @pytest.mark.parametrize("others", [{}, DRAG])
-def test_it_is_of_fourth_order(others: dict[str, Any]) -> None:
+def test_the_integrator_is_of_fourth_order(others: dict[str, Any]) -> None:
     x, u = points(rigid_body(VEHICLE, 0.2), np.random.default_rng(2))
 
     def end(substeps: int) -> Array:

@@ -26,9 +26,9 @@ HOVER = np.full(4, VEHICLE.hover_speed)
 
 
 def bounds() -> Bounds:
-    found = paper_problem().bounds
-    assert found is not None
-    return replace(found, delta_min=np.full(4, -10.0), delta_max=np.full(4, 10.0))
+    result = paper_problem().bounds
+    assert result is not None
+    return replace(result, delta_min=np.full(4, -10.0), delta_max=np.full(4, 10.0))
 
 
 def objective() -> Objective:
@@ -56,10 +56,10 @@ def tilted(roll: float, rate: float, yaw: float = 0.0) -> Array:
 
 
 def test_a_safe_command_passes() -> None:
-    wanted = HOVER + np.array([1.0, -2.0, 1.0, -2.0])
-    command = filtered(make_filter(), np.zeros(12), wanted)
+    desired = HOVER + np.array([1.0, -2.0, 1.0, -2.0])
+    command = filtered(make_filter(), np.zeros(12), desired)
     assert command.status == UNCONSTRAINED
-    assert np.array_equal(command.speeds, wanted)
+    assert np.array_equal(command.speeds, desired)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 140.0])

@@ -89,7 +89,7 @@ def moments(flight: Flight, first: int, periods: int) -> Iterator[tuple[StepInpu
         yield StepInputs(time=log.t[k], acting=before[k]), log.state[k], reference[k + 1 : k + 51]
 
 
-def test_without_parts_it_is_the_papers_controller(constrained_flight: Flight, vehicle: Vehicle) -> None:
+def test_without_optional_parts_it_is_the_papers_controller(constrained_flight: Flight, vehicle: Vehicle) -> None:
     """100 periods in which the tilt bound is active at times, with yaw on its way from 30 deg to 0."""
     problem = paper_problem()
     paper, ours = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem)), robust(vehicle)
@@ -174,7 +174,7 @@ def test_constant_forces_torques_and_mass_leave_no_steady_error(vehicle: Vehicle
     assert np.abs(end[[0, 2, 4]]).max() > 0.05
 
 
-def test_what_is_stated_is_not_taken_for_a_disturbance(vehicle: Vehicle) -> None:
+def test_stated_mismatch_is_not_attributed_to_a_disturbance(vehicle: Vehicle) -> None:
     """Lag, delay and tilt are all in what the observer expects."""
     plant = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
     controller = robust(vehicle, **EVERYTHING)
@@ -201,7 +201,7 @@ def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> N
     assert controller.disturbance[2] == pytest.approx(vehicle.gravity * (1.0 - factor), abs=0.05)
 
 
-def test_what_a_worn_rotor_does_is_known_at_any_thrust(vehicle: Vehicle) -> None:
+def test_the_effect_of_a_worn_rotor_is_predicted_at_any_thrust(vehicle: Vehicle) -> None:
     """Climbing with more thrust, it turns the vehicle more, by as much: nothing is left to learn."""
     worn = nonlinear_model(vehicle, PERIOD)
     worn = replace(worn, effectiveness=worn.effectiveness * [1.0, 0.8, 1.0, 1.0])
@@ -240,7 +240,7 @@ def test_nothing_is_learned_on_the_ground_or_from_what_is_no_number(vehicle: Veh
 
 
 @pytest.mark.parametrize("gap", [0, 2, 40])
-def test_nothing_is_learned_over_a_pause(vehicle: Vehicle, gap: int) -> None:
+def test_the_observer_skips_pauses(vehicle: Vehicle, gap: int) -> None:
     """What was expected a period later applies to no other instant."""
     controller, acting = robust(vehicle, **EVERYTHING), np.full(4, vehicle.hover_speed)
     controller.step(StepInputs(time=1.0, acting=acting), np.zeros(12), HOLD)
@@ -249,9 +249,7 @@ def test_nothing_is_learned_over_a_pause(vehicle: Vehicle, gap: int) -> None:
 
 
 @pytest.mark.parametrize(("predicted", "learned"), [(0, True), (4, True), (5, False), (30, False)])
-def test_predicted_states_teach_nothing_and_long_spans_of_them_neither(
-    vehicle: Vehicle, predicted: int, learned: bool
-) -> None:
+def test_predicted_states_do_not_update_the_observer(vehicle: Vehicle, predicted: int, learned: bool) -> None:
     """From a slow sensor's next measurement it learns; after a longer outage it restarts."""
     controller, acting = robust(vehicle, **EVERYTHING), np.full(4, vehicle.hover_speed)
     measured, guessed = np.zeros(12), np.zeros(12)
@@ -389,7 +387,7 @@ def test_numbers_out_of_hand_are_refused_and_forgotten(vehicle: Vehicle, value: 
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.02])
-def test_numbers_that_get_out_of_hand_on_the_way_spoil_nothing(vehicle: Vehicle, delay: float) -> None:
+def test_overflow_has_no_side_effects(vehicle: Vehicle, delay: float) -> None:
     """Rates that no vehicle has, though a sensor might say so, overflow within a period of integration."""
     acting = np.full(4, vehicle.hover_speed)
     controller = robust(vehicle, **{**EVERYTHING, "delay": delay})
@@ -402,7 +400,7 @@ def test_numbers_that_get_out_of_hand_on_the_way_spoil_nothing(vehicle: Vehicle,
         assert np.isfinite(controller.disturbance).all()
 
 
-def test_what_is_not_solved_holds_the_command_in_force_with_its_status(vehicle: Vehicle) -> None:
+def test_without_a_solution_the_command_in_force_is_held(vehicle: Vehicle) -> None:
     controller = robust(vehicle)
     acting = np.full(4, 120.0)
     tilted = make_state(euler=(math.radians(30.0), 0.0, 0.0))
@@ -422,7 +420,7 @@ def test_on_the_ground_rotors_are_stopped_as_fast_as_allowed(vehicle: Vehicle, p
     assert [command.speeds.tolist() for command in stops] == [[5.0] * 4, [0.0] * 4, [0.0] * 4]
 
 
-def test_its_own_last_command_acts_where_none_is_given(vehicle: Vehicle) -> None:
+def test_the_last_command_acts_by_default(vehicle: Vehicle) -> None:
     given, without = robust(vehicle, **EVERYTHING), robust(vehicle, **EVERYTHING)
     state = make_state(position=(0.0, 0.0, -3.0))
     acting = np.full(4, vehicle.hover_speed)

@@ -90,16 +90,16 @@ def test_output_passes_samples_of_a_parabola_by_that_much() -> None:
 @pytest.mark.parametrize("delay", [0.0, 0.02])
 def test_uncorrected_error_of_a_double_integrator_grows_with_the_square_of_time(delay: float) -> None:
     A, B, C, E = DOUBLE_INTEGRATOR
-    found = growth(A, B, C, 0.7 * E, np.zeros((1, 2)), period=PERIOD, horizon=6, delay=delay)
+    result = growth(A, B, C, 0.7 * E, np.zeros((1, 2)), period=PERIOD, horizon=6, delay=delay)
     times = delay + PERIOD * np.arange(1, 7)
-    np.testing.assert_allclose(found[:, 0], 0.7 * times**2 / 2.0, rtol=1e-12)
+    np.testing.assert_allclose(result[:, 0], 0.7 * times**2 / 2.0, rtol=1e-12)
 
 
 def test_deadbeat_correction_of_a_double_integrator_ends_the_growth_after_two_periods() -> None:
     A, B, C, E = DOUBLE_INTEGRATOR
     K = np.array([[1.0 / PERIOD**2, 1.5 / PERIOD]])
-    found = growth(A, B, C, E, K, period=PERIOD, horizon=5)
-    np.testing.assert_allclose(found[:, 0], PERIOD**2 * np.array([0.5, 1.0, 1.0, 1.0, 1.0]), rtol=1e-9)
+    result = growth(A, B, C, E, K, period=PERIOD, horizon=5)
+    np.testing.assert_allclose(result[:, 0], PERIOD**2 * np.array([0.5, 1.0, 1.0, 1.0, 1.0]), rtol=1e-9)
 
 
 # The worst of disturbances
@@ -135,12 +135,10 @@ def errors(vehicle: Vehicle, w: Array, *, rotor_lag: float, delay: float, subste
 
 
 @pytest.mark.parametrize(("rotor_lag", "delay"), [(0.0, 0.0), (0.05, 0.0), (0.0, 0.02), (0.05, 0.05)])
-def test_margin_is_what_the_worst_disturbance_does_and_no_more(
-    vehicle: Vehicle, rotor_lag: float, delay: float
-) -> None:
+def test_margins_equal_the_worst_disturbances_effect(vehicle: Vehicle, rotor_lag: float, delay: float) -> None:
     largest, substeps, periods, about_x = np.repeat([0.5, 0.3], 3), 50, 10, 3
     settings = TighteningSettings(acceleration=0.5, angular_acceleration=0.3, turning=0.0)
-    found = tilt_margins(vehicle, settings, rotor_lag=rotor_lag, delay=delay)
+    result = tilt_margins(vehicle, settings, rotor_lag=rotor_lag, delay=delay)
     late = round(delay / PERIOD * substeps)
     length = periods * substeps + late
 
@@ -152,13 +150,13 @@ def test_margin_is_what_the_worst_disturbance_does_and_no_more(
     single[range(length), about_x, range(length)] = 1.0
     worst = np.zeros((length, 6, 1))
     worst[:, about_x, 0] = 0.3 * np.sign(respond(single)[-1, 0])
-    assert respond(worst)[-1, 0, 0] == pytest.approx(found[periods - 1, 0], rel=2e-3)
+    assert respond(worst)[-1, 0, 0] == pytest.approx(result[periods - 1, 0], rel=2e-3)
 
     rng = np.random.default_rng(0)
     for hold in (1, 10, substeps, 4 * substeps):
         signs = rng.choice([-1.0, 1.0], (-(-length // hold), 6, 50)).repeat(hold, axis=0)[:length]
         samples = np.abs(respond(largest[:, None] * signs)[late + substeps - 1 :: substeps])
-        assert (samples <= found[:periods, :, None] * (1.0 + 1e-9)).all()
+        assert (samples <= result[:periods, :, None] * (1.0 + 1e-9)).all()
 
 
 # What margins depend on
@@ -171,11 +169,11 @@ def test_without_disturbance_only_the_way_between_samples_is_left(vehicle: Vehic
 
 @pytest.mark.parametrize("rotor_lag", [0.0, 0.05])
 def test_margins_grow_over_the_horizon_and_saturate(vehicle: Vehicle, rotor_lag: float) -> None:
-    found = tilt_margins(vehicle, rotor_lag=rotor_lag)
-    assert found.shape == (HORIZON, 2)
-    assert (np.diff(found, axis=0) >= 0.0).all()
-    np.testing.assert_allclose(found[20], found[-1], rtol=1e-2)
-    np.testing.assert_allclose(found[:, 0], found[:, 1], rtol=1e-9)  # roll and pitch are alike
+    result = tilt_margins(vehicle, rotor_lag=rotor_lag)
+    assert result.shape == (HORIZON, 2)
+    assert (np.diff(result, axis=0) >= 0.0).all()
+    np.testing.assert_allclose(result[20], result[-1], rtol=1e-2)
+    np.testing.assert_allclose(result[:, 0], result[:, 1], rtol=1e-9)  # roll and pitch are alike
 
 
 @pytest.mark.parametrize(
@@ -184,9 +182,9 @@ def test_margins_grow_over_the_horizon_and_saturate(vehicle: Vehicle, rotor_lag:
 def test_defaults_draw_the_tilt_in_as_documented(
     vehicle: Vehicle, rotor_lag: float, delay: float, first: float, last: float
 ) -> None:
-    found = np.degrees(tilt_margins(vehicle, rotor_lag=rotor_lag, delay=delay, estimated=True))
-    np.testing.assert_allclose(found[0], first, atol=0.005)
-    np.testing.assert_allclose(found[-1], last, atol=0.005)
+    result = np.degrees(tilt_margins(vehicle, rotor_lag=rotor_lag, delay=delay, estimated=True))
+    np.testing.assert_allclose(result[0], first, atol=0.005)
+    np.testing.assert_allclose(result[-1], last, atol=0.005)
     text = " ".join((ROOT / "docs" / "robust.md").read_text(encoding="utf-8").split())
     assert f"{last:.2f} deg" in text
 

@@ -29,7 +29,7 @@ def test_margins_are_signed_distances_to_the_nearer_bound() -> None:
     np.testing.assert_array_equal(Z.margin(np.array([-2.0, -1.0, 0.0, 1.5, 2.0, 2.25])), [-1, 0, 1, 0.5, 0, -0.25])
 
 
-def test_a_peak_between_the_samples_is_found() -> None:
+def test_a_peak_between_samples_is_detected() -> None:
     finding = find(logged("z", samples=SAMPLES, plant=PLANT), Z)
     assert finding.peak_sampled == 1.9
     assert finding.worst_margin_sampled == pytest.approx(0.1)

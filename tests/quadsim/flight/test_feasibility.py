@@ -35,32 +35,32 @@ def winding(t: Array) -> tuple[Array, ...]:
 
 
 def test_hover_requires_the_hover_speed_and_nothing_else(vehicle: Vehicle) -> None:
-    _, found = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t + 3.0, 0.0 * t - 1.0, 0.0 * t + 0.5))
-    np.testing.assert_allclose(found.speeds, vehicle.hover_speed, rtol=1e-12)
-    np.testing.assert_allclose(found.state[0], [0, 0, 3, 0, -1, 0, 0, 0, 0, 0, 0.5, 0], atol=1e-15)
-    assert not found.torque.any()
-    assert not tilt(found.state).any()
+    _, result = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t + 3.0, 0.0 * t - 1.0, 0.0 * t + 0.5))
+    np.testing.assert_allclose(result.speeds, vehicle.hover_speed, rtol=1e-12)
+    np.testing.assert_allclose(result.state[0], [0, 0, 3, 0, -1, 0, 0, 0, 0, 0, 0.5, 0], atol=1e-15)
+    assert not result.torque.any()
+    assert not tilt(result.state).any()
 
 
 def test_a_circle_requires_the_tilt_of_its_centripetal_acceleration(vehicle: Vehicle) -> None:
     """tan(tilt) = v^2 / (r g), where v^2 / r of a sampled circle is r (2 - 2 cos(w h)) / h^2."""
     radius, rate = 2.0, 1.2
-    _, found = demanded(vehicle, lambda t: (radius * np.cos(rate * t), radius * np.sin(rate * t), 0.0 * t, 0.0 * t))
+    _, result = demanded(vehicle, lambda t: (radius * np.cos(rate * t), radius * np.sin(rate * t), 0.0 * t, 0.0 * t))
     sampled = radius * (2.0 - 2.0 * math.cos(rate * PERIOD)) / PERIOD**2
-    np.testing.assert_allclose(tilt(found.state), math.atan(sampled / vehicle.gravity), rtol=1e-9)
-    np.testing.assert_allclose(tilt(found.state), math.atan(radius * rate**2 / vehicle.gravity), rtol=2e-5)
+    np.testing.assert_allclose(tilt(result.state), math.atan(sampled / vehicle.gravity), rtol=1e-9)
+    np.testing.assert_allclose(tilt(result.state), math.atan(radius * rate**2 / vehicle.gravity), rtol=2e-5)
     thrust = vehicle.mass * math.hypot(vehicle.gravity, radius * rate**2)
-    np.testing.assert_allclose(found.thrust, thrust, rtol=1e-5)
-    np.testing.assert_allclose(np.linalg.norm(found.state[:, VELOCITY], axis=1), radius * rate, rtol=1e-4)
+    np.testing.assert_allclose(result.thrust, thrust, rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(result.state[:, VELOCITY], axis=1), radius * rate, rtol=1e-4)
 
 
 def test_the_thrust_along_body_z_accelerates_the_vehicle_as_required(vehicle: Vehicle) -> None:
-    _, found = demanded(vehicle, winding)
-    up = body_to_world(found.state[:, EULER])[:, :, 2]
-    acceleration = found.thrust[:, None] / vehicle.mass * up - [0.0, 0.0, vehicle.gravity]
-    np.testing.assert_allclose(acceleration, found.acceleration, atol=1e-12)
-    wrench = found.speeds**2 @ vehicle.allocation.T
-    np.testing.assert_allclose(wrench, np.column_stack([found.thrust, found.torque]), atol=1e-9)
+    _, result = demanded(vehicle, winding)
+    up = body_to_world(result.state[:, EULER])[:, :, 2]
+    acceleration = result.thrust[:, None] / vehicle.mass * up - [0.0, 0.0, vehicle.gravity]
+    np.testing.assert_allclose(acceleration, result.acceleration, atol=1e-12)
+    wrench = result.speeds**2 @ vehicle.allocation.T
+    np.testing.assert_allclose(wrench, np.column_stack([result.thrust, result.torque]), atol=1e-9)
 
 
 def test_the_torque_changes_the_angular_momentum() -> None:
@@ -68,13 +68,13 @@ def test_the_torque_changes_the_angular_momentum() -> None:
     vehicle = lopsided()
 
     def imbalance(period: float) -> float:
-        _, found = demanded(vehicle, winding, period=period)
-        euler = found.state[:, EULER]
+        _, result = demanded(vehicle, winding, period=period)
+        euler = result.state[:, EULER]
         rotation = body_to_world(euler)
-        body_rates = euler_to_body_rates(euler, found.state[:, EULER_RATE])
+        body_rates = euler_to_body_rates(euler, result.state[:, EULER_RATE])
         momentum = np.einsum("kij,kj->ki", rotation, np.array(vehicle.inertia) * body_rates)
         change = (momentum[2:] - momentum[:-2]) / (2.0 * period)
-        return float(np.abs(change - np.einsum("kij,kj->ki", rotation, found.torque)[1:-1]).max())
+        return float(np.abs(change - np.einsum("kij,kj->ki", rotation, result.torque)[1:-1]).max())
 
     assert imbalance(0.01) < 0.03 * np.abs(demanded(vehicle, winding)[1].torque).max()
     assert imbalance(0.01) / imbalance(0.005) == pytest.approx(4.0, rel=0.05)
@@ -111,30 +111,30 @@ def test_a_kink_requires_a_tilt_but_no_torque(vehicle: Vehicle) -> None:
     poses = np.zeros((14, 4))
     poses[:, 0] = 0.1 * np.maximum(t, 0.0)
     kinks = (t[:-1] <= 0.0) & (t[1:] >= 0.0)
-    found = demand(poses, PERIOD, vehicle, kinks=kinks)
-    assert tilt(found.state).max() == pytest.approx(math.atan(0.1 / PERIOD / vehicle.gravity))
-    np.testing.assert_allclose(found.torque, 0.0, atol=1e-9)
+    result = demand(poses, PERIOD, vehicle, kinks=kinks)
+    assert tilt(result.state).max() == pytest.approx(math.atan(0.1 / PERIOD / vehicle.gravity))
+    np.testing.assert_allclose(result.torque, 0.0, atol=1e-9)
     assert np.abs(demand(poses, PERIOD, vehicle).torque).max() > 10.0
 
 
 def test_a_course_within_all_limits_is_reported_feasible(vehicle: Vehicle) -> None:
     _, needed = demanded(vehicle, lambda t: (0.2 * np.cos(t), 0.2 * np.sin(t), 0.0 * t, 0.0 * t))
-    found = assess(needed, vehicle, bounds={"roll": (-0.1, 0.1), "speed": (0.0, 250.0), "slew": (-10.0, 5.0)})
-    assert found.problems == ()
-    assert found.sentence == (
+    result = assess(needed, vehicle, bounds={"roll": (-0.1, 0.1), "speed": (0.0, 250.0), "slew": (-10.0, 5.0)})
+    assert result.problems == ()
+    assert result.sentence == (
         "The course requires up to 1.17 deg of tilt (bound 5.73 deg), 0.2 m/s, and rotor speeds of 192.8 to 192.8 "
         "rad/s (limits 0 and 250 rad/s)."
     )
-    assert found.thrust_to_weight == pytest.approx(math.hypot(1.0, 0.2 / vehicle.gravity), rel=1e-5)
-    assert found.acceleration == pytest.approx(0.2, rel=1e-4)
-    assert found.yaw_rate == 0.0
+    assert result.thrust_to_weight == pytest.approx(math.hypot(1.0, 0.2 / vehicle.gravity), rel=1e-5)
+    assert result.acceleration == pytest.approx(0.2, rel=1e-4)
+    assert result.yaw_rate == 0.0
 
 
 def test_every_limit_and_bound_that_is_left_is_named(vehicle: Vehicle) -> None:
     _, needed = demanded(vehicle, lambda t: (np.sin(2.0 * t), 0.0 * t, np.sin(2.0 * t) * 0.5, 3.0 * t), seconds=6.0)
     bounds = {"roll": (-0.2, 0.2), "vx": (-1.0, 5.0), "yaw_rate": (-1.0, 1.0), "speed": (180.0, 260.0)}
-    found = assess(needed, replace(vehicle, speed_max=200.0), bounds={**bounds, "slew": (-0.1, 0.1)}, jumps=(1.0,))
-    names = [problem.rsplit(" (", 1) for problem in found.problems]
+    result = assess(needed, replace(vehicle, speed_max=200.0), bounds={**bounds, "slew": (-0.1, 0.1)}, jumps=(1.0,))
+    names = [problem.rsplit(" (", 1) for problem in result.problems]
     assert [(text.split(" up")[0].split(" down")[0], kind) for text, kind in names] == [
         ("rotor speed", "limit 200)"),
         ("roll", "bound 11.46)"),
@@ -145,36 +145,36 @@ def test_every_limit_and_bound_that_is_left_is_named(vehicle: Vehicle) -> None:
         ("change of rotor speed", "bound 0.1)"),
         ("change of rotor speed", "bound -0.1)"),
     ]
-    assert f"rotor speed up to {needed.speeds.max():.4g} rad/s (limit 200)" in found.problems
-    assert f"vx down to {needed.state[:, INDEX['vx']].min():.4g} m/s (bound -1)" in found.problems
-    assert "rad/s per period" in found.problems[-1]
-    assert found.sentence.startswith("The course steps (at t = 1 s); the rest requires up to ")
-    assert found.sentence.endswith(f" It cannot be followed exactly: {'; '.join(found.problems)}.")
-    assert found.yaw_rate == pytest.approx(math.degrees(3.0))
-    assert found.yaw == pytest.approx(math.degrees(18.0))
-    assert " m/s, a yaw of 1031.3 deg, and rotor speeds of " in found.sentence
+    assert f"rotor speed up to {needed.speeds.max():.4g} rad/s (limit 200)" in result.problems
+    assert f"vx down to {needed.state[:, INDEX['vx']].min():.4g} m/s (bound -1)" in result.problems
+    assert "rad/s per period" in result.problems[-1]
+    assert result.sentence.startswith("The course steps (at t = 1 s); the rest requires up to ")
+    assert result.sentence.endswith(f" It cannot be followed exactly: {'; '.join(result.problems)}.")
+    assert result.yaw_rate == pytest.approx(math.degrees(3.0))
+    assert result.yaw == pytest.approx(math.degrees(18.0))
+    assert " m/s, a yaw of 1031.3 deg, and rotor speeds of " in result.sentence
 
 
 def test_falling_faster_than_free_is_thrust_downwards(vehicle: Vehicle) -> None:
     _, needed = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t, -t * t * vehicle.gravity, 0.0 * t))
-    found = assess(needed, vehicle)
-    assert found.tilt == pytest.approx(180.0)
+    result = assess(needed, vehicle)
+    assert result.tilt == pytest.approx(180.0)
 
 
 def test_a_torque_beyond_the_thrust_is_not_flyable(vehicle: Vehicle) -> None:
     _, needed = demanded(vehicle, lambda t: (0.0 * t, 0.0 * t, 0.0 * t, 2.0 * np.sin(8.0 * t)))
-    found = assess(needed, vehicle)
+    result = assess(needed, vehicle)
     most = np.abs(needed.torque[:, 2]).max()  # [N m]; each rotor gives a quarter of it, at d / b per thrust
     least = 0.25 * (vehicle.mass * vehicle.gravity - most / vehicle.drag_to_thrust)
-    assert found.thrust_min == pytest.approx(least)
-    assert found.problems == (
-        f"rotor speed up to {found.rotor_max:.4g} rad/s (limit 250)",
+    assert result.thrust_min == pytest.approx(least)
+    assert result.problems == (
+        f"rotor speed up to {result.rotor_max:.4g} rad/s (limit 250)",
         f"not flyable: a rotor would need a negative thrust, down to {least:.4g} N",
     )
-    assert found.rotor_min == 0.0
-    assert " rotor speeds of 0 to " in found.sentence
+    assert result.rotor_min == 0.0
+    assert " rotor speeds of 0 to " in result.sentence
     bounded = assess(needed, vehicle, bounds={"speed": (0.0, 250.0)})
-    assert bounded.problems == found.problems  # a bound as wide as the limit is not named again
+    assert bounded.problems == result.problems  # a bound as wide as the limit is not named again
 
 
 def lopsided() -> Vehicle:

@@ -95,7 +95,7 @@ def test_every_column_has_its_unit(tmp_path: Path) -> None:
         assert (schema.metadata[b"scenario"], schema.metadata[b"seed"]) == (b"made-up", b"3")
 
 
-def test_what_a_flight_does_not_have_takes_no_column(tmp_path: Path) -> None:
+def test_absent_signals_have_no_columns(tmp_path: Path) -> None:
     log = small_log()
     control = dataclasses.replace(log.control, truth=log.control.state)
     plant = dataclasses.replace(log.plant, wrench=None, wind=None)

@@ -19,9 +19,9 @@ from quadsim.state import Array
 def control(z: list[float], reference: list[float]) -> ControlLog:
     """A log where z [m] and its reference are as given and all else is zero."""
     log = small_log(len(z)).control
-    state, wanted = np.zeros_like(log.state), np.zeros_like(log.reference)
-    state[:, 4], wanted[:, 2] = z, reference
-    return replace(log, truth=state, reference=wanted)
+    state, desired = np.zeros_like(log.state), np.zeros_like(log.reference)
+    state[:, 4], desired[:, 2] = z, reference
+    return replace(log, truth=state, reference=desired)
 
 
 def test_tracking_errors_are_real_minus_reference() -> None:
@@ -80,8 +80,8 @@ def test_a_first_order_response_settles_after_tau_ln_20(tau: float, before: floa
     t = np.arange(400) * period
     x = np.where(t < start, before, after + (before - after) * np.exp(-(t - start) / tau))
     expected = period * math.ceil(tau * math.log(20.0) / period)
-    found = settled(t, x, before=before, after=after, start=start, until=20.0)
-    assert found == pytest.approx(expected, abs=1e-9)
+    result = settled(t, x, before=before, after=after, start=start, until=20.0)
+    assert result == pytest.approx(expected, abs=1e-9)
 
 
 def test_an_output_that_leaves_the_band_again_has_not_settled_before() -> None:

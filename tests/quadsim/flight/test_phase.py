@@ -166,12 +166,12 @@ def test_take_off_and_touchdown_of_a_ballistic_hop() -> None:
     t, states, clearances = hop(0.8)
     expected = np.sqrt(2.0 * 9.81 * (0.8 - TOUCH))
     start, rise = 0.5, np.sqrt(2.0 * 9.81 * 0.8)
-    found = touchdown(t, states, clearances)
-    assert found is not None
-    assert found["time"] == pytest.approx(start + (rise + expected) / 9.81, abs=1.01e-3)
-    assert found["speed"] == pytest.approx(expected, abs=0.01)
-    assert found["horizontal_speed"] == pytest.approx(0.5, abs=1e-12)
-    assert found["tilt"] == pytest.approx(3.0, abs=1e-6)
+    result = touchdown(t, states, clearances)
+    assert result is not None
+    assert result["time"] == pytest.approx(start + (rise + expected) / 9.81, abs=1.01e-3)
+    assert result["speed"] == pytest.approx(expected, abs=0.01)
+    assert result["horizontal_speed"] == pytest.approx(0.5, abs=1e-12)
+    assert result["tilt"] == pytest.approx(3.0, abs=1e-6)
     airborne = start + (rise - np.sqrt(rise**2 - 2.0 * 9.81 * AIRBORNE)) / 9.81
     assert takeoff_time(t, clearances) == pytest.approx(airborne, abs=1.01e-3)
 

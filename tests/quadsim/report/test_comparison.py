@@ -27,8 +27,8 @@ def having(run: Run, scenario: str, **entries: Any) -> Run:
 def with_margin(entry: dict[str, Any], margin: float) -> dict[str, Any]:
     """A required constraint that was held, or violated, by a margin."""
     margins = dict.fromkeys(("worst_margin", "worst_margin_sampled"), margin)
-    found = {"required": True, "satisfied": margin >= 0.0, "verdict": "satisfied" if margin >= 0.0 else "violated"}
-    return {**entry, **margins, **found, "worst_time": 1.0}
+    result = {"required": True, "satisfied": margin >= 0.0, "verdict": "satisfied" if margin >= 0.0 else "violated"}
+    return {**entry, **margins, **result, "worst_time": 1.0}
 
 
 @pytest.fixture
@@ -55,8 +55,8 @@ def worse_run(short_run: Run) -> Run:
 
 
 def cells(rows: list[Row], label: str, group: str | None = None) -> tuple[Cell, ...]:
-    (found,) = (row for row in rows if row.label == label and group in (None, row.group))
-    return found.cells
+    (result,) = (row for row in rows if row.label == label and group in (None, row.group))
+    return result.cells
 
 
 def texts(rows: list[Row], label: str, group: str | None = None) -> list[str]:
@@ -156,27 +156,27 @@ def test_a_verdict_minds_required_constraints_and_whether_they_were_reached(bare
     beyond = dict.fromkeys(("worst_margin", "worst_margin_sampled", "worst_time"))
     unreached = {**with_margin(entry, 1.0), **beyond, "name": "arrival", "satisfied": False}
     held, broken = with_margin(entry, 1.0), with_margin(entry, -1.0)
-    found = {
+    result = {
         "incomplete": [held, unreached],
         "violated": [broken, unreached],
         "satisfied": [{**broken, "required": False}, {**unreached, "required": False}],
     }
-    for word, constraints in found.items():
+    for word, constraints in result.items():
         assert verdict({**bare_run.summary, "constraints": constraints}) == word
 
 
 def test_permanent_fallback_is_no_success_and_is_reported_with_its_reason(bare_run: Run) -> None:
     held, broken = ([with_margin(entry, by) for entry in bare_run.summary["constraints"]] for by in (1.0, -1.0))
-    found = {"sentence": "no answer at t = 1.00 s", "advice": "to try: more", "time": 1.0}
+    result = {"sentence": "no answer at t = 1.00 s", "advice": "to try: more", "time": 1.0}
     controller = {**bare_run.summary["controller"], "unrecovered": 318}
     good = having(bare_run, "good", constraints=held)
-    stuck = having(good, "stuck", controller=controller, diagnosis=found)
+    stuck = having(good, "stuck", controller=controller, diagnosis=result)
     crashed = having(good, "crashed", ground={"crashed": True})
     assert [verdict(run.summary) for run in (good, stuck, crashed)] == ["satisfied", "violated", "violated"]
     assert violated_by_fallback(stuck.summary)
     assert not violated_by_fallback(crashed.summary)
     assert not violated_by_fallback(having(stuck, "both", constraints=broken).summary)
-    reasons = ["318 periods in fallback, never recovered", found["sentence"], found["advice"]]
+    reasons = ["318 periods in fallback, never recovered", result["sentence"], result["advice"]]
     assert failure_sentences(stuck.summary) == reasons
     rows = comparison_rows([good, stuck])
     assert texts(rows, "why no optimum") == ["-", "; ".join(map(str, reasons))]

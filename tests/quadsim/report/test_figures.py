@@ -105,18 +105,18 @@ def test_another_scenario_gives_plain_names_and_its_effects(short_run: Run, empt
 
 
 def test_states_are_those_of_the_plant_with_units_references_and_bounds(short_run: Run) -> None:
-    found = panels(states([short_run]))
-    assert list(found) == ["x [m]", "roll [deg]", "y [m]", "pitch [deg]", "z [m]", "yaw [deg]"]
+    result = panels(states([short_run]))
+    assert list(result) == ["x [m]", "roll [deg]", "y [m]", "pitch [deg]", "z [m]", "yaw [deg]"]
     plant, control = short_run.log.plant, short_run.log.control
-    np.testing.assert_array_equal(curves(found["z [m]"])["flight"].y, plant.state[:, INDEX["z"]])
-    np.testing.assert_allclose(curves(found["pitch [deg]"])["flight"].y, np.degrees(plant.state[:, INDEX["pitch"]]))
-    np.testing.assert_array_equal(curves(found["z [m]"])["reference, filtered"].y, control.reference[:, 2])
-    assert [(bound.value, bound.start, bound.stop) for bound in found["roll [deg]"].bounds] == [
+    np.testing.assert_array_equal(curves(result["z [m]"])["flight"].y, plant.state[:, INDEX["z"]])
+    np.testing.assert_allclose(curves(result["pitch [deg]"])["flight"].y, np.degrees(plant.state[:, INDEX["pitch"]]))
+    np.testing.assert_array_equal(curves(result["z [m]"])["reference, filtered"].y, control.reference[:, 2])
+    assert [(bound.value, bound.start, bound.stop) for bound in result["roll [deg]"].bounds] == [
         (-5.0, 0.0, short_run.end),
         (5.0, 0.0, short_run.end),
     ]
     assert "measured" not in states([short_run]).labels
-    assert found["z [m]"].least_range is None, "it moves"
+    assert result["z [m]"].least_range is None, "it moves"
     assert times([short_run]).panels[0].bounds[0].value == 50.0, "the deadline"
     late = dataclasses.replace(short_run, limits=(Limit(name="late", signal="roll", upper=5.0, start=100.0),))
     assert panels(states([late]))["roll [deg]"].bounds == (), "it begins after the flight"

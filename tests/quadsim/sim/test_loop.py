@@ -165,8 +165,8 @@ def test_a_flight_that_is_lost_is_recorded_up_to_there(vehicle: Vehicle) -> None
     whole, cut = (fall(vehicle, {"depth": depth}) for depth in (math.inf, 0.5))
     assert (whole.reason, whole.lost, whole.control.t.size) == (None, None, PERIODS)
     assert (cut.status, cut.lost, cut.interrupted) == ("aborted", "depth", False)
-    found = "the depth below the lowest of start and reference is 0.60086 m"
-    assert cut.reason == f"at t = 0.350 s: lost: {found}, beyond lost.depth = 0.5 m"
+    result = "the depth below the lowest of start and reference is 0.60086 m"
+    assert cut.reason == f"at t = 0.350 s: lost: {result}, beyond lost.depth = 0.5 m"
     assert (cut.control.t.size, cut.plant.t[-1]) == (7, 0.35)
     np.testing.assert_array_equal(cut.plant.state, whole.plant.state[: cut.plant.t.size])
     np.testing.assert_array_equal(cut.control.speeds, whole.control.speeds[:7])

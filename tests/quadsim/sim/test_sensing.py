@@ -55,10 +55,10 @@ def test_a_perfect_sensor_reports_the_truth(name: SensorName, physics: Array) ->
 def test_noise_and_bias_are_as_stated_on_each_axis(name: SensorName, physics: Array) -> None:
     noise, bias = np.array([0.01, 0.02, 0.05]), np.array([0.1, -0.2, 0.05])
     sensor = Sensor(name=name, rate=1000.0, noise=tuple(noise), bias=tuple(bias))
-    found = errors(sampler(sensor).sample(physics, 0), physics)
-    np.testing.assert_allclose(found.mean(0), bias, atol=4 * noise.max() / np.sqrt(STEPS))
-    np.testing.assert_allclose(found.std(0), noise, rtol=4 / np.sqrt(2 * STEPS))  # of a standard deviation, 4 sigma
-    corr = np.corrcoef(found[1:].T, found[:-1].T)
+    result = errors(sampler(sensor).sample(physics, 0), physics)
+    np.testing.assert_allclose(result.mean(0), bias, atol=4 * noise.max() / np.sqrt(STEPS))
+    np.testing.assert_allclose(result.std(0), noise, rtol=4 / np.sqrt(2 * STEPS))  # of a standard deviation, 4 sigma
+    corr = np.corrcoef(result[1:].T, result[:-1].T)
     assert np.abs(corr - np.eye(6)).max() < 5 / np.sqrt(STEPS)  # white, and the axes independent
 
 
@@ -87,10 +87,10 @@ def test_outliers_widen_the_noise_of_their_share_of_samples(physics: Array) -> N
     sensor = Sensor(
         name=SensorName.POSITION, rate=1000.0, noise=(0.1, 0.1, 0.1), outliers=Outliers(probability=0.1, size=20.0)
     )
-    found = errors(sampler(sensor).sample(physics, 0), physics)
+    result = errors(sampler(sensor).sample(physics, 0), physics)
     clean = errors(sampler(replace(sensor, outliers=None)).sample(physics, 0), physics)
-    widened = np.isclose(found, 20.0 * clean, rtol=1e-6, atol=1e-9)
-    assert np.all(widened | np.isclose(found, clean, rtol=1e-6, atol=1e-9))
+    widened = np.isclose(result, 20.0 * clean, rtol=1e-6, atol=1e-9)
+    assert np.all(widened | np.isclose(result, clean, rtol=1e-6, atol=1e-9))
     assert np.all(widened.all(axis=1) == widened.any(axis=1))  # all axes of a sample together
     assert widened[:, 0].mean() == pytest.approx(0.1, abs=4 * np.sqrt(0.1 * 0.9 / STEPS))
 

@@ -141,8 +141,8 @@ def test_a_flight_far_out_is_at_the_edge_and_does_not_flatten_the_others(thousan
     panel = over(table, "wind")
     markers = {int(flight): s.marker for s in panel.series if s.flights is not None for flight in s.flights}
     flights = table["flight"].to_pylist()
-    found = [markers[flights[i]] for i in (0, 1, 3)]
-    assert found == ["triangle-down", "triangle-down", "triangle-right"]
+    result = [markers[flights[i]] for i in (0, 1, 3)]
+    assert result == ["triangle-down", "triangle-down", "triangle-right"]
     assert len(markers) == 1000, "every flight is a point"
     assert panel.y_range is not None
     assert panel.y_range[0] > -0.6
@@ -189,23 +189,23 @@ def test_a_browser_draws_the_page_and_has_no_complaint(make_campaign: MakeCampai
 
 
 def test_failures_over_a_drawn_number_are_those_of_its_fifths(thousand: pa.Table) -> None:
-    found = estimate(thousand)["parameters"]["wind"]["groups"]
+    result = estimate(thousand)["parameters"]["wind"]["groups"]
     wind, failed = (np.array(thousand[name].to_pylist(), float) for name in ("draw.wind", "failed"))
-    assert [group["flights"] for group in found] == [200] * 5
-    assert found[0]["low"] == wind.min()
-    assert found[-1]["high"] == wind.max()
-    for group, after in zip(found, [*found[1:], None], strict=True):
+    assert [group["flights"] for group in result] == [200] * 5
+    assert result[0]["low"] == wind.min()
+    assert result[-1]["high"] == wind.max()
+    for group, after in zip(result, [*result[1:], None], strict=True):
         inside = (wind >= group["low"]) & (wind <= group["high"])
         assert group["count"] == failed[inside].sum()
         assert after is None or group["high"] < after["low"]
-    assert found[-1]["share"] > found[0]["share"]
+    assert result[-1]["share"] > result[0]["share"]
 
 
 def test_few_values_are_groups_of_their_own_and_few_flights_none(thousand: pa.Table) -> None:
     i = thousand.column_names.index("draw.horizon")
     horizons = pa.array([20 + 10 * (k % 3) for k in range(1000)])
-    found = estimate(thousand.set_column(i, "draw.horizon", horizons))["parameters"]["horizon"]["groups"]
-    assert [(group["low"], group["high"], group["flights"]) for group in found] == [
+    result = estimate(thousand.set_column(i, "draw.horizon", horizons))["parameters"]["horizon"]["groups"]
+    assert [(group["low"], group["high"], group["flights"]) for group in result] == [
         *((20.0, 20.0, 334), (30.0, 30.0, 333), (40.0, 40.0, 333))
     ]
     assert len(estimate(thousand.slice(0, 30))["parameters"]["mass"]["groups"]) == 3

@@ -115,8 +115,8 @@ def test_two_campaigns_are_compared_flight_by_flight(
         assert 0 < text.index("initial.position.2") < text.index("of 6 paired flights")
     assert "initial.position.2" in page
     assert "of 6 paired flights" in page
-    found = json.loads((pairs / "comparison.json").read_text(encoding="utf-8"))
-    assert found["differences"] == [{"field": "initial.position.2", "values": [0.0, 0.05]}]
+    result = json.loads((pairs / "comparison.json").read_text(encoding="utf-8"))
+    assert result["differences"] == [{"field": "initial.position.2", "values": [0.0, 0.05]}]
 
 
 @pytest.mark.parametrize(

@@ -103,11 +103,11 @@ def flown(flights: int, violated: int) -> pa.Table:
 
 
 def test_a_requirement_is_read() -> None:
-    found = parse_requirement("P(violation) < 0.01 @ 95%")
-    assert (found.event.text, found.operation, found.share, found.confidence) == ("violation", "<", 0.01, 0.95)
-    found = parse_requirement(" p( rmse.z>0.5 )>=2.5%@99.9 % ")
-    assert (found.event.text, found.operation, found.share) == ("rmse.z > 0.5", ">=", 0.025)
-    assert found.confidence == pytest.approx(0.999)
+    result = parse_requirement("P(violation) < 0.01 @ 95%")
+    assert (result.event.text, result.operation, result.share, result.confidence) == ("violation", "<", 0.01, 0.95)
+    result = parse_requirement(" p( rmse.z>0.5 )>=2.5%@99.9 % ")
+    assert (result.event.text, result.operation, result.share) == ("rmse.z > 0.5", ">=", 0.025)
+    assert result.confidence == pytest.approx(0.999)
 
 
 @pytest.mark.parametrize(
@@ -146,10 +146,10 @@ def test_it_takes_299_clean_flights_for_one_percent() -> None:
     parsed = parse_requirement("P(violation) < 0.01 @ 95%")
     assert least_flights(parsed) == 299  # the rule of three gives 300
     assert not judge(flown(298, 0), parsed).holds
-    found = judge(flown(299, 0), parsed)
-    assert found.holds
-    assert found.bound == pytest.approx(0.00997, abs=1e-5)
-    assert found.sentence == (
+    result = judge(flown(299, 0), parsed)
+    assert result.holds
+    assert result.bound == pytest.approx(0.00997, abs=1e-5)
+    assert result.sentence == (
         "P(violation) < 0.01 @ 95% holds: violation in 0 of 299 flights (0 %), so with 95 % confidence at most 0.997 %."
     )
 
@@ -169,12 +169,12 @@ def test_the_least_number_supports_and_one_less_does_not(share: float, confidenc
 
 def test_the_bound_is_one_sided() -> None:
     """4 of 1000: the one-sided bound is 0.91 %, the two-sided interval goes on to 1.02 %."""
-    found = judge(flown(1000, 4), parse_requirement("P(violation) < 0.01 @ 95%"))
+    result = judge(flown(1000, 4), parse_requirement("P(violation) < 0.01 @ 95%"))
     one_sided = stats.binomtest(4, 1000, alternative="less").proportion_ci(0.95).high
     two_sided = stats.binomtest(4, 1000).proportion_ci(0.95).high
-    assert found.bound == pytest.approx(one_sided)
+    assert result.bound == pytest.approx(one_sided)
     assert one_sided < 0.01 < two_sided
-    assert found.holds
+    assert result.holds
 
 
 def test_a_lower_limit_takes_the_lower_bound() -> None:
@@ -193,6 +193,6 @@ def test_a_flight_without_the_number_counts_against_it() -> None:
 
 def test_no_flights_support_nothing() -> None:
     for text in ("P(violation) < 0.99 @ 50%", "P(violation) > 0.01 @ 50%"):
-        found = judge(flown(0, 0), parse_requirement(text))
-        assert not found.holds
-        assert "in 0 of 0 flights, so" in found.sentence
+        result = judge(flown(0, 0), parse_requirement(text))
+        assert not result.holds
+        assert "in 0 of 0 flights, so" in result.sentence

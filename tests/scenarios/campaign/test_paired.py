@@ -31,15 +31,15 @@ def better(make_campaign: MakeCampaign) -> pa.Table:
 
 
 def test_a_better_controller_is_found_to_be(thousand: pa.Table, better: pa.Table) -> None:
-    found = compare_pairs(thousand, better, NAMES)
-    assert found.verdict == "better"
+    result = compare_pairs(thousand, better, NAMES)
+    assert result.verdict == "better"
     failed = [np.array(table["failed"].to_pylist()) for table in (thousand, better)]
-    failure = found.events[0]
+    failure = result.events[0]
     assert failure.counts == (failed[0].sum(), failed[1].sum())
     assert (failure.only_a, failure.only_b) == ((failed[0] & ~failed[1]).sum(), (failed[1] & ~failed[0]).sum())
-    assert failure.pairs == found.flights == 1000
+    assert failure.pairs == result.flights == 1000
     assert failure.difference == (failure.only_b - failure.only_a) / 1000 < 0.0
-    assert found.sentence.startswith("robust is better than paper: of 1000 paired flights, ")
+    assert result.sentence.startswith("robust is better than paper: of 1000 paired flights, ")
     assert compare_pairs(better, thousand, NAMES).verdict == "worse"
 
 
@@ -47,33 +47,33 @@ def test_losses_are_compared_beside_failures(make_campaign: MakeCampaign) -> Non
     """Four of forty lost against none read as not distinguishable, without a word of it."""
     one, other = make_campaign(40, seed=1, severity=100.0), make_campaign(40, seed=1, severity=100.0)
     verdicts = ["lost"] * 4 + ["violated"] * 36
-    found = compare_pairs(changed(one, "verdict", verdicts), changed(other, "verdict", ["violated"] * 40), NAMES)
-    assert found.verdict == "not distinguishable"
-    lost = next(event for event in found.events if event.event == "lost")
+    result = compare_pairs(changed(one, "verdict", verdicts), changed(other, "verdict", ["violated"] * 40), NAMES)
+    assert result.verdict == "not distinguishable"
+    lost = next(event for event in result.events if event.event == "lost")
     assert (lost.counts, lost.p, lost.p_holm) == ((4, 0), 0.125, 0.125)
     many = ["lost"] * 12 + ["violated"] * 28
-    found = compare_pairs(changed(one, "verdict", many), changed(other, "verdict", ["violated"] * 40), NAMES)
-    assert "not distinguishable by their failures" in found.sentence
-    table = found.to_markdown()
+    result = compare_pairs(changed(one, "verdict", many), changed(other, "verdict", ["violated"] * 40), NAMES)
+    assert "not distinguishable by their failures" in result.sentence
+    table = result.to_markdown()
     assert "| lost | 12 (30.0 %) | 0 (0 %) | 12 | 0 | 0 | p < 0.001 | **p < 0.001** |" in table
     assert "| timeout |" not in table, "it never happened"
 
 
 def test_every_event_and_constraint_is_compared_and_corrected(thousand: pa.Table, better: pa.Table) -> None:
-    found = compare_pairs(thousand, better, NAMES)
-    assert [event.event for event in found.events] == [*EVENT_NAMES, "roll not held", "slew not held"]
-    tested = [event for event in found.events if event.only_a + event.only_b]
+    result = compare_pairs(thousand, better, NAMES)
+    assert [event.event for event in result.events] == [*EVENT_NAMES, "roll not held", "slew not held"]
+    tested = [event for event in result.events if event.only_a + event.only_b]
     assert [event.p_holm for event in tested] == holm([event.p for event in tested])
-    assert all(event.p_holm == 1.0 for event in found.events if event not in tested)
-    assert found.to_json()["events"]["lost"]["p_holm"] == next(e for e in found.events if e.event == "lost").p_holm
+    assert all(event.p_holm == 1.0 for event in result.events if event not in tested)
+    assert result.to_json()["events"]["lost"]["p_holm"] == next(e for e in result.events if e.event == "lost").p_holm
 
 
 def test_metrics_are_compared_where_both_were_completed(thousand: pa.Table, better: pa.Table) -> None:
-    found = compare_pairs(thousand, better, NAMES)
+    result = compare_pairs(thousand, better, NAMES)
     status = [np.array(table["status"].to_pylist()) == "completed" for table in (thousand, better)]
     both = status[0] & status[1]
-    assert found.completed == both.sum() < 1000
-    metric = next(metric for metric in found.metrics if metric.name == "worst_margin")
+    assert result.completed == both.sum() < 1000
+    metric = next(metric for metric in result.metrics if metric.name == "worst_margin")
     values = [np.array(table["worst_margin"].to_pylist(), float)[both] for table in (thousand, better)]
     assert metric.difference.pairs == both.sum()
     assert metric.difference.mean == pytest.approx((values[1] - values[0]).mean())
@@ -82,24 +82,24 @@ def test_metrics_are_compared_where_both_were_completed(thousand: pa.Table, bett
 
 
 def test_a_campaign_and_itself_are_not_distinguishable(thousand: pa.Table) -> None:
-    found = compare_pairs(thousand, thousand, ("a", "b"))
-    assert found.verdict == "not distinguishable"
-    assert found.sentence.startswith("b and a are not distinguishable by their failures: of 1000")
-    assert found.events[0].p == 1.0
-    assert all(metric.difference.mean == 0.0 for metric in found.metrics)
+    result = compare_pairs(thousand, thousand, ("a", "b"))
+    assert result.verdict == "not distinguishable"
+    assert result.sentence.startswith("b and a are not distinguishable by their failures: of 1000")
+    assert result.events[0].p == 1.0
+    assert all(metric.difference.mean == 0.0 for metric in result.metrics)
 
 
 def test_flights_of_one_campaign_alone_are_left_out(thousand: pa.Table, better: pa.Table) -> None:
     order = np.random.default_rng(0).permutation(600)
-    found = compare_pairs(thousand, better.take(order), NAMES)
-    assert (found.flights, found.left_out) == (600, 400)
-    assert found.events == compare_pairs(thousand.slice(0, 600), better.slice(0, 600), NAMES).events
-    assert "400 flights are left out" in found.to_markdown()
+    result = compare_pairs(thousand, better.take(order), NAMES)
+    assert (result.flights, result.left_out) == (600, 400)
+    assert result.events == compare_pairs(thousand.slice(0, 600), better.slice(0, 600), NAMES).events
+    assert "400 flights are left out" in result.to_markdown()
 
 
 def test_campaigns_of_one_name_are_distinguished(thousand: pa.Table, better: pa.Table) -> None:
-    found = compare_pairs(thousand, better, ("paper", "paper"))
-    assert found.sentence.startswith("paper (second) is better than paper (first): of 1000")
+    result = compare_pairs(thousand, better, ("paper", "paper"))
+    assert result.sentence.startswith("paper (second) is better than paper (first): of 1000")
 
 
 def test_other_draws_are_refused(thousand: pa.Table) -> None:
@@ -133,18 +133,18 @@ def test_flights_of_other_numbers_are_refused(thousand: pa.Table) -> None:
 
 
 def test_what_one_campaign_alone_draws_is_reported(thousand: pa.Table, better: pa.Table) -> None:
-    found = compare_pairs(thousand.drop_columns(["draw.lag"]), better, NAMES)
-    assert found.own_draws == ("lag",)
-    assert "lag" not in found.shared_draws
-    assert "one campaign alone draws lag" in found.to_markdown()
+    result = compare_pairs(thousand.drop_columns(["draw.lag"]), better, NAMES)
+    assert result.own_draws == ("lag",)
+    assert "lag" not in result.shared_draws
+    assert "one campaign alone draws lag" in result.to_markdown()
 
 
 def test_a_comparison_is_plain_data_and_a_table(thousand: pa.Table, better: pa.Table) -> None:
-    found = compare_pairs(thousand, better, NAMES)
-    plain = found.to_json()
+    result = compare_pairs(thousand, better, NAMES)
+    plain = result.to_json()
     assert json.loads(json.dumps(plain, allow_nan=False)) == plain
     assert plain["verdict"] == "better"
-    text = found.to_markdown()
+    text = result.to_markdown()
     assert text.startswith("# robust against paper\n\nPairs share their seed")
     assert "\n\nrobust is better than paper" in text
     assert "differ:" not in text.partition("robust is better")[0], "nobody said what differs"

@@ -36,14 +36,14 @@ from scenarios.campaign.statistics import (
 
 @pytest.mark.parametrize(("count", "trials"), [(0, 1), (1, 1), (0, 20), (3, 20), (37, 1000), (999, 1000), (10, 10)])
 def test_the_interval_is_scipys(count: int, trials: int) -> None:
-    found = proportion(count, trials)
+    result = proportion(count, trials)
     exact = stats.binomtest(count, trials).proportion_ci(0.95, method="exact")
-    assert (found["lower"], found["upper"]) == pytest.approx((exact.low, exact.high), abs=1e-9)
+    assert (result["lower"], result["upper"]) == pytest.approx((exact.low, exact.high), abs=1e-9)
     one_sided = stats.binomtest(count, trials, alternative="less").proportion_ci(0.95, method="exact")
-    assert found["upper_one_sided"] == pytest.approx(one_sided.high, abs=1e-9)
+    assert result["upper_one_sided"] == pytest.approx(one_sided.high, abs=1e-9)
     other = stats.binomtest(count, trials, alternative="greater").proportion_ci(0.9, method="exact")
     assert lower_bounds(count, trials, 0.9) == pytest.approx(other.low, abs=1e-9)
-    assert found["share"] == count / trials
+    assert result["share"] == count / trials
 
 
 def test_bounds_in_closed_form() -> None:
@@ -68,8 +68,8 @@ def test_bounds_have_their_nominal_coverage(n: int, p: float) -> None:
 
 def test_intervals_cover_simulated_campaigns() -> None:
     rng = np.random.default_rng(1)
-    found = [proportion(int(count), 300) for count in rng.binomial(300, 0.04, 2000)]
-    covered = np.mean([one["lower"] <= 0.04 <= one["upper"] for one in found])
+    result = [proportion(int(count), 300) for count in rng.binomial(300, 0.04, 2000)]
+    covered = np.mean([one["lower"] <= 0.04 <= one["upper"] for one in result])
     assert 0.95 <= covered < 0.985
 
 
@@ -95,15 +95,15 @@ def test_paired_difference_is_scipys() -> None:
     rng = np.random.default_rng(5)
     a = rng.normal(size=60)
     b = a + 0.3 + 0.5 * rng.normal(size=60)
-    found = paired_difference(a, b)
+    result = paired_difference(a, b)
     interval = stats.ttest_rel(b, a).confidence_interval(0.95)
-    assert (found.mean, found.lower, found.upper) == pytest.approx((np.mean(b - a), interval.low, interval.high))
+    assert (result.mean, result.lower, result.upper) == pytest.approx((np.mean(b - a), interval.low, interval.high))
 
 
 def test_paired_difference_covers() -> None:
     rng = np.random.default_rng(6)
-    found = [paired_difference(np.zeros(40), rng.exponential(size=40)) for _ in range(600)]
-    covered = [one.lower is not None and one.upper is not None and one.lower <= 1.0 <= one.upper for one in found]
+    result = [paired_difference(np.zeros(40), rng.exponential(size=40)) for _ in range(600)]
+    covered = [one.lower is not None and one.upper is not None and one.lower <= 1.0 <= one.upper for one in result]
     assert 0.89 < np.mean(covered) < 0.97  # of a skewed law, the t interval is a little short
 
 
@@ -124,20 +124,20 @@ def test_rank_correlation_is_scipys() -> None:
     rng = np.random.default_rng(2)
     x, y = rng.normal(size=200), np.round(rng.normal(size=200), 1)  # with ties
     y += 0.2 * x
-    found = related(x, y)
+    result = related(x, y)
     expected = stats.spearmanr(x, y)
-    assert found is not None
-    assert (found.rho, found.p, found.flights) == pytest.approx((expected.statistic, expected.pvalue, 200), rel=1e-9)
+    assert result is not None
+    assert (result.rho, result.p, result.flights) == pytest.approx((expected.statistic, expected.pvalue, 200), rel=1e-9)
 
 
 def test_rank_correlation_of_few_counts_all_permutations() -> None:
     x, y = np.array([3.0, 1.0, 4.0, 1.5, 5.0]), np.array([0.0, 0.0, 1.0, 0.0, 1.0])
-    found = related(x, y)
-    assert found is not None
+    result = related(x, y)
+    assert result is not None
     rho = [stats.spearmanr(x, np.array(order)).statistic for order in itertools.permutations(y)]
-    beyond = np.mean(np.array(rho) >= found.rho - 1e-12)
-    assert found.rho == pytest.approx(stats.spearmanr(x, y).statistic)
-    assert found.p == pytest.approx(2.0 * beyond)
+    beyond = np.mean(np.array(rho) >= result.rho - 1e-12)
+    assert result.rho == pytest.approx(stats.spearmanr(x, y).statistic)
+    assert result.p == pytest.approx(2.0 * beyond)
     perfect = related(np.arange(5.0), np.arange(5.0))
     assert perfect is not None
     assert (perfect.rho, perfect.p) == pytest.approx((1.0, 2.0 / 120.0))
@@ -166,18 +166,18 @@ def bowl(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("n", [30, 60, 1000])
 def test_harm_at_both_ends_is_seen_by_xi_alone(n: int) -> None:
     mass, margin = bowl(n, 1)
-    found = related(mass, margin)
-    assert found is not None
-    assert found.p > 0.05
-    assert found.p_xi < 0.002
-    assert found.xi > 0.25
+    result = related(mass, margin)
+    assert result is not None
+    assert result.p > 0.05
+    assert result.p_xi < 0.002
+    assert result.xi > 0.25
 
 
 def test_xi_is_scipys_with_its_asymptotic_law() -> None:
     x, y = bowl(300, 2)
-    found, expected = related(x, y), stats.chatterjeexi(x, y)
-    assert found is not None
-    assert (found.xi, found.p_xi, found.flights) == (expected.statistic, expected.pvalue, 300)
+    result, expected = related(x, y), stats.chatterjeexi(x, y)
+    assert result is not None
+    assert (result.xi, result.p_xi, result.flights) == (expected.statistic, expected.pvalue, 300)
 
 
 @pytest.mark.parametrize(("ones", "zeros"), [(3, 5), (1, 6), (4, 4), (7, 2)])
@@ -188,9 +188,9 @@ def test_xi_of_an_event_has_an_exact_p_value(ones: int, zeros: int) -> None:
     orders = [np.isin(np.arange(n), chosen).astype(float) for chosen in itertools.combinations(range(n), ones)]
     xis = np.array([stats.chatterjeexi(x, order).statistic for order in orders])
     for order, xi in zip(orders, xis, strict=True):
-        found = related(x, order)
-        assert found is not None
-        assert found.p_xi == pytest.approx(np.mean(xis >= xi - 1e-9))
+        result = related(x, order)
+        assert result is not None
+        assert result.p_xi == pytest.approx(np.mean(xis >= xi - 1e-9))
 
 
 def test_the_p_value_of_xi_has_its_nominal_level() -> None:
@@ -199,8 +199,8 @@ def test_the_p_value_of_xi_has_its_nominal_level() -> None:
     for n, runs in ((15, 60), (60, 200), (300, 120)):
         for y_of in (lambda size: rng.normal(size=size), lambda size: (rng.random(size) < 0.1) * 1.0):
             for x_of in (lambda size: rng.uniform(size=size), lambda size: rng.integers(0, 4, size) * 1.0):
-                found = [dependence(x_of(n), y_of(n), rng) for _ in range(runs)]
-                p = np.array([one.p_xi for one in found if one is not None])
+                result = [dependence(x_of(n), y_of(n), rng) for _ in range(runs)]
+                p = np.array([one.p_xi for one in result if one is not None])
                 assert np.mean(p < 0.05) < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / p.size), (n, p.size)
 
 
@@ -245,27 +245,27 @@ def small() -> pa.Table:
 
 
 def test_events_and_verdicts_are_counted(small: pa.Table) -> None:
-    found = estimate(small)
-    assert found["flights"] == 8
-    assert found["verdicts"] == {"satisfied": 3, "violated": 2, "lost": 2, "error": 1} | dict.fromkeys(NONE, 0)
-    counts = {name: event["count"] for name, event in found["events"].items()}
+    result = estimate(small)
+    assert result["flights"] == 8
+    assert result["verdicts"] == {"satisfied": 3, "violated": 2, "lost": 2, "error": 1} | dict.fromkeys(NONE, 0)
+    counts = {name: event["count"] for name, event in result["events"].items()}
     expected = {"failure": 6, "violation": 5, "lost": 2, "crash": 1, "error": 1} | dict.fromkeys(NONE, 0)
     assert counts == expected
-    assert [line[0].text for line in event_table(found).lines] == ["failure", "violation", "lost", "crash", "error"]
-    failure = found["events"]["failure"]
+    assert [line[0].text for line in event_table(result).lines] == ["failure", "violation", "lost", "crash", "error"]
+    failure = result["events"]["failure"]
     exact = stats.binomtest(6, 8).proportion_ci(0.95)
     assert (failure["share"], failure["lower"], failure["upper"]) == pytest.approx((0.75, exact.low, exact.high))
 
 
 def test_metrics_are_those_of_the_flights_that_have_them(small: pa.Table) -> None:
-    found = estimate(small)["metrics"]
-    assert list(found) == ["duration", "rmse.x", "worst_margin"]
+    result = estimate(small)["metrics"]
+    assert list(result) == ["duration", "rmse.x", "worst_margin"]
     values = np.array([0.1, 0.2, 0.3, 5.0, 0.4, 6.0, 0.9])
-    assert found["rmse.x"]["flights"] == 7
-    assert found["rmse.x"]["mean"] == pytest.approx(values.mean())
-    assert found["rmse.x"]["sd"] == pytest.approx(values.std(ddof=1))
-    assert found["rmse.x"]["p95"] == pytest.approx(np.percentile(values, 95))
-    assert (found["rmse.x"]["min"], found["rmse.x"]["max"]) == (0.1, 6.0)
+    assert result["rmse.x"]["flights"] == 7
+    assert result["rmse.x"]["mean"] == pytest.approx(values.mean())
+    assert result["rmse.x"]["sd"] == pytest.approx(values.std(ddof=1))
+    assert result["rmse.x"]["p95"] == pytest.approx(np.percentile(values, 95))
+    assert (result["rmse.x"]["min"], result["rmse.x"]["max"]) == (0.1, 6.0)
 
 
 def test_a_constraint_that_lost_flights_did_not_reach_did_not_hold(small: pa.Table) -> None:
@@ -279,24 +279,24 @@ def test_incomplete_flights_are_neither_failures_nor_successes(small: pa.Table) 
     verdicts = ["incomplete" if i in (0, 2) else value for i, value in enumerate(small["verdict"].to_pylist())]
     held = [None if i in (0, 2) else value for i, value in enumerate(small["satisfied.roll"].to_pylist())]
     table = with_column(with_column(small, "verdict", verdicts), "satisfied.roll", held)
-    found, before = estimate(table), estimate(small)
-    assert (found["flights"], found["verdicts"]["incomplete"]) == (8, 2)
+    result, before = estimate(table), estimate(small)
+    assert (result["flights"], result["verdicts"]["incomplete"]) == (8, 2)
     for event in ("failure", "violation"):
-        assert found["events"][event]["flights"] == 6
-        assert found["events"][event]["count"] == before["events"][event]["count"]
-    assert found["events"]["lost"] == before["events"]["lost"]
-    assert found["constraints"]["roll"]["not_satisfied"]["flights"] == 6
+        assert result["events"][event]["flights"] == 6
+        assert result["events"][event]["count"] == before["events"][event]["count"]
+    assert result["events"]["lost"] == before["events"]["lost"]
+    assert result["constraints"]["roll"]["not_satisfied"]["flights"] == 6
     assert judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).flights == 6
-    assert verdict_sentence(found).startswith("6 of 6 flights failed")
-    assert verdict_sentence(found).endswith("; 2 incomplete flights not counted")
+    assert verdict_sentence(result).startswith("6 of 6 flights failed")
+    assert verdict_sentence(result).endswith("; 2 incomplete flights not counted")
 
 
 def test_a_campaign_of_incomplete_flights_reports_no_failure_and_no_success(small: pa.Table) -> None:
     table = with_column(with_column(small, "verdict", ["incomplete"] * 8), "failed", [False] * 8)
     table = with_column(with_column(table, "violated", [False] * 8), "satisfied.roll", [None] * 8)
-    found = estimate(table)
-    assert verdict_sentence(found) == "0 of 0 flights failed; 8 incomplete flights not counted"
-    assert found["events"]["failure"]["flights"] == found["constraints"]["roll"]["not_satisfied"]["flights"] == 0
+    result = estimate(table)
+    assert verdict_sentence(result) == "0 of 0 flights failed; 8 incomplete flights not counted"
+    assert result["events"]["failure"]["flights"] == result["constraints"]["roll"]["not_satisfied"]["flights"] == 0
     assert not judge(table, parse_requirement("P(violation) < 0.99 @ 95%")).holds
     with pytest.raises(InputError, match="no pair of flights of which both reached every required constraint"):
         compare_pairs(table, table, ("one", "other"))
@@ -328,53 +328,53 @@ def test_no_flight_is_no_worst(small: pa.Table) -> None:
 
 
 def test_a_lost_flight_without_margin_ranks_below_all(small: pa.Table) -> None:
-    found = estimate(small)["parameters"]["mass"]["worst_margin"]
+    result = estimate(small)["parameters"]["mass"]["worst_margin"]
     mass = [1.0, 1.3, 1.1, 1.5, 1.4, 1.6, 0.9]
     expected = stats.spearmanr(mass, [0.5, -0.1, 0.2, -3.0, -0.4, -1e9, 0.8]).statistic
-    assert found["rho"] == pytest.approx(expected)
-    assert found["flights"] == 7
+    assert result["rho"] == pytest.approx(expected)
+    assert result["flights"] == 7
 
 
 def test_what_is_drawn_from_names_has_shares(small: pa.Table) -> None:
-    found = estimate(small)["parameters"]["kind"]
-    assert found["kind"] == "name"
-    assert {level: (share["count"], share["flights"]) for level, share in found["levels"].items()} == {
+    result = estimate(small)["parameters"]["kind"]
+    assert result["kind"] == "name"
+    assert {level: (share["count"], share["flights"]) for level, share in result["levels"].items()} == {
         "a": (2, 4),
         "b": (4, 4),
     }
 
 
 def test_drivers_are_those_that_were_put_in(thousand: pa.Table) -> None:
-    found = estimate(thousand)["parameters"]
-    tested = {name: entry["worst_margin"] for name, entry in found.items() if entry["kind"] == "number"}
+    result = estimate(thousand)["parameters"]
+    tested = {name: entry["worst_margin"] for name, entry in result.items() if entry["kind"] == "number"}
     assert {name for name, one in tested.items() if one["p_holm"] < 0.05} == {"mass", "wind"}
     assert tested["wind"]["rho"] < tested["mass"]["rho"] < -0.3
     assert all(one["p"] <= one["p_holm"] for one in tested.values())
-    assert found["wind"]["failed"]["rho"] > 0.1
-    assert set(found["payload"]["levels"]) == {"false", "true"}
+    assert result["wind"]["failed"]["rho"] > 0.1
+    assert set(result["payload"]["levels"]) == {"false", "true"}
 
 
 def test_nothing_goes_with_what_never_happens(make_campaign: MakeCampaign) -> None:
-    found = estimate(make_campaign(40, severity=0.0))
-    assert found["events"]["failure"]["count"] == 0
-    assert all(entry["failed"] is None for entry in found["parameters"].values() if entry["kind"] == "number")
+    result = estimate(make_campaign(40, severity=0.0))
+    assert result["events"]["failure"]["count"] == 0
+    assert all(entry["failed"] is None for entry in result["parameters"].values() if entry["kind"] == "number")
 
 
 @pytest.mark.parametrize("flights", [0, 1, 2, 5])
 def test_campaigns_of_few_flights_are_strict_json(make_campaign: MakeCampaign, flights: int) -> None:
     table = make_campaign(flights)
-    found = estimate(table)
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
-    assert found["flights"] == flights
-    assert len(found["worst"]) == flights
+    result = estimate(table)
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+    assert result["flights"] == flights
+    assert len(result["worst"]) == flights
 
 
 def test_the_summary_of_a_thousand_is_strict_json(thousand: pa.Table) -> None:
-    found = estimate(thousand)
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
-    assert len(found["worst"]) == 10
-    assert found["metrics"]["rmse.x"]["unit"] == "m"
-    assert not [name for name in found["metrics"] if name.startswith(("draw.", "margin.", "time_violated.", "seed"))]
+    result = estimate(thousand)
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+    assert len(result["worst"]) == 10
+    assert result["metrics"]["rmse.x"]["unit"] == "m"
+    assert not [name for name in result["metrics"] if name.startswith(("draw.", "margin.", "time_violated.", "seed"))]
 
 
 def flown(draws: dict[str, Any], margin: np.ndarray, lost: np.ndarray | None = None) -> pa.Table:
@@ -403,19 +403,19 @@ def bowl_table(n: int, seed: int) -> pa.Table:
 def test_harm_at_both_ends_is_reported(n: int) -> None:
     """The margin falls with the distance of the mass from 1: a rank correlation alone found nothing."""
     summary = estimate(bowl_table(n, 4))
-    found = summary["parameters"]["mass"]["worst_margin"]
-    assert found["p_holm"] > 0.05
-    assert found["p_xi_holm"] < 0.05
+    result = summary["parameters"]["mass"]["worst_margin"]
+    assert result["p_holm"] > 0.05
+    assert result["p_xi_holm"] < 0.05
     assert driver_sentence(summary).startswith("The worst margin depends on mass (rho ")
     line = driver_table(summary).lines[0]
     assert (line[0].text, line[1].mark, line[3].mark) == ("mass", "", "best")
 
 
 def test_both_measures_are_corrected_together() -> None:
-    found = parameters(bowl_table(400, 5))
+    result = parameters(bowl_table(400, 5))
     entries = [
         (parameter[outcome], key)
-        for parameter in found.values()
+        for parameter in result.values()
         for outcome in ("worst_margin", "failed")
         for key in ("p", "p_xi")
     ]
@@ -434,10 +434,10 @@ def test_noise_is_taken_for_a_driver_in_one_campaign_of_twenty_at_most() -> None
             "horizon": rng.integers(0, 5, n)
         }
         table = flown(draws, 0.3 + rng.standard_cauchy(n) * 0.2, lost=rng.random(n) < 0.05)
-        found = parameters(table)
+        result = parameters(table)
         corrected = [
             parameter[outcome][key]
-            for parameter in found.values()
+            for parameter in result.values()
             for outcome in ("worst_margin", "failed")
             for key in ("p_holm", "p_xi_holm")
         ]

@@ -242,9 +242,9 @@ def test_the_worst_margin_is_negative_where_a_constraint_that_was_reached_did_no
 ) -> None:
     inner, outer = sorted(tolerances)
     limit = Limit(name="a", signal=signal, lower=lower, upper=5.0, tolerance=outer, tolerance_sampled=inner)
-    found = finding(limit, margin, sampled)
-    share, _ = worst_margin([found])
-    assert (share is not None and share < 0.0) is not found.satisfied
+    result = finding(limit, margin, sampled)
+    share, _ = worst_margin([result])
+    assert (share is not None and share < 0.0) is not result.satisfied
 
 
 def test_text_that_is_no_unicode_is_stored() -> None:

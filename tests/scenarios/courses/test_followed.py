@@ -38,17 +38,17 @@ def test_a_set_point_runs_the_filter_on_from_its_row() -> None:
     preview = followed.preview(100, 50)
     followed.set(100, {"x": 2.0})
     followed.set(300, {"yaw": -1.0, "x": 0.5})
-    found = rows(followed)
+    result = rows(followed)
     expected = course.sample(tau_s * np.arange(SAMPLES))
     expected[101:, 0], expected[301:, 0], expected[301:, 3] = 2.0, 0.5, -1.0
     last = course.initial
     for k, sample in enumerate(expected):
         expected[k] = last = sample + keep * (last - sample)
-    np.testing.assert_array_equal(found, expected)
-    np.testing.assert_array_equal(found[:101], before[:101])  # what was in force stays
-    np.testing.assert_array_equal(found[:, 1:3], before[:, 1:3])  # the other axes stay on the course
+    np.testing.assert_array_equal(result, expected)
+    np.testing.assert_array_equal(result[:101], before[:101])  # what was in force stays
+    np.testing.assert_array_equal(result[:, 1:3], before[:, 1:3])  # the other axes stay on the course
     np.testing.assert_array_equal(preview, before[101:151])  # what was known then
-    assert (followed.preview(300, 3)[:, 0] == found[301:304, 0]).all()
+    assert (followed.preview(300, 3)[:, 0] == result[301:304, 0]).all()
 
 
 def test_without_a_response_time_a_set_point_is_reached_at_once() -> None:

@@ -71,10 +71,10 @@ def test_the_heading_is_the_direction_of_travel_and_has_no_jumps(name: str) -> N
 def test_the_rate_of_a_ramped_angle_is_the_known_polynomial() -> None:
     rate, ramp, total, h = 0.7, 2.0, 4.0, 1e-4
     t = np.arange(0.0, total / rate + ramp, h)
-    found = derivative(ramped(t, rate=rate, total=total, ramp=ramp), h)
+    result = derivative(ramped(t, rate=rate, total=total, ramp=ramp), h)
     s = np.clip(np.minimum(t, total / rate + ramp - t)[1:-1] / ramp, 0.0, 1.0)
     expected = rate * (35 * s**4 - 84 * s**5 + 70 * s**6 - 20 * s**7)
-    np.testing.assert_allclose(found, expected, atol=1e-8)
+    np.testing.assert_allclose(result, expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("ramp", [0.0, 2.0])

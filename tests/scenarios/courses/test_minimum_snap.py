@@ -21,9 +21,9 @@ def kkt_solution(times: Array, values: Array, order: int) -> Array:
     powers = np.arange(p)
 
     def row(segment: int, t: float, k: int) -> Array:
-        found = np.zeros(n * p)
-        found[segment * p : (segment + 1) * p] = [math.perm(i, k) * t ** (i - k) if i >= k else 0.0 for i in powers]
-        return found
+        result = np.zeros(n * p)
+        result[segment * p : (segment + 1) * p] = [math.perm(i, k) * t ** (i - k) if i >= k else 0.0 for i in powers]
+        return result
 
     Q = np.zeros((n * p, n * p))
     rows, right = [], []

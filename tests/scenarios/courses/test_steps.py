@@ -35,8 +35,8 @@ def test_later_windows_win_where_they_overlap() -> None:
 
 def test_a_course_switches_where_its_value_does() -> None:
     windows = [Window(start=0.0, stop=4.0, value=1.0), Window(start=1.0, stop=3.0, value=2.0)]
-    found = switches(windows, 0.0, initial=0.0)
-    assert found == [(0.0, 0.0, 1.0), (1.0, 1.0, 2.0), (3.0, 2.0, 1.0), (4.0, 1.0, 0.0)]
+    result = switches(windows, 0.0, initial=0.0)
+    assert result == [(0.0, 0.0, 1.0), (1.0, 1.0, 2.0), (3.0, 2.0, 1.0), (4.0, 1.0, 0.0)]
     touching = [Window(start=-1.0, stop=2.0, value=5.0), Window(start=2.0, stop=3.0, value=5.0)]
     assert switches(touching, 0.0, initial=5.0) == [(3.0, 5.0, 0.0)]
     assert switches([], 0.0, initial=0.5) == [(0.0, 0.5, 0.0)]
@@ -44,8 +44,8 @@ def test_a_course_switches_where_its_value_does() -> None:
 
 def test_the_steps_of_the_papers_course() -> None:
     """A step is watched until the next is within the preview of 50 periods, 2.5 s; yaw starts 30 deg off its course."""
-    found = Assembly(load_scenario("paper-constrained")).course_steps
-    rows = [(step.channel, step.time, step.before, step.after, step.until) for step in found]
+    result = Assembly(load_scenario("paper-constrained")).course_steps
+    rows = [(step.channel, step.time, step.before, step.after, step.until) for step in result]
     assert rows == [
         *(("x", 10.0, 0.0, 10.0, 37.5), ("x", 40.0, 10.0, 0.0, 60.0)),
         *(("y", 20.0, 0.0, 10.0, 37.5), ("y", 40.0, 10.0, 0.0, 60.0)),

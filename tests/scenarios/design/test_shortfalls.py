@@ -24,30 +24,30 @@ HUMMINGBIRD, LOPES = (load_vehicle(vehicle_path(name)) for name in ("hummingbird
 
 def test_hover_beyond_what_the_scenario_allows_is_reported_in_numbers() -> None:
     stated = ["constraints.speed.lower=0.0", "constraints.speed.upper=250.0"]
-    found = shortfalls(load_scenario("hover", stated), HUMMINGBIRD)
-    assert found[0] == "controller.input_bounds.speed: hover is 453.2 rad/s, the scenario allows 250"
-    assert "5 rad/s per period take 3.85 s" in found[1]
-    assert found[2] == "constraint speed: hover is 453.2 rad/s, the audit allows 0 to 250"
+    result = shortfalls(load_scenario("hover", stated), HUMMINGBIRD)
+    assert result[0] == "controller.input_bounds.speed: hover is 453.2 rad/s, the scenario allows 250"
+    assert "5 rad/s per period take 3.85 s" in result[1]
+    assert result[2] == "constraint speed: hover is 453.2 rad/s, the audit allows 0 to 250"
 
 
 def test_each_other_bound_that_is_missed_has_a_line() -> None:
     scenario = load_scenario("robust", ["controller.rotor_lag=vehicle", "controller.output_bounds.roll=[-60.0, 60.0]"])
-    found = shortfalls(scenario, LOPES)
-    assert any(line.startswith("controller.output_bounds.roll: 60 deg, but from 53.5 deg") for line in found)
-    assert any(line.startswith("controller.rotor_lag is the vehicle's") for line in found)
+    result = shortfalls(scenario, LOPES)
+    assert any(line.startswith("controller.output_bounds.roll: 60 deg, but from 53.5 deg") for line in result)
+    assert any(line.startswith("controller.rotor_lag is the vehicle's") for line in result)
     demanding = load_scenario("hummingbird-figure-eight", ["controller.input_bounds.speed=[460.0, 900.0]"])
-    found = shortfalls(demanding, HUMMINGBIRD)
-    assert "the scenario requires at least 460" in found[0]
-    assert "the scenario counts on 900 rad/s, the rotors reach 838" in found[1]
+    result = shortfalls(demanding, HUMMINGBIRD)
+    assert "the scenario requires at least 460" in result[0]
+    assert "the scenario counts on 900 rad/s, the rotors reach 838" in result[1]
     lqr = load_scenario("hover", ["controller={ type = 'lqr', tilt = 70.0 }"])
     assert [line.partition(":")[0] for line in shortfalls(lqr, LOPES)] == ["controller.tilt"]
 
 
 def test_a_course_that_is_too_fast_is_reported_with_the_speed_at_which_it_fits() -> None:
     fast = load_scenario("hummingbird-figure-eight", ["reference.period=6.0", "duration=12.0"])
-    found = shortfalls(fast, HUMMINGBIRD)
-    assert "the course requires roll up to" in found[0]
-    assert found[-1].startswith("It would fit at ")
+    result = shortfalls(fast, HUMMINGBIRD)
+    assert "the course requires roll up to" in result[0]
+    assert result[-1].startswith("It would fit at ")
     assert shortfalls(load_scenario("hummingbird-figure-eight"), HUMMINGBIRD) == ()
 
 

@@ -53,10 +53,10 @@ def test_a_random_agent_holds_five_degrees_of_tilt_behind_it_and_crashes_without
 def test_what_is_safe_passes_to_the_bit() -> None:
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(safety_filter.filtered_air("gust"), action="speeds"))
     env.reset(seed=0)
-    wanted = env.unwrapped.started.vehicle.hover_speed + np.array([0.5, 0.25, -0.5, 0.125])
-    info = env.step(wanted)[4]
+    desired = env.unwrapped.started.vehicle.hover_speed + np.array([0.5, 0.25, -0.5, 0.125])
+    info = env.step(desired)[4]
     assert info["filter"] == {"intervened": False, "correction": 0.0, "fallback": 0}
-    assert np.array_equal(env.unwrapped.flight().command[0], wanted)
+    assert np.array_equal(env.unwrapped.flight().command[0], desired)
 
 
 def test_an_action_that_is_not_finite_is_not_flown() -> None:

@@ -164,11 +164,11 @@ def test_a_lost_flight_ends_the_session_with_its_reason(session: Session) -> Non
 
 
 def test_knobs_have_units_and_limits() -> None:
-    found = {knob.path: knob for knob in knobs(load_scenario("robust").controller)}
-    assert found["horizon"].minimum == 1
-    assert found["output_bounds.roll"].value == (-5.0, 5.0)
-    assert "[m/s]" in found["offset_free.velocity_noise"].about
-    assert "type" not in found
+    result = {knob.path: knob for knob in knobs(load_scenario("robust").controller)}
+    assert result["horizon"].minimum == 1
+    assert result["output_bounds.roll"].value == (-5.0, 5.0)
+    assert "[m/s]" in result["offset_free.velocity_noise"].about
+    assert "type" not in result
 
 
 class Clock:

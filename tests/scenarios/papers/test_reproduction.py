@@ -119,11 +119,11 @@ def test_a_flight_that_ends_early_reproduces_nothing(tmp_path: Path) -> None:
             "{ position = [0.0, 0.0, 1.0], euler = [20.0, 0.0, 0.0] }",
         )
     )
-    (found,) = quadsim.reproduce(path, progress=False)
-    assert found.numbers[0].ours is None
-    assert not found.within
-    assert "depth below" in found.numbers[0].sentence
-    assert "| time flown | s | 0.5 | - | - | 1 | no |" in grid_to_markdown(found.grid)
+    (result,) = quadsim.reproduce(path, progress=False)
+    assert result.numbers[0].ours is None
+    assert not result.within
+    assert "depth below" in result.numbers[0].sentence
+    assert "| time flown | s | 0.5 | - | - | 1 | no |" in grid_to_markdown(result.grid)
 
 
 def test_the_command_prints_and_fails_beyond_tolerance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

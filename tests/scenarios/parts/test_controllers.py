@@ -326,5 +326,5 @@ def test_it_comes_back_from_its_resolved_file_which_the_schema_allows(controller
 def test_a_name_alone_takes_fields_from_settings_and_from_files_over_it(tmp_path: Path) -> None:
     (tmp_path / "one.toml").write_text('base = "hover"\nname = "one"\ncontroller = "pid"\n')
     (tmp_path / "two.toml").write_text('base = "one.toml"\nname = "two"\n[controller]\ntilt = 20.0\n')
-    found = load_scenario(str(tmp_path / "two.toml"), ["controller.horizon=4"]).controller
-    assert found == PID(tilt=20.0, horizon=4)
+    result = load_scenario(str(tmp_path / "two.toml"), ["controller.horizon=4"]).controller
+    assert result == PID(tilt=20.0, horizon=4)

@@ -46,7 +46,7 @@ def test_without_effects_nothing_acts() -> None:
 
 
 def test_every_field_arrives() -> None:
-    found = effects(
+    result = effects(
         "effects.rotors={rise=0.01, fall=0.02, acceleration=900.0, inertia=1e-4, efficiency=[1.0, 0.9, 0.8, 0.7]}",
         "effects.air={density=1.1, rotor_drag=2e-4, body_drag=[0.01, 0.02, 0.03]}",
         "effects.ground={effect=true, rotor_radius=0.1}",
@@ -54,7 +54,7 @@ def test_every_field_arrives() -> None:
         "payloads=[{mass=0.3, position=[0.0, 0.0, -0.1]}]}",
         "effects.disturbance={force=[1.0, 2.0, 3.0], torque=[0.1, 0.2, 0.3], force_noise=0.4, torque_noise=0.5}",
     )
-    assert found == Effects(
+    assert result == Effects(
         rotors=RotorDynamics(rise=0.01, fall=0.02, acceleration=900.0, inertia=1e-4, efficiency=(1.0, 0.9, 0.8, 0.7)),
         air=Air(density=1.1, rotor_drag=2e-4, body_drag=(0.01, 0.02, 0.03)),
         ground=Ground(effect=True, rotor_radius=0.1),
@@ -70,15 +70,15 @@ def test_every_field_arrives() -> None:
 
 def test_sizes_left_out_are_the_vehicle_s() -> None:
     loaded, vehicle = scenario("effects={rotors={}, air={}, ground={effect=true}}", vehicle="hummingbird")
-    found = loaded.effects.resolved(vehicle)
-    assert found.rotors is not None
-    assert found.air is not None
-    assert found.ground is not None
-    assert (found.rotors.rise, found.rotors.fall) == (vehicle.rotor_rise, vehicle.rotor_fall)
-    assert found.rotors.inertia == vehicle.rotor_inertia
-    assert (found.air.rotor_drag, found.air.body_drag) == (vehicle.rotor_drag, vehicle.body_drag)
-    assert found.ground.rotor_radius == vehicle.rotor_radius
-    assert found.resolved(vehicle) == found
+    result = loaded.effects.resolved(vehicle)
+    assert result.rotors is not None
+    assert result.air is not None
+    assert result.ground is not None
+    assert (result.rotors.rise, result.rotors.fall) == (vehicle.rotor_rise, vehicle.rotor_fall)
+    assert result.rotors.inertia == vehicle.rotor_inertia
+    assert (result.air.rotor_drag, result.air.body_drag) == (vehicle.rotor_drag, vehicle.body_drag)
+    assert result.ground.rotor_radius == vehicle.rotor_radius
+    assert result.resolved(vehicle) == result
 
 
 LOSS = {"type": "rotor_loss", "rotor": 2}
@@ -93,12 +93,14 @@ def test_losses_of_a_rotor_multiply_while_they_last(order: int) -> None:
         event(**LOSS, at=3.0, loss=0.3),
         event(type="rotor_loss", rotor=4, at=2.0, loss=1.0),
     ][::order]
-    found = Assembly(scenario("effects.rotors.efficiency=[1.0, 0.9, 1.0, 1.0]", events(*entries))[0]).changes()
-    shares = {change.at: change.efficiency for change in found if isinstance(change, RotorChange) and change.rotor == 2}
+    result = Assembly(scenario("effects.rotors.efficiency=[1.0, 0.9, 1.0, 1.0]", events(*entries))[0]).changes()
+    shares = {
+        change.at: change.efficiency for change in result if isinstance(change, RotorChange) and change.rotor == 2
+    }
     expected = {1.0: 0.8, 2.0: 0.4, 3.0: 0.4 * 0.9 * 0.7, 4.0: 0.8 * 0.9 * 0.7, 6.0: 0.8 * 0.7}
     assert shares == pytest.approx({time: 0.9 * share for time, share in expected.items()})
-    assert RotorChange(at=2.0, rotor=4, efficiency=0.0) in found
-    assert len(found) == 6
+    assert RotorChange(at=2.0, rotor=4, efficiency=0.0) in result
+    assert len(result) == 6
 
 
 def test_payloads_come_and_go() -> None:
@@ -106,8 +108,8 @@ def test_payloads_come_and_go() -> None:
         event(type="payload_pickup", at=1.0, mass=0.5, position=[0.1, 0.0, 0.0]),
         event(type="payload_drop", at=2.0),
     )
-    found = Assembly(scenario(events(*entries))[0]).changes()
-    assert found == (PayloadPickup(at=1.0, mass=0.5, position=(0.1, 0.0, 0.0)), PayloadDrop(at=2.0))
+    result = Assembly(scenario(events(*entries))[0]).changes()
+    assert result == (PayloadPickup(at=1.0, mass=0.5, position=(0.1, 0.0, 0.0)), PayloadDrop(at=2.0))
 
 
 def test_wind_is_mean_gusts_and_changes() -> None:
@@ -135,10 +137,10 @@ def test_turbulence_passes_at_the_mean_wind_s_speed() -> None:
 
 def test_computation_takes_its_times_and_stalls() -> None:
     stall = events(event(type="stall", at=1.0, duration=0.2))
-    found = Assembly(scenario(stall)[0]).computation()
-    assert found is not None
-    assert [(each.at, each.duration) for each in found.stalls] == [(1.0, 0.2)]
-    assert replace(found, stalls=()) == Computation(plan=False)
+    result = Assembly(scenario(stall)[0]).computation()
+    assert result is not None
+    assert [(each.at, each.duration) for each in result.stalls] == [(1.0, 0.2)]
+    assert replace(result, stalls=()) == Computation(plan=False)
     loaded, _ = scenario("computation={delay=0.01, per_iteration=1e-4, jitter=0.002}")
     assert Assembly(loaded).computation() == Computation(delay=0.01, per_iteration=1e-4, plan=False, jitter=0.002)
 

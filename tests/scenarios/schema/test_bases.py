@@ -39,15 +39,15 @@ def test_a_file_holds_only_what_differs(tmp_path: Path) -> None:
         upper = 3.0
         """,
     )
-    found, base = load_scenario(mine), load_scenario("paper-constrained")
-    assert (found.name, found.group, found.vehicle.mass, found.controller.horizon) == ("mine", "other", 4.2, 30)
-    assert found.reference == base.reference
+    result, base = load_scenario(mine), load_scenario("paper-constrained")
+    assert (result.name, result.group, result.vehicle.mass, result.controller.horizon) == ("mine", "other", 4.2, 30)
+    assert result.reference == base.reference
     changed = "controller.horizon = 30; constraints.roll.tolerance = 0.5; constraints.climb.signal = "
-    assert found.description.startswith(f"{base.description} (changed: ")
-    assert changed in found.description
-    assert [entry.name for entry in found.constraints] == [*(entry.name for entry in base.constraints), "climb"]
-    assert found.constraints[0] == replace(base.constraints[0], tolerance=0.5)
-    assert found.constraints[1:-1] == base.constraints[1:]
+    assert result.description.startswith(f"{base.description} (changed: ")
+    assert changed in result.description
+    assert [entry.name for entry in result.constraints] == [*(entry.name for entry in base.constraints), "climb"]
+    assert result.constraints[0] == replace(base.constraints[0], tolerance=0.5)
+    assert result.constraints[1:-1] == base.constraints[1:]
 
 
 def test_bases_have_bases_and_paths_are_their_own(tmp_path: Path) -> None:
@@ -55,9 +55,9 @@ def test_bases_have_bases_and_paths_are_their_own(tmp_path: Path) -> None:
     write(tmp_path / "deep", "light.toml", vehicle_path("lopes2011").read_text(encoding="utf-8"))
     write(tmp_path / "deep", "first.toml", 'base = "hover"\nname = "first"\nvehicle = { file = "light.toml" }\n')
     top = write(tmp_path, "top.toml", 'base = "deep/first.toml"\nname = "top"\nduration = 2.0\n')
-    found = load_scenario(top, ["duration=3.0"])
-    assert (found.name, found.duration) == ("top", 3.0)
-    assert found.vehicle.file == str((tmp_path / "deep" / "light.toml").resolve())
+    result = load_scenario(top, ["duration=3.0"])
+    assert (result.name, result.duration) == ("top", 3.0)
+    assert result.vehicle.file == str((tmp_path / "deep" / "light.toml").resolve())
 
 
 def test_another_type_replaces_a_table() -> None:

@@ -113,7 +113,7 @@ JUNK = st.sampled_from([None, True, "", "junk", -1.0, np.nan, np.inf, -np.inf, 1
 def leaves(table: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Paths to everything in nested tables and lists."""
     items = table.items() if isinstance(table, dict) else enumerate(table) if isinstance(table, list) else ()
-    return [found for key, value in items for found in [(*path, key), *leaves(value, (*path, key))]]
+    return [result for key, value in items for result in [(*path, key), *leaves(value, (*path, key))]]
 
 
 @settings(max_examples=150)

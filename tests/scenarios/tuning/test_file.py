@@ -75,10 +75,10 @@ def test_a_file_may_hold_only_what_differs(tmp_path: Path) -> None:
     write_tuning(tmp_path, campaign=campaign(base="held.toml"))
     (tmp_path / "held.toml").write_text('base = "paper-nominal"\nname = "held"\nfailure = ["lost"]\n', encoding="utf-8")
     (tmp_path / "shorter.toml").write_text('base = "little.toml"\ntrials = 12\n', encoding="utf-8")
-    found = load_tuning(str(tmp_path / "shorter.toml"))
-    assert (found.spec.trials, found.spec.batch, found.spec.name) == (12, 6, "little")
-    assert found.start.spec.failure == ["lost"]
-    assert [each.name for each in found.start.spec.vary][-1] == "pitch"
+    result = load_tuning(str(tmp_path / "shorter.toml"))
+    assert (result.spec.trials, result.spec.batch, result.spec.name) == (12, 6, "little")
+    assert result.start.spec.failure == ["lost"]
+    assert [each.name for each in result.start.spec.vary][-1] == "pitch"
 
 
 def test_a_file_written_out_is_the_same_tuning(tmp_path: Path) -> None:

@@ -60,9 +60,9 @@ def test_a_known_optimum_is_found(whole: TuningResult) -> None:
     start, best = (whole.summary["candidates"][candidate] for candidate in (START, whole.summary["answer"]))
     assert best["values"][0] < start["values"][0]
     assert whole.holds
-    found = load_scenario(str(whole.directory / "best.toml"))
-    assert found == whole.best
-    assert Rollout(found).fly().outcome == "satisfied"
+    result = load_scenario(str(whole.directory / "best.toml"))
+    assert result == whole.best
+    assert Rollout(result).fly().outcome == "satisfied"
 
 
 def test_all_candidates_meet_the_same_draws(whole: TuningResult) -> None:

@@ -174,8 +174,8 @@ def test_the_last_second_shows_why_there_was_no_answer_and_that_the_fallback_wen
     footage = make_footage(short_run, np.array([4.9, 5.0, 6.0]))
 
     def headlines(sentence: str, advice: str) -> list[list[str]]:
-        found = {"sentence": sentence, "advice": advice}
-        run = replace(short_run, summary={**short_run.summary, "controller": controller, "diagnosis": found})
+        result = {"sentence": sentence, "advice": advice}
+        run = replace(short_run, summary={**short_run.summary, "controller": controller, "diagnosis": result})
         overlay = Overlay(run, footage, width=1280, height=720)
         return [[text for text, _, _ in overlay._headlines(i)] for i in range(3)]
 

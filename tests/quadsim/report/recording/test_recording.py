@@ -199,10 +199,10 @@ def test_events_report_each_change_of_the_solver_why_it_failed_and_the_end(
     by = ["piqp-dense"] * 20 + ["gain"] * 10 + ["core"] * 10 + ["fallback"] * 3 + ["piqp-dense"] * (K - 43)
     changed = dataclasses.replace(control, status=tuple(status), answered_by=tuple(by), fallback=fallback)
     log = dataclasses.replace(short_run.log, control=changed, reason="the battery fell off")
-    found = {"time": 2.0, "sentence": "cannot hold together: roll upper by 1 deg", "advice": "to try: more"}
+    result = {"time": 2.0, "sentence": "cannot hold together: roll upper by 1 deg", "advice": "to try: more"}
     summary = {
         **short_run.summary,
-        "diagnosis": found,
+        "diagnosis": result,
         "controller": {**short_run.summary["controller"], "unrecovered": 40},
     }
     content = record(dataclasses.replace(short_run, log=log, summary=summary))

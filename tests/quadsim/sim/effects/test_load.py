@@ -25,10 +25,10 @@ def test_inertia_of_many_points_is_the_sum_over_points(vehicle: Vehicle) -> None
     centre = masses @ positions / masses.sum()
     arms = positions - centre
     inertia = sum(m * (r @ r * np.eye(3) - np.outer(r, r)) for m, r in zip(masses, arms, strict=True))
-    found = mass_properties(vehicle, Load(centre_of_mass=(0.02, -0.01, 0.03)), payloads)
-    assert found.mass == pytest.approx(vehicle.mass + 0.9)
-    np.testing.assert_allclose(found.centre, centre)
-    np.testing.assert_allclose(found.inertia, inertia, atol=1e-12)
+    result = mass_properties(vehicle, Load(centre_of_mass=(0.02, -0.01, 0.03)), payloads)
+    assert result.mass == pytest.approx(vehicle.mass + 0.9)
+    np.testing.assert_allclose(result.centre, centre)
+    np.testing.assert_allclose(result.inertia, inertia, atol=1e-12)
 
 
 def test_a_heavier_vehicle_sinks_with_the_thrust_of_its_file(vehicle: Vehicle) -> None:

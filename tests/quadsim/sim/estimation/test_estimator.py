@@ -193,8 +193,8 @@ def test_a_gyro_that_comes_to_be_far_off_is_found_out(gentle: Any, run_filter: S
     )
     assert np.degrees(np.abs(stubborn[1][-1, 6:9])).max() > 10.0
     assert np.degrees(np.abs(patient[1][-20:, 6:9])).max() < 2.0
-    found = patient[1][-1, 12:15] + shifted.offset  # what is left of the bias and the fault's together
-    assert np.degrees(np.abs(found)).max() < 0.5
+    result = patient[1][-1, 12:15] + shifted.offset  # what is left of the bias and the fault's together
+    assert np.degrees(np.abs(result)).max() < 0.5
 
 
 def test_it_never_fails_nor_answers_with_nan(vehicle: Vehicle) -> None:

@@ -86,13 +86,13 @@ def test_the_noise_that_gathers_is_van_loans(vehicle: Vehicle) -> None:
     rest = np.zeros(16)
     rest[6] = 1.0
     h = 0.01
-    found = predict(model, Estimate(mean=rest, covariance=np.zeros((15, 15))), drive(model, np.zeros(4)), h).covariance
+    result = predict(model, Estimate(mean=rest, covariance=np.zeros((15, 15))), drive(model, np.zeros(4)), h).covariance
     # Without thrust at rest: two double integrators and a walk.  Van Loan, IEEE TAC 23 (1978).
     A, Q = np.zeros((15, 15)), np.zeros((15, 15))
     A[0:3, 3:6] = A[6:9, 9:12] = np.eye(3)
     Q[3:6, 3:6], Q[9:12, 9:12], Q[12:, 12:] = 0.09 * np.eye(3), 4.0 * np.eye(3), 0.01 * np.eye(3)
     both = expm(h * np.block([[-A, Q], [np.zeros((15, 15)), A.T]]))
-    np.testing.assert_allclose(found, both[15:, 15:].T @ both[:15, 15:], rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(result, both[15:, 15:].T @ both[:15, 15:], rtol=1e-9, atol=1e-18)
 
 
 def test_rotors_do_not_turn_backwards(vehicle: Vehicle, model: MotionModel) -> None:

@@ -123,12 +123,12 @@ def test_at_a_late_horizon_each_step_knows_whether_it_stood(takeoff: Any, run_fi
     )
     far = Sensor(name=SensorName.VELOCITY, rate=0.1, noise=(1e6, 1e6, 1e6), delay=0.2)
     for motion, standing in ((takeoff, range(REST)), (landing, range(FLIGHT, FLIGHT + REST))):
-        found: list[Array] = []
+        result: list[Array] = []
         for horizon in (replace(far, delay=0.0), far):
             _, errors, deviations, _ = run_filter(motion, (*SENSORS, horizon), SETTINGS, seed=1, standing=standing)
-            found.append(np.hstack([errors, deviations]))
-        np.testing.assert_allclose(found[1], found[0], atol=1e-9)
-        stood = np.all(found[0][:, 3:6] == 0.0, axis=1)
+            result.append(np.hstack([errors, deviations]))
+        np.testing.assert_allclose(result[1], result[0], atol=1e-9)
+        stood = np.all(result[0][:, 3:6] == 0.0, axis=1)
         assert np.array_equal(np.flatnonzero(stood), np.arange(standing.start, standing.stop, 50) // 50)
 
 

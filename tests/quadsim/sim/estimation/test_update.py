@@ -131,5 +131,5 @@ def test_an_attitude_error_turns_the_body_about_its_own_axes() -> None:
     mean[6:10] = Rotation.from_euler("Z", 90, degrees=True).as_quat(scalar_first=True)
     error[6] = np.radians(10.0)  # about body x, which points along world y
     expected = Rotation.from_rotvec([0.0, np.radians(10.0), 0.0]) * Rotation.from_quat(mean[6:10], scalar_first=True)
-    found = Rotation.from_quat(retract(mean, error)[6:10], scalar_first=True)
-    assert (found * expected.inv()).magnitude() < 1e-12
+    result = Rotation.from_quat(retract(mean, error)[6:10], scalar_first=True)
+    assert (result * expected.inv()).magnitude() < 1e-12
