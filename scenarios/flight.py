@@ -18,7 +18,7 @@ import numpy as np
 from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import MissingPackageError, OutputError, QuadsimError, UnknownNameError, printable
 from quadsim.flight import metrics, rundir
-from quadsim.flight.audit import HELD, SIGNALS, Finding, margins_at, margins_sampled
+from quadsim.flight.audit import SIGNALS, VERDICT_TEXT, Finding, margins_at, margins_sampled
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
@@ -365,7 +365,7 @@ class Flight(Result):
 
         rows = "".join(
             f"<tr><td>{escape(entry.limit.name)}</td><td>{entry.deciding_margin:.4g} {escape(entry.limit.unit)}</td>"
-            f"<td>{entry.deciding[1]:g}</td><td>{HELD[entry.verdict]}</td></tr>"
+            f"<td>{entry.deciding[1]:g}</td><td>{VERDICT_TEXT[entry.verdict]}</td></tr>"
             for entry in self.findings
         )
         errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz" if self.time.size)
