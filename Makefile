@@ -73,9 +73,9 @@ build: setup  ## source archive and wheel in dist/; the wheel is installed alone
 	@$(PY) -m pytest -q tests/test_packaging.py
 	@ls dist
 
-docs: setup $(VENV)/.docs  ## build the documentation into site/, with a gallery; a broken link or a missing docstring fails
+docs: setup $(VENV)/.docs  ## build the documentation into site/, with films; a broken link or a missing docstring fails
 	@$(PY) -m ruff check --quiet --select D1 --ignore D105,D107 quadsim mpc scenarios
-	@$(PY) docs/gallery.py
+	@$(PY) docs/gallery.py films
 	@$(VENV)/bin/zensical build --clean
 	@sed -i 's|https://unpkg.com/iframe-worker/shim|assets/iframe-worker.js|' site/*.html
 	@! grep -lE 'src="https?:|<link[^>]*href="https?:[^"]*\.(css|js)' site/*.html || { echo "These pages need a network." >&2; false; }

@@ -45,13 +45,13 @@ def measure(quick: bool) -> list[Record]:
     """Campaigns by one worker and by two, by PIQP and by the core where there is one, in turns."""
     rounds, flights = (1, 2) if quick else (3, 40)
     solvers = ["piqp", "core"] if why_missing() is None else ["piqp"]
-    found = []
+    results = []
     for _ in range(rounds):
         for name, workers in (("paper-constrained", 1), ("paper-constrained", 2), ("robust", 2)):
             scenario = load(name).replace({"duration": 0.5, "constraints": []} if quick else {})
             for solver in solvers:
-                found.append(campaign(scenario.replace({"controller.solver": solver}), solver, flights, workers))
-    return found
+                results.append(campaign(scenario.replace({"controller.solver": solver}), solver, flights, workers))
+    return results
 
 
 def main() -> None:

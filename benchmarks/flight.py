@@ -45,11 +45,11 @@ def measure(name: str, quick: bool) -> list[Record]:
                     "log and loop": wall - step - sum(spent.values()),
                 }
             )
-    flown, wall = log.control.t.size * scenario.control_period, float(np.median(walls))
-    medians = {part: float(np.median([each[part] for each in parts])) for part in parts[0]}
+    simulated, wall = log.control.t.size * scenario.control_period, float(np.median(walls))
+    medians = {part: float(np.median([part_times[part] for part_times in parts])) for part in parts[0]}
     whole = sum(medians.values())
     rows = [{"part": part, "seconds": spent, "share_%": 100.0 * spent / whole} for part, spent in medians.items()]
-    return [*rows, {"part": f"the whole, without clocks; {flown / wall:.0f} times real time", "seconds": wall}]
+    return [*rows, {"part": f"the whole, without clocks; {simulated / wall:.0f} times real time", "seconds": wall}]
 
 
 def main() -> None:

@@ -76,7 +76,7 @@ def cells(quick: bool) -> list[tuple[str, str, Scenario]]:
     if quick:
         start = start.replace({"duration": QUICK[2], "constraints": []})
     paper = read_toml(scenario_path(SCENARIO))["controller"]
-    found = []
+    cells_flown = []
     for condition, entry in conditions.items():
         if quick and condition not in QUICK[1]:
             continue
@@ -84,8 +84,8 @@ def cells(quick: bool) -> list[tuple[str, str, Scenario]]:
         known = (entry.get("rotor_lag", 0.0), entry.get("delay", 0.0))
         for name, table in controllers(paper, *known, start.control_period).items():
             if not quick or name in QUICK[0]:
-                found.append((name, condition, changed.replace({"controller": table})))
-    return found
+                cells_flown.append((name, condition, changed.replace({"controller": table})))
+    return cells_flown
 
 
 def fly(scenario: Scenario) -> Record:

@@ -66,14 +66,14 @@ def entries(scenario: Scenario) -> dict[str, Scenario]:
     """The scenario with each installed solver, and with its whole law in C."""
     entries = {name: scenario.replace({"controller.solver": name}) for name in read_catalogue().solvers}
     entries[LAW] = scenario.replace({"controller.compiled": True})
-    found = {}
+    usable = {}
     for name, changed in entries.items():
         try:
             Assembly(changed).controller()
         except (MissingPackageError, MissingCoreError):
             continue
-        found[name] = changed
-    return found
+        usable[name] = changed
+    return usable
 
 
 def measure(name: str, quick: bool) -> list[Record]:
@@ -104,7 +104,7 @@ def measure(name: str, quick: bool) -> list[Record]:
             plant.state()
 
         times = time_in_turns(
-            {solver: (each.prepare, each.answer) for solver, each in candidates.items()},
+            {solver: (candidate.prepare, candidate.answer) for solver, candidate in candidates.items()},
             segments[:1] if quick else segments,
             between=fly_a_period,
             repeats=1 if quick else 3,
@@ -117,9 +117,9 @@ def measure(name: str, quick: bool) -> list[Record]:
             "solver": solver,
             "setup_ms": setup[solver],
             **step_quantiles(times[solver]),
-            **_answers(each.commands, exact),
+            **_answers(candidate.commands, exact),
         }
-        for solver, each in candidates.items()
+        for solver, candidate in candidates.items()
     ]
 
 

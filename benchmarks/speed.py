@@ -115,12 +115,12 @@ def controllers(vehicle: Vehicle, tuned: Table, period: float, bound: float) -> 
         },
     }
     shared = ("horizon", "output_weights", "input_weights", "output_bounds", "input_bounds")
-    held = max(1, math.floor(NODE / period + 1e-9))  # periods from node to node
+    periods_per_node = max(1, math.floor(NODE / period + 1e-9))  # periods from node to node
     nonlinear = {
         "type": "nonlinear",
-        "horizon": held * math.ceil(tuned["horizon"] / held),
-        "node": held * period,
-        "substeps": math.ceil(held * period / lag) if lag else 1,
+        "horizon": periods_per_node * math.ceil(tuned["horizon"] / periods_per_node),
+        "node": periods_per_node * period,
+        "substeps": math.ceil(periods_per_node * period / lag) if lag else 1,
         "rotor_lag": tuned["rotor_lag"],
         "terminal": "lqr",
         "tilt": bound,
@@ -218,16 +218,16 @@ def draw(records: Sequence[Record], path: Path) -> None:
     for column, course in enumerate(courses):
         errors, violations = panels[:, column]
         for i, law in enumerate(LAWS):
-            flown = [record for record in records if (record["course"], record["controller"]) == (course, law)]
+            selected = [record for record in records if (record["course"], record["controller"]) == (course, law)]
             look: Table = {
                 "color": f"C{i}",
                 "linestyle": "--" if law in LINEAR else "-",
                 "marker": "o",
                 "markersize": 3,
             }
-            speeds = [record["speed"] for record in flown]
-            errors.plot(speeds, [math.nan if f["error"] is None else f["error"] for f in flown], label=law, **look)
-            violations.plot(speeds, [100.0 * record["violated"] for record in flown], **look)
+            speeds = [record["speed"] for record in selected]
+            errors.plot(speeds, [math.nan if f["error"] is None else f["error"] for f in selected], label=law, **look)
+            violations.plot(speeds, [100.0 * record["violated"] for record in selected], **look)
         errors.set_title(course, loc="left", fontsize=10)
         errors.set_yscale("log")
         violations.set_xlabel("speed [m/s]")

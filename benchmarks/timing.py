@@ -110,8 +110,8 @@ class Stopwatch:
 
 def step_quantiles(ms: Array) -> Record:
     """Median, 99th percentile and maximum of step times (K,) [ms]."""
-    found = percentiles(ms)
-    return {f"{name}_ms": float(found[name]) for name in ("p50", "p99", "max")}
+    quantiles = percentiles(ms)
+    return {f"{name}_ms": float(quantiles[name]) for name in ("p50", "p99", "max")}
 
 
 def time_in_turns(

@@ -13,7 +13,7 @@ INK, SOFT, FORWARD, TURN = "#6577d6", "#737ea6", "#d9534f", "#2e9b5f"
 STYLE = "font: 13px sans-serif; fill: " + SOFT
 
 
-def svg(width: int, height: int, parts: list[str]) -> str:
+def svg(width: int, height: int, parts: list[str], *, arrows: bool = True) -> str:
     """An image of these parts that has no background, for light and dark pages."""
     marker = "".join(
         f'<marker id="{name}" viewBox="0 0 8 8" refX="6" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
@@ -23,7 +23,7 @@ def svg(width: int, height: int, parts: list[str]) -> str:
     lines = "\n".join(parts)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}">\n'
-        f"<defs>{marker}</defs>\n{lines}\n</svg>\n"
+        f"{f'<defs>{marker}</defs>' if arrows else ''}\n{lines}\n</svg>\n"
     )
 
 

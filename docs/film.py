@@ -77,9 +77,11 @@ class Plot:
         rows = np.clip(np.searchsorted(run.log.plant.t, self._grid), 0, run.log.plant.t.size - 1)
         signals = {name: SIGNALS[name].plant for name in names}
         self._curves = {name: values(run.log.plant)[rows] for name, values in signals.items() if values is not None}
-        self._bounds = sorted({bound for name in names for bound, _, _ in bounds_of(run.limits, name, run.end)})
+        self._limits = [limit for limit in run.limits if limit.signal in names]
+        self._bounds = [bound for name in names for bound in bounds_of(run.limits, name, float(footage.times[-1]))]
         reach = 1.15 * max(float(np.abs(curve).max()) for curve in self._curves.values())
-        high = max(reach, *(1.8 * abs(bound) for bound in self._bounds), 1.0)
+        widest = max((abs(bound) for bound, _, _ in self._bounds), default=reach)
+        high = max(min(reach, 4.0 * widest), 1.8 * widest if names != ("tilt",) else 0.0, 1.0)  # a fall is cut off
         self._low, self._high = (0.0 if names == ("tilt",) else -high), high
 
     def _at(self, times: Array, values: Array) -> list[tuple[float, float]]:
@@ -93,16 +95,17 @@ class Plot:
         canvas, ends = ImageDraw.Draw(image), self._times[[0, -1]]
         (left, top), (right, bottom) = self._at(ends, np.array([self._high, self._low]))
         canvas.rectangle((left, top, right, bottom), fill=FIELD)
-        for bound in (0.0, *self._bounds):
-            line = self._at(ends, np.full(2, bound))
+        for bound, start, stop in ((0.0, *ends), *self._bounds):
+            line = self._at(np.clip([start, stop], *ends), np.full(2, bound))
             canvas.line(line, fill=ink.AMBER if bound else ink.FAINT, width=SHARP if bound else 1)
-            painter.text(self._left - 5, line[0][1] / SHARP, f"{bound:g}", size=12, colour=ink.GREY, anchor="rm")
+            if abs(bound) > 0.1 * self._high or not bound:
+                painter.text(self._left - 5, line[0][1] / SHARP, f"{bound:g}", size=12, colour=ink.GREY, anchor="rm")
         now = np.searchsorted(self._grid, self._times[i], side="right")
         for j, ((name, curve), colour) in enumerate(zip(self._curves.items(), CURVES, strict=False)):
-            points = self._at(self._grid[:now], curve[:now])
+            points = self._at(self._grid[:now], np.clip(curve[:now], self._low, self._high))
             canvas.line(points, fill=colour, width=2 * SHARP, joint="curve")
-            if self._bounds:
-                beyond = (curve[:now] > self._bounds[-1] + 0.05) | (curve[:now] < self._bounds[0] - 0.05)
+            for limit in (limit for limit in self._limits if limit.signal == name):
+                beyond = limit.holds_at(self._grid[:now]) & (limit.margin(curve[:now]) < -limit.tolerance)
                 for k in np.flatnonzero(beyond[1:]):
                     canvas.line(points[k : k + 2], fill=ink.RED, width=3 * SHARP)
             painter.text(GAP, self._top + 8 + 17 * j, name, size=12, colour=colour, anchor="lm")

@@ -1,111 +1,91 @@
-"""Make docs/gallery.md, a picture and the numbers of every scenario that ships: `make docs`.
-
-Flies every scenario; neither the page nor the figures are stored in the repository.
-"""
+"""The pictures of docs/gallery.md: `films` into docs/films, in `make docs`; `thumbnails` of all scenarios, stored."""
 
 from __future__ import annotations
 
-import json
-import shutil
-import tempfile
+import re
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import get_args
+from typing import Any, Final
 
-import matplotlib as mpl
+import film
+import imageio
 import numpy as np
-from matplotlib.figure import Figure
-from remake import ROOT, TITLES, scenario_cells
+from drawings import FORWARD, INK, SOFT, svg
 
-import quadsim
 from quadsim.errors import RenderingUnavailableError
-from scenarios.flight import Flight
-from scenarios.machine import usable_cores
-from scenarios.schema.scenario import Group
+from quadsim.report.film.frames import Shot, thin
+from quadsim.state import Array
 
-DOCS = Path(__file__).resolve().parent
-PAGE, FIGURES = DOCS / "gallery.md", DOCS / "gallery"
-GOLDEN = json.loads((ROOT / "tests/golden/library.json").read_text(encoding="utf-8"))
-SIDES = np.array([-1.0, 1.0])
-FILMED = ("power-loop", "inverted-start", "window", "thrown-ball")
-"""Scenarios whose films are on the page too, where films can be made."""
-HEAD = """# Gallery
-
-Every scenario that ships: its path (dashed: the reference), roll and pitch with their bounds, or the tilt where the
-vehicle may turn upside down, the verdict, and the constraint that came nearest to its bound. `quadsim run NAME` flies
-one, films it and writes its recording; `quadsim scenario NAME` prints its file. What the words mean:
-[scenarios](scenarios.md).
-"""
+DOCS: Final = Path(__file__).resolve().parent
+THUMBNAILS, FILMS = DOCS / "assets" / "gallery", DOCS / "films"
+WIDTH, HEIGHT, MARGIN = 160, 90, 8  # of a thumbnail [pixels]
+FINEST: Final = 0.3  # how far a drawn path may be from the real one [pixels]
+LEAST: Final = 0.5  # a thumbnail shows at least so much [m]
+LONGEST, FPS = 12.0, 20  # of a film [s]; longer flights are shown faster
+VIEW: Final = np.array([[0.87, -0.87, 0.0], [0.3, 0.3, -1.0]])  # world -> right and down, seen from above at an angle
 
 
-def draw(flight: Flight, file: Path) -> None:
-    """The path in space, roll and pitch."""
-    figure = Figure(figsize=(8.0, 2.9), layout="constrained")
-    left, right = figure.add_gridspec(1, 2, width_ratios=(1.0, 1.5))
-    space = figure.add_subplot(left, projection="3d")
-    reference, state = flight.reference, flight.plant
-    space.plot(reference["x"], reference["y"], reference["z"], color="0.5", linestyle="--", linewidth=0.9)
-    space.plot(state["x"], state["y"], state["z"], color="C0", linewidth=1.1)
-    paths = np.stack([np.concatenate([reference[axis], state[axis]]) for axis in "xyz"])
-    middle, widest = 0.5 * (paths.min(axis=1) + paths.max(axis=1)), max(1.0, np.ptp(paths, axis=1).max())
-    half = 0.5 * np.maximum(np.ptp(paths, axis=1), 0.25 * widest)
-    space.set(xlim=middle[0] + SIDES * half[0], ylim=middle[1] + SIDES * half[1], zlim=middle[2] + SIDES * half[2])
-    space.set_box_aspect(half)
-    space.ticklabel_format(useOffset=False)
-    space.tick_params(labelsize=6, pad=-2)
-    space.locator_params(nbins=4)
-    axes = figure.add_subplot(right)
-    shown = {"roll": state["roll"], "pitch": state["pitch"]}
-    if flight.log.plant.attitude is not None:  # may turn upside down
-        shown = {"tilt": np.arccos(np.cos(state["roll"]) * np.cos(state["pitch"]))}
-    for i, (name, angle) in enumerate(shown.items()):
-        axes.plot(state["t"], np.degrees(angle), color=f"C{i}", linewidth=1.0, label=name)
-    for limit in (finding.limit for finding in flight.audit if finding.limit.signal in shown):
-        for bound in (bound for bound in (limit.lower, limit.upper) if np.isfinite(bound)):
-            axes.hlines(bound, limit.start, min(limit.stop, state["t"][-1]), color="tab:red", linestyle=":")
-    axes.legend(ncols=2, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
-    axes.set(xlabel="time [s]", ylabel=f"{', '.join(shown)} [deg]")
-    figure.savefig(file, format="svg", metadata={"Date": None})
+def thumbnail(name: str) -> None:
+    """A scenario's path and its reference, dashed, with a dot at the end: red where the flight was lost or violated."""
+    import quadsim
 
-
-def film(flight: Flight, file: Path) -> str:
-    """The film of a flight as the page shows it; nothing where none can be made."""
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            run = flight.save(Path(folder) / "run", recording=False, figures=False)
-        except RenderingUnavailableError:
-            return ""
-        shutil.copy(run / "flight.mp4", file)
-    return f'<video controls muted loop preload="metadata" width="100%" src="gallery/{file.name}"></video>\n'
-
-
-def entry(name: str) -> tuple[Group, str]:
-    """Fly and draw a scenario; its group, and its section of the page."""
     flight = quadsim.fly(name, progress=False)
-    draw(flight, FIGURES / f"{name}.svg")
-    clip = film(flight, FIGURES / f"{name}.mp4") if name in FILMED else ""
-    verdict, errors, nearest = scenario_cells(GOLDEN[name])
-    numbers = f"**{verdict}**"
-    if errors != "-":
-        numbers += f" · RMS error x, y, z {errors} m · nearest to its bound: {nearest}"
-    return flight.scenario.group, (
-        f"### {name}\n\n{flight.scenario.description}.\n\n![Path and attitude of {name}](gallery/{name}.svg)\n\n"
-        f"{numbers}\n{clip and chr(10) + clip}"
+    paths = [np.stack([of[axis] for axis in "xyz"], axis=1) @ VIEW.T for of in (flight.reference, flight.plant)]
+    low, high = (
+        np.min([path.min(axis=0) for path in paths], axis=0),
+        np.max([path.max(axis=0) for path in paths], axis=0),
     )
+    room = np.array([WIDTH - 2 * MARGIN, HEIGHT - 2 * MARGIN])
+    scale = float((room / np.maximum(high - low, LEAST)).min())
+    shown = [0.5 * np.array([WIDTH, HEIGHT]) + scale * (path - 0.5 * (low + high)) for path in paths]
+    end = shown[1][-1]
+    colour = INK if flight.outcome == "satisfied" else FORWARD
+    parts = [
+        polyline(shown[0], f'stroke="{SOFT}" stroke-dasharray="3 2"'),
+        polyline(shown[1], f'stroke="{INK}" stroke-width="1.5"'),
+        f'<circle cx="{end[0]:.1f}" cy="{end[1]:.1f}" r="3.5" fill="{colour}"/>',
+    ]
+    (THUMBNAILS / f"{name}.svg").write_text(svg(WIDTH, HEIGHT, parts, arrows=False), encoding="utf-8")
+
+
+def polyline(points: Array, looks: str) -> str:
+    """A path through points (n, 2), without those that no eye sees."""
+    kept = thin(np.column_stack([points, np.zeros(len(points))]), FINEST)
+    return f'<polyline points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in points[kept])}" fill="none" {looks}/>'
+
+
+def film_flight(name: str) -> None:
+    """The film of a scenario, H.264."""
+    film.start()
+    import quadsim
+
+    run = quadsim.fly(name, progress=False).run
+    speed = max(1.0, run.end / LONGEST)
+    shot = Shot(run="", width=480, height=270, fps=FPS, speed=speed, count=round(run.end * FPS / speed))
+    title = name if speed == 1.0 else f"{name}, {speed:.1f} times as fast"
+    writer: Any = imageio.get_writer(
+        FILMS / f"{name}.mp4", format="FFMPEG", fps=FPS, codec="libx264", pixelformat="yuv420p", quality=None,
+        macro_block_size=1, ffmpeg_log_level="error", output_params=["-crf", "26", "-threads", "1"],
+    )  # fmt: skip
+    with writer:
+        for picture in film.panels(run, title, shot):
+            writer.append_data(np.asarray(picture))
 
 
 def main() -> None:
-    """Fly everything and write the page."""
-    FIGURES.mkdir(exist_ok=True)
-    mpl.rcParams |= {"svg.hashsalt": "quadsim", "font.size": 8.0, "axes.spines.top": False, "axes.spines.right": False}
-    with ProcessPoolExecutor(usable_cores()) as pool:
-        entries = list(pool.map(entry, quadsim.catalogue().scenarios))
-    parts = [HEAD]
-    for group in get_args(Group):
-        members = [text for of, text in entries if of == group]
-        if members:
-            parts += [f"## {TITLES.get(group, group)}\n", *members]
-    PAGE.write_text("\n".join(parts), encoding="utf-8")
+    """Make what is named; without off-screen OpenGL the page keeps its drawings and says so."""
+    from scenarios.catalogue import scenario_names
+    from scenarios.machine import usable_cores
+
+    names = re.findall(r"films/([\w-]+)\.mp4", (DOCS / "gallery.md").read_text(encoding="utf-8"))
+    task, folder = (film_flight, FILMS) if sys.argv[1:] == ["films"] else (thumbnail, THUMBNAILS)
+    folder.mkdir(exist_ok=True)
+    try:
+        with ProcessPoolExecutor(usable_cores()) as pool:
+            list(pool.map(task, names if task is film_flight else scenario_names()))
+    except RenderingUnavailableError as error:
+        print(f"The gallery is built without films: {error}", file=sys.stderr)
 
 
 if __name__ == "__main__":

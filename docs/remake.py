@@ -2,7 +2,7 @@
 
 A table stands between `<!-- NAME: filled by docs/remake.py from FILE -->` and `<!-- NAME end -->`.  Golden numbers are
 in the repository, under tests/golden; all other files are made by a command, under runs/.  A table whose file is not
-there stays as it is.  The records of two benchmarks are kept as CSV, docs/data.
+there stays as it is.  The records of three benchmarks are kept as CSV, docs/data.
 
     python docs/remake.py                    # fill all tables from the files that are there
     python docs/remake.py speed mismatch     # run the commands that make these files first
@@ -59,7 +59,8 @@ def commands(name: str) -> list[list[str]]:
         case "first-flights":
             return [[python, "tests/first_flights.py"]]
         case "pictures":
-            return [[python, f"docs/{script}.py"] for script in ("drawings", "figures", "film")]
+            scripts = (["drawings.py"], ["figures.py"], ["film.py"], ["gallery.py", "thumbnails"])
+            return [[python, f"docs/{script}", *rest] for script, *rest in scripts]
         case "campaigns":
             return [[quadsim, "campaign", each, "--out", f"runs/campaigns/{each}", "--resume"] for each in CAMPAIGNS]
         case "tunings":
@@ -117,12 +118,12 @@ def _bound(found: dict[str, Any], unit: str) -> str:
 
 def scenarios(golden: dict[str, Any]) -> str:
     """The library's scenarios, a table for each group."""
-    head = ("scenario", "shows", "verdict", "RMS error x, y, z [m]", "nearest to its bound")
+    head = ("", "scenario", "verdict", "nearest", "RMS error x, y, z [m]")
     specs = {name: load_scenario(name) for name in golden}
     parts = []
     for group in get_args(Group):
         rows = [
-            (f"`{name}`", specs[name].description, *scenario_cells(entry))
+            (f"![{name}](assets/gallery/{name}.svg)", f"`{name}` {specs[name].description}", *scenario_cells(entry))
             for name, entry in golden.items()
             if specs[name].group == group
         ]
@@ -132,11 +133,11 @@ def scenarios(golden: dict[str, Any]) -> str:
 
 
 def scenario_cells(entry: dict[str, Any]) -> tuple[str, str, str]:
-    """A scenario's verdict, errors and nearest bound; "-" where the vehicle was lost."""
+    """A scenario's verdict, nearest bound and errors; "-" where the vehicle was lost."""
     if "rmse" not in entry:
         return entry["verdict"], "-", "-"
     errors = ", ".join(f"{error:.3f}" for error in entry["rmse"])
-    return entry["verdict"], errors, f"{entry['nearest']} {entry['margin'] + 0.0:.2f} {entry['unit']}"
+    return entry["verdict"], f"{entry['nearest']} {entry['margin'] + 0.0:.2f} {entry['unit']}", errors
 
 
 def papers(reproduction: dict[str, Any]) -> str:
@@ -220,6 +221,16 @@ def _change(start: float, best: float) -> str:
     return f"{100.0 * (best - start) / abs(start):+.1f} %"
 
 
+def solvers(data: Any) -> str:
+    """Step times of every solver, and how they compare with the first of the scenario."""
+    rows, first = [], {row["scenario"]: row for row in reversed(_records(data))}
+    for row in _records(data):
+        times = (f"{row[key]:.3g}" for key in ("p50_ms", "p99_ms"))
+        ratios = (f"{row[key] / first[row['scenario']][key]:.2f}" for key in ("p50_ms", "p99_ms"))
+        rows.append((row["scenario"], row["solver"], *times, *ratios))
+    return markdown(("scenario", "solver", "p50 [ms]", "p99 [ms]", "p50, ratio", "p99, ratio"), rows)
+
+
 def records(data: Any) -> str:
     """A benchmark's records, one a row, under their keys."""
     rows = _records(data)
@@ -263,7 +274,8 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "first-flights": first_flights,
     "campaigns": campaigns,
     "tunings": tunings,
-    **dict.fromkeys(("solvers", "flight", "film", "campaign"), records),
+    "solvers": solvers,
+    **dict.fromkeys(("flight", "film", "campaign"), records),
 }
 
 
@@ -307,7 +319,7 @@ def main() -> None:
         page.write_text(text, encoding="utf-8")
         for source in missing:
             print(f"{page.relative_to(ROOT)}: stays as it is without {source}")
-    for name in ("mismatch", "speed"):
+    for name in ("mismatch", "solvers", "speed"):
         write_csv(name)
     for name, drawn in FIGURES.items():
         if (ROOT / drawn).is_file():

@@ -5,7 +5,7 @@
     flight = quadsim.fly("paper-constrained")
     flight.outcome, flight.metrics["rmse.x"], flight.margins["roll"].min()
 
-What is public is named in `__all__` and imported when it is first used (PEP 562), so `import quadsim` costs nothing.
+Public names are in `__all__` and imported on first use (PEP 562), so `import quadsim` costs nothing.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ __all__ = [*_PUBLIC]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
+    """Import a public name on first use."""
     if name not in _PUBLIC:
         raise AttributeError(f"module 'quadsim' has no attribute {name!r}")
     return globals().setdefault(name, getattr(importlib.import_module(_PUBLIC[name]), name))

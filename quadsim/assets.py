@@ -1,4 +1,4 @@
-"""The data files: where they are, in a wheel or in a checkout, and how they are read."""
+"""The data files, in a wheel or a checkout, and how to read them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any, Final
 
 from quadsim.errors import FileError, InputError, UnknownNameError
 
-DEEPEST: Final = 20  # tables and lists within one another; a scenario has a third of them
+DEEPEST: Final = 20  # deepest nesting of tables and lists; a scenario has a third of it
 _KEY: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
 _TOO_DEEP: Final = re.compile(rf"(?<![\w-]){_KEY}(?:[ \t]*+\.[ \t]*+{_KEY}){{{DEEPEST}}}")
 
 
 def models_dir() -> Path:
-    """The folder with `quadrotor.xml` and the vehicle files."""
+    """Return the folder with `quadrotor.xml` and the vehicle files."""
     package = Path(__file__).resolve().parent
     for candidate in (package / "models", package.parent / "models"):
         if (candidate / "quadrotor.xml").is_file():
@@ -25,21 +25,21 @@ def models_dir() -> Path:
 
 
 def own_packages() -> dict[str, str]:
-    """The entry of its environment by which a child process finds quadsim where this one did."""
+    """Return the environment entry by which a child process finds this quadsim."""
     folders = (str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH"))
     return {"PYTHONPATH": os.pathsep.join(filter(None, folders))}
 
 
 def vehicle_names() -> list[str]:
-    """Names of the vehicles that ship, sorted."""
+    """Return the names of the shipped vehicles, sorted."""
     return sorted(path.stem for path in models_dir().glob("*.toml"))
 
 
 def vehicle_path(name: str) -> Path:
-    """The vehicle file for a shipped name or a path ending in `.toml`.
+    """Return the vehicle file of a shipped name, or a path ending in `.toml`.
 
     Raises:
-        FileError, UnknownNameError: there is none.
+        FileError, UnknownNameError: it does not exist.
     """
     if name.endswith(".toml"):
         if not Path(name).is_file():
@@ -52,7 +52,7 @@ def vehicle_path(name: str) -> Path:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file's tables.
+    """Read a TOML file's tables.
 
     Raises:
         FileError: it is missing, unreadable or not TOML.
@@ -63,19 +63,19 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise FileError(path, f"cannot be read ({error})") from error
     except InputError as error:
         raise FileError(path, str(error)) from error
-    except ValueError as error:  # also numbers beyond what Python reads
+    except ValueError as error:  # includes numbers that Python cannot read
         raise FileError(path, f"is not valid TOML: {error}") from error
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The tables of a text.
+    """Parse the tables of a TOML text.
 
     Raises:
         InputError: they are nested too deep.
         ValueError: it is not TOML.
     """
-    deeper = InputError(f"must have at most {DEEPEST} tables and lists within one another")
-    if _TOO_DEEP.search(text):  # tomllib takes gigabytes for a key of 40 000 dots
+    deeper = InputError(f"must nest tables and lists at most {DEEPEST} deep")
+    if _TOO_DEEP.search(text):  # tomllib needs gigabytes for a key of 40 000 dots
         raise deeper
     try:
         data = tomllib.loads(text)
@@ -87,7 +87,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def _is_deeper(value: Any, levels: int) -> bool:
-    """Whether tables and lists are nested more than this many levels deep."""
+    """Return whether tables and lists are nested more than `levels` deep."""
     layer = [value]
     for _ in range(levels + 1):
         tables = (

@@ -1,7 +1,7 @@
-"""Every error the project raises: what was given, what is allowed, what to try.
+"""Every error that the project raises: the value given, the values allowed, and a remedy.
 
-Two families hang from one root. `InputError` is the user's to mend (exit status 2); `FlightError` is something
-that happened in flight: it ends the flight, is recorded with it as its reason, and gives exit status 1.
+Two families have one root.  An `InputError` is for the user to correct (exit status 2). A `FlightError` happens in
+flight: it ends the flight, is recorded as its reason, and gives exit status 1.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-_TRACEBACK_LINES: Final = 20  # that are kept of what ended a flight
-_LONGEST: Final = 500  # characters of its message
+_TRACEBACK_LINES: Final = 20  # lines kept of the traceback that ended a flight
+_LONGEST: Final = 500  # characters kept of its message
 _HIDDEN: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
-"""Unicode categories that steer what is shown, or show nothing: controls, formats such as direction, surrogates."""
+"""Unicode categories that control a terminal or are invisible: controls, formats such as direction, surrogates."""
 
 
 def printable(text: str, *, keep: str = "") -> str:
-    r"""A text with each character that steers a terminal as an escape, e.g. `\x1b`, but for those to `keep`."""
+    r"""Escape the characters that control a terminal, e.g. as `\x1b`, except those in `keep`."""
     if text.isprintable():
         return text
     return "".join(
@@ -32,7 +32,7 @@ def printable(text: str, *, keep: str = "") -> str:
 class QuadsimError(Exception):
     """Root of all errors raised on purpose; `exit_status` is what the command line returns for it.
 
-    Errors cross from one process to another: they pickle whole, whatever arguments their constructors need.
+    Errors survive pickling between processes, whatever arguments their constructors need.
 
     Examples:
         >>> import quadsim
@@ -45,20 +45,20 @@ class QuadsimError(Exception):
 
     exit_status = 2
     result: object = None
-    """What was done all the same: the flight whose film failed."""
+    """The result obtained despite the error, e.g. the flight whose film failed."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return _restore, (type(self), self.args, self.__dict__)
 
 
 class InputError(QuadsimError, ValueError):
-    """The input was wrong; the message is one a person can act on."""
+    """The input is invalid; the message tells the user how to correct it."""
 
 
 class ParameterError(InputError):
-    """A parameter is outside what is allowed.
+    """A parameter is outside its allowed range.
 
-    The owner is what it belongs to, e.g. `vehicle`, empty for an option of the command line; the rule is the end of
+    `owner` is the object it belongs to, e.g.  `vehicle`, empty for a command-line option; `rule` completes the sentence
     "must be ...".
     """
 
@@ -68,7 +68,7 @@ class ParameterError(InputError):
 
 
 class ExportError(InputError):
-    """A controller that has no C of its own; the reason is the end of "... cannot be exported: ..."."""
+    """The controller has no C implementation; `reason` completes "... cannot be exported: ..."."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(f"this scenario's controller cannot be exported: {reason}")
@@ -76,7 +76,7 @@ class ExportError(InputError):
 
 
 class MissingCoreError(InputError):
-    """The compiled core was requested, and there is none here; the message says why."""
+    """The compiled core was requested but is missing; the message says why."""
 
     def __init__(self, reason: str, instead: str = "choose controller.solver = 'piqp'") -> None:
         super().__init__(f"there is no core here: {reason}; or {instead}")
@@ -84,9 +84,9 @@ class MissingCoreError(InputError):
 
 
 class UnknownNameError(InputError):
-    """A name of a kind that is not one of a known set.
+    """A name outside a known set.
 
-    The message lists the set and its nearest member, or those that are `meant`: the same thing, spelt otherwise.
+    The message lists the set and the closest name, or those in `meant`: other spellings of the same thing.
     """
 
     def __init__(self, kind: str, name: str, allowed: Iterable[str], hint: str = "", meant: Sequence[str] = ()) -> None:
@@ -106,7 +106,7 @@ class FileError(InputError):
 
 
 class MissingPackageError(InputError):
-    """What was requested needs an optional package that is not installed; the message names it."""
+    """A feature needs an optional package that is not installed; the message names it."""
 
     def __init__(self, what: str, package: str, *, extra: str) -> None:
         super().__init__(f"{what} needs the package {package!r}: pip install 'quadsim[{extra}]'")
@@ -114,7 +114,7 @@ class MissingPackageError(InputError):
 
 
 class MissingProgramError(InputError):
-    """What was requested needs a program that is not installed; the message names it."""
+    """A feature needs a program that is not installed; the message names it."""
 
     def __init__(self, what: str, program: str, *, packages: str) -> None:
         super().__init__(f"{what} needs {program!r}: apt-get install --no-install-recommends {packages}")
@@ -122,7 +122,7 @@ class MissingProgramError(InputError):
 
 
 class OutputError(QuadsimError, OSError):
-    """Results cannot be written: directory not writable, disk full; nothing is left behind."""
+    """Results cannot be written, e.g. to a read-only directory or a full disk; nothing partial is left."""
 
     def __init__(self, path: Path | str, problem: str) -> None:
         super().__init__(f"cannot write {printable(str(path))}: {problem}")
@@ -130,7 +130,7 @@ class OutputError(QuadsimError, OSError):
 
 
 class RenderingUnavailableError(QuadsimError):
-    """Neither EGL nor OSMesa can render on this machine."""
+    """This machine can render with neither EGL nor OSMesa."""
 
     def __init__(self, tried: dict[str, str]) -> None:
         details = "; ".join(f"{backend}: {problem}" for backend, problem in tried.items())
@@ -143,11 +143,11 @@ class RenderingUnavailableError(QuadsimError):
 
 
 class ViewerUnavailableError(QuadsimError):
-    """The rerun viewer cannot be started here."""
+    """The rerun viewer cannot start here."""
 
 
 class FlightError(QuadsimError):
-    """Something that ends a flight at a simulated time [s]; it becomes the flight's recorded reason."""
+    """An error that ends a flight at a simulated time [s] and becomes its recorded reason."""
 
     exit_status = 1
 
@@ -157,11 +157,11 @@ class FlightError(QuadsimError):
 
 
 class DivergenceError(FlightError):
-    """The plant's state became non-finite, left every plausible range, or MuJoCo reported a numerical warning."""
+    """The plant's state became non-finite or implausible, or MuJoCo reported a numerical warning."""
 
 
 class LostError(FlightError):
-    """The vehicle is beyond one of the flight's loss criteria; see `quadsim.flight.phase.CRITERIA`."""
+    """The vehicle exceeds one of the flight's loss criteria; see `quadsim.flight.phase.CRITERIA`."""
 
     def __init__(self, criterion: str, quantity: str, unit: str, *, value: float, limit: float, time: float) -> None:
         message = f"lost: {quantity} {value:.5g} {unit}, beyond lost.{criterion} = {limit:g} {unit}"
@@ -170,11 +170,11 @@ class LostError(FlightError):
 
 
 class CommandError(FlightError):
-    """A command that must not reach the plant: wrong shape, non-finite, or beyond any rotor's speed."""
+    """A command was rejected before it reached the plant: wrong shape, non-finite, or above any rotor's speed."""
 
 
 class ForceError(FlightError):
-    """A user-defined force that is not six finite numbers."""
+    """A user-defined force is not six finite numbers."""
 
 
 class PlanExhaustedError(FlightError):
@@ -182,7 +182,7 @@ class PlanExhaustedError(FlightError):
 
 
 class RaisedError(FlightError):
-    """The controller or a force raised something, or asked Python to exit; `traceback` has its last lines."""
+    """The controller or a force raised an exception, or exited; `traceback` has its last lines."""
 
     def __init__(self, what: str, error: BaseException, *, time: float) -> None:
         lines = "".join(traceback.format_exception(error)).splitlines()
@@ -192,14 +192,14 @@ class RaisedError(FlightError):
 
 
 class InterruptedFlightError(FlightError):
-    """The person flying pressed Ctrl-C."""
+    """The user pressed Ctrl-C."""
 
     def __init__(self, *, time: float) -> None:
         super().__init__("interrupted (Ctrl-C)", time=time)
 
 
 def _restore(kind: type[QuadsimError], arguments: tuple[object, ...], values: dict[str, object]) -> QuadsimError:
-    """An error as it was, its message and its values, not rebuilt from them."""
+    """Restore an error's message and attributes without calling its constructor."""
     error = kind.__new__(kind)
     error.args = arguments
     error.__dict__.update(values)

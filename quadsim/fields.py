@@ -1,9 +1,9 @@
-"""What the fields of settings may hold, in Python and in files alike: kinds of numbers with their limits.
+"""The types of settings fields, in Python and in files: numbers with their limits.
 
-A settings dataclass is the one declaration of its fields: type and limits by `annotated_types`, unit and meaning by
-`annotated_types.doc`, default.  `scenarios.schema` reads tables of scenario files straight into these dataclasses, and
-makes messages, the JSON Schema and commented files of them.  Numbers are therefore in the units of files: angles in
-degrees; what computes with them converts them.
+A settings dataclass is the only declaration of its fields: type and limits by `annotated_types`, unit and meaning by
+`annotated_types.doc`, default value.  `scenarios.schema` reads tables of scenario files into these dataclasses, and
+derives messages, the JSON Schema and commented files from them.  Numbers are therefore in file units, angles in
+degrees; the code that computes with them converts them.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ Number = Annotated[float, Ge(-1e6), Le(1e6)]
 NonNegative = Annotated[float, Ge(0.0), Le(1e6)]
 Positive = Annotated[float, Gt(0.0), Le(1e6)]
 Fraction = Annotated[float, Ge(0.0), Le(1.0)]
-Weight = Annotated[float, Gt(0.0), Le(1e12)]  # of a cost function
-Vector = Annotated[tuple[Number, ...], Len(3, 3)]  # of three numbers, x, y, z
+Weight = Annotated[float, Gt(0.0), Le(1e12)]  # weight in a cost function
+Vector = Annotated[tuple[Number, ...], Len(3, 3)]  # x, y, z
 Pair = Annotated[tuple[Number, ...], Len(2, 2)]
 Instant = Annotated[float, Ge(0.0), Le(1e6), doc("[s] when it happens")]  # of an event
 
 
 def filled(settings: Settings, **values: object) -> Settings:
-    """A settings dataclass with the fields that are None taken from elsewhere."""
+    """Return settings with the fields that are None set to `values`."""
     absent: dict[str, Any] = {name: value for name, value in values.items() if getattr(settings, name) is None}
     return replace(settings, **absent)  # type: ignore[type-var]
 
 
 def is_plain(value: object) -> bool:
-    """Whether a value is one that TOML and JSON can hold, and no date."""
+    """Return whether TOML and JSON can both hold a value; dates do not qualify."""
     if isinstance(value, dict):
         return all(map(is_plain, value.values()))
     if isinstance(value, list):

@@ -5,7 +5,7 @@
 
     env = gymnasium.make("quadsim/PaperConstrained-v0")
 
-Importing this module registers an id for each scenario of the library; `make_env` makes an environment of any other.
+Importing this module registers an id for each library scenario; `make_env` makes an environment from any other.
 """
 
 from __future__ import annotations

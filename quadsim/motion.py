@@ -1,4 +1,4 @@
-"""What a course requires of a vehicle over time, for controllers with preview."""
+"""The reference motion of a vehicle along a course, for controllers with preview."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from quadsim.state import Array
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """A reference motion, K samples a control period apart, from one instant to the end of the course."""
+    """A reference motion, K samples one control period apart, from an instant to the end of the course."""
 
     position: Array  # (K, 3) world [m]
     velocity: Array  # (K, 3) world [m/s]
     acceleration: Array  # (K, 3) world [m/s^2]
     attitude: Array  # (K, 4) unit quaternions wxyz, body to world, sign continuous from sample to sample
     body_rates: Array  # (K, 3) body frame [rad/s]
-    thrusts: Array  # (K, 4) of the rotors [N], not clipped to what they can give
+    thrusts: Array  # (K, 4) rotor thrusts [N], not clipped to the rotors' range
 
     def __len__(self) -> int:
         """K, the number of samples."""
         return len(self.position)
 
     def after(self, k: int) -> Motion:
-        """The motion from sample k on, as views; beyond the end its last sample, at which the course ends."""
+        """Return the motion from sample k on, as views; beyond the end, its last sample."""
         first = min(k, len(self) - 1)
         return Motion(**{name: samples[first:] for name, samples in vars(self).items()})

@@ -1,8 +1,9 @@
-"""The one place that replaces and removes files.
+"""The only code that replaces and removes files.
 
-An output directory that is there and not empty is refused.  A new one is built beside its place and renamed into it;
-`files` in its `summary.json` has the SHA-256 of every other file.  To overwrite it is to unlink, by name, the regular
-files on that list; anything else in it is refused before.  One that grows in place, as a campaign's does, is locked.
+An existing output directory that is not empty is refused.  A new one is built beside its place and renamed into it;
+`files` in its `summary.json` has the SHA-256 of every other file.  Overwriting unlinks, by name, the regular files on
+that list, and refuses a directory that holds anything else.  A directory that grows in place, such as a campaign's, is
+locked.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from typing import Any, Final
 from quadsim.errors import OutputError, printable
 
 SUMMARY_FILE: Final = "summary.json"
-LOCK_FILE: Final = ".lock"  # of a directory that grows
+LOCK_FILE: Final = ".lock"  # in a directory that grows
 _FREE_BYTES_NEEDED: Final = 16 * 1024 * 1024
 
 
 def absolute(path: Path | str) -> Path:
-    """The absolute path, links and `..` followed and `~` expanded, so that no controller's `chdir` moves it.
+    """Return the absolute path with links, `..` and `~` resolved, so that a controller's `chdir` cannot move it.
 
     Raises:
         OutputError: it leads nowhere.
@@ -37,31 +38,35 @@ def absolute(path: Path | str) -> Path:
         real = Path(os.path.realpath(Path(path).expanduser()))
         if real.is_symlink():
             raise ValueError("a symbolic link leads back to itself")
-    except (ValueError, RuntimeError, OSError) as error:  # also a null byte; a user without a home; too long a name
+    except (
+        ValueError,
+        RuntimeError,
+        OSError,
+    ) as error:  # includes null bytes, users without a home, names that are too long
         raise OutputError(ascii(str(path))[1:-1], getattr(error, "strerror", None) or str(error)) from error
     return real
 
 
 def to_json(data: Mapping[str, Any]) -> str:
-    """Strict JSON (no NaN), as all our files have it."""
+    """Serialise to strict JSON (no NaN), the format of all our files."""
     return json.dumps(data, indent=2, allow_nan=False) + "\n"
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file's content, as a list of files has it."""
+    """Return the SHA-256 of a file's content, as file lists record it."""
     with path.open("rb") as file:
         return f"sha256:{hashlib.file_digest(file, 'sha256').hexdigest()}"
 
 
 def file_hashes(directory: Path) -> dict[str, str]:
-    """SHA-256 of every regular file below a directory but its summary and its lock, by relative path, sorted."""
+    """SHA-256 of every regular file below a directory except its summary and lock, by relative path, sorted."""
     names = {name for name, mode in _below(directory).items() if S_ISREG(mode)} - {SUMMARY_FILE, LOCK_FILE}
     return {name: digest_of(directory / name) for name in sorted(names)}
 
 
 @contextlib.contextmanager
 def reserving(path: Path | str, *, overwrite: bool = False, free: bool = False) -> Iterator[Path]:
-    """The absolute place of an output directory, made before the work for it; gone again if the block leaves it empty.
+    """Create an output directory before its contents are computed; it is removed if the block leaves it empty.
 
     `overwrite` allows an earlier output there; `free` takes the next free name instead: NAME, NAME-2, ...
 
@@ -90,15 +95,15 @@ def reserving(path: Path | str, *, overwrite: bool = False, free: bool = False) 
     finally:
         for folder in made:
             with contextlib.suppress(OSError):
-                folder.rmdir()  # which removes an empty one only
+                folder.rmdir()  # removes only an empty folder
 
 
 @contextlib.contextmanager
 def writing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
-    """A directory to fill, which becomes `path`, its files listed, when the block ends well, and vanishes else.
+    """A directory to fill; it becomes `path`, with its file list, if the block succeeds, and vanishes otherwise.
 
     Raises:
-        OutputError: see `reserving`; where something else is in its place by then, what was made stays beside it.
+        OutputError: see `reserving`; if `path` has been taken meanwhile, the result stays beside it.
     """
     with reserving(path, overwrite=overwrite) as target, _beside(target) as work:
         work.chmod(S_IMODE(target.stat().st_mode))
@@ -116,10 +121,10 @@ def writing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def adding(directory: Path, **changes: Any) -> Iterator[Path]:
-    """A folder to fill; when the block ends well its files go into a finished directory, `changes` into its summary.
+    """A folder to fill; if the block succeeds, its files go into a finished directory and `changes` into its summary.
 
     Raises:
-        OutputError: they cannot be written, or something that the summary does not list has their names.
+        OutputError: they cannot be written, or files that the summary does not list have their names.
     """
     with _beside(directory) as work:
         yield work
@@ -134,7 +139,7 @@ def adding(directory: Path, **changes: Any) -> Iterator[Path]:
 
 
 def amend(directory: Path, changes: Mapping[str, Any]) -> None:
-    """Change entries of a directory's summary in one step; of a table only the entries that are given."""
+    """Change entries of a directory's summary atomically; in a nested table, only the entries given."""
     path = directory / SUMMARY_FILE
     summary = json.loads(path.read_bytes()) if path.exists() else {}
     for key, value in changes.items():
@@ -145,22 +150,22 @@ def amend(directory: Path, changes: Mapping[str, Any]) -> None:
 
 
 def require_file(path: Path | str, *, overwrite: bool = False) -> Path:
-    """The absolute path of a file that may be written; refused before any work is done for it.
+    """Return the absolute path of an output file; call it before the work for it starts.
 
     Raises:
-        OutputError: it cannot be written, or something is there that may not be overwritten.
+        OutputError: it cannot be written, or exists and may not be overwritten.
     """
     path = absolute(path)
     with _errors(path):
         if os.path.lexists(path) and not (overwrite and path.is_file()):
-            raise OutputError(path, "is a folder" if path.is_dir() else "it is already there; choose another file")
+            raise OutputError(path, "is a folder" if path.is_dir() else "it already exists; choose another file")
         with tempfile.TemporaryFile(dir=path.parent):
             return path
 
 
 @contextlib.contextmanager
 def writing_file(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
-    """A file to write in a folder of its own, which becomes `path` when the block ends well; errors: `require_file`."""
+    """A file to write in a temporary folder; it becomes `path` if the block succeeds; errors as in `require_file`."""
     path = require_file(path, overwrite=overwrite)
     with _beside(path) as work:
         yield work / f"new{path.suffix}"
@@ -174,7 +179,7 @@ class Growing:
         self.path = path
 
     def write(self, files: Mapping[str, bytes]) -> None:
-        """Write or replace files by their relative paths, each in one step."""
+        """Write or replace files by their relative paths, each atomically."""
         for name, content in files.items():
             with _errors(self.path / name):
                 (self.path / name).parent.mkdir(exist_ok=True)
@@ -182,7 +187,7 @@ class Growing:
                     new.write_bytes(content)
 
     def remove(self, names: Sequence[str]) -> None:
-        """Remove files, and folders that are empty then."""
+        """Remove files, and folders that become empty."""
         with _errors(self.path):
             for name in names:
                 (self.path / name).unlink(missing_ok=True)
@@ -197,7 +202,7 @@ class Growing:
 
 @contextlib.contextmanager
 def growing(path: Path | str, mark: str, *, overwrite: bool = False) -> Iterator[Growing]:
-    """A directory that grows in place, by one process at a time: a new one, or one with a file `mark`.
+    """A directory that grows in place, written by one process at a time: a new one, or one with a file `mark`.
 
     Raises:
         OutputError: it cannot be written, holds something else, or another process writes there.
@@ -217,10 +222,10 @@ def growing(path: Path | str, mark: str, *, overwrite: bool = False) -> Iterator
 
 
 def _require_replaceable(target: Path, *, overwrite: bool) -> None:
-    """Refuse a directory that is not empty, unless its own summary lists all in it and it may be overwritten."""
+    """Refuse a directory that is not empty, unless its summary lists all its files and it may be overwritten."""
     if not target.is_dir():
         raise OutputError(target, "a file is already there; choose another --out")
-    with contextlib.suppress(FileNotFoundError):  # where the current directory is gone
+    with contextlib.suppress(FileNotFoundError):  # the current directory may be gone
         if target.samefile(Path.cwd()):
             raise OutputError(target, "it is the current directory; name one to be made")
     there, listed = _below(target), _listed(target)
@@ -249,7 +254,7 @@ def _clear(target: Path, keep: str = "") -> None:
 
 
 def _listed(directory: Path) -> dict[str, str] | None:
-    """The files that a directory's summary lists, with their SHA-256; None where there is no such list."""
+    """Return the files that a directory's summary lists, with their SHA-256; None if it has no list."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         files = json.loads((directory / SUMMARY_FILE).read_bytes())["files"]
         return files if files and all(value.startswith("sha256:") for value in files.values()) else None
@@ -257,7 +262,7 @@ def _listed(directory: Path) -> dict[str, str] | None:
 
 
 def _below(directory: Path) -> dict[str, int]:
-    """The modes of all below a directory by relative path, folders before what is in them; links are not followed."""
+    """Return the modes of everything below a directory by relative path, parents first; links are not followed."""
     paths = (Path(folder, name) for folder, inner, files in os.walk(directory) for name in sorted((*inner, *files)))
     return {path.relative_to(directory).as_posix(): path.lstat().st_mode for path in paths}
 
@@ -268,7 +273,7 @@ def _few(names: Sequence[str]) -> str:
 
 @contextlib.contextmanager
 def _beside(target: Path) -> Iterator[Path]:
-    """A folder beside a target, gone when the block ends; an error about what is in it names it as if in the target."""
+    """A temporary folder beside a target; errors about its contents name them as if they were in the target."""
     with _errors(target):
         work = Path(tempfile.mkdtemp(prefix=".quadsim-", suffix=".partial", dir=target.parent))
         try:
@@ -278,12 +283,12 @@ def _beside(target: Path) -> Iterator[Path]:
                 raise
             raise OutputError(target / error.path.relative_to(work), error.problem) from error
         finally:
-            shutil.rmtree(work, ignore_errors=True)  # made here, under a name that nobody was told
+            shutil.rmtree(work, ignore_errors=True)  # made here, under a private name
 
 
 @contextlib.contextmanager
 def _locked(directory: Path) -> Iterator[None]:
-    """Hold a directory for this process alone."""
+    """Lock a directory for this process."""
     with _errors(directory / LOCK_FILE):
         handle = os.open(directory / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
     try:
@@ -298,7 +303,7 @@ def _locked(directory: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _errors(path: Path) -> Iterator[None]:
-    """Raise the system's errors as those of an output."""
+    """Raise the system's errors as output errors."""
     try:
         yield
     except OutputError:

@@ -1,12 +1,12 @@
 """Rotations: quaternions, Euler angles, and their rates.
 
-Quaternions are (w, x, y, z), body to world, Hamilton's product; Euler angles are Z-Y-X, body_to_world =
-Rz(yaw) Ry(pitch) Rx(roll); rotation vectors are angle times axis [rad].  A small error e of an attitude q
-turns the body: q * exp(e).
-Solà, "Quaternion kinematics for the error-state Kalman filter", 2017, arXiv:1711.02508: Eqs. (12), (101), (105).
+Quaternions are (w, x, y, z), body to world, with Hamilton's product; Euler angles are Z-Y-X, body_to_world = Rz(yaw)
+Ry(pitch) Rx(roll); rotation vectors are angle times axis [rad]. A small error e of an attitude q rotates the body: q *
+exp(e). See `docs/conventions.md`. Solà, "Quaternion kinematics for the error-state Kalman filter", 2017,
+arXiv:1711.02508: Eqs.  (12), (101), (105).
 
-Functions of arrays take any leading dimensions; functions of tuples take plain numbers, which for one attitude are
-several times faster.
+Functions of arrays take any leading dimensions; functions of tuples take plain numbers, which are several times faster
+for a single attitude.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion: ...
 @overload
 def multiply(a: Array, b: Array) -> Array: ...
 def multiply(a: Any, b: Any) -> Any:
-    """Hamilton's product of tuples of plain numbers or (..., 4): the rotation b, then, in the frame it leads to, a."""
+    """Hamilton's product of tuples of plain numbers or (..., 4): rotation b first, then a in the resulting frame."""
     if isinstance(a, tuple):
         return _product(a, b)
     return np.stack(_product(np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)), axis=-1)
@@ -64,7 +64,7 @@ def exponential(vector: Vector) -> Quaternion:
     """The unit quaternion of a rotation vector [rad]."""
     x, y, z = vector
     angle = math.sqrt(x * x + y * y + z * z)
-    # sin(a/2)/a by its series where the quotient loses its digits; the terms left out are below 1e-17 there.
+    # sin(a/2)/a by its series where the quotient loses precision; the terms omitted are below 1e-17 there.
     scale = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
     return math.cos(0.5 * angle), scale * x, scale * y, scale * z
 
@@ -96,13 +96,13 @@ def euler_to_quaternion(euler: Array) -> Array:
 
 
 def of_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """The same of one attitude, in plain numbers."""
+    """The same for one attitude, in plain numbers."""
     halves = 0.5 * roll, 0.5 * pitch, 0.5 * yaw
     return _quaternion(map(math.cos, halves), map(math.sin, halves))
 
 
 def _quaternion(cosines: Iterable[Any], sines: Iterable[Any]) -> tuple[Any, Any, Any, Any]:
-    """The unit quaternion of half the Euler angles' cosines and sines, arrays or plain numbers."""
+    """The unit quaternion from cosines and sines of half the Euler angles, arrays or plain numbers."""
     (cr, cp, cy), (sr, sp, sy) = cosines, sines
     return (
         cr * cp * cy + sr * sp * sy,

@@ -405,17 +405,17 @@ class Corridor(Region):
             return self
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         gone = np.concatenate([[0.0], np.cumsum(steps)])
-        begin, end = self.path
-        if gone[-1] < begin - _ROUNDING:
+        path_start, end = self.path
+        if gone[-1] < path_start - _ROUNDING:
             rule = f"within the {gone[-1]:.4g} m of the reference's path that are flown"
             raise ParameterError(f"corridors.{self.name}", "path", list(self.path), rule)
         # Where the reference rests at the window's begin or end, the window has all of that rest.
-        first, last = np.searchsorted(gone, begin - _ROUNDING), np.searchsorted(gone, end + _ROUNDING, "right") - 1
+        first, last = np.searchsorted(gone, path_start - _ROUNDING), np.searchsorted(gone, end + _ROUNDING, "right") - 1
 
         def passed(k: np.intp, at: float) -> float:
             return float(t[k] + (at - gone[k]) / steps[k] * (t[k + 1] - t[k]))
 
-        start = float(t[0]) if first == 0 else passed(first - 1, begin)
+        start = float(t[0]) if first == 0 else passed(first - 1, path_start)
         return replace(self, path=None, start=start, stop=passed(last, end) if last < len(steps) else math.inf)
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time as clock
-from base64 import b64encode
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from html import escape
@@ -19,7 +18,7 @@ import numpy as np
 from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import MissingPackageError, OutputError, QuadsimError, UnknownNameError, printable
 from quadsim.flight import metrics, rundir
-from quadsim.flight.audit import HELD, SIGNALS, Finding, margins_at, margins_sampled
+from quadsim.flight.audit import SIGNALS, VERDICT_TEXT, Finding, margins_at, margins_sampled
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from mpc.ocp import InfeasiblePeriod
+    from quadsim.report.figure import Figure
     from scenarios.assembly import Assembly
     from scenarios.schema.scenario import Verdict  # only here: Jedi completes no object with a property of a Literal
 
@@ -116,12 +116,7 @@ class Flight(Result):
     def __repr__(self) -> str:
         flown = self.log.control.t.size * self.scenario.control_period
         line = f"<Flight {self.scenario.name}: {self.outcome}, {flown:.2f} s by {self.controller}"
-        reached = [finding for finding in self.findings if finding.verdict != "incomplete" and finding.limit.required]
-        if not reached:
-            return f"{line}>"
-        worst = min(reached, key=lambda finding: sum(finding.deciding) / finding.limit.half_band)
-        margin, tolerance = worst.deciding
-        return f"{line}\n worst margin: {worst.limit.name} {margin:.4g} {worst.limit.unit}, tolerance {tolerance:g}>"
+        return f"{line}{f', {self.log.reason}' if self.log.reason else ''}{worst_margin(self.findings)}>"
 
     @property
     def outcome(self) -> Verdict:
@@ -282,7 +277,7 @@ class Flight(Result):
         for name in signals:
             if name not in (*SIGNALS, "xy"):
                 raise UnknownNameError("signal", name, (*SIGNALS, "xy"))
-        figure = draw_signals(self.run, signals or ("x", "y", "z", "roll", "pitch", "yaw"))
+        figure = draw_signals([self.run], signals or ("x", "y", "z", "roll", "pitch", "yaw"))
         return draw(figure, interactive=True).axes
 
     def save(
@@ -358,25 +353,29 @@ class Flight(Result):
         """`summary.json`, as it is on disk where the flight is."""
         return dict(self.summary) if self.directory is None else rundir.read_summary(self.directory)
 
+    def small_plot(self) -> Figure | None:
+        """See `Result.small_plot`: position over time."""
+        from quadsim.report.flight_figures import signals
+
+        return signals([self.run], ("x", "y", "z")) if self.time.size else None
+
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""
+        from quadsim.report.to_matplotlib import to_html
+
         rows = "".join(
             f"<tr><td>{escape(entry.limit.name)}</td><td>{entry.deciding_margin:.4g} {escape(entry.limit.unit)}</td>"
-            f"<td>{HELD[entry.verdict]}</td></tr>"
+            f"<td>{entry.deciding[1]:g}</td><td>{VERDICT_TEXT[entry.verdict]}</td></tr>"
             for entry in self.findings
         )
         errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz" if self.time.size)
-        plot = ""
-        if self.time.size:
-            from quadsim.report.flight_figures import signals
-            from quadsim.report.to_matplotlib import to_png
-
-            plot = b64encode(to_png(signals(self.run, ("x", "y", "z")), dpi=70)).decode()
-            plot = f'<img alt="position over time" src="data:image/png;base64,{plot}">'
+        figure = self.small_plot()
+        plot = "" if figure is None else to_html(figure)
         return (
             f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self.summary['duration']:g} s flown, "
             f"RMS error [m]: {errors or 'none'}</p>"
-            f"<table><tr><th>constraint</th><th>deciding margin</th><th>verdict</th></tr>{rows}</table>{plot}"
+            "<table><tr><th>constraint</th><th>deciding margin</th><th>tolerance</th><th>verdict</th></tr>"
+            f"{rows}</table>{plot}"
         )
 
     @property
@@ -394,6 +393,20 @@ def to_pandas(table: pa.Table) -> Any:
     if find_spec("pandas") is None:
         raise MissingPackageError("a DataFrame", "pandas", extra="pandas")
     return table.to_pandas()
+
+
+def worst_margin(findings: Iterable[Finding]) -> str:
+    """The smallest margin of the required constraints that were reached, as the second line of a repr.
+
+    Those of the commands count once they are violated: a command at its own bound is no near miss.
+    """
+    required = [finding for finding in findings if finding.verdict != "incomplete" and finding.limit.required]
+    reached = [each for each in required if each.verdict == "violated" or each.limit.signal not in ("speed", "slew")]
+    if not reached:
+        return ""
+    worst = min(reached, key=lambda finding: sum(finding.deciding) / finding.limit.half_band)
+    margin, tolerance = worst.deciding
+    return f"\n worst margin: {worst.limit.name} {margin:.4g} {worst.limit.unit}, tolerance {tolerance:g}"
 
 
 def require_rendering() -> None:

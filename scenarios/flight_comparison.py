@@ -16,7 +16,7 @@ from quadsim.outputs import reserving
 from quadsim.report.table import Row
 from scenarios.campaign.store import is_campaign as is_campaign
 from scenarios.campaign.store import stored_plan
-from scenarios.flight import Flight
+from scenarios.flight import Flight, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import reaudit
@@ -25,9 +25,11 @@ from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
+    from quadsim.report.figure import Figure
     from scenarios.campaign.paired import PairedComparison
 
 _log: Final = logging.getLogger("quadsim")
+_FIRST: Final = 4  # flights of which its repr has two lines
 _BRIEF: Final = ("outcome", "required constraints", "RMS error", "verdict", "answered by", "statuses", "whole step, m")
 """How the labels begin of the rows that are shown; the page and its `comparison.md` have them all."""
 
@@ -43,6 +45,21 @@ class FlightComparison(Result):
     rows: list[Row]  # the table, a row per quantity
     names: tuple[str, ...]  # of its columns, one per flight
     page: Path | None  # `index.html`, where it was written
+
+    def __repr__(self) -> str:
+        flights = []
+        for name, run in zip(self.names, self.runs, strict=True):
+            findings = map(rundir.finding_from_json, run.summary["constraints"])
+            flights.append(f"\n {name}: {run.summary['verdict']}{worst_margin(findings)}")
+        more = f"\n and {len(flights) - _FIRST} more" if len(flights) > _FIRST else ""
+        return f"<FlightComparison of {len(flights)} flights{''.join(flights[:_FIRST])}{more}>"
+
+    def small_plot(self) -> Figure | None:
+        """See `Result.small_plot`: position over time."""
+        from quadsim.report.flight_figures import signals
+
+        flown = [run for run in self.runs if run.log.control.t.size]
+        return signals(self.runs, ("x", "y", "z")) if flown else None
 
     def to_markdown(self) -> str:
         """The table as Markdown."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from quadsim.report.figure import Figure
     from scenarios.schema.scenario import Scenario
 
 Shown: TypeAlias = "Iterable[RenderableType]"
@@ -48,14 +49,20 @@ class Result:
 
     def __repr__(self) -> str:
         """The first lines of its text."""
-        lines = self.text().splitlines()
+        lines = [line.rstrip() for line in self.text().splitlines()]
         return "\n".join([*lines[:9], *(["..."] if len(lines) > 9 else [])])
 
+    def small_plot(self) -> Figure | None:
+        """A small plot of it, for notebooks; None for none."""
+        return None
+
     def _repr_html_(self) -> str:
-        """For notebooks."""
+        """For notebooks: its tables and its plot."""
+        from quadsim.report.to_matplotlib import to_html
         from scenarios import console
 
-        return console.to_html(self.shown())
+        plot = self.small_plot()
+        return console.to_html(self.shown()) + ("" if plot is None else to_html(plot))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from quadsim.controller import OPTIMAL, Phase, counts, law_name
-from quadsim.flight.audit import HELD
+from quadsim.flight.audit import VERDICT_TEXT
 from quadsim.flight.rundir import constraint_verdict, deciding_margin
 from quadsim.report.comparison import (
     crash,
@@ -100,7 +100,7 @@ def _verdict(entry: Mapping[str, Any]) -> Text:
     verdict = constraint_verdict(entry)
     if verdict == "violated":
         return console.styled(("VIOLATED", "red") if entry["required"] else ("exceeded*", "yellow"))
-    return console.styled((HELD[verdict], "green" if verdict == "satisfied" else "yellow"))
+    return console.styled((VERDICT_TEXT[verdict], "green" if verdict == "satisfied" else "yellow"))
 
 
 def _tracking_table(tracking: Mapping[str, Any]) -> Table:

@@ -25,8 +25,6 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCKS = re.compile(r"^```python(?: exec)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PYTHON = {page: blocks for page in PAGES if (blocks := BLOCKS.findall(page.read_text(encoding="utf-8")))}
 """Pages with examples in Python."""
-MADE = {"gallery.md"}
-"""Pages that `make docs` makes."""
 ENTRY_POINTS = {"quadsim.controllers"}
 """Groups of entry points, which are written like modules."""
 
@@ -45,7 +43,7 @@ def test_the_papers_flights_give_their_golden_numbers(name: str, fly_once: Calla
     assert (found["optima"], found["periods"]) == (golden["optima"], golden["periods"])
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/scenarios.md"])
+@pytest.mark.parametrize("document", ["README.md", "docs/gallery.md"])
 def test_tables_of_golden_numbers_are_filled(document: str) -> None:
     text = (ROOT / document).read_text(encoding="utf-8")
     assert "from tests/golden/" in text
@@ -60,7 +58,7 @@ def test_every_table_that_is_filled_is_known_and_stays_where_its_file_is_not(
     assert len(blocks) == opened
     assert {name for name, _, _ in blocks} == set(remake.TABLES)
     monkeypatch.setattr(remake, "ROOT", tmp_path)
-    page = "before\n<!-- solvers: filled by docs/remake.py from made.json -->\nold\n<!-- solvers end -->\nafter\n"
+    page = "before\n<!-- flight: filled by docs/remake.py from made.json -->\nold\n<!-- flight end -->\nafter\n"
     assert remake.filled(page) == (page, ["made.json"])
     rows = [{"solver": "piqp", "p50_ms": 0.12345}, {"solver": "osqp", "p50_ms": None}]
     (tmp_path / "made.json").write_text(json.dumps({"machine": "fast", "records": rows}))
@@ -91,11 +89,11 @@ def test_documents_link_to_files_that_exist_and_the_site_has_every_page() -> Non
     for document in [*ROOT.glob("*.md"), *pages]:
         text = document.read_text(encoding="utf-8")
         for target in re.findall(r"\]\(([^)#]+)\)", text):
-            if "://" not in target and target not in MADE:
+            if "://" not in target:
                 assert (document.parent / target).exists(), f"{document.name} links to {target}"
         assert document not in pages or "](../" not in text, "what is in the repository alone is named, not linked"
     site = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    assert set(re.findall(r"[a-z-]+\.md", site)) == {path.name for path in pages} | MADE
+    assert set(re.findall(r"[a-z-]+\.md", site)) == {path.name for path in pages}
 
 
 @pytest.mark.usefixtures("campaigns_here")

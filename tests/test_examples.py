@@ -57,12 +57,12 @@ def test_an_installed_one_flies_by_the_name_of_its_entry_point(monkeypatch: pyte
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_the_lines_of_the_readme_are_those_of_the_example(
+def test_the_lines_of_the_pages_are_those_of_the_example(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    readme, page = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/own-controller.md"))
     for line in ('base = "waypoints"', 'controller = "my_controller:MyController"'):
-        assert f"  {line}" in readme.splitlines()
+        assert line in page.splitlines()
         assert line in (EXAMPLES / "my_controller.toml").read_text(encoding="utf-8").splitlines()
     command = "quadsim run examples/my_controller.toml"
     assert command in readme

@@ -1,13 +1,13 @@
 """Nonlinear MPC: sequential quadratic programming on the rigid body with a quaternion.
 
-Each period the model is linearised along the plan of the last one, at the nodes' stored states and inputs, and the QP
+In each period, the model is linearised along the previous plan, at the nodes' stored states and inputs, and the QP
 
     min  sum |C_r (s_i - s_i^r)|^2_Q + |u_i - u_i^r|^2_R    s.t.  s_{i+1} = A_i s_i + B_i u_i + c_i,  s_0 measured
 
-is solved: a full Gauss-Newton step, the real-time iteration (Diehl, Bock and Schloeder 2005).  Its states s have the
-quaternion q_r* q for q, with the node's reference q_r: a rotation of four numbers, by which both attitude errors of
-`AttitudeError` become linear with fixed weights.  A measured state enters as s_0 alone; node 0 is linearised at the
-stored state.
+is solved: a full Gauss-Newton step, the real-time iteration (Diehl, Bock and Schloeder 2005). The states s contain the
+quaternion q_r* q instead of q, with the node's reference q_r: a rotation of four numbers that makes both attitude
+errors of `AttitudeError` linear with constant weights.  A measured state enters only as s_0; node 0 is linearised at
+the stored state.
 """
 
 from __future__ import annotations
@@ -60,19 +60,19 @@ from quadsim.state import ANGLE_RATES, ANGLES, EULER, EULER_RATE, N_STATES, POSI
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 LARGEST_CONDENSED: Final = 80
-"""Inputs and slacks over the horizon up to which a condensed QP is solved faster than a staged one."""
+"""Largest number of inputs and slacks over the horizon for which a condensed QP is faster than a staged one."""
 OUTSIDE: Final = 1e-6
-"""How far outside its bounds an input, a share of the largest, may be answered; it is then moved onto them."""
+"""Tolerance of an input's bounds, as a share of the largest input; an answer outside is moved onto them."""
 SHORTEST: Final = 0.1
-"""Least share of a Gauss-Newton step that Aitken's relaxation takes where several are."""
+"""Smallest share of a Gauss-Newton step that Aitken's relaxation takes."""
 CONVERGED: Final = 0.1
-"""Largest dynamics defect of a plan that counts as converged (`quadsim.controller.SQP`).  Flights of the library exceed
-it in at most 9 periods, after steps of the course and upside down; one that tumbles, in all."""
+"""Largest dynamics defect of a converged plan (`quadsim.controller.SQP`). Library flights exceed it in at most 9
+periods, after steps of the course and upside down; a tumbling vehicle exceeds it in all."""
 PATIENCE: Final = 8
-"""After so many steps, none of them shorter than the shortest before, half as much of each is taken at most."""
+"""Steps without a new shortest one after which the largest share of a step is halved."""
 TILT_SIDES: Final = 12
-"""Sides of the polygon within the circle that a bound on the tilt makes of the thrust axis's horizontal part; it takes
-up to 3.4 % of the bound's sine away."""
+"""Sides of the polygon that a tilt bound imposes on the thrust axis's horizontal part, inside the circle; it costs up
+to 3.4 % of the bound's sine."""
 _AXIS_SLOPES: Final = 2.0 * np.array(
     [
         [[0, 0, 1, 0], [0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0]],
@@ -80,13 +80,13 @@ _AXIS_SLOPES: Final = 2.0 * np.array(
     ],
     float,
 )
-"""Take q to the derivatives of R(q) e_z along x, 2 (x z + w y), and y, 2 (y z - w x)."""
+"""Map q to the derivatives of R(q) e_z along x, 2 (x z + w y), and y, 2 (y z - w x)."""
 _PLAUSIBLE: Final = 1e5
 _SAME_TIME: Final = 1e-6  # [s]
 
 
 def frames_of(q: Array) -> Array:
-    """(M, 4, 4) matrices that take q to q_r* q, of q_r (M, 4)."""
+    """Return (M, 4, 4) matrices that map q to q_r* q, for q_r (M, 4)."""
     w, x, y, z = q.T
     rows = np.array([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
     return np.ascontiguousarray(rows.transpose(2, 0, 1))
@@ -157,7 +157,7 @@ class NonlinearMPC:
         return np.minimum(np.maximum(shares, self._lower), self._upper)
 
     def _speeds(self, shares: Array) -> Array:
-        """Rotor speeds [rad/s] of inputs."""
+        """Return the rotor speeds [rad/s] of inputs."""
         return np.sqrt(self._model.thrusts(np.maximum(shares, 0.0)) / self._vehicle.thrust_coefficient)
 
     def _problem(self, constraints: tuple[Constraint, ...]) -> Problem:
@@ -178,7 +178,7 @@ class NonlinearMPC:
             P = self._riccati(linear, objective)
         else:
             P = float(settings.terminal) * objective.weights[0]
-        if self._tilted:  # two more states: the thrust axis along world x and y
+        if self._tilted:  # two further states: the thrust axis along world x and y
             none = np.zeros((2, 2))
             A, B = scipy.linalg.block_diag(linear.A, none), np.vstack([linear.B, np.zeros((2, N_ROTORS))])
             linear, P = replace(linear, A=A, B=B), scipy.linalg.block_diag(P, none)
@@ -195,14 +195,14 @@ class NonlinearMPC:
         )
 
     def _held(self, n: int) -> Iterator[Constraint]:
-        """Bounds on steps of speeds, tilt and body rates, in a problem with n states."""
+        """Yield the bounds on slew, tilt and body rates, in a problem with n states."""
         settings, bounds, largest = self.settings, self._bounds, self._vehicle.speed_max
         if np.isfinite(bounds.delta_min).any() or np.isfinite(bounds.delta_max).any():
             if settings.inputs is not Inputs.SPEED:
                 rule = 'left out where inputs = "thrust": a step of a speed is not linear in thrusts; inputs = "speed"'
                 raise ParameterError("controller", "input_bounds.slew", bounds.delta_max.tolist(), rule)
-            steps = np.full((settings.horizon, 1), float(settings.stride))  # periods from one node to the next,
-            steps[0] = 1.0  # but for the first, which follows the command in force
+            steps = np.full((settings.horizon, 1), float(settings.stride))  # periods between nodes,
+            steps[0] = 1.0  # except the first node, which follows the command in force
             lower, upper = steps * bounds.delta_min / largest, steps * bounds.delta_max / largest
             yield Constraint(name="slews", lower=lower, upper=upper, E=np.eye(N_ROTORS))
         if settings.tilt is not None:
@@ -210,7 +210,7 @@ class NonlinearMPC:
             rows = np.zeros((TILT_SIDES, n))
             rows[:, -2], rows[:, -1] = np.cos(angles), np.sin(angles)
             upper = np.full(TILT_SIDES, math.sin(settings.tilt) * math.cos(math.pi / TILT_SIDES))
-            penalty = self._penalty(TILT_SIDES, 1.0 / math.cos(settings.tilt))  # of its sine, instead of the tilt
+            penalty = self._penalty(TILT_SIDES, 1.0 / math.cos(settings.tilt))  # in the sine of the tilt
             yield Constraint(name="tilt", lower=np.full(TILT_SIDES, -math.inf), upper=upper, C=rows, penalty=penalty)
         rates = np.array(settings.largest_rates)
         if np.isfinite(rates).any():
@@ -224,7 +224,7 @@ class NonlinearMPC:
         return Penalty(l1=np.full(rows, l1 * scale), l2=np.full(rows, l2 * scale**2), largest=True)
 
     def _of_states(self, constraint: Constraint, n: int) -> Constraint:
-        """Rows over the 12 states and rotor speeds as rows over the model's; refused where not linear in those."""
+        """Convert rows over the 12 states and rotor speeds to the model's; refuse those not linear in its states."""
         C, D = (np.zeros((constraint.lower.shape[-1], size)) for size in (n, N_ROTORS))
         if constraint.C is not None:
             if constraint.C[:, [*EULER, *EULER_RATE]].any():
@@ -239,7 +239,7 @@ class NonlinearMPC:
         return replace(constraint, C=C, D=D)
 
     def _riccati(self, linear: LinearModel, objective: Objective) -> Array:
-        """P at hover, where the quaternion's scalar does not move, and costs nothing."""
+        """Return P at hover, where the quaternion's scalar part is constant and has no cost."""
         others = np.delete(np.arange(linear.n), 3)
         reduced = replace(objective, C_r=objective.C_r[:, others], P=None)
         if self.settings.attitude_error is AttitudeError.DIFFERENCE:
@@ -261,7 +261,7 @@ class NonlinearMPC:
         self.infeasible_period: InfeasiblePeriod | None = None
 
     def _forget(self) -> None:
-        """Start without a plan, and assume no disturbance."""
+        """Drop the plan, and assume no disturbance."""
         self._plan: tuple[Array, Array] | None = None
         self._quaternion: Array | None = None
         self._last: tuple[float, Array] | None = None  # time and state of the last period
@@ -274,7 +274,7 @@ class NonlinearMPC:
         self._update_disturbance(np.zeros(6))
 
     def adopt(self, previous: object) -> None:
-        """Go on from what the law before knew: rotor speeds, disturbance, plan."""
+        """Take over rotor speeds, disturbance and plan of the previous law."""
         law = within(previous, NonlinearMPC)
         if law is not None:
             alike = self.settings.inputs is law.settings.inputs
@@ -297,12 +297,12 @@ class NonlinearMPC:
             self._update_disturbance(self._observer.estimate)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """See `quadsim.controller.Controller.step`; numbers out of hand are answered with the status `invalid_data`."""
+        """See `quadsim.controller.Controller.step`; numbers out of range give the status `invalid_data`."""
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
         last, self._last = self._last, None
         before, self._called_at, self._rotors_before = self._called_at, now.time, self._rotors
-        if self.settings.rotor_lag and math.isfinite(before):  # the rotors have followed what was commanded
+        if self.settings.rotor_lag and math.isfinite(before):  # the rotors have followed the command
             left = math.exp(-(now.time - before) / self.settings.rotor_lag)
             commanded = self._shares(self._acting)
             self._rotors = commanded + left * (self._rotors - commanded)
@@ -354,7 +354,7 @@ class NonlinearMPC:
         return replace(command_of(speeds[0], np.repeat(speeds, stride, axis=0), status, answer), sqp=sqp)
 
     def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`; with the disturbance estimated last, and without rotor lag."""
+        """See `quadsim.controller.Controller.predict`; with the latest disturbance estimate, without rotor lag."""
         model = replace(self._model, step=self._period, rotor_lag=None, substeps=1)
         x, predicted = _body(states), np.empty((*plans.shape[:2], N_STATES))
         for i in range(plans.shape[1]):
@@ -380,7 +380,7 @@ class NonlinearMPC:
         return x
 
     def _learn(self, last: tuple[float, Array], time: float, measured: Array) -> None:
-        """Compare the measured state with what was to be expected after the last one, disturbances included."""
+        """Compare the measured state with its prediction from the last one, disturbance included."""
         before, x = last
         if not abs(time - before - self._period) <= _SAME_TIME:
             return
@@ -393,11 +393,11 @@ class NonlinearMPC:
         self._update_disturbance(self._observer.estimate)
 
     def _update_disturbance(self, estimate: Array) -> None:
-        """Predict with this disturbance (6,) from now on."""
+        """Use this disturbance (6,) in predictions from now on."""
         self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=estimate[3:])
 
     def _follow(self, ramp: RampObserver, time: float, measured: Array) -> None:
-        """Take what is observed for drag, as far as it follows the velocity, and for a constant force beyond."""
+        """Split the observed force into drag, as far as it follows the velocity, and a constant remainder."""
         R, velocity = rotation(measured[Q] / np.linalg.norm(measured[Q])), measured[V]
         ramp.update(time, velocity, R, measured[W], self._acting)
         acceleration, _, angular = ramp.foreseen(0.5 * self._period)
@@ -410,7 +410,7 @@ class NonlinearMPC:
         )
 
     def _balanced(self, nodes: Nodes) -> Nodes:
-        """The reference with what balances drag and the disturbance: thrust turned the least way, and torque."""
+        """Add to the reference what balances drag and disturbance: thrust turned by the least rotation, and torque."""
         model = self._model
         if not (model.drags or model.acceleration.any() or model.angular_acceleration.any()):
             return nodes
@@ -421,7 +421,7 @@ class NonlinearMPC:
         force = np.concatenate([total, total[-1:]])[:, None] * axis
         thrust_acceleration = force - model.acceleration - drag_acceleration(model, q, states[:, V])
         size = np.maximum(np.linalg.norm(thrust_acceleration, axis=1), 1e-9)
-        # The least rotation from one axis to another is (1 + a . b, a x b), up to its length.
+        # The least rotation from axis a to axis b is (1 + a . b, a x b), up to its length.
         turn = np.concatenate(
             [
                 1.0 + np.sum(axis * thrust_acceleration, axis=1)[:, None] / size[:, None],
@@ -438,7 +438,7 @@ class NonlinearMPC:
         return Nodes(states, thrusts + effort @ self._inverse.T)
 
     def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem, SQP | None]:
-        """Steps of sequential quadratic programming from the stored plan; the last problem is that of the answer."""
+        """Take SQP steps from the stored plan; the returned problem is that of the answer."""
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
         inputs = self._model.shares(nodes.thrusts)
         start = np.hstack([nodes.states, np.vstack([inputs, inputs[-1:]])])[:, :n]
@@ -473,9 +473,9 @@ class NonlinearMPC:
             if self.settings.iterations > 1:
                 if moved <= self.settings.tolerance:
                     break
-                # Full Gauss-Newton steps may oscillate: the share of them that is taken follows from how
-                # much of the last one each undoes (Aitken's relaxation; Irons and Tuck 1969), and falls permanently
-                # where steps have not become shorter for long.
+                # Full Gauss-Newton steps may oscillate.  Aitken's relaxation (Irons and Tuck 1969) takes a share of
+                # each step, from how much of the previous step it undoes; the largest share falls permanently if steps
+                # do not get shorter.
                 step = (plan - u).ravel()
                 undone = 1.0 - float(step @ last / (last @ last)) if last.size else 1.0
                 patience = PATIENCE if moved < 0.9 * least else patience - 1
@@ -489,7 +489,7 @@ class NonlinearMPC:
         return query, answer, problem, SQP(float(defect), float(moved))
 
     def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:
-        """A, B, c along a plan of states (N + 1, n) and inputs (N, 4)."""
+        """Return A, B, c along a plan of states (N + 1, n) and inputs (N, 4)."""
         A, B, end = linearise_nodes(self._model, x[:-1], u, frames)
         turned, end = x[:-1].copy(), end.copy()
         turned[:, Q] = (frames[:-1] @ turned[:, Q, None])[:, :, 0]
@@ -498,10 +498,10 @@ class NonlinearMPC:
         return self._with_axis(A, B, c, x[1:, Q], frames[1:]) if self._tilted else (A, B, c)
 
     def _with_axis(self, A: Array, B: Array, c: Array, q: Array, frames: Array) -> tuple[Array, Array, Array]:
-        """The model with two more states, the thrust axis along world x and y, linearised at quaternions q (N, 4)."""
+        """Add the thrust axis along world x and y as two states, linearised at quaternions q (N, 4)."""
         slope = _AXIS_SLOPES @ q[:, None, :, None]  # (N, 2, 4, 1)
         known = thrust_axis(q)[:, :2] - (slope[..., 0] @ q[:, :, None])[:, :, 0]
-        rows = slope[..., 0] @ frames.transpose(0, 2, 1)  # by the quaternion in the node's frame
+        rows = slope[..., 0] @ frames.transpose(0, 2, 1)  # in the quaternion of the node's frame
         N, n = c.shape
         wide, inputs = np.zeros((N, n + 2, n + 2)), np.concatenate([B, rows @ B[:, Q]], axis=1)
         wide[:, :n, :n], wide[:, n:, :n] = A, rows @ A[:, Q]
@@ -518,7 +518,7 @@ class NonlinearMPC:
 
 
 def _body(states: Array) -> Array:
-    """(..., 13) the rigid body's states of states (..., 12)."""
+    """(..., 13) states of the rigid body from states (..., 12)."""
     x = np.empty((*states.shape[:-1], N_BODY))
     x[..., P], x[..., V] = states[..., POSITIONS], states[..., VELOCITIES]
     x[..., Q] = euler_to_quaternion(states[..., ANGLES])
@@ -530,9 +530,9 @@ def _converges(
     make: Callable[..., NonlinearMPC], settings: NonlinearSettings, start: Mapping[str, object], time: float,
     measured: Array, nodes: Nodes, iterations: int,
 ) -> bool:  # fmt: skip
-    """Whether a period's plan converges within so many iterations, from a law's attributes before it.
+    """Return whether a period's plan converges within `iterations`, from a law's attributes before it.
 
-    All but the number of iterations is data of that period, so that a flight can be pickled.
+    All other arguments are data of that period, so that a flight can be pickled.
     """
     law = make(settings=replace(settings, iterations=iterations))
     vars(law).update(start)

@@ -1,16 +1,16 @@
-"""The nonlinear model: any attitude, any heading, rotors that may lag.  Sec. 2.2.
+"""The nonlinear model: any attitude, any heading, optional rotor lag.  Sec. 2.2.
 
 With Z-Y-X Euler angles eta = (roll, pitch, yaw) and body rates omega = E(eta) d(eta)/dt, the states of the paper obey
 
     d2(p)/dt2 = U / m R(eta) e_z - g e_z + a
     d2(eta)/dt2 = E(eta)^-1 (d(omega)/dt - dE/dt d(eta)/dt),    d(omega)/dt = I^-1 (tau - omega x I omega) + alpha
 
-with [U, tau] from the squared rotor speeds and a constant disturbance (a, alpha).  Sec. 2.2 takes d(eta)/dt for omega,
-which holds at small angles only.  Rotor speeds are the inputs; or, with a lag, states 12 to 15 that follow the inputs
+with [U, tau] from the squared rotor speeds and a constant disturbance (a, alpha). Sec.  2.2 uses d(eta)/dt for omega,
+which is valid only at small angles.  Rotor speeds are the inputs or, with a lag, states 12 to 15 that follow the inputs
 as tau_r dw/dt = u - w.
 
-Inputs are held over a control period, so that rotor speeds are known exactly at every instant of it.  The body is
-integrated by the classical Runge-Kutta method of fourth order.
+Inputs are held over a control period, so rotor speeds are known exactly at every instant of it.  The classical
+fourth-order Runge-Kutta method integrates the body.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 Triple: TypeAlias = tuple[float, float, float]
 
 SUBSTEPS: Final = 2
-"""Runge-Kutta steps per period.  Over 50 ms from 30 deg of tilt, turning at 2 rad/s, commands 50 rad/s apart, two leave
-errors of 1e-5 rad, or 3e-4 rad with a rotor lag of 20 ms; one leaves ten times as much."""
+"""Runge-Kutta steps per period.  Over 50 ms from 30 deg of tilt, turning at 2 rad/s, with commands 50 rad/s apart, two
+steps have errors of 1e-5 rad, or 3e-4 rad with a rotor lag of 20 ms; one step has ten times as much."""
 
 
 def zero() -> Array:
-    """Three zeros, which nobody writes to."""
+    """Three zeros, not to be written to."""
     return read_only(np.zeros(3))
 
 
 @dataclass(frozen=True, kw_only=True)
 class NonlinearModel:
-    """x(k+1) = f(x(k), u(k)); see the module.  Another disturbance is a matter of `dataclasses.replace`."""
+    """x(k+1) = f(x(k), u(k)); see the module.  `dataclasses.replace` sets another disturbance."""
 
-    effectiveness: Array  # (4, 4) takes squared rotor speeds to U / m [m/s^2] and I^-1 tau [rad/s^2]
+    effectiveness: Array  # (4, 4) maps squared rotor speeds to U / m [m/s^2] and I^-1 tau [rad/s^2]
     gyration: Array  # (3,) of (Iyy - Izz) / Ixx, (Izz - Ixx) / Iyy, (Ixx - Iyy) / Izz
     gravity: float  # g [m/s^2]
     period: float  # tau_s [s]
     substeps: int = SUBSTEPS  # Runge-Kutta steps per period
-    rotor_lag: float | None = None  # time constant tau_r of the rotor speeds [s]; None for speeds that are the inputs
+    rotor_lag: float | None = None  # time constant tau_r of the rotor speeds [s]; None if the inputs are the speeds
     acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
     angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha of the disturbance, body frame [rad/s^2]
 
@@ -85,9 +85,9 @@ def advance(model: NonlinearModel, x: Array, u: Array) -> Array:
 def advance_disturbed(
     model: NonlinearModel, x: Array, u: Array, period: float, effectiveness: Array, acceleration: Sequence[float]
 ) -> Array:
-    """`advance` by a model with these numbers instead of its own.
+    """`advance` with the disturbance given as numbers.
 
-    In plain numbers: arrays of three take several times as long.
+    It uses plain numbers: arrays of three are several times slower.
     """
     step = period / model.substeps
     speeds = _rotor_speeds(model, step, x[N_STATES:], u)
@@ -128,7 +128,7 @@ def advance_disturbed(
             v = _moved(v, sixth, _weighted(a_1, a_2, a_3, a_4))
             q = _moved(q, sixth, _weighted(s, s_2, s_3, s_4))
             s = _moved(s, sixth, _weighted(b_1, b_2, b_3, b_4))
-    except ValueError:  # an infinite angle, whose sine is no number
+    except ValueError:  # the sine of an infinite angle
         return np.full_like(x, np.nan)
     end = np.empty_like(x)
     end[POSITIONS], end[VELOCITIES], end[ANGLES], end[ANGLE_RATES] = p, v, q, s
@@ -148,7 +148,7 @@ def _weighted(first: Triple, second: Triple, third: Triple, fourth: Triple) -> T
 
 
 def _rotor_speeds(model: NonlinearModel, step: float, rotors: Array, inputs: Array) -> Array:
-    """(4 substeps, 4) speeds of rotors (4,) under inputs (4,) where Runge-Kutta's method needs them, of a step [s]."""
+    """(4 substeps, 4) rotor speeds at the Runge-Kutta instants of a step [s], from rotors (4,) under inputs (4,)."""
     instants = (np.arange(model.substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel()
     if model.rotor_lag is None:
         return np.broadcast_to(inputs, (instants.size, *inputs.shape))
@@ -156,7 +156,7 @@ def _rotor_speeds(model: NonlinearModel, step: float, rotors: Array, inputs: Arr
 
 
 def spun(model: NonlinearModel, rotors: Array, command: Array, time: float) -> Array:
-    """Rotor speeds (4,) some time [s] after speeds (4,) under a command (4,) [rad/s]."""
+    """Rotor speeds (4,) a time [s] after speeds (4,) under a command (4,) [rad/s]."""
     if model.rotor_lag is None:
         return command
     return command + math.exp(-time / model.rotor_lag) * (rotors - command)

@@ -1,4 +1,4 @@
-"""What the nodes of a horizon are to be at: states, and the inputs that hold them."""
+"""The reference of a horizon's nodes: states, and the inputs that hold them."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from quadsim.state import Array
 
 
 class Nodes(NamedTuple):
-    """The reference of N + 1 nodes, the first of them now."""
+    """The reference of N + 1 nodes, starting now."""
 
     states: Array  # (N + 1, 13)
     thrusts: Array  # (N, 4) of the rotors [N]
 
 
 def nodes_of_motion(motion: Motion, horizon: int, stride: int) -> Nodes:
-    """The samples k, k + stride, ...; where these end, the last of them again, and of thrusts the last but one."""
+    """Take the samples k, k + stride, ...; past the end repeat the last one, and for thrusts the last but one."""
     last = (len(motion) - 1) // stride
     at, with_inputs = (
         stride * np.minimum(np.arange(count), end) for count, end in ((horizon + 1, last), (horizon, max(last - 1, 0)))
@@ -31,9 +31,9 @@ def nodes_of_motion(motion: Motion, horizon: int, stride: int) -> Nodes:
 
 
 def nodes_of_preview(reference: Array, horizon: int, stride: int, period: float, hover: float) -> Nodes:
-    """Of x, y, z, yaw (N stride, 4) from t_{k+1} on: velocity by differences, level, rotors at a thrust of `hover` [N].
+    """Take x, y, z, yaw (N stride, 4) from t_{k+1} on: velocity by differences, level, rotor thrusts `hover` [N].
 
-    The first node, which costs nothing, is where the line through the first two samples is now.
+    The first node, which has no cost, is extrapolated from the first two samples.
     """
     steps = np.diff(reference, axis=0) if len(reference) > 1 else np.zeros((1, 4))
     ahead = np.concatenate([[2.0 * reference[0] - reference[min(1, len(reference) - 1)]], reference])

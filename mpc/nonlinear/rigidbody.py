@@ -1,18 +1,18 @@
 """The rigid body with a quaternion: any attitude, no singularity, exact derivatives of all nodes in one pass.
 
-States are position p (world), quaternion q = (w, x, y, z) (Hamilton, body to world), velocity v (world) and body rates
-omega: 13; with rotor lag the four rotors' thrusts or speeds follow the inputs and are four more,
+The states are position p (world), quaternion q = (w, x, y, z) (Hamilton, body to world), velocity v (world) and body
+rates omega: 13. With rotor lag, the four rotors' thrusts or speeds are four further states that follow the inputs,
 
     p' = v,    q' = 1/2 q (0, omega),    v' = T R(q) e_z - g e_z + R(q) d(R(q)' v) + a,
     omega' = I^-1 (tau - omega x I omega) + alpha,    d(v_b) = -(D_1 v_b + D_2 |v_b| v_b) / m, component by component.
 
-R(q) is polynomial and never divided by |q|^2, so that the derivatives hold for a q of any length.  Inputs u are the
-rotors' thrusts or speeds as shares of the largest, held over a step of one node; T = thrust / m and I^-1 tau are known
-exactly at every instant of it.  The body is integrated by the classical Runge-Kutta method.
+R(q) is polynomial and not divided by |q|^2, so the derivatives are valid for a q of any length.  Inputs u are the
+rotors' thrusts or speeds as shares of the largest, held between nodes; T = thrust / m and I^-1 tau are known exactly at
+every instant.  The classical Runge-Kutta method integrates the body.
 
-All but the drag is of second degree in (q, omega), T and I^-1 tau given: with F the Jacobian of that part, which is
-linear in (q, omega, T q), its value is F x / 2.  So the derivatives and the value itself are the columns of one matrix
-that goes through the Runge-Kutta stages.
+All terms but drag are quadratic in (q, omega), for given T and I^-1 tau: with F the Jacobian of that part, linear in
+(q, omega, T q), its value is F x / 2. So derivatives and value are the columns of one matrix that passes through the
+Runge-Kutta stages.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from quadsim.state import Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 N_BODY: Final = 13
-"""States of the body; those of the rotors come after them."""
+"""States of the body; rotor states follow."""
 P, Q, V, W = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
 _TURNING: Final = 10
-"""Rows and columns of (q, v, omega), which the derivatives depend on."""
+"""Rows and columns of (q, v, omega), on which the derivatives depend."""
 _q, _v, _w = slice(0, 4), slice(4, 7), slice(7, 10)
 
 
 class Inputs(StrEnum):
-    """What the inputs are shares of the largest of."""
+    """The physical quantity of the inputs, as shares of the largest."""
 
     THRUST = "thrust"
     SPEED = "speed"
@@ -46,9 +46,9 @@ class Inputs(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class RigidBody:
-    """x(k+1) = f(x(k), u(k)) over a time; see the module.  Another disturbance is a matter of `dataclasses.replace`."""
+    """x(k+1) = f(x(k), u(k)) between nodes; see the module.  `dataclasses.replace` sets another disturbance."""
 
-    effectiveness: Array  # (4, 4) takes rotor thrusts [N] to T [m/s^2] and I^-1 tau [rad/s^2]
+    effectiveness: Array  # (4, 4) maps rotor thrusts [N] to T [m/s^2] and I^-1 tau [rad/s^2]
     largest_thrust: float  # of a rotor [N]
     inertia: Array  # (3,) [kg m^2]
     mass: float  # [kg]
@@ -56,7 +56,7 @@ class RigidBody:
     step: float  # time between nodes [s]
     substeps: int = 1  # Runge-Kutta steps in it
     inputs: Inputs = Inputs.THRUST
-    rotor_lag: float | None = None  # time constant by which thrusts or speeds follow the inputs [s]; None for none
+    rotor_lag: float | None = None  # time constant of thrusts or speeds [s]; None for none
     drag: Array = field(default_factory=zero)  # (3,) D_1, linear, body axes [N s/m]
     quadratic_drag: Array = field(default_factory=zero)  # (3,) D_2, body axes [N s^2/m^2]
     acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
@@ -64,7 +64,7 @@ class RigidBody:
 
     @cached_property
     def features(self) -> Array:
-        """(11, 100): takes (q, omega, T q) to F, the Jacobian of (q, v, omega)' but for drag, by (q, v, omega)."""
+        """(11, 100): maps (q, omega, T q) to F, the Jacobian of (q, v, omega)' in (q, v, omega) without drag."""
         ixx, iyy, izz = self.inertia.tolist()
         return _features(((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz))
 
@@ -79,17 +79,17 @@ class RigidBody:
         return N_BODY if self.rotor_lag is None else N_BODY + N_ROTORS
 
     def thrusts(self, shares: Array) -> Array:
-        """Rotor thrusts [N] of inputs, or of the rotors' states."""
+        """Return the rotor thrusts [N] for inputs, or for the rotors' states."""
         return self.largest_thrust * (shares if self.inputs is Inputs.THRUST else np.square(shares))
 
     def shares(self, thrusts: Array) -> Array:
-        """Inputs of rotor thrusts [N], negative ones counted as none where inputs are speeds."""
+        """Return the inputs for rotor thrusts [N]; negative ones count as zero if inputs are speeds."""
         shares = np.asarray(thrusts) / self.largest_thrust
         return shares if self.inputs is Inputs.THRUST else np.sqrt(np.maximum(shares, 0.0))
 
 
 def rigid_body(vehicle: Vehicle, step: float, **others: object) -> RigidBody:
-    """The vehicle's model, undisturbed; `others` are fields of `RigidBody`."""
+    """Return the vehicle's model, undisturbed; `others` sets fields of `RigidBody`."""
     resistance = np.array([vehicle.mass, *vehicle.inertia])
     return RigidBody(
         effectiveness=read_only(vehicle.allocation / vehicle.thrust_coefficient / resistance[:, None]),
@@ -105,7 +105,7 @@ def rigid_body(vehicle: Vehicle, step: float, **others: object) -> RigidBody:
 @cache
 def _features(gyration: tuple[float, float, float]) -> Array:
     F = np.zeros((11, _TURNING, _TURNING))
-    w, x, y, z, p, q, r, Tw = range(8)  # the last is the first of four, T q
+    w, x, y, z, p, q, r, Tw = range(8)  # the last is the first of four components of T q
     half = 0.5
     # q' = 1/2 q (0, omega): each term is sign/2 q_i omega_j in row k.
     for k, i, j, sign in (
@@ -150,8 +150,8 @@ def rotation(q: Array) -> Array:
 
 
 def _rotation_slopes() -> Array:
-    """(4, 36): takes q to the derivatives (4, 3, 3) of R(q) by its components."""
-    q = np.eye(4)  # R - I is a quadratic form: its polarisation
+    """(4, 36): maps q to the derivatives (4, 3, 3) of R(q) in its components."""
+    q = np.eye(4)  # R - I is a quadratic form; this is its polarisation
     return (rotation(q[:, None] + q) - rotation(q)[:, None] - rotation(q) + np.eye(3)).reshape(4, 36)
 
 
@@ -159,13 +159,13 @@ _SLOPES: Final = _rotation_slopes()
 
 
 def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None = None) -> tuple[Array, Array, Array]:
-    """A, B and the end x(k+1) of the map from M nodes' states x (M, n) under inputs u (M, 4).
+    """Linearise the map from M nodes' states x (M, n) under inputs u (M, 4) to the next nodes: A, B and x(k+1).
 
-    With `frames` (M + 1, 4, 4), orthogonal matrices, A and B are for states whose quaternion is multiplied by them, the
-    first M of them at the beginning of the steps and the last M at the end.
+    With `frames` (M + 1, 4, 4), orthogonal matrices that multiply the quaternion, A and B refer to the transformed
+    states: the first M frames at the start of the steps, the last M at the end.
 
     Returns:
-        (M, n, n), (M, n, 4) and (M, n): exact derivatives of the Runge-Kutta map; the end is not multiplied by frames.
+        (M, n, n), (M, n, 4) and (M, n): exact derivatives of the Runge-Kutta map; x(k+1) is not transformed.
     """
     m = model.n - 3 + N_ROTORS + 1  # columns: q, v, omega, rotors, inputs, and the value
     Y = np.empty((len(x), _TURNING, m))
@@ -178,9 +178,10 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
 
 
 def _integrate(model: RigidBody, drives: Array, Y: Array) -> tuple[Array, Array]:
-    """Take columns Y (M, 10, m) through the Runge-Kutta stages, and (M, 3, m) how far position has moved.
+    """Integrate columns Y (M, 10, m) through the Runge-Kutta stages; also return (M, 3, m) the change of position.
 
-    They are derivatives of (q, v, omega), and last its value, or that alone; `drives` are of the last of them.
+    The columns are derivatives of (q, v, omega), and last its value, or the value alone; `drives` are those of the
+    last.
     """
     M, _, m = Y.shape
     lagging, driven = model.rotor_lag is not None, slice(m - drives.shape[-1], m)
@@ -236,13 +237,13 @@ def _assemble(
 
 
 def _rotors_after(model: RigidBody, x: Array, u: Array) -> Array:
-    """(M, 4) the rotors' states after a step; only where they lag."""
+    """(M, 4) the rotors' states after a step; only with lag."""
     assert model.rotor_lag is not None
     return u + math.exp(-model.step / model.rotor_lag) * (x[:, N_BODY:] - u)
 
 
 def _drives(model: RigidBody, x: Array, u: Array) -> Array:
-    """(K, M, 4, 4 or 8, and 1): slopes of (T, I^-1 tau) by the rotors' states and inputs, and values, at K instants."""
+    """(K, M, 4, 4 or 8, and 1): slopes of (T, I^-1 tau) in the rotors' states and inputs, and values, at K instants."""
     if model.rotor_lag is None:
         decay = np.zeros(1)
     else:
@@ -263,9 +264,9 @@ def _drives(model: RigidBody, x: Array, u: Array) -> Array:
 
 
 def _drag(model: RigidBody, F: Array, state: Array) -> Array:
-    """Add drag's derivatives to F (M, 10, 10); (M, 3) its acceleration [m/s^2], of states (M, 10)."""
+    """Add drag's derivatives to F (M, 10, 10); return (M, 3) its acceleration [m/s^2], for states (M, 10)."""
     q, v = state[:, _q], state[:, _v]
-    slopes = (q @ _SLOPES).reshape(-1, 4, 3, 3)  # of R by each component of q, of which R - I is of second degree
+    slopes = (q @ _SLOPES).reshape(-1, 4, 3, 3)  # slopes of R in each component of q; R - I is quadratic
     R = 0.5 * (q[:, None] @ slopes.reshape(-1, 4, 9)).reshape(-1, 3, 3) + _EYE
     body = (v[:, None] @ R)[:, 0]
     size = np.abs(body)
@@ -279,7 +280,7 @@ def _drag(model: RigidBody, F: Array, state: Array) -> Array:
 
 
 def drag_acceleration(model: RigidBody, q: Array, v: Array) -> Array:
-    """(..., 3) acceleration by drag, world [m/s^2], of quaternions (..., 4) and velocities (..., 3) [m/s]."""
+    """(..., 3) acceleration by drag, world [m/s^2], for quaternions (..., 4) and velocities (..., 3) [m/s]."""
     R = rotation(q)
     air = (np.swapaxes(R, -1, -2) @ v[..., None])[..., 0]
     pull = -(model.drag * air + model.quadratic_drag * np.abs(air) * air) / model.mass
@@ -287,7 +288,7 @@ def drag_acceleration(model: RigidBody, q: Array, v: Array) -> Array:
 
 
 def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
-    """The states (..., n) one step after states x (..., n) under inputs u (..., 4), without derivatives."""
+    """Return the states (..., n) one step after states x (..., n) under inputs u (..., 4), without derivatives."""
     shape, x, u = x.shape, x.reshape(-1, model.n), u.reshape(-1, N_ROTORS)
     Y, travelled = _integrate(model, _drives(model, x, u)[..., -1:], x[:, 3:N_BODY, None])
     end = [x[:, P] + travelled[:, :, 0], Y[:, :, 0]]

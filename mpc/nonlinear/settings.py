@@ -1,4 +1,4 @@
-"""What a nonlinear MPC is made from."""
+"""The settings of a nonlinear MPC."""
 
 from __future__ import annotations
 
@@ -48,34 +48,34 @@ from quadsim.vehicle import Vehicle
 if TYPE_CHECKING:
     from mpc.obstacles import Shape
 
-LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states that are so of the quaternion model too
+LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states in which the quaternion model is linear, too
 VEHICLES_SPEEDS: Final = RotorBounds()
 Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
 Rates = Positive | Annotated[tuple[Positive, ...], Len(3, 3)]
 
 AxisWeights = Weight | Annotated[Sequence[Weight], Len(3, 3)]
-"""One weight for three axes, or one each."""
+"""One weight for three axes, or one per axis."""
 
 
 class AttitudeError(StrEnum):
-    """What the weight of the attitude is of, with the reference q_r."""
+    """The attitude error that is weighted, with the reference q_r."""
 
     ERROR_STATE = "error-state"
-    """2 vec(q_r* q), three components: the rotation vector to first order, and the same of q and -q."""
+    """2 vec(q_r* q), three components: the rotation vector to first order, and equal for q and -q."""
     DIFFERENCE = "difference"
-    """q - q_r, four components, whose signs have to agree: to first order half the rotation vector."""
+    """q - q_r, four components, for equal signs of q and q_r: half the rotation vector to first order."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Weights:
-    """What squared distances from the reference cost."""
+    """Weights of squared distances from the reference."""
 
     position: Annotated[AxisWeights, doc("[1/m^2] one weight, or x, y, z")] = 10.0
     attitude: Annotated[AxisWeights, doc("[1/rad^2] one weight, or about body x, y, z")] = 0.1
     velocity: Annotated[AxisWeights, doc("[1/(m/s)^2] one weight, or x, y, z")] = 0.05
     body_rates: Annotated[AxisWeights, doc("[1/(rad/s)^2] one weight, or about body x, y, z")] = 0.05
-    input: Annotated[Weight, doc("[-] of an input's distance from the reference's, as shares")] = 0.1
-    move: Annotated[NonNegative, doc("[-] of an input's change from one node to the next, as shares")] = 0.0
+    input: Annotated[Weight, doc("[-] weight of the inputs' distance from the reference, as shares")] = 0.1
+    move: Annotated[NonNegative, doc("[-] weight of the inputs' change from node to node, as shares")] = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -94,29 +94,29 @@ _USUAL = Weights()
 
 @dataclass(frozen=True, kw_only=True)
 class NonlinearSettings:
-    """Horizon, cost and model; the units are those of the states, inputs are shares of the largest."""
+    """Horizon, cost and model; weights are in the units of the states, inputs are shares of the largest."""
 
     horizon: int = 10  # N, nodes
-    stride: int = 1  # control periods from one node to the next
-    iterations: int = 1  # most steps of sequential quadratic programming in a period; 1 is the real-time iteration
-    tolerance: float = 1e-6  # largest step of a state or an input that ends them
-    shift: bool | None = None  # whether the plan moves on by a node before it is linearised along; None: if stride is 1
-    substeps: int = 1  # Runge-Kutta steps from one node to the next
-    inputs: Inputs = Inputs.THRUST  # what the inputs are shares of the largest of
+    stride: int = 1  # control periods per node
+    iterations: int = 1  # most SQP steps in a period; 1 is the real-time iteration
+    tolerance: float = 1e-6  # largest change of a state or an input at which they stop
+    shift: bool | None = None  # whether the plan is shifted by a node before it is linearised; None: if stride is 1
+    substeps: int = 1  # Runge-Kutta steps per node
+    inputs: Inputs = Inputs.THRUST  # physical quantity of the inputs
     rotor_lag: float | None = None  # time constant of the rotors' thrusts or speeds [s]; None for none
-    drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # linear, that the model knows, body axes [N s/m]
+    drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # linear drag in the model, body axes [N s/m]
     quadratic_drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # in each component of the velocity [N s^2/m^2]
-    attitude_error: AttitudeError = AttitudeError.ERROR_STATE  # what the weight of the attitude is of
-    weights: Weights = _USUAL  # what distances from the reference cost
+    attitude_error: AttitudeError = AttitudeError.ERROR_STATE  # the attitude error that is weighted
+    weights: Weights = _USUAL  # weights of distances from the reference
     terminal: float | str = (
-        0.0  # the last state's weight over the others', 0 for none; "lqr" for the Riccati equation's
+        0.0  # weight of the last state relative to the others, 0 for none; "lqr" for the Riccati equation's
     )
     tilt: float | None = None  # largest angle between thrust axis and vertical [rad], below pi/2; None for no bound
-    largest_rates: tuple[float, ...] = (math.inf, math.inf, math.inf)  # body rates [rad/s]
-    soft: tuple[float, float] | None = None  # (l1, l2) of exceeding these by 1 rad or 1 rad/s; None for hard bounds
-    observer: ObserverSettings | None = None  # of the disturbance observer; None for no offset-free tracking
-    ramp: RampSettings | None = None  # of the one that follows changing forces, and fits drag to them; None for none
-    solver: str | None = None  # see `mpc.solvers.find_solver`; None for the fastest one for the size
+    largest_rates: tuple[float, ...] = (math.inf, math.inf, math.inf)  # bounds on body rates [rad/s]
+    soft: tuple[float, float] | None = None  # (l1, l2) per 1 rad or 1 rad/s beyond these bounds; None for hard bounds
+    observer: ObserverSettings | None = None  # settings of the disturbance observer; None for no offset-free tracking
+    ramp: RampSettings | None = None  # settings of the observer of changing forces and drag; None for none
+    solver: str | None = None  # see `mpc.solvers.find_solver`; None for the fastest for the size
 
     def outputs(self) -> tuple[Array, Array]:
         """C_r (n_r, 13) and the diagonal of Q_y (n_r,), for states whose quaternion is q_r* q."""
@@ -138,8 +138,8 @@ class Nonlinear(ControllerTable):
     any_attitude: ClassVar = True
 
     type: Annotated[Literal["nonlinear"], doc("the control law, by its name in `quadsim list`")] = "nonlinear"
-    horizon: Annotated[Horizon, doc("[periods] how far it looks ahead, a whole number of nodes")] = 20
-    node: Annotated[Positive | None, doc("[s] from one node to the next, whole periods; absent: one period")] = None
+    horizon: Annotated[Horizon, doc("[periods] prediction horizon, a whole number of nodes")] = 20
+    node: Annotated[Positive | None, doc("[s] time between nodes, whole periods; absent: one period")] = None
     iterations: Annotated[
         int,
         Ge(1),
@@ -150,7 +150,7 @@ class Nonlinear(ControllerTable):
         bool | None, doc("whether the last plan is shifted by a node; absent: where a node is one period")
     ] = None
     substeps: Annotated[int, Ge(1), Le(100), doc("Runge-Kutta steps per node")] = 1
-    inputs: Annotated[Literal["thrust", "speed"], doc("what the inputs are, as shares of the rotors' largest")] = (
+    inputs: Annotated[Literal["thrust", "speed"], doc("quantity of the inputs, as shares of the rotors' largest")] = (
         "thrust"
     )
     weights: Weights = _USUAL
@@ -167,9 +167,9 @@ class Nonlinear(ControllerTable):
     ] = "none"
     rotor_lag: Annotated[
         Lag,
-        doc('[s] time constant by which rotors follow that is predicted, 0 for none; "vehicle": its rotor_rise'),
+        doc('[s] rotor time constant in the prediction, 0 for none; "vehicle": its rotor_rise'),
     ] = 0.0
-    drag: Annotated[Drag, doc("[N s/m] linear drag that is predicted, along body x, y, z")] = (0.0, 0.0, 0.0)
+    drag: Annotated[Drag, doc("[N s/m] linear drag in the prediction, along body x, y, z")] = (0.0, 0.0, 0.0)
     quadratic_drag: Annotated[Drag, doc("[N s^2/m^2] the same, of each component's square")] = (0.0, 0.0, 0.0)
     output_bounds: Annotated[
         dict[str, Pair], doc("[m, m/s] lower and upper bound, of positions and velocities by their states' names")
@@ -181,22 +181,22 @@ class Nonlinear(ControllerTable):
     body_rate: Annotated[
         Rates | None, doc("[deg/s] largest magnitude, one or about body x, y, z; absent: no bound")
     ] = None
-    soft: Annotated[Soft | None, doc("of the three above; absent: hard")] = None
+    soft: Annotated[Soft | None, doc("penalty of the three above; absent: hard")] = None
     avoidance: Annotated[
         Avoidance | None,
-        doc("absent: it knows of no obstacles, corridors or fence, which are audited all the same"),
+        doc("absent: the controller ignores obstacles, corridors and fence; the audit does not"),
     ] = None
     polytopes: Annotated[
         tuple[Polytope, ...],
         MaxLen(MOST_ENTRIES),
-        doc("bounds on sums of positions, velocities and, as inputs, rotor speeds; audited as well"),
+        doc("linear constraints on positions, velocities and, as inputs, rotor speeds; audited as well"),
     ] = ()
     offset_free: ObserverSettings | None = None
     disturbance: Annotated[
         RampSettings | None,
         doc("absent: no drag is fitted, no changing force followed; not beside offset_free"),
     ] = None
-    indi: Annotated[INDISettings | None, doc("absent: rotors hold the commands for a period")] = None
+    indi: Annotated[INDISettings | None, doc("absent: rotors hold each command for a period")] = None
     input_bounds: RotorBounds = VEHICLES_SPEEDS
     fallback: FallbackSettings = USUAL_FALLBACK
     kkt_every: KktEvery = KKT_EVERY
@@ -266,7 +266,7 @@ class Nonlinear(ControllerTable):
         return law if self.indi is None else Incremental(law, vehicle, self.indi, bounds)
 
     def settings(self, vehicle: Vehicle, stride: int) -> NonlinearSettings:
-        """The same in SI units, of nodes of `stride` periods."""
+        """Return the same in SI units, for nodes of `stride` periods."""
         return NonlinearSettings(
             horizon=self.horizon // stride,
             stride=stride,
@@ -289,7 +289,7 @@ class Nonlinear(ControllerTable):
         )
 
     def _stride(self, period: float) -> int:
-        """Periods from one node to the next."""
+        """Return the number of periods per node."""
         if self.node is None:
             return 1
         stride = round(self.node / period)
@@ -302,7 +302,7 @@ class Nonlinear(ControllerTable):
         return stride
 
     def _rows(self) -> tuple[Constraint, ...]:
-        """`output_bounds` and `polytopes` as rows over the 12 states and four rotor speeds."""
+        """Return `output_bounds` and `polytopes` as rows over the 12 states and four rotor speeds."""
         polytopes = rows_of(self.polytopes)
         if not self.output_bounds:
             return polytopes

@@ -1,4 +1,4 @@
-"""The QP solvers by name, and a problem's QP solved each period by one of them: `Query -> Answer`."""
+"""The QP solvers by name; each solves a problem's QP in every period: `Query -> Answer`."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ from quadsim.errors import InputError, MissingCoreError, MissingPackageError, Pa
 from quadsim.state import Array
 
 Formulation: TypeAlias = Condensed | PartiallyCondensed
-"""The ways to write an MPC's optimisation as a QP."""
+"""The QP formulations of an optimal control problem."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolverEntry:
-    """What a named solver takes."""
+    """A named solver and the form of the problem that it takes."""
 
     description: str  # one line
-    package: str  # what it is imported as
-    dense: bool = True  # whether it takes the condensed QP, else the staged one
-    steps_per_stage: int | None = None  # of the staged one; None for what suits the inputs
-    extra: str = ""  # the extra of this project that installs the package; empty for one that is always there
+    package: str  # import name
+    dense: bool = True  # whether it takes the condensed QP instead of the staged one
+    steps_per_stage: int | None = None  # of the staged QP; None for a choice by the number of inputs
+    extra: str = ""  # quadsim's extra that installs the package; empty if it is always installed
 
     def formulate(self, problem: Problem, *, changing: bool = False) -> Formulation:
-        """The form of the problem that it takes, of a model that may be `changing` from period to period."""
+        """Return the form of the problem that it takes, for a model that may be `changing` from period to period."""
         if self.dense:
             return Condensed(problem)
         return PartiallyCondensed(problem, steps_per_stage=self.steps_per_stage, changing=changing)
 
     @property
     def installed(self) -> bool:
-        """Whether the package is there; importing it is left for later."""
+        """Whether the package is installed; it is not imported yet."""
         return not self._missing
 
     @property
     def line(self) -> str:
-        """The description, and how to install what is missing."""
+        """The description, with the command that installs a missing package."""
         return self._missing or self.description
 
     @property
@@ -71,7 +71,7 @@ SOLVERS: Final = {
     "piqp-dense": SolverEntry(description="PIQP, dense Cholesky, on the paper's condensed matrices", package="piqp"),
     "daqp": SolverEntry(description="DAQP, dual active set, condensed, warm-started", package="daqp", extra="daqp"),
 }
-"""QP solvers that are set up once, and told what changes from one period to the next."""
+"""QP solvers that are set up once and then updated in each period."""
 
 COMPILED: Final = SolverEntry(
     description="the compiled core: the exact optimum where matrices are fixed; PIQP answers what it gives up",
@@ -81,18 +81,18 @@ COMPILED: Final = SolverEntry(
 ALIASES: Final = {"piqp": "piqp-multistage"}
 
 CORE_OR_PIQP: Final = "core-or-piqp"
-"""The core where it is compiled and takes the problem, else PIQP."""
+"""The core if it is compiled and takes the problem, else PIQP."""
 
 INVALID_DATA: Final = "invalid_data"
-"""Status of a query with numbers that is passed to no back end."""
+"""Status of a query with numbers that no back end receives."""
 
 LARGEST: Final = 1e6
-"""Magnitude of a number in a changing model beyond which it is no vehicle's: four steps of such numbers multiply to
-1e30, where PIQP takes bounds for infinite."""
+"""Largest plausible number in a changing model: beyond it, four steps multiply to 1e30, which PIQP treats as
+infinite."""
 
 
 def find_solver(name: str) -> SolverEntry:
-    """The solver of a name: the core, one of `SOLVERS` or of qpsolvers; `UnknownNameError` where there is none."""
+    """Return the solver of a name: the core, one of `SOLVERS` or of qpsolvers; `UnknownNameError` if there is none."""
     name = ALIASES.get(name, name)
     if name in (CORE, CORE_OR_PIQP, *SOLVERS):
         return SOLVERS.get(name, COMPILED)
@@ -104,11 +104,11 @@ def find_solver(name: str) -> SolverEntry:
 
 
 def solver_entries() -> dict[str, SolverEntry]:
-    """All solvers by name: `SOLVERS`, the core, and those of qpsolvers that are installed."""
+    """Return all solvers by name: `SOLVERS`, the core, and those of qpsolvers that are installed."""
     entries = SOLVERS | {CORE: COMPILED}
     if importlib.util.find_spec("qpsolvers") is None:
         return entries
-    from qpsolvers import available_solvers  # imports every solver there is
+    from qpsolvers import available_solvers  # imports every installed solver
 
     others = sorted({*available_solvers} - {*entries, *ALIASES})
     return entries | {
@@ -122,9 +122,9 @@ def solver_entries() -> dict[str, SolverEntry]:
 
 
 def make_backend(name: str, *, changing: bool = False) -> Backend:
-    """A fresh back end of a named QP solver; raises `UnknownNameError`, or `MissingPackageError`."""
+    """Return a new back end of a named QP solver; raises `UnknownNameError`, or `MissingPackageError`."""
     if name in (CORE, CORE_OR_PIQP):
-        raise UnknownNameError("QP solver", name, SOLVERS, "make_solver has it")
+        raise UnknownNameError("QP solver", name, SOLVERS, "use make_solver")
     entry = find_solver(name)
     if not entry.installed:
         raise MissingPackageError(f"the solver {name!r}", entry.package, extra=entry.extra)
@@ -137,14 +137,14 @@ def make_backend(name: str, *, changing: bool = False) -> Backend:
 
         return DaqpDense()
     if name in SOLVERS:
-        raise UnknownNameError("QP solver", name, SOLVERS, "make_backend makes none of it")
+        raise UnknownNameError("QP solver", name, SOLVERS, "make_backend cannot make one")
     from mpc.solvers.qpsolvers import AnyOfQpsolvers
 
     return AnyOfQpsolvers(name)
 
 
 class Method(StrEnum):
-    """How much of the QP had to be solved."""
+    """The part of the QP that had to be solved."""
 
     FREE = "the unconstrained optimum"
     AXES = "active rows of states alone"
@@ -152,26 +152,26 @@ class Method(StrEnum):
 
 
 class Answer(NamedTuple):
-    """An optimum as a plan; arrays are not to be written to."""
+    """An optimum as a plan; its arrays are read-only by convention."""
 
-    plan: Array  # (N, nu) inputs [rad/s]; to be used only when the status is accepted
-    slacks: Array  # (N, m_s) by how much soft rows are violated
-    status: str  # `solved`, `unconstrained`, or what went wrong
+    plan: Array  # (N, nu) inputs [rad/s]; valid only if the status is accepted
+    slacks: Array  # (N, m_s) violations of soft rows
+    status: str  # `solved`, `unconstrained`, or the reason of a failure
     answered_by: str  # `gain`, `core` or the QP solver's name; see `quadsim.controller.Command`
-    iterations: int = 0  # of whoever answered
+    iterations: int = 0  # of the solver that answered
     active: int = 0  # constraints active at the optimum
     solve_s: float = 0.0  # wall time [s]
-    reported_primal: float = math.nan  # see `mpc.qp.Solution`, as the next
+    reported_primal: float = math.nan  # see `mpc.qp.Solution`, as for the next
     reported_dual: float = math.nan
-    method: Method = Method.WHOLE  # how much of the QP had to be solved
-    states: Array | None = None  # (N, n) predicted, where the model changes and there is an optimum
-    certificate: Callable[[], tuple[QP, Solution]] | None = None  # a QP and the solution; None where the data made none
-    infeasibility: float = math.nan  # see `mpc.answer.AnswerCheck`, as the next; NaN where it is not computed
+    method: Method = Method.WHOLE  # the part of the QP that had to be solved
+    states: Array | None = None  # (N, n) predicted, if the model changes and there is an optimum
+    certificate: Callable[[], tuple[QP, Solution]] | None = None  # the QP and its solution; None for invalid data
+    infeasibility: float = math.nan  # see `mpc.answer.AnswerCheck`, as for the next; NaN if not computed
     kkt: KKTResiduals | None = None
 
     @classmethod
     def of(cls, form: Formulation, qp: QP, solution: Solution, answered_by: str) -> Answer:
-        """A solver's solution of a QP, as a plan and slacks."""
+        """Convert a solver's solution of a QP to a plan and slacks."""
         return cls(
             form.inputs(solution.x),
             form.slacks(solution.x),
@@ -187,7 +187,7 @@ class Answer(NamedTuple):
 
 
 class Solver(Protocol):
-    """Finds a problem's optimum each period."""
+    """Computes a problem's optimum in each period."""
 
     @property
     def name(self) -> str:
@@ -195,20 +195,20 @@ class Solver(Protocol):
 
     @property
     def formulation(self) -> Formulation:
-        """The QP that its solutions are of."""
+        """The QP to which its solutions refer."""
 
     def reset(self) -> None:
-        """Forget the last period's answer, where it is where the next one starts."""
+        """Clear the last answer, if the next search starts from it."""
 
     def solve(self, query: Query) -> Answer:
-        """The optimum for a query; whatever happens is in its status."""
+        """Return the optimum of a query; failures are reported in its status."""
 
 
 def make_solver(name: str, problem: Problem) -> Solver:
-    """A problem's solver by name: the core, or a QP solver that has the unconstrained optimum tried before it.
+    """Return a problem's solver by name: the core, or a QP solver that first tries the unconstrained optimum.
 
     Raises:
-        UnknownNameError, MissingPackageError, MissingCoreError: there is no such solver, or not here.
+        UnknownNameError, MissingPackageError, MissingCoreError: the solver does not exist, or is not installed.
         ParameterError: the core cannot take the problem.
     """
     if name not in (CORE, CORE_OR_PIQP):
@@ -227,11 +227,11 @@ def make_solver(name: str, problem: Problem) -> Solver:
 
 
 class QPSolver:
-    """A problem's QP, solved each period by a named solver.
+    """Solves a problem's QP in each period with a named solver.
 
-    Queries of a `changing` one have models of their own (`mpc.ocp.Query.steps`).  With `free_first`, the unconstrained
-    optimum is tried before: where it satisfies every constraint, it is the optimum, and no QP is solved.  The staged QP
-    of a changing problem has none to try.
+    Queries of a `changing` problem carry their own models (`mpc.ocp.Query.steps`). With `free_first`, the unconstrained
+    optimum is tried first: if it satisfies every constraint, it is the optimum, and no QP is solved.  The staged QP of
+    a changing problem has no such shortcut.
     """
 
     def __init__(self, name: str, problem: Problem, *, changing: bool = False, free_first: bool = False) -> None:
@@ -244,15 +244,15 @@ class QPSolver:
         self.reset()
 
     def reset(self) -> None:
-        """See `Solver.reset`: back ends that start from their last answer, restart from scratch."""
+        """See `Solver.reset`: back ends that start from their last answer restart from scratch."""
         self._backend = make_backend(self.name, changing=self._changing)
         self._backend.setup(self.formulation.qp)
 
     def solve(self, query: Query) -> Answer:
         """See `Solver.solve`.
 
-        Data that is not finite, or beyond `LARGEST` in a model that changes, is answered with the status
-        `invalid_data`: no back end can be trusted to notice.
+        Data that is not finite, or beyond `LARGEST` in a changing model, gives the status `invalid_data`, since back
+        ends may not notice it.
         """
         form, by, method, spent_s = self.formulation, self.name, Method.WHOLE, 0.0
         if not _usable(query):
@@ -276,7 +276,7 @@ class QPSolver:
 
 
 def _usable(query: Query) -> bool:
-    """Whether all numbers are finite, those of a changing model also no larger than `LARGEST`."""
+    """Return whether all numbers are finite and, in a changing model, at most `LARGEST`."""
     state, desired, u_before, rest, steps = query
     if steps is None:
         return math.isfinite(state.sum() + desired.sum() + u_before.sum())

@@ -18,7 +18,7 @@ from quadsim.controller import SOLVED
 from quadsim.state import Array
 
 SETTINGS: Final = {
-    "primal_tol": 1e-8,  # rad or rad/s; its own 1e-6 is as fast
+    "primal_tol": 1e-8,  # rad or rad/s; DAQP's default of 1e-6 is equally fast
     "iter_limit": 5000,  # changes of the active set; the paper's QPs take 1 to 180
 }
 
@@ -71,10 +71,10 @@ class DaqpDense:
 
 
 def _dense(matrix: Matrix) -> Array:
-    """A C-contiguous copy of a matrix."""
+    """Return a C-contiguous copy of a matrix."""
     return np.array(matrix.toarray() if isinstance(matrix, csc_matrix) else matrix, order="C")
 
 
 def _bounds(qp: QP) -> tuple[Array, Array]:
-    """The upper and lower sides of [x; G x; A x]."""
+    """Return the upper and lower sides of [x; G x; A x]."""
     return np.concatenate([qp.x_u, qp.h_u, qp.b]), np.concatenate([qp.x_l, qp.h_l, qp.b])

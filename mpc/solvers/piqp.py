@@ -11,9 +11,9 @@ import piqp
 from mpc.qp import QP, Solution
 from quadsim.controller import SOLVED
 
-MAX_ITERATIONS: Final = 100  # cap for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 8 to 23
+MAX_ITERATIONS: Final = 100  # limit for hopeless data (NaN runs PIQP to its limit); the paper's QPs take 8 to 23
 
-ACTIVE_SLACK: Final = 1e-6  # distance to a bound (rad or rad/s) below which a constraint may count as active
+ACTIVE_SLACK: Final = 1e-6  # distance to a bound (rad or rad/s) below which a constraint may be active
 
 STATUS: Final = {
     piqp.PIQP_SOLVED: SOLVED,
@@ -26,25 +26,25 @@ STATUS: Final = {
 }
 
 TOLERANCE: Final = 1e-9
-"""Absolute; PIQP's own is 1e-8.  Next to a constraint that is hardly active the inputs converge as its square root:
-over the paper's flight, one form of the QP or another has a first input 1e-3 rad/s from the optimum at 1e-8 and at
-3e-9; at 1e-9 all are within 4e-4, for one more iteration."""
+"""Absolute tolerance; PIQP's default is 1e-8. Next to a barely active constraint, the inputs converge only as its
+square root: over the paper's flight, at 1e-8 and 3e-9 one form of the QP has a first input 1e-3 rad/s from the optimum;
+at 1e-9 all are within 4e-4, for one more iteration."""
 
 GAP: Final = 1e-10
-"""Of primal and dual objective.  With PIQP's own 1e-8, a bound that is just touched leaves the first input of one form
-of the QP or another 4e-3 rad/s off, whatever `TOLERANCE` is."""
+"""Tolerance of the duality gap.  With PIQP's default of 1e-8, a bound that is just touched puts the first input of one
+form of the QP 4e-3 rad/s off, whatever `TOLERANCE` is."""
 
 CHANGING_TOLERANCE: Final = 1e-8
-"""Where matrices change; PIQP's own.  A tenth of it takes 3 more of 20 iterations where tilt is at its bound."""
+"""For changing matrices; PIQP's default.  A tenth of it takes 3 more of 20 iterations where tilt is at its bound."""
 
 CHANGING_SCALINGS: Final = 3
-"""Passes of PIQP's scaling, which new matrices need again: its usual ten take 0.2 ms longer, and save nothing."""
+"""Passes of PIQP's scaling, repeated for new matrices: its default of ten takes 0.2 ms longer without benefit."""
 
 
 class Piqp:
     """See `mpc.qp.Backend`; multistage, for block-banded QPs with the variables in stage order, or `dense`.
 
-    `changing`: whether values of the matrices change from one period to the next.
+    `changing`: whether the matrices' values change from period to period.
     """
 
     def __init__(self, *, dense: bool = False, changing: bool = False) -> None:
@@ -61,16 +61,16 @@ class Piqp:
             settings.eps_rel = settings.eps_duality_gap_rel = 0.1 * CHANGING_TOLERANCE
 
     def setup(self, qp: QP) -> None:
-        """See `mpc.qp.Backend.setup`; PIQP must see every vector that it will later be updated with."""
+        """See `mpc.qp.Backend.setup`; PIQP must receive every vector that is updated later."""
         self._solver.setup(qp.P, qp.c, qp.A, qp.b, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)
         self._last = qp
 
     def solve(self, qp: QP) -> Solution:
-        """Update what differs from the last QP, matrices of the same pattern included, solve, copy everything out.
+        """Update the differences from the last QP, including matrices of the same pattern, solve, and copy the result.
 
-        PIQP's result arrays are views that the next solve overwrites, and a failed solve leaves a finite x: the
-        status is the only thing to go by.  Sizes must be right: a wrong one keeps the old data silently.
-        One update for all: two would scale the data twice.
+        PIQP's result arrays are views that the next solve overwrites, and a failed solve leaves a finite x: the status
+        is the only thing to go by.  Sizes must be right: a wrong one keeps the old data silently.  One update for all:
+        two would scale the data twice.
         """
         last, self._last = self._last, qp
         matrices = {}
@@ -81,7 +81,7 @@ class Piqp:
         status = self._solver.solve()
         elapsed = clock.perf_counter() - started
         result, info = self._solver.result, self._solver.result.info
-        # At an interior-point optimum a constraint is active where its multiplier exceeds its slack, and that is small.
+        # At an interior-point optimum, a constraint is active if its slack is small and below its multiplier.
         lower, upper = (result.z_l, result.s_l), (result.z_u, result.s_u)
         box = (result.z_bl, result.s_bl), (result.z_bu, result.s_bu)
         return Solution(

@@ -1,4 +1,4 @@
-"""Any solver of qpsolvers, by its name there, on the condensed QP; it is set up anew in each period.
+"""Any solver of qpsolvers, by its name there, on the condensed QP, set up anew in each period.
 
 Caron et al., qpsolvers: Quadratic Programming Solvers in Python, https://github.com/qpsolvers/qpsolvers.
 """
@@ -17,7 +17,7 @@ from mpc.qp import QP, Solution
 from quadsim.controller import SOLVED
 
 ACTIVE_MULTIPLIER: Final = 1e-5
-"""Size of a multiplier from which its constraint counts as active; at the paper's optima they reach 1e3."""
+"""Multiplier from which a constraint counts as active; at the paper's optima they reach 1e3."""
 UNSOLVED: Final = "unsolved"
 """Status of a QP without a solution; qpsolvers does not say why."""
 
@@ -26,7 +26,7 @@ SETTINGS: Final[dict[str, dict[str, Any]]] = {
     "osqp": {"eps_abs": 1e-5, "eps_rel": 0.0, "max_iter": 10_000},  # at 1e-4 the first input is off by 1e-2 rad/s
     "proxqp": {"eps_abs": 1e-7, "eps_rel": 0.0, "max_iter": 1000},
 }
-"""Where a solver's own tolerances are too loose for commands."""
+"""Tighter tolerances for solvers whose defaults are too loose for commands."""
 
 
 class AnyOfQpsolvers:
@@ -37,10 +37,10 @@ class AnyOfQpsolvers:
         self._matrix = np.asarray if name in qpsolvers.dense_solvers else csc_matrix
 
     def setup(self, qp: QP) -> None:
-        """Nothing is kept from one QP to the next."""
+        """Do nothing: each QP is set up anew."""
 
     def solve(self, qp: QP) -> Solution:
-        """See `mpc.qp.Backend.solve`; each two-sided row or entry of the box becomes two, a side at infinity none."""
+        """See `mpc.qp.Backend.solve`; a two-sided row or box entry becomes two, without infinite sides."""
         started = clock.perf_counter()
         rows = np.concatenate([np.eye(qp.c.size), qp.G])
         lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
@@ -50,7 +50,7 @@ class AnyOfQpsolvers:
             self._matrix(qp.P), qp.c, self._matrix(one_sided), np.concatenate([upper[above], -lower[below]])
         )
         try:
-            with warnings.catch_warnings(action="ignore"):  # of what is converted, or not solved, which the status says
+            with warnings.catch_warnings(action="ignore"):  # about conversions and failures, which the status reports
                 answer = qpsolvers.solve_problem(problem, solver=self._name, **SETTINGS.get(self._name, {}))
         except qpsolvers.QPError:
             answer = qpsolvers.Solution(problem)

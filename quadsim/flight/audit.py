@@ -1,9 +1,9 @@
-"""Limits -> signed margins, at the control samples and at the physics rate, per constraint.
+"""The audit: signed margins of every limit, at the control samples and at the physics rate.
 
-A QP bounds the samples of a linear model; a vehicle has to hold its limits in between as well.  The audit therefore
-reads the plant at the physics rate, and states its tolerances: a verdict is `margin >= -tolerance`.
+A QP bounds the samples of a linear model, but the vehicle must respect its limits between samples too.  The audit
+therefore reads the plant at the physics rate, with stated tolerances: the verdict is `margin >= -tolerance`.
 
-One sign throughout: a margin is the distance to the nearer bound, positive inside, negative beyond it.
+A margin is the signed distance to the nearer bound: positive inside, negative beyond it; see `docs/conventions.md`.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ from quadsim.state import (
 from quadsim.vehicle import N_ROTORS
 
 Mask = NDArray[np.bool_]
-Held = Literal["satisfied", "violated", "incomplete"]
-HELD: Final[dict[str, str]] = {"satisfied": "holds", "violated": "violated", "incomplete": "not reached"}
-"""The verdicts on a constraint in a reader's words."""
+Verdict = Literal["satisfied", "violated", "incomplete"]
+VERDICT_TEXT: Final[dict[str, str]] = {"satisfied": "holds", "violated": "violated", "incomplete": "not reached"}
+"""Display text of the verdicts on a constraint."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Signal:
-    """Something that can be limited: its unit in limits, and how to take it from a log."""
+    """A quantity that can be limited: its unit in limits, and how to read it from a log."""
 
-    unit: str  # unit of the limit, e.g. `deg`
+    unit: str  # unit of its limits, e.g. `deg`
     sampled: Callable[[ControlLog], Array]  # log -> (K,) or (K, j) values at the control samples, in `unit`
     plant: Callable[[PlantLog], Array] | None
-    """log -> (M,) or (M, j) values at the physics rate, or None for what exists at samples only."""
+    """log -> (M,) or (M, j) values at the physics rate, or None for a quantity that exists only at samples."""
 
     def finest(self, log: FlightLog) -> tuple[Array, Array]:
-        """Times [s] and values: of the plant's rows where it exists there, else at the control samples."""
+        """Return times [s] and values at the plant's rate, or at the control samples if the plant has none."""
         if self.plant is None:
             return log.control.t, self.sampled(log.control)
         return log.plant.t, self.plant(log.plant)
@@ -78,7 +78,7 @@ def _body_rate(axis: int) -> Signal:
     def rates(states: Array) -> Array:
         return np.degrees(euler_to_body_rates(states[:, EULER], states[:, EULER_RATE])[:, axis])
 
-    def plant(log: PlantLog) -> Array:  # Euler rates lose their digits near the vertical
+    def plant(log: PlantLog) -> Array:  # Euler rates lose precision near the vertical
         return rates(log.state) if log.body_rates is None else np.degrees(log.body_rates[:, axis])
 
     return Signal(unit="deg/s", sampled=lambda log: rates(log.truth), plant=plant)
@@ -92,7 +92,7 @@ SIGNALS: Final[dict[str, Signal]] = {
         unit="deg", sampled=lambda log: np.degrees(tilt(log.truth)), plant=lambda log: np.degrees(tilt(log.state))
     ),
     **{f"body_rate_{name}": _body_rate(axis) for axis, name in enumerate("xyz")},
-    # Commanded at the samples, acting in between: they differ where rotors saturate.
+    # Commanded at the samples, acting in between: the two differ when rotors saturate.
     "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds),
     "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None),
 }
@@ -106,13 +106,13 @@ TERMS: Final[dict[str, Signal]] = {
     **{name: SIGNALS[name] for name in STATE_NAMES},
     **{f"speed_{i + 1}": _rotor(i) for i in range(N_ROTORS)},
 }
-"""What a sum may have as its terms."""
+"""The terms allowed in a sum."""
 SUM: Final = "sum"  # the signal of a limit on a sum of terms
-CLEARANCE: Final = "clearance"  # the signal of a limit in space: how far the vehicle's bounding ball stays clear [m]
+CLEARANCE: Final = "clearance"  # the signal of a limit in space: clearance of the vehicle's bounding ball [m]
 
 
 def sum_signal(terms: tuple[tuple[str, float], ...]) -> Signal:
-    """A sum of terms, each a name in `TERMS` and its factor."""
+    """Return the signal of a sum of terms, each a name in `TERMS` with its factor."""
     signals = [(factor, TERMS[name]) for name, factor in terms]
     units = {signal.unit for _, signal in signals}
     return Signal(
@@ -126,13 +126,13 @@ def sum_signal(terms: tuple[tuple[str, float], ...]) -> Signal:
 class Limit:
     """Bounds on a signal of the flight.
 
-    `slew` is the command's step per period, `speed` and `slew` hold for every rotor.  A bound that is infinite is none.
-    An entry without bounds stands for the controller's; `scenarios.limits` puts these in.
+    `slew` is the command's step per period; `speed` and `slew` apply to every rotor.  An infinite bound means no bound.
+    An entry without bounds takes the controller's, which `scenarios.limits` fills in.
     """
 
-    name: Annotated[str, doc("what reports call it")] = field(metadata={"pattern": "^[A-Za-z0-9_.-]+$"})
+    name: Annotated[str, doc("name in reports")] = field(metadata={"pattern": "^[A-Za-z0-9_.-]+$"})
     signal: Annotated[
-        str, doc("what is bounded: " + ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items()))
+        str, doc("bounded quantity: " + ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items()))
     ] = field(metadata={"json_schema_extra": {"enum": [*SIGNALS]}})
     lower: Annotated[Number, doc("[unit of the signal] lower bound; both absent: the controller's")] = -math.inf
     upper: Annotated[Number, doc("[unit of the signal] upper bound; both absent: the controller's")] = math.inf
@@ -159,7 +159,7 @@ class Limit:
 
     @property
     def source(self) -> Signal:
-        """What is bounded."""
+        """The bounded quantity."""
         return SIGNALS[self.signal]
 
     @property
@@ -169,22 +169,22 @@ class Limit:
 
     @property
     def has_bounds(self) -> bool:
-        """Whether it states a bound of its own."""
+        """Whether it states its own bounds."""
         return math.isfinite(self.lower) or math.isfinite(self.upper)
 
     @property
     def half_band(self) -> float:
-        """Half of what lies between the bounds; of one bound alone its magnitude, or 1 where that is 0."""
+        """Half the gap between the bounds; the magnitude of a single bound, or 1 if that is 0."""
         if math.isfinite(self.lower) and math.isfinite(self.upper):
             return 0.5 * (self.upper - self.lower)
         return abs(self.lower if math.isfinite(self.lower) else self.upper) or 1.0
 
     def holds_at(self, t: Array) -> Mask:
-        """(K,) whether it holds at times (K,) [s]."""
+        """Return (K,) whether it applies at times (K,) [s]."""
         return (t >= self.start - 1e-9) & (t <= self.stop + 1e-9)
 
     def margin(self, values: Array) -> Array:
-        """(K,) signed distance to the nearer bound, the smallest over rotors; negative = violated."""
+        """Return (K,) the signed distance to the nearer bound, the smallest over rotors; negative = violated."""
         margin = np.minimum(values - self.lower, self.upper - values)
         return margin if margin.ndim == 1 else margin.min(axis=1)
 
@@ -194,7 +194,7 @@ class SumLimit(Limit):
     """Bounds on a sum of signals."""
 
     signal: str = SUM
-    terms: tuple[tuple[str, float], ...]  # the names in `TERMS` and their factors
+    terms: tuple[tuple[str, float], ...]  # names in `TERMS` with their factors
 
     def _check_signal(self) -> None:
         for name, _ in self.terms:
@@ -203,25 +203,25 @@ class SumLimit(Limit):
 
     @property
     def source(self) -> Signal:
-        """What is bounded."""
+        """The bounded quantity."""
         return sum_signal(self.terms)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpaceLimit(Limit):
-    """An obstacle to keep clear of, or a region to stay in."""
+    """An obstacle to avoid, or a region to stay in."""
 
     signal: str = CLEARANCE
     lower: float = 0.0
     shape: Constraining  # the obstacle or region
-    radius: float  # of the vehicle's bounding ball [m]
+    radius: float  # radius of the vehicle's bounding ball [m]
 
     def _check_signal(self) -> None:
-        """None is to be known: it is a distance."""
+        """Do nothing: the signal is a distance."""
 
     @property
     def source(self) -> Signal:
-        """What is bounded."""
+        """The bounded quantity."""
         return Signal(
             unit="m",
             sampled=lambda log: self.shape.clearance(log.t, log.truth[:, POSITION]) - self.radius,
@@ -231,22 +231,22 @@ class SpaceLimit(Limit):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """What the audit found for one limit; margins and peaks in the limit's unit."""
+    """The audit's result for one limit; margins and peaks in the limit's unit."""
 
     limit: Limit  # the limit audited
-    peak_sampled: float  # the value nearest to (or furthest beyond) a bound at the control samples
-    peak_plant: float  # the same at the physics rate; NaN for signals that exist at samples only
+    peak_sampled: float  # value closest to (or furthest beyond) a bound at the control samples
+    peak_plant: float  # the same at the physics rate; NaN for signals that exist only at samples
     worst_margin_sampled: float  # smallest signed margin at the control samples
-    worst_margin: float  # smallest signed margin at the physics rate, or at the samples where the signal has no other
-    worst_time: float  # when that was [s]
+    worst_margin: float  # smallest signed margin at the physics rate, or at the samples if the signal exists only there
+    worst_time: float  # time of the smallest margin [s]
     time_violated: float  # time spent beyond bound plus tolerance [s]
 
     @property
-    def verdict(self) -> Held:
+    def verdict(self) -> Verdict:
         """Whether the limit held, within its tolerances, at the samples and between them.
 
-        `incomplete` where the flight has no value in the limit's time window, as when it ended before.  A window that
-        fell between two samples is judged by the plant.
+        `incomplete` if the flight has no value in the limit's time window, for example because it ended earlier.  The
+        plant decides a window that lies between two samples.
         """
         if math.isnan(self.worst_time):
             return "incomplete"
@@ -255,14 +255,14 @@ class Finding:
 
     @property
     def satisfied(self) -> bool:
-        """Whether the limit was reached, and held."""
+        """Whether the limit was reached and held."""
         return self.verdict == "satisfied"
 
     @property
     def deciding(self) -> tuple[float, float]:
-        """The signed margin that the verdict rests on, at the physics rate unless the samples alone violate the limit.
+        """The decisive signed margin, and its tolerance.
 
-        With it the tolerance that belongs to it.
+        It is taken at the physics rate, unless only the samples violate the limit.
         """
         sampled, margin = self.worst_margin_sampled, self.worst_margin
         if sampled < -self.limit.tolerance_sampled and margin >= -self.limit.tolerance:
@@ -271,38 +271,40 @@ class Finding:
 
     @property
     def deciding_margin(self) -> float:
-        """The first of `deciding`."""
+        """The first entry of `deciding`."""
         return self.deciding[0]
 
 
 def margins_sampled(limit: Limit, log: FlightLog) -> Array:
-    """(K,) signed margins of a limit at the control samples, NaN outside its time window."""
+    """Return (K,) signed margins of a limit at the control samples, NaN outside its time window."""
     return margins_at(limit, log.control.t, limit.source.sampled(log.control))
 
 
 def margins_at(limit: Limit, t: Array, values: Array) -> Array:
-    """(K,) signed margins of a limit on the values of its signal at times t (K,), NaN outside its time window."""
+    """Return (K,) signed margins of a limit for its signal's values at times t (K,), NaN outside its time window."""
     return np.where(limit.holds_at(t), limit.margin(values), np.nan)
 
 
 def smallest_margins(log: FlightLog, limits: Sequence[Limit]) -> dict[str, float]:
-    """Smallest signed margin of each limit by its name, at the finest rate there is; NaN outside its time window."""
+    """Smallest signed margin of each limit, by name, at the highest available rate; NaN outside its window."""
     return {limit.name: _worst(limit, *limit.source.finest(log))[1] for limit in limits}
 
 
 def audit(log: FlightLog, limits: Sequence[Limit]) -> tuple[Finding, ...]:
-    """Hold a flight, its plant rows at the physics rate, against its limits: one finding for each, in order."""
+    """Audit a flight, its plant rows at the physics rate, against its limits: one finding per limit, in order."""
     return tuple(_find(log, limit) for limit in limits)
 
 
 def _find(log: FlightLog, limit: Limit) -> Finding:
     t, values = log.control.t, limit.source.sampled(log.control)
     sampled = peak, margin, time = _worst(limit, t, values)
-    if t.size:  # before the first period nothing was flown
+    if t.size:  # a flight can end before its first period
         t, values = limit.source.finest(log)
         peak, margin, time = _worst(limit, t, values)
     beyond = limit.holds_at(t) & (limit.margin(values) < -limit.tolerance)
-    held = np.diff(t, append=log.plant.t[-1:])  # each value stands until the next, the last until the flight's end
+    durations = np.diff(
+        t, append=log.plant.t[-1:]
+    )  # each value lasts until the next, the last one until the flight's end
     return Finding(
         limit=limit,
         peak_sampled=sampled[0],
@@ -310,12 +312,12 @@ def _find(log: FlightLog, limit: Limit) -> Finding:
         worst_margin_sampled=sampled[1],
         worst_margin=margin,
         worst_time=time,
-        time_violated=round(float(held[beyond].sum()), 9) + 0.0,
+        time_violated=round(float(durations[beyond].sum()), 9) + 0.0,
     )
 
 
 def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
-    """Value, margin and time where the margin is smallest; NaN when the window is empty."""
+    """Return value, margin and time of the smallest margin; NaN if the window is empty."""
     inside = limit.holds_at(t)
     if not inside.any():
         return math.nan, math.nan, math.nan

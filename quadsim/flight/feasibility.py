@@ -1,12 +1,12 @@
-"""What a course requires of a vehicle, before it is flown: differential flatness.
+"""The demands of a course on a vehicle, computed before the flight by differential flatness.
 
-A quadrotor's attitude, rates, torques and rotor speeds follow from where it shall be, its yaw, and their derivatives
-(Mellinger & Kumar 2011, Sec. III).  Derivatives are central differences at the control period: of the samples that a
-controller is given, nothing in between is known to it, and a corner requires a turn within one period.  Three
-cases are left out, where differences would be meaningless:
+A quadrotor's attitude, rates, torques and rotor speeds follow from its position, its yaw, and their derivatives
+(Mellinger & Kumar 2011, Sec.  III). Derivatives are central differences at the control period, of the samples that the
+controller receives: it knows nothing in between, and a corner demands a turn within one period.  Three effects are left
+out, because differences would be meaningless:
 
-- around a jump of the course itself no acceleration is counted (hover is taken);
-- around a kink, where the velocity or its derivative may jump, no torque is counted;
+- around a jump of the course, acceleration (hover is assumed);
+- around a kink, where the velocity or its derivative may jump, torque;
 - wind and drag.
 """
 
@@ -26,54 +26,55 @@ from quadsim.vehicle import Vehicle
 
 STENCIL: Final = 2  # samples on either side that a torque depends on
 TOLERANCE: Final = 1e-6
-"""How far beyond a bound a demand may go, relative to the bound and absolute: rounding in the differences."""
+"""Tolerances of a bound, relative and absolute, for rounding in the differences."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Demand:
-    """What flying a course exactly would take, at K samples."""
+    """The demands of flying a course exactly, at K samples."""
 
     state: Array  # (K, 12) the states of `quadsim.state`, SI
     acceleration: Array  # (K, 3) world [m/s^2]
     thrust: Array  # (K,) of all rotors together [N]
     torque: Array  # (K, 3) body [N m]; 0 around kinks and jumps
-    thrusts: Array  # (K, 4) of each rotor [N]; no rotor can give a negative one
+    thrusts: Array  # (K, 4) thrust per rotor [N]; negative ones are impossible
     speeds: Array  # (K, 4) rotor speeds [rad/s]; 0 where a thrust is negative
-    slews: Array  # (K - 1, 4) their steps from sample to sample, NaN where a torque is left out on either side [rad/s]
+    slews: Array  # (K - 1, 4) speed steps from sample to sample [rad/s], NaN next to an omitted torque
 
 
 @dataclass(frozen=True, kw_only=True)
 class Feasibility:
-    """A course held against a vehicle's limits and a controller's bounds; peaks over the whole course."""
+    """A course compared with a vehicle's limits and a controller's bounds; peaks over the whole course."""
 
     tilt: float  # largest [deg]
     velocity: float  # largest magnitude [m/s]
     acceleration: float  # largest magnitude [m/s^2]
-    yaw: float  # largest magnitude [deg]; a model linearised at zero yaw holds near 0
+    yaw: float  # largest magnitude [deg]; a model linearised at zero yaw is valid near 0
     yaw_rate: float  # largest magnitude [deg/s]
     rotor_min: float  # lowest rotor speed [rad/s]; 0 where a rotor's thrust is negative
     rotor_max: float  # highest rotor speed [rad/s]
     thrust_to_weight: float  # largest
-    thrust_min: float  # least of one rotor [N]; negative: the course is not flyable, whatever the rotors' limits
-    jumps: tuple[float, ...]  # times at which the course itself jumps [s]; the peaks leave them out
+    thrust_min: (
+        float  # least thrust of a rotor [N]; if negative, the course is not flyable, whatever the rotors' limits
+    )
+    jumps: tuple[float, ...]  # times of jumps of the course [s]; the peaks exclude them
     problems: tuple[str, ...]
-    """What is beyond a limit or a bound, a line each; empty for a course that can be flown exactly."""
-    sentence: str  # all this for a person
+    """One line per exceeded limit or bound; empty for a course that can be flown exactly."""
+    sentence: str  # summary for the user
 
 
 def demand(
     course: Array, period: float, vehicle: Vehicle, *, jumps: Mask | None = None, kinks: Mask | None = None
 ) -> Demand:
-    """What flying a sampled course exactly would take.
+    """Compute the demands of flying a sampled course exactly.
 
     With f = a + g e_z, and a frame turned by the yaw psi, the thrust is m |f| along body z = f / |f|, so that
     roll = asin(-f_y / |f|), pitch = atan2(f_x, f_z).  Body rates are those of the attitudes half a period before and
     after, and tau = J d(w)/dt + w x J w; rotor speeds come from thrust and torque by the inverse allocation.
 
     Args:
-        course: (K + 4, 4) x, y, z [m], yaw [rad], world, two samples before the first of interest and two after the
-            last.
-        period: of the samples [s].
+        course: (K + 4, 4) x, y, z [m], yaw [rad], world, with two extra samples on either side.
+        period: sample period [s].
         vehicle: mass, inertia, gravity, rotors.
         jumps: (K + 3,) whether the course jumps between a sample and the next.
         kinks: (K + 3,) whether its velocity, or the derivative of that, may jump there.
@@ -128,15 +129,15 @@ def assess(
     tightened: Mapping[str, tuple[float, float]] | None = None,
     jumps: Sequence[float] = (),
 ) -> Feasibility:
-    """Hold a demand against the vehicle's rotor speeds and a controller's bounds.
+    """Compare demands with the vehicle's rotor speeds and a controller's bounds.
 
     Args:
-        needed: the demand.
-        vehicle: of which the rotor limits count.
-        bounds: lower and upper bound by name, a state of `quadsim.state` in SI, `speed` [rad/s] of the rotors or `slew`
-            [rad/s per period].
-        tightened: what tightening leaves of them at the end of the horizon, of states; looked at where the bounds
-            themselves hold.
+        needed: the demands.
+        vehicle: its rotor limits count.
+        bounds: lower and upper bounds by name: a state of `quadsim.state` in SI, `speed` [rad/s] of the rotors or
+            `slew` [rad/s per period].
+        tightened: the bounds on states after tightening at the end of the horizon; checked if the bounds themselves
+            hold.
         jumps: times [s] at which the course jumps.
     """
     bounds = bounds or {}
@@ -158,11 +159,11 @@ def assess(
 
 
 def _attitudes(pushed: Array, yaw: Array) -> Array:
-    """(M, 3) roll, pitch, yaw [rad] whose body z is along the specific force (M, 3) [m/s^2]."""
+    """(M, 3) roll, pitch, yaw [rad] with body z along the specific force (M, 3) [m/s^2]."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     forward = cos * pushed[:, 0] + sin * pushed[:, 1]
     left = cos * pushed[:, 1] - sin * pushed[:, 0]
-    pitch = np.unwrap(np.arctan2(forward, pushed[:, 2]))  # upside down it goes on beyond 180 deg
+    pitch = np.unwrap(np.arctan2(forward, pushed[:, 2]))  # upside down, pitch continues beyond 180 deg
     roll = np.arctan2(-left, np.hypot(forward, pushed[:, 2]))
     return np.stack([roll, pitch, yaw], axis=1)
 
@@ -173,14 +174,14 @@ def _problems(
     bounds: Mapping[str, tuple[float, float]],
     tightened: Mapping[str, tuple[float, float]],
 ) -> tuple[str, ...]:
-    """A line for each side of a limit or bound that the demand leaves."""
+    """Return one line per side of a limit or bound that the demands exceed."""
     least, most = vehicle.speed_min, vehicle.speed_max
     problems = _beyond("rotor speed", "rad/s", needed.speeds, (least, most), "limit")
     thrust = float(needed.thrusts.min())
     if thrust < -TOLERANCE * vehicle.mass * vehicle.gravity:
         problems.append(f"not flyable: a rotor would need a negative thrust, down to {thrust:.4g} N")
     for name, (lower, upper) in bounds.items():
-        if name == "speed":  # where the vehicle's limit is as narrow, it has been named
+        if name == "speed":  # an equally narrow vehicle limit is already listed
             tighter = (lower if lower > least else -math.inf, upper if upper < most else math.inf)
             problems += _beyond("rotor speed", "rad/s", needed.speeds, tighter, "bound")
         elif name == "slew":

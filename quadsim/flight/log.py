@@ -1,6 +1,6 @@
-"""One flight as stacked arrays with units: the control periods, what a clock measured, and the plant between commands.
+"""One flight as arrays with units: the control periods, clock times, and the plant between commands.
 
-`quadsim.flight.parquet` writes and reads it.
+`quadsim.flight.parquet` writes and reads it; `docs/conventions.md` defines states, frames and times.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ RESIDUALS: Final = (
     *("reported_primal", "reported_dual", "infeasibility"),
     *("kkt_stationarity", "kkt_complementarity", "kkt_dual"),
 )
-"""Columns of numbers that some periods lack: NaN here, null in files; see `quadsim.controller.Command`."""
+"""Columns that some periods lack: NaN here, null in files; see `quadsim.controller.Command`."""
 WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}": "N m" for axis in "xyz"}}
-"""Columns of the external force, world, and torque, body frame, with their units; only where there is any."""
+"""Columns of the external force, world, and torque, body frame, with units; only if there is any."""
 WIND: Final = {f"wind_{axis}": "m/s" for axis in "xyz"}
-"""Columns of the wind, world, with their units; only where there is any."""
+"""Columns of the wind, world, with units; only if there is any."""
 
 QUATERNION: Final = {f"q{axis}": "-" for axis in "wxyz"}
-"""Columns of the attitude, body to world, with their units; only of flights that may turn upside down."""
+"""Columns of the attitude, body to world, with units; only for flights that may turn upside down."""
 BODY_RATES: Final = {f"body_rate_{axis}": "rad/s" for axis in "xyz"}
-"""Columns of the body rates, with their units; likewise."""
+"""Columns of the body rates, with units; same condition."""
 SQP_RESIDUAL: Final = {"sqp_defect": "-", "sqp_step": "-"}
-"""Columns of `quadsim.controller.SQP`, with their units; only of flights by sequential quadratic programming."""
+"""Columns of `quadsim.controller.SQP`, with units; only for flights with sequential quadratic programming."""
 
 Fields = dict[str, dict[str, str]]
 """The fields of a log, each with its columns and their units."""
@@ -85,43 +85,43 @@ class ControlLog:
     """One row per control period k, taken at t_k; K rows."""
 
     t: Array  # (K,) [s]
-    state: Array  # (K, 12) state as measured, which the controller received; units of `STATE_UNITS`
-    truth: Array  # (K, 12) state as it was; the same where measurement is perfect
+    state: Array  # (K, 12) measured state, as the controller received it; units of `STATE_UNITS`
+    truth: Array  # (K, 12) true state; equal if measurement is perfect
     reference: Array  # (K, 4) filtered reference x, y, z [m], yaw [rad] at t_k
-    speeds: Array  # (K, 4) commanded rotor speeds in force at the period's end [rad/s]
+    speeds: Array  # (K, 4) commanded rotor speeds in force at the end of the period [rad/s]
     speeds_before: Array  # (4,) u(-1), the command before the first [rad/s]
     status: tuple[str, ...]
-    """K texts, one of `quadsim.controller.ACCEPTED` or what was instead; see `quadsim.controller.Command`."""
+    """K texts, one of `quadsim.controller.ACCEPTED` or the reason of a rejection; see `quadsim.controller.Command`."""
     answered_by: tuple[str, ...]
     """K texts: `gain`, `core`, a QP solver's name, `law`, `fallback` or `stopped`."""
-    phase: tuple[str, ...]  # K texts, where the flight stood with the ground; see `quadsim.controller.Phase`
-    iterations: np.ndarray[Any, np.dtype[np.int64]]  # (K,) of whoever answered
+    phase: tuple[str, ...]  # K texts, see `quadsim.controller.Phase`
+    iterations: np.ndarray[Any, np.dtype[np.int64]]  # (K,) of the solver that answered
     active: np.ndarray[Any, np.dtype[np.int64]]  # (K,) constraints active at the optimum
     fallback: np.ndarray[Any, np.dtype[np.int64]]  # (K,) 0 none, higher = deeper
     slack: Array  # (K,) largest softening of an output bound [rad]
-    reported_primal: Array  # (K,) as the QP solver reports it; NaN of this and all below where there is none
-    reported_dual: Array  # (K,) likewise
-    infeasibility: Array  # (K,) largest violation of a row as posed, by the plan, less the row's slack [row's unit]
+    reported_primal: Array  # (K,) as reported by the QP solver; here and below NaN if not available
+    reported_dual: Array  # (K,) same
+    infeasibility: Array  # (K,) largest violation of a row by the plan, less the row's slack [row's unit]
     kkt_stationarity: Array  # (K,) residuals computed from the QP; see `quadsim.controller.Command`
-    kkt_complementarity: Array  # (K,) likewise
-    kkt_dual: Array  # (K,) likewise
+    kkt_complementarity: Array  # (K,) same
+    kkt_dual: Array  # (K,) same
     delay: Array  # (K,) simulated time from the measurement to the command [s]
-    attitude: Array | None = None  # (K, 4) quaternion wxyz as measured, sign continuous; None where Euler angles do
-    body_rates: Array | None = None  # (K, 3) as measured [rad/s]; None where Euler angles do
-    sqp: Array | None = None  # (K, 2) of `quadsim.controller.SQP`, NaN in periods without; None where all are
+    attitude: Array | None = None  # (K, 4) measured quaternion wxyz, sign continuous; None if Euler angles suffice
+    body_rates: Array | None = None  # (K, 3) measured body rates [rad/s]; None if Euler angles suffice
+    sqp: Array | None = None  # (K, 2) of `quadsim.controller.SQP`, NaN in periods without; None if all are
     logged: Mapping[str, tuple[str, Array]] = field(default_factory=dict)
     """What the controller logged, by name: unit and values (K,), NaN in periods without."""
 
     @property
     def measured_perfectly(self) -> bool:
-        """Whether the measured state was the true one throughout."""
+        """Whether the measured state always equals the true one."""
         return self.state is self.truth or bool(np.array_equal(self.state, self.truth))
 
     @property
     def measured_error(self) -> Array:
-        """(K, 12) measured less true state; of an attitude that is logged a rotation vector and body rates, body axes.
+        """(K, 12) measured less true state; a logged attitude gives a rotation vector and body rates, body axes.
 
-        Of flights whose attitude is not logged the differences of Euler angles and of their rates.
+        Without one, it is the difference of Euler angles and of their rates.
         """
         error = self.state - self.truth
         if self.attitude is not None and self.body_rates is not None:
@@ -133,7 +133,7 @@ class ControlLog:
 
     @property
     def crashed(self) -> bool:
-        """Whether anything but the feet met the ground."""
+        """Whether anything but the feet touched the ground."""
         return str(Phase.CRASHED) in self.phase
 
     @property
@@ -144,7 +144,7 @@ class ControlLog:
 
 @dataclass(frozen=True, kw_only=True)
 class TimingLog:
-    """What a clock measured, per control period."""
+    """Clock times per control period."""
 
     t: Array
     solve_ms: Array
@@ -159,35 +159,35 @@ class PlantLog:
     state: Array  # (M, 12) true state, yaw unwrapped
     speeds: Array  # (M, 4) rotor speeds from t on [rad/s]; rotors that lag pass through them
     wrench: Array | None = None
-    """(M, 6) external force, world [N], and torque, body frame [N m], from t on; None where there is none."""
+    """(M, 6) external force, world [N], and torque, body frame [N m], from t on; None if there is none."""
     wind: Array | None = None  # (M, 3) velocity of the air, world [m/s]; None without wind
-    attitude: Array | None = None  # (M, 4) true quaternion wxyz; None where Euler angles do
-    body_rates: Array | None = None  # (M, 3) true body rates [rad/s]; None where Euler angles do
+    attitude: Array | None = None  # (M, 4) true quaternion wxyz; None if Euler angles suffice
+    body_rates: Array | None = None  # (M, 3) true body rates [rad/s]; None if Euler angles suffice
 
     def every(self, stride: int) -> PlantLog:
-        """Each `stride`-th row, from the first on."""
+        """Return every `stride`-th row, starting with the first."""
         thinned: dict[str, Any] = {name: None if rows is None else rows[::stride] for name, rows in vars(self).items()}
         return PlantLog(**thinned)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlightLog:
-    """A whole flight, or as much of one as was flown."""
+    """A whole flight, or the part that was flown."""
 
     control: ControlLog  # one row per control period
     timing: TimingLog  # clock times, one row per control period
     plant: PlantLog  # the plant, at the physics rate after a flight, at the log rate when read from a file
     predicted: np.ndarray[Any, np.dtype[np.float32]] | None = None
-    """(K, N, 3) float32 positions [m] predicted at each period for t_{k+1} .. t_{k+N}, N the shortest horizon of its
-    controllers; None where one of them has no model."""
-    reason: str | None = None  # why the flight ended early; None when it was completed
-    interrupted: bool = False  # whether the person flying ended it
-    traceback: tuple[str, ...] = ()  # last lines of what the controller or a force raised, which ended the flight
-    lost: str | None = None  # which of the loss criteria ended it, e.g. `tilt`; None where none did
+    """(K, N, 3) float32 positions [m] predicted in each period for t_{k+1} .. t_{k+N}, N the shortest horizon of its
+    controllers; None if one of them has no model."""
+    reason: str | None = None  # why the flight ended early; None if it was completed
+    interrupted: bool = False  # whether the user ended it
+    traceback: tuple[str, ...] = ()  # last traceback lines of the exception in a controller or force that ended it
+    lost: str | None = None  # loss criterion that ended it, e.g. `tilt`; None if none did
 
     @property
     def aborted(self) -> bool:
-        """Whether the flight was ended by its pilot or by code that raised, not by the vehicle."""
+        """Whether the user or an exception ended the flight, not the vehicle."""
         return self.interrupted or bool(self.traceback)
 
     @property

@@ -15,23 +15,22 @@ from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, TimingLog
 from quadsim.flight.phase import AIRBORNE, Outline, clearance, takeoff_time, touchdown
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
 
-SETTLING_BAND: Final = 0.05  # half width of the band an output has to stay in to be settled, as a share of the step
+SETTLING_BAND: Final = 0.05  # half-width of the settling band, as a share of the step
 
 UNRECOVERED: Final = 1.0
-"""Time that a flight has to be in fallback at its end for that to count as permanent [s]: the longest that one shifted
-plan is held, unless a scenario sets another."""
+"""Time in fallback at the end of a flight that counts as permanent [s]: the default limit on one shifted plan."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CourseStep:
-    """A step that the unfiltered course takes in one channel; angles in rad, lengths in m."""
+    """A step of the unfiltered course in one channel; angles in rad, lengths in m."""
 
     channel: str  # `x`, `y`, `z` or `yaw`
-    time: float  # when the course steps [s]
-    before: float  # the value before; at the start of a flight, where the vehicle is
-    after: float  # the value after
+    time: float  # time of the step [s]
+    before: float  # previous value; at the start of a flight, the vehicle's
+    after: float  # new value
     until: float
-    """When the controller first sees the channel's next step coming, or else the flight is planned to end [s]."""
+    """When the controller first sees the channel's next step, or the planned end of the flight [s]."""
 
 
 def tracking(log: ControlLog) -> dict[str, Any]:
@@ -66,33 +65,32 @@ def tracking(log: ControlLog) -> dict[str, Any]:
 
 
 def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict[str, Any]]:
-    """How long each step of the course takes until the output has settled.
+    """Compute the settling time of each step of the course.
 
-    The settling time runs from the step of the unfiltered course to the first control sample from which on the output
-    stays within `SETTLING_BAND` of the step around its new value.  Samples are looked at up to `until`: a controller
-    with a preview moves before the next step, on purpose.  What steps of the other channels disturb does count.  None
-    where the output does not settle in that time, the flight ended before it was over, or there is no such time, the
-    next step coming into view at once.
+    It runs from the step of the unfiltered course to the first control sample after which the output stays within
+    `SETTLING_BAND` of the step around its new value.  Samples count up to `until`: a controller with a preview moves
+    before the next step, on purpose.  Disturbances by steps of other channels count.  The time is None if the output
+    does not settle, the flight ends too early, or the next step is in view at once.
 
     Returns:
-        One entry per step, in order: the step's own values, and `settled` [s].
+        One entry per step, in order: the step's fields, and `settled` [s].
     """
     period = t[1] - t[0] if t.size > 1 else 0.0
     entries = []
     for step in steps:
-        held = (t >= step.time - 1e-9) & (t <= step.until + 1e-9)
-        error = outputs[held, REFERENCE_NAMES.index(step.channel)] - step.after
+        in_window = (t >= step.time - 1e-9) & (t <= step.until + 1e-9)
+        error = outputs[in_window, REFERENCE_NAMES.index(step.channel)] - step.after
         outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(step.after - step.before))
         first = outside[-1] + 1 if outside.size else 0
-        flown = t.size > 1 and t[-1] + period > step.until - 1e-9
-        settled = round(float(t[held][first] - step.time), 9) if flown and first < error.size else None
+        reached_end = t.size > 1 and t[-1] + period > step.until - 1e-9
+        settled = round(float(t[in_window][first] - step.time), 9) if reached_end and first < error.size else None
         step_taken = {name: getattr(step, name) for name in ("channel", "time", "before", "after")}
         entries.append({**step_taken, "settled": settled})
     return entries
 
 
 def peak_tilt(state: Array) -> float:
-    """The largest magnitude that roll or pitch reaches in states (K, 12) [deg]; each is bounded by itself, Eq. (35)."""
+    """Largest magnitude of roll or pitch in states (K, 12) [deg]; each has its own bound, Eq. (35)."""
     return float(np.degrees(np.abs(state[:, [INDEX["roll"], INDEX["pitch"]]]).max()))
 
 
@@ -111,17 +109,17 @@ def control(log: ControlLog) -> dict[str, float]:
 
 
 def percentiles(values: Array) -> dict[str, float]:
-    """Median, 95th and 99th percentile and maximum."""
+    """Return the median, 95th and 99th percentile and maximum."""
     p50, p95, p99 = np.percentile(values, [50, 95, 99])
     return {"p50": float(p50), "p95": float(p95), "p99": float(p99), "max": float(values.max())}
 
 
 def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[str, Any]:
-    """Counts of statuses, answerers and fallbacks, `unrecovered`, iterations, residuals, times [ms].
+    """Count statuses, answerers and fallbacks; `unrecovered`, iterations, residuals, times [ms].
 
-    `iterations` are those of the periods that the QP solver answered, None where there are none, or several solvers;
-    `iterations_by` has every answerer that iterates.  Of each residual: the largest among accepted answers, and in how
-    many of these periods it was computed.
+    `iterations` covers the periods that the QP solver answered, None if there are none, or several solvers;
+    `iterations_by` lists every answerer that iterates.  Each residual has its largest value among accepted answers, and
+    the number of these periods in which it was computed.
     """
     accepted = np.array([status in ACCEPTED for status in log.status])
     answerers = np.array(log.answered_by)
@@ -150,9 +148,9 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
 
 
 def unrecovered(log: ControlLog) -> int:
-    """Periods in fallback up to the flight's end, from which it never recovered; 0 where they are too short to count.
+    """Return the periods in fallback at the end of a flight that never recovered; 0 if they are too short to count.
 
-    They count from `UNRECOVERED` on, or where the whole flight was in fallback.
+    They count from `UNRECOVERED` on, or if the whole flight was in fallback.
     """
     good = np.flatnonzero(log.fallback == 0)
     periods = log.t.size - (int(good[-1]) + 1 if good.size else 0)
@@ -161,14 +159,14 @@ def unrecovered(log: ControlLog) -> int:
 
 
 def computation(log: ControlLog) -> dict[str, Any]:
-    """Simulated times from measurement to command [ms], and how many commands came too late to be used."""
+    """Simulated times from measurement to command [ms], and the number of commands that came too late."""
     return {"delay_ms": percentiles(1e3 * log.delay), "missed": log.status.count(MISSED)}
 
 
 def estimation(log: ControlLog) -> dict[str, Any]:
     """Errors of the measured state, measured minus true, by state: RMS, and the largest magnitude.
 
-    Samples that are no numbers, as a failed sensor gives them, are counted and left out.
+    Samples that are not numbers, as from a failed sensor, are counted and excluded.
     """
     error = log.measured_error
     finite = np.isfinite(error)
@@ -182,10 +180,10 @@ def estimation(log: ControlLog) -> dict[str, Any]:
 
 
 def ground(log: FlightLog, outline: Outline) -> dict[str, Any]:
-    """How the flight left the ground and met it again, from plant rows at the physics rate.
+    """Summarise take-off and touchdown, from plant rows at the physics rate.
 
     Returns:
-        `started`, `landed` or `flying`; `takeoff_time` [s] and `touchdown`, of feet or hull, each None where there was
+        `started`, `landed` or `flying`; `takeoff_time` [s] and `touchdown`, of feet or hull, each None if there was
         none; `phase`, the last one; `crashed`.
     """
     feet = clearance(log.plant.state, outline.feet, outline.foot_radius, outline.floor)
@@ -200,13 +198,13 @@ def ground(log: FlightLog, outline: Outline) -> dict[str, Any]:
 
 
 def _largest(residuals: Array) -> dict[str, Any]:
-    """The largest of those that are there, None where none is, and how many are."""
+    """Return the largest available residual, None if there is none, and the number of available ones."""
     computed = residuals[np.isfinite(residuals)]
     return {"max": float(computed.max()) if computed.size else None, "periods": computed.size}
 
 
 def flight_numbers(log: FlightLog, deadline_ms: float, course: Sequence[CourseStep] = ()) -> dict[str, Any]:
-    """`tracking`, `control` and `controller` of a summary; each is empty when no period was flown."""
+    """Return `tracking`, `control` and `controller` of a summary; each is empty if no period was flown."""
     if not log.control.t.size:
         return {"tracking": {}, "control": {}, "controller": {}}
     settled = settling(log.control.t, log.control.truth[:, REFERENCE_STATES], course)

@@ -1,8 +1,8 @@
 """A flight log's Parquet files.
 
-Three tables, as in the file contract: what happened once per control period (`flight.parquet`), what a clock measured
-(`timing.parquet`, the only one that differs between two equal flights), and the plant between commands
-(`plant.parquet`).  A fourth, `horizon.parquet`, keeps the predicted positions of every period for pictures.
+Three tables: control periods (`flight.parquet`), clock times (`timing.parquet`, the only one that differs between two
+equal flights), and the plant between commands (`plant.parquet`). A fourth, `horizon.parquet`, keeps the predicted
+positions of every period for figures and films.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def _table(columns: Iterable[_Column], metadata: Mapping[str, str]) -> pa.Table:
 
 
 def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, str]) -> dict[str, pa.Table]:
-    """A flight's tables `flight`, `timing`, `plant`, and `horizon` where positions were predicted; see `write_log`."""
+    """A flight's tables `flight`, `timing`, `plant`, and `horizon` if positions were predicted; see `write_log`."""
     control = log.control
     fields = {name: units for name, units in CONTROL.items() if name != "truth" or not control.measured_perfectly}
     before = ",".join(repr(float(speed)) for speed in control.speeds_before)
@@ -102,27 +102,27 @@ def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, 
 def write_log(directory: Path, log: FlightLog, *, plant_stride: int, metadata: Mapping[str, str]) -> None:
     """Write a flight's Parquet files into an existing directory.
 
-    Every `plant_stride`-th physics step is a row of `plant.parquet`; `metadata`, texts without clock times, is stored
+    Every `plant_stride`-th physics step is a row of `plant.parquet`. `metadata`, texts without clock times, is stored
     in each file's schema.
     """
     for name, table in log_tables(log, plant_stride=plant_stride, metadata=metadata).items():
-        with (directory / f"{name}.parquet").open("wb") as file:  # Arrow by itself takes no path that is no Unicode
+        with (directory / f"{name}.parquet").open("wb") as file:  # Arrow takes no path that is not Unicode
             pq.write_table(table, file, compression="zstd")
 
 
 def read_parquet(path: Path) -> pa.Table:
-    """A Parquet file, read by the calling thread alone.
+    """Read a Parquet file in the calling thread.
 
-    Arrow's own threads may still hold the file when Python ends, and a thread that takes Python's lock then aborts the
+    Arrow's own threads may still hold the file when Python exits; a thread that then takes Python's lock aborts the
     process (https://github.com/apache/arrow/issues/34314).
 
     Raises:
-        FileError: it is missing, no file, or damaged.
+        FileError: it is missing, not a file, or damaged.
     """
-    if not path.is_file():  # reading a pipe would not end
-        raise FileError(path, "is not a readable Parquet file (it is missing or no file)")
+    if not path.is_file():  # reading a pipe would block
+        raise FileError(path, "is not a readable Parquet file (missing, or not a file)")
     try:
-        with path.open("rb") as file:  # Arrow by itself takes no path that is no Unicode
+        with path.open("rb") as file:  # Arrow takes no path that is not Unicode
             return pq.ParquetFile(file, pre_buffer=False).read(use_threads=False)
     except (OSError, ValueError, pa.ArrowException) as error:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
@@ -172,7 +172,7 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
         predicted = _read_predicted(directory / HORIZON_FILE)
         rows = {control.t.size, timing_log.t.size, *(() if predicted is None else (len(predicted),))}
         if len(rows) > 1 or not plant_log.t.size:
-            raise ValueError("its tables have not as many rows as one another, or none")
+            raise ValueError("its tables are empty or differ in length")
         for t in (control.t, plant_log.t):
             if not np.isfinite(t).all() or (np.diff(t) <= 0.0).any():
                 raise ValueError("t does not increase")
@@ -188,5 +188,5 @@ def _read_predicted(path: Path) -> np.ndarray[Any, np.dtype[np.float32]] | None:
         return None
     table = read_parquet(path)
     columns = [table.column(f"predicted_{axis}").combine_chunks() for axis in "xyz"]
-    shape = (table.num_rows, columns[0].type.list_size)  # also right for a flight of no period
+    shape = (table.num_rows, columns[0].type.list_size)  # also valid for a flight without periods
     return np.stack([column.flatten().to_numpy().reshape(shape) for column in columns], axis=-1)

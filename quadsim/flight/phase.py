@@ -1,4 +1,4 @@
-"""Ground and loss: what of a vehicle may touch the ground, the phase of its flight, and whether it is lost."""
+"""Ground contact and loss: the parts that may touch the ground, the phase of the flight, and the loss criteria."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from quadsim.rotation import body_to_world
 from quadsim.space import Obstacle, Solids
 from quadsim.state import EULER, INDEX, POSITION, REFERENCE_NAMES, Array, tilt
 
-AIRBORNE: Final = 0.05  # clearance of the feet [m] above which a vehicle flies: no landing gear springs back that far
-TOUCH: Final = 2e-3  # clearance [m] from which on a part touches: contacts are soft, and points stand for rounded parts
+AIRBORNE: Final = 0.05  # clearance of the feet [m] above which a vehicle flies; no landing gear springs back that far
+TOUCH: Final = 2e-3  # clearance [m] below which a part touches: contacts are soft, and points represent rounded parts
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outline:
-    """Where an airframe can touch the ground, in the body frame; at rest on its feet its origin is at z = 0."""
+    """The parts of an airframe that can touch the ground, body frame; at rest on its feet its origin is at z = 0."""
 
     feet: Array  # (4, 3) centres of the feet [m]
     foot_radius: float  # [m]
-    hull: Array  # (P, 3) points of what must not touch: the rims of the rotor discs and the underside [m]
+    hull: Array  # (P, 3) points that must not touch: the rims of the rotor discs and the underside [m]
     floor: float  # height of the floor [m]
     disc: float  # height of the rotor discs above the origin [m]
 
 
 def clearance(states: Array, points: Array, radius: float, floor: float) -> Array:
-    """How far the lowest of several points stays clear of the floor, negative inside it.
+    """Clearance of the lowest of several points above the floor, negative inside it.
 
-    min over p of (position + R p)_z - radius - floor [m], (M,), of states (M, 12), points (P, 3) in the body frame [m],
-    a sphere's radius around each of them and the floor's height [m].
+    min over p of (position + R p)_z - radius - floor [m], (M,), for states (M, 12), points (P, 3) in the body frame
+    [m], the radius of a sphere around each point, and the floor's height [m].
     """
     down = body_to_world(states[:, EULER])[:, 2, :] @ points.T
     lowest: Array = states[:, INDEX["z"]] + down.min(axis=1) - radius - floor
@@ -42,37 +42,38 @@ def clearance(states: Array, points: Array, radius: float, floor: float) -> Arra
 
 
 def touchdown(t: Array, states: Array, clearances: Array) -> dict[str, float] | None:
-    """The first touch after the vehicle has flown; None where there is none.
+    """Return the first touch after take-off; None if there is none.
 
     Args:
         t: (M,) [s].
-        states: (M, 12), at the physics rate: at the log rate the speed is that of up to a log period before.
-        clearances: (M,) of what may meet the ground first [m].
+        states: (M, 12), at the physics rate; at the log rate, the speed is up to one log period old.
+        clearances: (M,) of the parts that may touch first [m].
 
     Returns:
-        Of the last state before: `time` [s], `speed` downwards and `horizontal_speed` [m/s], and `tilt` [deg].
+        From the last state before the touch: `time` [s], `speed` downwards and `horizontal_speed` [m/s], and `tilt`
+            [deg].
     """
-    flown = np.flatnonzero(clearances > AIRBORNE)
-    if not flown.size:
+    airborne = np.flatnonzero(clearances > AIRBORNE)
+    if not airborne.size:
         return None
-    met = np.flatnonzero(clearances[flown[0] :] <= TOUCH)
+    met = np.flatnonzero(clearances[airborne[0] :] <= TOUCH)
     if not met.size:
         return None
-    last = flown[0] + met[0] - 1
+    last = airborne[0] + met[0] - 1
     vx, vy, vz = (float(states[last, INDEX[name]]) for name in ("vx", "vy", "vz"))
     lean = float(np.degrees(tilt(states[last : last + 1])[0]))
     return {"time": float(t[last]), "speed": -vz, "horizontal_speed": math.hypot(vx, vy), "tilt": lean}
 
 
 def takeoff_time(t: Array, clearances: Array) -> float | None:
-    """When a vehicle that starts on the ground first flies [s]; None where it starts in the air or stays down."""
-    flown = np.flatnonzero(clearances > AIRBORNE)
-    return float(t[flown[0]]) if flown.size and flown[0] > 0 else None
+    """Return when a vehicle that starts on the ground takes off [s]; None if it starts in the air or stays down."""
+    airborne = np.flatnonzero(clearances > AIRBORNE)
+    return float(t[airborne[0]]) if airborne.size and airborne[0] > 0 else None
 
 
-TAKEOFF_RISE: Final = 0.05  # how far above the resting height a reference has to rise to require flight [m]
-REST: Final = 0.2  # how long the feet have to touch the ground without a break for the vehicle to have landed [s]
-CAPSIZED: Final = 60.0  # tilt [deg] beyond which a vehicle that touches the ground has crashed
+TAKEOFF_RISE: Final = 0.05  # rise of the reference above the resting height that calls for a take-off [m]
+REST: Final = 0.2  # uninterrupted contact of the feet after which the vehicle has landed [s]
+CAPSIZED: Final = 60.0  # tilt [deg] above which a vehicle that touches the ground has crashed
 
 CRITERIA: Final = {
     "tilt": ("the thrust axis is tilted by", "deg"),
@@ -80,24 +81,24 @@ CRITERIA: Final = {
     "depth": ("the depth below the lowest of start and reference is", "m"),
     "speed": ("the speed is", "m/s"),
 }
-"""Each criterion by its name in `[lost]`, with its unit; the first that is met is the reason."""
+"""Criteria by their name in `[lost]`, with units; the first one met is the reason."""
 
 
 class PhaseMonitor:
-    """Determines, once per control period, whether the vehicle stands, is about to take off, flies or has crashed.
+    """Determines the phase of flight once per control period.
 
     - The first state decides: `landed` up to a clearance of `AIRBORNE`, else `flying`.
     - On the ground it is `armed` while the previewed reference rises more than `TAKEOFF_RISE` above the resting height,
       else `landed`; from `armed` it is `flying` as soon as the clearance exceeds `AIRBORNE`.
     - From `flying` it is `landed` once the feet have touched for `REST` and the whole preview stays on the ground.
-    - From any phase, it has `crashed`, permanently, when anything but the feet touches the ground, or the feet do with
-      the vehicle tilted beyond `CAPSIZED`, or when the vehicle's bounding ball touches an obstacle.
+    - From any phase it becomes `crashed`, permanently, when anything but the feet touches the ground, when the feet
+      touch with a tilt beyond `CAPSIZED`, or when the vehicle's bounding ball touches an obstacle.
 
     Args:
-        outline: what may touch the ground, and where that is; None where there is no ground.
+        outline: the parts that may touch the ground; None without ground.
         period: the control period [s].
-        obstacles: what must not be touched.
-        radius: of the vehicle's bounding ball [m].
+        obstacles: objects that must not be touched.
+        radius: radius of the vehicle's bounding ball [m].
     """
 
     def __init__(
@@ -106,20 +107,22 @@ class PhaseMonitor:
         self._outline, self._obstacles, self._radius = outline, Solids(obstacles), radius
         if outline is not None:
             self._takeoff_height = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + TAKEOFF_RISE
-            self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # higher up nothing can touch
+            self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # nothing can touch above it
             self._periods_of_rest = math.ceil(REST / period - 1e-9)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the flight: the next state is the first."""
+        """Restart: the next state is the first."""
         self._phase: Phase | None = None
         self._touched = 0
 
     def advance(self, t: Array, states: Array, preview: Array) -> Phase:
-        """The phase of the control period that starts now.
+        """Return the phase of the control period that starts now.
 
-        Of true states (M, 12) at times (M,) [s] since the last period began, the last of them now, and of the reference
-        (N, 4) that the controller is about to see.
+        Args:
+            t: (M,) times since the last period began [s], the last one now.
+            states: (M, 12) true states at these times.
+            preview: (N, 4) the reference that the controller is about to receive.
         """
         if (self._obstacles.clearances(t, states[:, POSITION])[0] <= self._radius).any():
             self._phase = Phase.CRASHED
@@ -150,19 +153,19 @@ class PhaseMonitor:
 
 
 def check_loss(limits: Mapping[str, float], time: float, state: Array, reference: Array, lowest: float) -> None:
-    """End the flight where its vehicle is lost.
+    """End the flight if its vehicle is lost.
 
     Args:
-        limits: the largest value of each of `CRITERIA`; one that is left out is not checked.
-        time: of the sample [s].
-        state: (12,) the true one.
+        limits: the largest value of each of `CRITERIA`; a missing one is not checked.
+        time: sample time [s].
+        state: (12,) the true state.
         reference: (4,) x, y, z [m], yaw [rad] at the same time.
-        lowest: height of the lowest of the start and the reference so far [m].
+        lowest: the lowest height of the start and the reference so far [m].
 
     Raises:
         LostError: a criterion is met.
     """
-    x, vx, y, vy, z, vz, roll, _, pitch, *_ = state.tolist()  # of so few numbers floats are quicker than arrays
+    x, vx, y, vy, z, vz, roll, _, pitch, *_ = state.tolist()  # floats are faster than arrays of so few numbers
     tilt = math.degrees(math.acos(math.cos(roll) * math.cos(pitch)))
     distance = math.dist((x, y, z), reference[:3].tolist())
     values = (tilt, distance, lowest - z, math.hypot(vx, vy, vz))

@@ -1,4 +1,4 @@
-"""A run's directory: tables, scenario and `summary.json`, each file with its SHA-256, read back."""
+"""A run's directory: tables, scenario and `summary.json`, with the SHA-256 of each file; how to read it back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from types import NoneType
 from typing import Any, Final
 
 from quadsim.errors import FileError, printable
-from quadsim.flight.audit import Finding, Held, Limit, SpaceLimit, SumLimit
+from quadsim.flight.audit import Finding, Limit, SpaceLimit, SumLimit, Verdict
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_log
 from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
@@ -22,7 +22,7 @@ from quadsim.vehicle import Vehicle
 
 NUMBER: Final = (int, float)
 MAYBE_NUMBER: Final = (int, float, NoneType)
-LARGEST_FILE: Final = 64_000_000  # size [bytes] of the largest file that is read
+LARGEST_FILE: Final = 64_000_000  # largest file [bytes] that is read
 _FORM: Final = {
     **dict.fromkeys(("scenario", "status"), str),
     "reason": (str, NoneType),
@@ -40,18 +40,18 @@ _CONSTRAINT: Final = {
         MAYBE_NUMBER,
     ),
 }
-"""What verdicts and pages rest on; the rest is trusted."""
+"""Entries on which verdicts and pages depend; the rest is trusted."""
 
 
 def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
-    """A JSON object from a file of quadsim's, `what` for messages; `form` has the type of each entry that it must have.
+    """Read a JSON object that quadsim wrote; `what` names it in messages, `form` gives the types of its entries.
 
     Raises:
-        FileError: it cannot be read, is no JSON, or an entry is missing or of another type.
+        FileError: it cannot be read, is not JSON, or an entry is missing or of another type.
     """
     try:
         if path.stat().st_size > LARGEST_FILE:
-            raise FileError(path, f"is not {what}: it must be of {LARGEST_FILE} or fewer bytes")
+            raise FileError(path, f"is not {what}: it has more than {LARGEST_FILE} bytes")
         table = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
     except (OSError, RecursionError, ValueError) as error:
         if isinstance(error, FileError):
@@ -63,24 +63,26 @@ def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
 
 
 def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no number of JSON")
+    raise ValueError(f"{constant} is not a JSON number")
 
 
 def _misfits(table: object, form: Mapping[str, Any]) -> list[str]:
-    """Entries of a table that are missing or of another type; true and false are no numbers."""
-    held = table if isinstance(table, dict) else {}
+    """Return the entries of a table that are missing or of another type; true and false are not numbers."""
+    entries = table if isinstance(table, dict) else {}
     return [
         name
         for name, kind in form.items()
-        if name not in held or not isinstance(held[name], kind) or (isinstance(held[name], bool) and kind is not bool)
+        if name not in entries
+        or not isinstance(entries[name], kind)
+        or (isinstance(entries[name], bool) and kind is not bool)
     ]
 
 
 def read_summary(directory: Path) -> dict[str, Any]:
-    """`summary.json` of a run directory.
+    """Read `summary.json` of a run directory.
 
     Raises:
-        FileError: there is none, quadsim did not write it, or a link leads out of the directory.
+        FileError: it is missing, was not written by quadsim, or a link leads out of the directory.
     """
     require_inside(directory)
     path = directory / SUMMARY_FILE
@@ -94,20 +96,20 @@ def read_summary(directory: Path) -> dict[str, Any]:
 
 
 def require_inside(directory: Path) -> None:
-    """Refuse to read a directory that holds a link out of it; links within it are no harm.
+    """Refuse to read a directory that contains a link to its outside; links within it are harmless.
 
     Raises:
         FileError: naming the first such link.
     """
     home = directory.resolve()
-    for folder, folders, files in os.walk(directory):  # which follows no link to a folder
+    for folder, folders, files in os.walk(directory):  # follows no link to a folder
         for path in (Path(folder, name) for name in sorted((*folders, *files))):
             if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(home):
                 raise FileError(path, f"is a link that leads out of {directory}; nothing is read through it")
 
 
 def limit_to_json(finding: Finding) -> dict[str, Any]:
-    """One entry of `constraints` in `summary.json`; an absent bound, or a window the flight never reached, is null."""
+    """Return an entry of `constraints` in `summary.json`; null for an absent bound or a window that was not reached."""
     limit = finding.limit
     stated = {name: value for name, value in vars(limit).items() if name not in ("name", "signal", "terms", "shape")}
     audited = {name: value for name, value in vars(finding).items() if name != "limit"}
@@ -124,7 +126,7 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
 
 
 def limit_from_json(entry: Mapping[str, Any]) -> Limit:
-    """The limit that `limit_to_json` wrote."""
+    """Return the limit that `limit_to_json` wrote."""
     absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
     values = {field.name: entry[field.name] for field in fields(Limit)}
     values |= {name: bound for name, bound in absent.items() if values[name] is None}
@@ -136,19 +138,19 @@ def limit_from_json(entry: Mapping[str, Any]) -> Limit:
 
 
 def finding_from_json(entry: Mapping[str, Any]) -> Finding:
-    """The finding that `limit_to_json` wrote."""
+    """Return the finding that `limit_to_json` wrote."""
     names = ("peak_sampled", "peak_plant", "worst_margin_sampled", "worst_margin", "worst_time", "time_violated")
     values = {name: math.nan if entry[name] is None else float(entry[name]) for name in names}
     return Finding(limit=limit_from_json(entry), **values)
 
 
-def constraint_verdict(entry: Mapping[str, Any]) -> Held:
-    """The verdict on a constraint of a summary that follows from its margins."""
+def constraint_verdict(entry: Mapping[str, Any]) -> Verdict:
+    """Return the verdict on a constraint of a summary, from its margins."""
     return finding_from_json(entry).verdict
 
 
 def deciding_margin(entry: Mapping[str, Any]) -> tuple[float | None, float]:
-    """The margin that this verdict rests on, None where there is none, and its tolerance."""
+    """Return the margin that decides this verdict, None if there is none, and its tolerance."""
     margin, tolerance = finding_from_json(entry).deciding
     return None if math.isnan(margin) else margin, tolerance
 
@@ -163,10 +165,10 @@ FIGURES_DIR: Final = "figures"
 class Run:
     """A finished run, read back from its directory."""
 
-    directory: Path  # where it is
+    directory: Path  # its path
     summary: dict[str, Any]  # `summary.json`
     log: FlightLog  # the flight, its plant rows at the log rate
-    vehicle: Vehicle  # the vehicle flown, as it really is
+    vehicle: Vehicle  # the vehicle flown, with its actual parameters
     limits: tuple[Limit, ...]  # the constraints it was audited against
 
     @property
@@ -199,6 +201,6 @@ def load_run(directory: Path) -> Run:
 
 
 def damaged_files(directory: Path, summary: Mapping[str, Any]) -> list[str]:
-    """Files named in the summary that are missing or whose SHA-256 is not the recorded one."""
+    """Return the files named in the summary that are missing or whose SHA-256 differs."""
     digests = file_hashes(directory)
     return [name for name, digest in summary["files"].items() if digests.get(name) != digest]

@@ -14,7 +14,7 @@ import numpy as np
 
 from quadsim.controller import Phase, law_name
 from quadsim.errors import printable
-from quadsim.flight.audit import HELD
+from quadsim.flight.audit import VERDICT_TEXT
 from quadsim.flight.rundir import constraint_verdict, deciding_margin
 from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
 from quadsim.space import SHAPES, Obstacle
@@ -145,11 +145,11 @@ def required(summary: Summary) -> Cell:
     """The verdict on the constraints that the scenario demands, naming those that do not hold."""
     demanded = [entry for entry in summary["constraints"] if entry["required"]]
     failing = {
-        what: [entry["name"] for entry in demanded if constraint_verdict(entry) == verdict]
-        for verdict, what in HELD.items()
+        text: [entry["name"] for entry in demanded if constraint_verdict(entry) == verdict]
+        for verdict, text in VERDICT_TEXT.items()
         if verdict != "satisfied"
     }
-    if parts := [f"{what}: {', '.join(names)}" for what, names in failing.items() if names]:
+    if parts := [f"{text}: {', '.join(names)}" for text, names in failing.items() if names]:
         return Cell(text="; ".join(parts), mark=Mark.BAD if failing["violated"] else Mark.WARN)
     return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none")
 
@@ -196,10 +196,10 @@ def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
 
 def _step_time_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
     measures = {"p50": "median", "p95": "95th percentile", "p99": "99th percentile", "max": "maximum"}
-    for clock, what in {"step_ms": "whole step", "solve_ms": "optimum alone, by whoever answered"}.items():
+    for clock, part in {"step_ms": "whole step", "solve_ms": "optimum alone, by whoever answered"}.items():
         for measure, label in measures.items():
             values = [nested(summary, "controller", clock, measure) for summary in summaries]
-            yield _best_smallest("Time", f"{what}, {label}", "ms", summaries, values)
+            yield _best_smallest("Time", f"{part}, {label}", "ms", summaries, values)
 
 
 def _best_smallest(
@@ -238,22 +238,22 @@ def _verdict(entry: Summary) -> Cell:
 
     For example `holds (margin -0.0376 deg, tolerance 0.05)`.
     """
-    held = constraint_verdict(entry)
-    finding = HELD[held]
-    if held == "violated" and not entry["required"]:
-        finding = "exceeded, not required"
-    if held != "incomplete":
+    verdict = constraint_verdict(entry)
+    text = VERDICT_TEXT[verdict]
+    if verdict == "violated" and not entry["required"]:
+        text = "exceeded, not required"
+    if verdict != "incomplete":
         margin, tolerance = deciding_margin(entry)
         at_samples = " at the samples" if margin != entry["worst_margin"] else ""
-        finding += f" (margin {format_number(margin)} {entry['unit']}{at_samples}, tolerance {tolerance:g})"
-    return Cell(text=finding, mark=_verdict_mark(entry))
+        text += f" (margin {format_number(margin)} {entry['unit']}{at_samples}, tolerance {tolerance:g})"
+    return Cell(text=text, mark=_verdict_mark(entry))
 
 
 def _verdict_mark(entry: Summary) -> Mark:
-    held = constraint_verdict(entry)
-    if held == "satisfied":
+    verdict = constraint_verdict(entry)
+    if verdict == "satisfied":
         return Mark.GOOD
-    return Mark.BAD if held == "violated" and entry["required"] else Mark.WARN
+    return Mark.BAD if verdict == "violated" and entry["required"] else Mark.WARN
 
 
 def _margin(key: str, tolerance: str) -> Callable[[Summary], Cell]:

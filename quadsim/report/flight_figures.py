@@ -104,10 +104,10 @@ def overview(runs: Sequence[Run]) -> Figure:
     return _timed("comparison", "", (*(_signal(runs, name) for name in names), rotors), runs)
 
 
-def signals(run: Run, names: Sequence[str]) -> Figure:
-    """Signals of the audit over time, and `xy`, the path from above, a panel each."""
-    panels = tuple(_above(run) if name == "xy" else _signal([run], name) for name in names)
-    return _timed("signals", "", panels, [run], columns=1)
+def signals(runs: Sequence[Run], names: Sequence[str]) -> Figure:
+    """Signals of the audit over time, and `xy`, the first run's path from above, a panel each."""
+    panels = tuple(_above(runs[0]) if name == "xy" else _signal(runs, name) for name in names)
+    return _timed("signals", "", panels, runs, columns=1)
 
 
 def states(runs: Sequence[Run]) -> Figure:

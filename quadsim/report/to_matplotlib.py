@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
 import textwrap
+from base64 import b64encode
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -41,6 +43,7 @@ STYLE: Final[dict[RcKeyType, Any]] = {
     "ytick.labelcolor": "#1c1e21",
 }
 _WIDTH, _ROW, _HEAD = 9.6, 1.95, 0.7  # of a figure, of a row of panels and of what stands above and below them [in]
+_LARGEST_SVG, _NOTEBOOK_DPI = 40_000, 55
 _LABEL: Final = 26  # characters beside a vertical axis
 _DASHES: Final = (0, (5, 2))
 _MARKERS: Final = {
@@ -75,6 +78,22 @@ def to_png(figure: Figure, dpi: float | None = None) -> bytes:
     with matplotlib.rc_context(STYLE):
         draw(figure).savefig(png, format="png", dpi=dpi or DPI)
     return png.getvalue()
+
+
+def to_html(figure: Figure) -> str:
+    """The figure for a notebook: SVG, or PNG where its curves make that large."""
+    import matplotlib
+
+    svg = io.StringIO()
+    with matplotlib.rc_context({**STYLE, "svg.fonttype": "none", "svg.hashsalt": figure.key}):
+        nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
+        draw(figure).savefig(svg, format="svg", metadata=nothing, dpi=72)
+    text = svg.getvalue()
+    text = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d)\d+", r"\1", path[0]), text[text.index("<svg") :])
+    if len(text) <= _LARGEST_SVG:
+        return text
+    png = b64encode(to_png(figure, dpi=_NOTEBOOK_DPI)).decode()
+    return f'<img alt="{figure.key}" src="data:image/png;base64,{png}">'
 
 
 def draw(figure: Figure, *, interactive: bool = False) -> Canvas:

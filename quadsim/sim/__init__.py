@@ -1,1 +1,1 @@
-"""What moves: the plant and its effects, sensors, state estimation, and the closed loop."""
+"""The simulation: plant and effects, sensors, state estimation, and the closed loop."""

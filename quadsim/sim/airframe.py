@@ -1,4 +1,4 @@
-"""From a vehicle to a compiled MuJoCo model: `models/quadrotor.xml` gives the shape, the vehicle gives the numbers."""
+"""Compile a vehicle into a MuJoCo model: `models/quadrotor.xml` gives the shape, the vehicle file the numbers."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ ROTOR_NAMES, ARM_NAMES, FOOT_NAMES, DISC_NAMES, PROPELLER_NAMES = (
 )
 
 DRAWN_ARM: Final = 0.3  # arm length [m] for which `quadrotor.xml` is drawn
-_WIDEST_DISC: Final = 0.48  # largest radius of a rotor disc, in distances between neighbouring rotors: discs never meet
+_WIDEST_DISC: Final = 0.48  # largest disc radius, in distances between rotors, so that discs never overlap
 _IDLE: Final = (mujoco.mjtDisableBit.mjDSBL_SPRING, mujoco.mjtDisableBit.mjDSBL_DAMPER)
-"""Stages of MuJoCo's step with nothing to do for a free body; with those of contact a sixth of its time."""
+"""Stages of MuJoCo's step that do nothing for a free body; with contact they take a sixth of its time."""
 _CONTACT: Final = (mujoco.mjtDisableBit.mjDSBL_CONSTRAINT, mujoco.mjtDisableBit.mjDSBL_CONTACT)
-"""Stages that only a body which may meet the ground needs."""
+"""Stages needed only by a body that may touch the ground."""
 _STIFFNESS: Final = (0.005, 1.0)
 """Time constant [s] and damping ratio of a contact (MuJoCo's solref); five steps, where MuJoCo requires two or more."""
 _FRICTION: Final = (0.8, 0.005, 0.0001)
-"""Sliding [-], torsional and rolling [m] friction between rubber feet and a hard floor; the first is a textbook value,
-the others MuJoCo's own."""
-_MEETS: Final = 1  # the bit of contype and conaffinity by which floor and airframe meet
+"""Sliding [-], torsional and rolling [m] friction between rubber feet and a hard floor: a textbook value, and MuJoCo's
+defaults."""
+_MEETS: Final = 1  # bit of contype and conaffinity for contact of floor and airframe
 _MEETS_OBSTACLES: Final = 2
-"""The bit of contype and conaffinity by which obstacles and the vehicle's bounding ball meet."""
+"""Bit of contype and conaffinity for contact of obstacles and the vehicle's bounding ball."""
 OBSTACLE_COLOUR: Final = (0.72, 0.36, 0.28, 1.0)
 _RIM: Final = 32
-"""Points that stand for the rim of a rotor disc: its lowest point is missed by half a percent of its radius at most."""
+"""Points on the rim of a rotor disc; they miss its lowest point by at most half a percent of its radius."""
 DRAG: Final = "drag"
 _BLUNT: Final = (0.5, 0.0, 0.0, 0.0, 0.0)
-"""Fluid coefficients that make MuJoCo's ellipsoid drag -rho C_blunt A |v| v into -rho A |v| v / 2; added mass stays."""
+"""Fluid coefficients that turn MuJoCo's ellipsoid drag -rho C_blunt A |v| v into -rho A |v| v / 2; added mass stays."""
 
 
 def outline(vehicle: Vehicle) -> Outline:
-    """What of the airframe meets the ground first."""
+    """Return the parts of the airframe that touch the ground first."""
     model = compile_model(vehicle, visuals=True)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -75,26 +75,26 @@ def compile_model(
     air_density: float = 0.0,
     obstacles: Sequence[Obstacle] = (),
 ) -> mujoco.MjModel:
-    """Compile the airframe with every physical number taken from the vehicle.
+    """Compile the airframe with all physical numbers from the vehicle.
 
-    Actuator i takes the thrust f_i = b w_i^2 [N] as its control and acts on site i along the site's z axis; the
-    sixth entry of its gear turns thrust into reaction torque, spin_i d / b [m].
+    Actuator i takes the thrust f_i = b w_i^2 [N] as its control and acts on site i along the site's z axis; the sixth
+    entry of its gear converts thrust to reaction torque, spin_i d / b [m].
 
     Args:
         vehicle: the numbers.
         timestep: physics step [s].
         limit_speeds: whether thrusts saturate at the vehicle's rotor speed range; else any thrust >= 0 acts.
-        visuals: whether to keep what only shows or measures (geoms, lights, cameras, sensors), fitted to the
-            vehicle's arms.  None of it moves the vehicle: without it every state is the same to the last bit, in half
+        visuals: whether to keep parts that only display or measure (geoms, lights, cameras, sensors), fitted to the
+            vehicle's arms.  They do not affect the motion: without them every state is equal to the last bit, in half
             the time.
-        contact: whether feet and hull meet the floor.
-        reweighed: whether the body's mass may be changed once compiled; see `quadsim.sim.effects.load.apply_mass`.
+        contact: whether feet and hull touch the floor.
+        reweighed: whether the body's mass may change after compilation; see `quadsim.sim.effects.load.apply_mass`.
         body_drag: drag areas C_d A along the body axes [m^2], or None.  The drag is MuJoCo's own, on the ellipsoid
-            whose projected areas they are: -rho A |v| v / 2 against the air that `option.wind` moves.  With it come
-            the ellipsoid's added-mass terms: a few grams of air, and a torque where it flies aslant (Munk's moment),
-            which a vehicle of some 200 g feels at 5 m/s.
+            with these projected areas: -rho A |v| v / 2 against the air that `option.wind` moves.  It includes the
+            ellipsoid's added-mass terms: a few grams of air, and a torque in oblique flow (Munk's moment), which a
+            vehicle of some 200 g feels at 5 m/s.
         air_density: rho [kg/m^3].
-        obstacles: what the vehicle's bounding ball meets; those that move are mocap bodies of their names.
+        obstacles: objects that the vehicle's bounding ball touches; moving ones are mocap bodies with their names.
     """
     spec = mujoco.MjSpec.from_file(str(models_dir() / "quadrotor.xml"))
     spec.option.timestep = timestep

@@ -1,4 +1,4 @@
-"""The time that a command takes to be computed, simulated: a slow solver flies, and the same way everywhere."""
+"""Computation time as simulated time: a slow solver affects the flight reproducibly."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from quadsim.fields import Instant, Positive
 
 @dataclass(frozen=True, kw_only=True)
 class Stall:
-    """The computer answers nothing for a while; a command being computed waits for its end."""
+    """The computer stops answering for a while; a command being computed waits until it resumes."""
 
     at: Instant
     type: Annotated[Literal["stall"], doc("kind of event: stall")] = "stall"
-    duration: Annotated[Positive, doc("[s] how long")]
+    duration: Annotated[Positive, doc("[s] length of the stall")]
 
     def text(self) -> str:
         """What happens, in words."""
@@ -37,7 +37,7 @@ class ComputationTime:
     plan: Annotated[
         bool | None,
         doc(
-            "whether the last plan is continued while a command is late; else the last command is held; absent: true "
+            "whether the last plan continues while a command is late; else the last command is held; absent: true "
             "with a controller within the fallback contract"
         ),
     ] = None
@@ -46,19 +46,19 @@ class ComputationTime:
 
 @dataclass(frozen=True, kw_only=True)
 class Computation(ComputationTime):
-    """How long the controller's computer takes from a measurement to the command, seconds of simulated time.
+    """Time from measurement to command, in simulated time.
 
-    The sum of a fixed part, a part per solver iteration, an exponentially distributed part, as the wait for a busy
-    processor is, and the wait for the end of a stall.  A command that comes after the next period's begin has missed
-    its deadline and is dropped.  What acts until one comes is the command before it or, with `plan`, the next step of
-    the last plan that came in time: where commands are due `delay` after their measurement, the actuators' side has
-    that plan and continues it.
+    The sum of a fixed part, a part per solver iteration, an exponentially distributed part, like the wait for a busy
+    processor, and the remainder of a stall.  A command that arrives after the next period has started misses its
+    deadline and is dropped.  Until a command arrives, the previous one acts or, with `plan`, the next step of the last
+    plan that arrived in time: if commands are due `delay` after their measurement, the actuators' side has that plan
+    and continues it.
     """
 
-    stalls: tuple[Stall, ...] = ()  # when the computer answers nothing
+    stalls: tuple[Stall, ...] = ()  # intervals without answers
 
     def taken(self, time: float, command: Command, rng: np.random.Generator) -> float:
-        """From the measurement at `time` [s] to the command [s]."""
+        """Return the time from the measurement at `time` [s] to the command [s]."""
         taken = self.delay + self.per_iteration * command.iterations
         if self.jitter:
             taken += rng.exponential(self.jitter)

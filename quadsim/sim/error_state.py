@@ -1,8 +1,8 @@
-"""The error-state Kalman filter's equations: an estimate, its prediction in time, and its update by a sample.
+"""The equations of the error-state Kalman filter: an estimate, its prediction in time, and its update by a sample.
 
 An estimate is a mean on the manifold of poses and rates, and the covariance of its small error e = [dp dv dtheta domega
 db], 15 numbers: position and velocity in the world frame, attitude as a rotation vector in the body frame (q_true = q *
-exp(dtheta)), body rates and gyro bias.  Solà 2017, Secs. 5.1.1 and 5.3.1; multiplicative in the sense of Markley,
+exp(dtheta)), body rates and gyro bias.  Solà 2017, Secs.  5.1.1 and 5.3.1; multiplicative in the sense of Markley,
 "Attitude error representations for Kalman filtering", JGCD 26 (2003).
 
 Prediction, the modelled vehicle as a rigid body driven by its rotor speeds, and the growth of the error with time:
@@ -15,13 +15,13 @@ vehicle's model in place of an accelerometer):
 
     dv: -R [a]x dtheta      dtheta: -[omega]x dtheta + domega      domega: I^-1 ([I omega]x - [omega]x I) domega
 
-On the ground a vehicle whose feet stand would fall by its rotor speeds alone.  The ground carries what the rotors do
-not, so nothing moves: p, q and the gyro's bias stay, v = 0 and omega = 0, which is a zero-velocity update (Groves,
-"Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems", 2nd ed. 2013, Sec. 15.3) at every step.
-Legs that give and slide a little leave v and omega white: sigma at any instant, forgotten after tau, so that position
-and attitude walk randomly with densities sigma sqrt(tau).
+On the ground, rotor speeds alone would let the vehicle fall.  The ground carries the rest of the weight, so nothing
+moves: p, q and the gyro's bias stay, v = 0 and omega = 0, a zero-velocity update (Groves, "Principles of GNSS,
+Inertial, and Multisensor Integrated Navigation Systems", 2nd ed.  2013, Sec.  15.3) at every step.  Legs that yield and
+slide a little keep v and omega as white noise: sigma at any instant, forgotten after tau, so that position and attitude
+walk randomly with densities sigma sqrt(tau).
 
-Update, what a sample changes in an estimate, and whether it is an outlier:
+The update of an estimate by a sample, and the test for outliers:
 
     r = z - h(x)    S = H P H' + R    K = P H' S^-1    e = K r    P <- P - K H P
 
@@ -61,27 +61,27 @@ MEAN_GYRO_BIAS: Final = slice(13, 16)
 class EstimatorSettings:
     """Tuning of the error-state filter.
 
-    Densities are those of white noise on all three axes alike: integrated for a time t they give the standard deviation
-    density sqrt(t).  The gate is that of the chi-square test of a sample's innovation.
+    Densities are those of white noise, equal on all three axes: integrated for a time t they give the standard
+    deviation density sqrt(t). The gate is the chi-square test of a sample's innovation.
     """
 
     acceleration_noise: Annotated[NonNegative, doc("[m/s^2/sqrt(Hz)] unmodelled white acceleration")] = 0.3
     angular_acceleration_noise: Annotated[
-        NonNegative, doc("[rad/s^2/sqrt(Hz)] white angular acceleration that it does not explain")
+        NonNegative, doc("[rad/s^2/sqrt(Hz)] unmodelled white angular acceleration")
     ] = 1.0
     gyro_bias_walk: Annotated[NonNegative, doc("[deg/s/sqrt(s)] random walk of the gyro's bias")] = 0.002
     initial_position: Annotated[NonNegative, doc("[m] standard deviation of the first estimate's error, per axis")] = (
         0.05
     )
-    initial_velocity: Annotated[NonNegative, doc("[m/s] the same")] = 0.05
-    initial_attitude: Annotated[NonNegative, doc("[deg] the same, about each body axis")] = 1.0
-    initial_rates: Annotated[NonNegative, doc("[deg/s] the same")] = 1.0
-    initial_gyro_bias: Annotated[NonNegative, doc("[deg/s] the same, of a bias first taken as zero")] = 0.5
-    gate: Annotated[
-        float, Gt(0.0), Lt(1.0), doc("[-] probability with which a right sample passes the test of its innovation")
-    ] = 0.9999
+    initial_velocity: Annotated[NonNegative, doc("[m/s] same")] = 0.05
+    initial_attitude: Annotated[NonNegative, doc("[deg] same, about each body axis")] = 1.0
+    initial_rates: Annotated[NonNegative, doc("[deg/s] same")] = 1.0
+    initial_gyro_bias: Annotated[NonNegative, doc("[deg/s] same, for a bias initialised to zero")] = 0.5
+    gate: Annotated[float, Gt(0.0), Lt(1.0), doc("[-] probability that a valid sample passes the innovation test")] = (
+        0.9999
+    )
     patience: Annotated[
-        NonNegative, doc("[s] after which a sensor that was rejected all along is accepted again; 0 for never")
+        NonNegative, doc("[s] time of uninterrupted rejection after which a sensor is accepted again; 0 for never")
     ] = 1.0
 
 
@@ -94,7 +94,7 @@ class Estimate:
 
 
 def retract(mean: Array, error: Array) -> Array:
-    """The mean (16,) moved by an error (15,); Solà 2017, Eq. (283)."""
+    """Move the mean (16,) by an error (15,); Solà 2017, Eq. (283)."""
     moved = np.empty_like(mean)
     moved[:6] = mean[:6] + error[:6]
     w, x, y, z = mean[MEAN_QUATERNION].tolist()
@@ -105,7 +105,7 @@ def retract(mean: Array, error: Array) -> Array:
 
 
 def difference(mean: Array, other: Array) -> Array:
-    """The error (15,) of `other` against `mean`, such that moving `other` by it gives `mean`; inverts `retract`."""
+    """Return the error (15,) that moves `other` to `mean`; the inverse of `retract`."""
     error = np.empty(N_ERRORS)
     error[:6] = mean[:6] - other[:6]
     error[9:] = mean[10:] - other[10:]
@@ -117,11 +117,11 @@ def difference(mean: Array, other: Array) -> Array:
 
 _EYE = read_only(np.eye(N_ERRORS))
 STILL_VELOCITY: Final = 0.1
-"""Standard deviation of the velocity of a vehicle that stands, per axis [m/s]; also of one that its ground cushion has
-lifted before the modelled thrust could."""
+"""Standard deviation of the velocity of a vehicle on the ground, per axis [m/s]; also of one that the ground effect
+lifts before the modelled thrust could."""
 STILL_RATE: Final = math.radians(0.5)
-"""The same of its body rates [rad/s]: as much as a MEMS gyro's noise, so that standing is worth a sample of it."""
-STILL_TIME: Final = 0.01  # time tau after which these velocities and rates are forgotten [s]
+"""The same for its body rates [rad/s]: a MEMS gyro's noise, so that rest on the ground is worth one of its samples."""
+STILL_TIME: Final = 0.01  # correlation time tau of these velocities and rates [s]
 
 
 _CHAIN = np.zeros((N_ERRORS, N_ERRORS))  # the two double integrators, dp/dt = v and dtheta/dt = omega
@@ -131,7 +131,7 @@ read_only(_CHAIN)
 
 @dataclass(frozen=True, kw_only=True)
 class Drive:
-    """What the rotors do: U / m [m/s^2] along body z, and (tau_x, tau_y, tau_z) [N m], body."""
+    """The action of the rotors: U / m [m/s^2] along body z, and (tau_x, tau_y, tau_z) [N m], body."""
 
     acceleration: float
     torque: tuple[float, float, float]
@@ -146,11 +146,11 @@ class MotionModel:
     inertia: Vector  # (Ixx, Iyy, Izz) [kg m^2]
     allocation: Array  # (4, 4) from squared rotor speeds to thrust and torque
     noise: tuple[Array, Array, Array]
-    """Three (15, 15) coefficients of h, h^2, h^3 in the noise that gathers in a time h; see `_gathered`."""
+    """Three (15, 15) coefficients of h, h^2, h^3 in the noise accumulated over a time h; see `_gathered`."""
 
 
 def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:
-    """The model of a vehicle disturbed as the settings say."""
+    """Return the model of a vehicle with the disturbances of the settings."""
     density = np.zeros(N_ERRORS)
     density[VELOCITY] = settings.acceleration_noise**2
     density[RATES] = settings.angular_acceleration_noise**2
@@ -165,13 +165,13 @@ def motion_model(vehicle: Vehicle, settings: EstimatorSettings) -> MotionModel:
 
 
 def drive(model: MotionModel, speeds: Array) -> Drive:
-    """What rotor speeds (4,) [rad/s] do; rotors do not turn backwards."""
+    """Return the action of rotor speeds (4,) [rad/s]; rotors do not turn backwards."""
     thrust, x, y, z = (model.allocation @ np.square(np.maximum(speeds, 0.0))).tolist()
     return Drive(acceleration=thrust / model.mass, torque=(x, y, z))
 
 
 def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: float) -> Estimate:
-    """The estimate a time h [s] later, short against the time in which the vehicle turns.
+    """Predict the estimate a time h [s] later, short compared with the time in which the vehicle turns.
 
     The mean by the midpoint rule, the attitude on the sphere; the covariance as F P F' + Q(h), F to third order in h.
     """
@@ -203,8 +203,8 @@ def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: flo
         ]
     )
 
-    # -R [a]x = a [-r2, r1, 0] with r1, r2 the columns of R, at the middle of the step as all else.
-    # Blocks are filled one above the other in the six columns of attitude and rates: one assignment costs as much as 9.
+    # -R [a]x = a [-r2, r1, 0] with r1, r2 the columns of R, all at mid-step.  The six columns of attitude and rates are
+    # filled block by block: one assignment costs as much as 9.
     A = _CHAIN.copy()
     A[VELOCITY.start : RATES.stop, ATTITUDE.start : RATES.stop] = [
         [-2.0 * a * (x * y - w * z), a * (1.0 - 2.0 * (y * y + z * z)), 0.0, 0.0, 0.0, 0.0],
@@ -225,29 +225,29 @@ def predict(model: MotionModel, estimate: Estimate, driven: Drive, duration: flo
 
 
 def _gathered(density: Array) -> tuple[Array, Array, Array]:
-    """Coefficients of the noise's covariance after a time h, int e^(N s) Q e^(N' s) ds = Q h + ... h^2 + ... h^3.
+    """Coefficients of the noise covariance after a time h, int e^(N s) Q e^(N' s) ds = Q h + ... h^2 + ... h^3.
 
-    N holds the two double integrators, dp/dt = v and dtheta/dt = omega; N^2 = 0, so the series ends.  That the axes
-    turn meanwhile changes nothing, as the noise is alike on all of them.
+    N holds the two double integrators, dp/dt = v and dtheta/dt = omega; N^2 = 0, so the series ends.  The rotation of
+    the axes has no effect, since the noise is isotropic.
     """
     N = _CHAIN
     return read_only(density), read_only(0.5 * (N @ density + density @ N.T)), read_only(N @ density @ N.T / 3.0)
 
 
 _RETAINED, _VARIANCE, _WALK = np.ones(N_ERRORS), np.zeros(N_ERRORS), np.zeros(N_ERRORS)
-"""1 where neither velocity nor rates have a part and else 0; their variance; the growth of the rest."""
+"""1 for entries without velocity or rates, else 0; the variance of velocity and rates; the growth of the rest."""
 _RETAINED[VELOCITY] = _RETAINED[RATES] = 0.0
 _VARIANCE[VELOCITY], _VARIANCE[RATES] = STILL_VELOCITY**2, STILL_RATE**2
 _WALK[POSITION], _WALK[ATTITUDE] = STILL_TIME * STILL_VELOCITY**2, STILL_TIME * STILL_RATE**2
 
 
 def lifts(model: MotionModel, driven: Drive) -> bool:
-    """Whether rotors lift a vehicle off the ground: their thrust exceeds its weight, U > m g."""
+    """Return whether rotors lift a vehicle off the ground: their thrust exceeds its weight, U > m g."""
     return driven.acceleration > model.gravity
 
 
 def stand(model: MotionModel, estimate: Estimate, duration: float) -> Estimate:
-    """The estimate a time h [s] later of a vehicle that stands; its velocity and rates are not used."""
+    """Predict the estimate of a vehicle on the ground a time h [s] later, without its velocity and rates."""
     mean = estimate.mean.copy()
     mean[VELOCITY] = mean[MEAN_RATES] = 0.0
     covariance = np.outer(_RETAINED, _RETAINED) * estimate.covariance + np.diag(_VARIANCE + duration * _WALK)
@@ -261,14 +261,14 @@ _BLOCKS: Final = {
     SensorName.ATTITUDE: (ATTITUDE,),
     SensorName.RATES: (RATES, GYRO_BIAS),
 }
-"""The parts of the error whose sum a sensor sees."""
+"""The error components whose sum a sensor measures."""
 _LEADS: Final = {
     SensorName.POSITION: (VELOCITY,),
     SensorName.VELOCITY: (),
     SensorName.ATTITUDE: (RATES, GYRO_BIAS),
     SensorName.RATES: (),
 }
-"""The parts whose errors add up in it over time; the gyro's bias does by way of the rates, which follow the gyro."""
+"""The components whose errors accumulate in it; the gyro's bias does so through the rates, which follow the gyro."""
 
 
 def _observation(name: SensorName) -> Array:
@@ -282,7 +282,7 @@ OBSERVATION: Final = {name: _observation(name) for name in SensorName}  # (3, 15
 
 
 def innovation(name: SensorName, mean: Array, value: Array) -> Array:
-    """(3,) a sample (3,) less that predicted by the mean (16,), in the sensor's unit."""
+    """(3,) a sample (3,) less its prediction from the mean (16,), in the sensor's unit."""
     if name is SensorName.ATTITUDE:
         w, x, y, z = mean[MEAN_QUATERNION].tolist()
         roll, pitch, yaw = value.tolist()
@@ -293,11 +293,11 @@ def innovation(name: SensorName, mean: Array, value: Array) -> Array:
 
 
 def update(estimate: Estimate, name: SensorName, value: Array, variance: Array, gate: float) -> tuple[Estimate, float]:
-    """The estimate after a sample (3,), and the sample's normalised innovation squared.
+    """Return the estimate after a sample (3,), and the sample's normalised innovation squared.
 
-    A sample whose normalised innovation squared is not within the gate, or not a number, changes nothing.  The error is
-    reset to zero without G = I - [dtheta / 2]x of Solà 2017, Eq. (287), which would turn the covariance by half the
-    correction and is there neglected, too.  `variance` (3, 3) is R, of the sensor's noise.
+    A sample outside the gate, or not a number, changes nothing.  The error is reset to zero without G = I - [dtheta /
+    2]x of Solà 2017, Eq.  (287), which would rotate the covariance by half the correction and is neglected there, too.
+    `variance` (3, 3) is R, of the sensor's noise.
     """
     H, P = OBSERVATION[name], estimate.covariance
     residual = innovation(name, estimate.mean, value)
@@ -311,12 +311,12 @@ def update(estimate: Estimate, name: SensorName, value: Array, variance: Array, 
     return Estimate(mean=retract(estimate.mean, gain @ residual), covariance=0.5 * (P + P.T)), distance
 
 
-def doubt(estimate: Estimate, name: SensorName, value: Array, refused: float) -> Estimate:
-    """The estimate with its variance widened by as much as a sample (3,) disagrees with it, so that the sample passes.
+def inflate(estimate: Estimate, name: SensorName, value: Array, refused: float) -> Estimate:
+    """Inflate the covariance of an estimate by its disagreement with a sample (3,), so that the sample passes the gate.
 
-    For the way back after divergence: the innovation squared is added to the variance of all that the sensor sees, and
-    (innovation / time)^2 to that of the rates of change which may have caused its error in the meantime, in which all
-    its samples were refused [s].
+    It recovers a diverged filter: the innovation squared is added to the variance of all components that the sensor
+    measures, and (innovation / time)^2 to that of their rates of change, with the time in which all samples were
+    rejected [s].
     """
     covariance = estimate.covariance.copy()
     squares = np.diag(np.square(innovation(name, estimate.mean, value)))

@@ -1,10 +1,10 @@
-"""The error-state extended Kalman filter over time: samples in the order they were taken, however late they arrive.
+"""The error-state extended Kalman filter over time: it uses samples in the order they were taken, however late.
 
-The filter stands at the fusion horizon, now less the largest delay: every sample taken before has arrived and has been
-used, in the order of the time stamps.  What has arrived since is stored, and each time an estimate is requested it is
-used on copies that run on to now; so a late sample corrects the past it belongs to.  The copy after each of these
-samples is kept, and is where the next estimate goes on from, until a sample arrives that was taken before it.  Rotor
-speeds, and whether the vehicle stood, are stored likewise for each step since the horizon.
+The filter runs at the fusion horizon, now less the largest delay: every sample taken before it has arrived and has been
+used, in the order of time stamps.  Later samples are stored; each request for an estimate uses them on copies that run
+up to now, so a late sample corrects the past it belongs to.  The copies after these samples are kept as starting points
+of the next estimate, until a sample arrives that was taken earlier.  Rotor speeds, and contact with the ground, are
+stored for each step since the horizon as well.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from quadsim.sim.error_state import (
     Drive,
     Estimate,
     EstimatorSettings,
-    doubt,
     drive,
+    inflate,
     lifts,
     motion_model,
     predict,
@@ -36,27 +36,27 @@ from quadsim.sim.sensing import AXES, Sample, Sensor, SensorName
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
-LONGEST_STEP: Final = 0.01  # longest prediction at once [s]
+LONGEST_STEP: Final = 0.01  # longest single prediction [s]
 NEEDED: Final = (SensorName.POSITION, SensorName.ATTITUDE)
 """Sensors without which position or heading would drift without bound."""
 _NAMES: Final = list(SensorName)
-_LARGEST: Final = 1e6  # A mean or a sample beyond this in magnitude [SI units], or not a number, is no information
+_LARGEST: Final = 1e6  # A mean or sample above this magnitude [SI units], or not a number, carries no information
 _LARGEST_VARIANCE: Final = 1e15  # the same for the trace of a covariance
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tally:
-    """What became of one sensor's samples."""
+    """Counts of one sensor's samples."""
 
-    accepted: int = 0  # how many were used
-    rejected: int = 0  # how many were refused: outside the gate, or not numbers
+    accepted: int = 0  # used
+    rejected: int = 0  # rejected: outside the gate, or not numbers
     nis: float = 0.0
-    """Sum of the normalised innovations squared of those used; three each on average, where all is as stated."""
+    """Sum of the normalised innovations squared of those used; on average three per sample with a correct model."""
 
 
 @dataclass(kw_only=True)
 class _Track:
-    """A filter at one instant; `refused` holds the step since which every sample of a sensor has been refused."""
+    """A filter at one instant; `refused` is the step since which every sample of a sensor has been rejected."""
 
     step: int
     estimate: Estimate
@@ -75,7 +75,7 @@ class _Track:
 
 
 class ErrorStateFilter:
-    """Turns samples and rotor speeds into an estimate.  Never raises in flight, and never answers with NaN.
+    """Turns samples and rotor speeds into an estimate.  It never raises in flight and never returns NaN.
 
     Attributes:
         settings: its tuning.
@@ -84,10 +84,10 @@ class ErrorStateFilter:
     def __init__(
         self, vehicle: Vehicle, sensors: Sequence[Sensor], settings: EstimatorSettings, *, timestep: float
     ) -> None:
-        """Set up, to be reset before use, for the modelled vehicle and sensors and a physics step [s].
+        """Prepare for the modelled vehicle, sensors and a physics step [s]; call `reset` before use.
 
         Raises:
-            ParameterError: a sensor is missing, or states a noise of zero.
+            ParameterError: a sensor is missing, or has a noise of zero.
         """
         from scipy.special import chdtri  # whose package takes a while to load, and few flights have an estimator
 
@@ -111,18 +111,18 @@ class ErrorStateFilter:
     def reset(self, mean: Array, speeds: Array, rng: np.random.Generator) -> None:
         """Start at step 0, with rotor speeds (4,) in force [rad/s].
 
-        The first estimate differs from the truth, a mean (16,) whose gyro bias is zero, by a drawn error of the initial
-        covariance; the bias by what it is.
+        The first estimate differs from the truth, a mean (16,) with zero gyro bias, by an error drawn from the initial
+        covariance; its bias by the true bias.
         """
         error = self._initial() * rng.standard_normal(N_ERRORS)
         error[12:] = 0.0
         estimate = Estimate(mean=retract(mean, error), covariance=np.diag(np.square(self._initial())))
         tallies = {name: Tally() for name in self._variances}
         self._track = _Track(step=0, estimate=estimate, tallies=tallies)
-        self._starts, self._speeds, self._standing = [0], speeds.copy(), False
+        self._starts, self._speeds, self._on_ground = [0], speeds.copy(), False
         self._drives: list[Drive | None] = [drive(self._model, speeds)]
         self._waiting: list[Sample] = []
-        self._ahead: list[_Track] = []  # after each of the first that wait
+        self._ahead: list[_Track] = []  # one after each of the first waiting samples
 
     def _initial(self) -> Array:
         s = self.settings
@@ -131,31 +131,31 @@ class ErrorStateFilter:
 
     @property
     def tallies(self) -> dict[SensorName, Tally]:
-        """What became of each sensor's samples, those after the fusion horizon not yet counted."""
+        """Counts of each sensor's samples; those after the fusion horizon are not yet included."""
         return dict(self._track.tallies)
 
-    def advance(self, commands: Array, samples: Iterable[Sample], first: int, *, standing: bool = False) -> None:
-        """Take note of a segment of flight and run the filter on to the fusion horizon.
+    def advance(self, commands: Array, samples: Iterable[Sample], first: int, *, on_ground: bool = False) -> None:
+        """Record a segment of flight and run the filter up to the fusion horizon.
 
         Args:
             commands: (M, 4) rotor speeds in force during each physics step [rad/s].
             samples: what has arrived meanwhile, in any order.
             first: number of the first of these physics steps.
-            standing: whether a land detector has seen the vehicle on the ground when the segment began; it has left the
+            on_ground: whether a land detector saw the vehicle on the ground at the start of the segment; it leaves the
                 ground once the modelled thrust exceeds its weight.
         """
         changed = np.any(commands != np.vstack([self._speeds, commands[:-1]]), axis=1)
-        changed[:1] |= standing is not self._standing
+        changed[:1] |= on_ground is not self._on_ground
         for i in np.flatnonzero(changed).tolist():
             driven = drive(self._model, commands[i])
             self._starts.append(first + i)
-            self._drives.append(None if standing and not lifts(self._model, driven) else driven)
+            self._drives.append(None if on_ground and not lifts(self._model, driven) else driven)
         if len(commands):
-            self._speeds, self._standing = commands[-1].copy(), standing
+            self._speeds, self._on_ground = commands[-1].copy(), on_ground
         horizon = first + len(commands) - self._horizon
         before = self._waiting.copy()
         for sample in samples:
-            if np.abs(sample.value).max() < _LARGEST:  # as NaN is not
+            if np.abs(sample.value).max() < _LARGEST:  # false for NaN
                 self._waiting.append(sample)
             else:
                 for track in (self._track, *self._ahead):
@@ -174,7 +174,7 @@ class ErrorStateFilter:
         del self._starts[:first], self._drives[:first]
 
     def estimate(self, step: int) -> Estimate:
-        """The estimate at a physics step, no earlier than the last one that was given."""
+        """Return the estimate at a physics step, no earlier than the previous request."""
         track = self._ahead[-1] if self._ahead else self._track
         for sample in self._waiting[len(self._ahead) :]:
             track = track.branch()
@@ -199,7 +199,7 @@ class ErrorStateFilter:
                 after = predict(self._model, track.estimate, driven, duration)
             size, spread = after.mean @ after.mean, after.covariance.trace()
             if not (size < _LARGEST**2 and spread < _LARGEST_VARIANCE):
-                # Nothing is known any more: stay where it was, as unsure as at the start, and let the sensors speak.
+                # The estimate is lost: keep the mean, restore the initial covariance, and let the sensors correct it.
                 after = Estimate(mean=track.estimate.mean, covariance=np.diag(np.square(self._initial())))
             track.estimate, track.step = after, until
 
@@ -207,7 +207,7 @@ class ErrorStateFilter:
         name = sample.sensor
         refused = sample.taken - track.refused.get(name, sample.taken)
         if refused >= self._patience > 0.0:
-            track.estimate = doubt(track.estimate, name, sample.value, refused * self._timestep)
+            track.estimate = inflate(track.estimate, name, sample.value, refused * self._timestep)
         after, distance = update(track.estimate, name, sample.value, self._variances[name], self._gate)
         if after is track.estimate:
             track.count(name, rejected=1)

@@ -34,20 +34,20 @@ _HEIGHT: Final = REFERENCE_NAMES.index("z")
 
 
 class Reference(Protocol):
-    """A filtered reference x, y, z [m], yaw [rad] that need not be known ahead."""
+    """A filtered reference x, y, z [m], yaw [rad], perhaps not known in advance."""
 
     def row(self, k: int) -> Array:
         """(4,) at t_k."""
         ...
 
     def preview(self, k: int, n: int) -> Array:
-        """(n, 4) at t_{k+1} .. t_{k+n}, as far as it is known at t_k."""
+        """(n, 4) at t_{k+1} .. t_{k+n}, as known at t_k."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """A reference that is known from the start: `values` (K + N, 4), row k at t_k."""
+    """A reference known from the start: `values` (K + N, 4), row k at t_k."""
 
     values: Array
 
@@ -61,20 +61,21 @@ class Rows:
 
 
 class ClosedLoop:
-    """A flight that is taken period by period.
+    """A flight, advanced period by period.
 
-    Batch flights, live sessions, learning environments and scripts drive the same loop.  Plant, controller and
-    navigation are reset first.
+    Batch flights, live sessions, learning environments and scripts use the same loop.  It resets plant, controller and
+    navigation at the start.
 
+    Attributes:
     Attributes:
         k: control periods flown so far.
         period: length of one [s].
-        controller: what flies it now; see `switch`.
-        course: what is followed.
-        answered: the latest time at which a command has come so far [s].
-        before: called with k when a period begins, before anything of it is measured; what changes then acts in it.
-        last: the period flown last; None before the first.
-        reason: why the flight has ended early; None while it has not.
+        controller: the controller in command; see `switch`.
+        course: the reference that is followed.
+        answered: latest time at which a command has arrived so far [s].
+        before: called with k at the start of a period, before any measurement; its changes act in that period.
+        last: the last period; None before the first.
+        reason: why the flight ended early; None while it has not.
     """
 
     def __init__(
@@ -309,11 +310,11 @@ class ClosedLoop:
             holds.append((acting, steps - wait))
         before = plant.physics
         holds = [(speeds, count) for speeds, count in holds if count > 0]
-        flown = [part for speeds, count in holds for part in _hold(plant, command.inner, speeds, count)]
+        flown_parts = [part for speeds, count in holds for part in _hold(plant, command.inner, speeds, count)]
         if self._navigation is not None:
-            for segment, speeds in flown:
+            for segment, speeds in flown_parts:
                 held = np.broadcast_to(speeds, (len(segment.physics), N_ROTORS))
-                self._navigation.advance(segment.physics, held, standing=now.phase in (Phase.LANDED, Phase.ARMED))
+                self._navigation.advance(segment.physics, held, on_ground=now.phase in (Phase.LANDED, Phase.ARMED))
         self._acting = acting
         return FlownPeriod(
             observation=observed,
@@ -323,7 +324,7 @@ class ClosedLoop:
             missed=missed,
             step_s=step_s,
             before=before,
-            segment=Segment.join([segment for segment, _ in flown]),
+            segment=Segment.join([segment for segment, _ in flown_parts]),
             rotors=plant.speeds,
         )
 

@@ -1,4 +1,4 @@
-"""Navigation: the state that a controller receives, from the sensors' measurements of the true one."""
+"""Navigation: the state that a controller receives, from measurements of the true state."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from quadsim.vehicle import Vehicle
 
 
 class Navigation:
-    """Sensors, and an estimator or none.
+    """Sensors with or without an estimator.
 
-    Without an estimator the controller receives the last sample of each sensor that has arrived, however old, and the
-    truth where there is no sensor; until the first sample arrives, the truth at t = 0.  With an estimator it
-    receives the estimate, from the sensors that there are.
+    Without an estimator, the controller receives the last sample of each sensor to arrive, however old, and the true
+    value where there is no sensor; until the first sample arrives, the true value at t = 0. With an estimator, it
+    receives the estimate from the available sensors.
 
     Attributes:
         attitude: quaternion (4,), wxyz, body to world, sign continuous, and body rates (3,) [rad/s], of the last
             `state`.
 
-    Each sensor draws from a generator of its own, so that adding one, or its noise, leaves the others' draws alone.
+    Each sensor has its own random generator, so that adding a sensor, or noise, does not change the others' draws.
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class Navigation:
         Args:
             vehicle: the modelled vehicle.
             timestep: physics step [s].
-            sensors: at most one of each name; absent ones are perfect, or not there where there is an estimator.
-            rng: where all randomness comes from.
-            faults: what befalls the sensors, perfect ones too.
-            estimator: the error-state filter's tuning, or None.
+            sensors: at most one per name; without an estimator, missing ones are perfect.
+            rng: the source of all randomness.
+            faults: faults of the sensors, including perfect ones.
+            estimator: settings of the error-state filter, or None.
 
         Raises:
             ParameterError: two sensors of one name, times that are no whole physics steps, a fault of a sensor that is
@@ -58,11 +58,11 @@ class Navigation:
         names = [sensor.name for sensor in sensors]
         if len(set(names)) < len(names):
             raise ParameterError("navigation", "sensors", [str(name) for name in names], "at most one of each name")
-        befallen = {fault.sensor for fault in faults} - set(names)
-        if estimator is not None and befallen:
+        faulty = {fault.sensor for fault in faults} - set(names)
+        if estimator is not None and faulty:
             rule = f"on a sensor that the estimator has ({', '.join(names)})"
-            raise ParameterError("fault", "sensor", str(min(befallen)), rule)
-        perfect = [Sensor(name=name, rate=1.0 / timestep) for name in sorted(befallen)]
+            raise ParameterError("fault", "sensor", str(min(faulty)), rule)
+        perfect = [Sensor(name=name, rate=1.0 / timestep) for name in sorted(faulty)]
         self._rng, *others = rng.spawn(1 + len(SensorName))
         generators = dict(zip(SensorName, others, strict=True))
         self._samplers = tuple(
@@ -78,12 +78,12 @@ class Navigation:
         return any(sampler.watched for sampler in self._samplers if sampler.sensor.name is sensor)
 
     def reschedule(self, faults: Sequence[SensorFault]) -> None:
-        """Let these faults take the place of those before, of sensors watched; samples already taken stay."""
+        """Replace the faults of watched sensors; samples already taken stay."""
         for sampler in self._samplers:
             sampler.reschedule(faults)
 
     def reset(self, physics: Array, speeds: Array, yaw: float = 0.0) -> None:
-        """Start again at MuJoCo's state (14,) and rotor speeds [rad/s], the same draws; yaw is near `yaw` [rad]."""
+        """Restart at MuJoCo's state (14,) and rotor speeds [rad/s] with the same draws; yaw is near `yaw` [rad]."""
         self._step, self._yaw, self._physics = 0, YawTurns(yaw), physics.copy()
         self.attitude: tuple[Array, Array] = physics[4:8].copy(), physics[11:14].copy()
         self._held = {name: truth(name, physics[None])[0] for name in SensorName}
@@ -97,20 +97,20 @@ class Navigation:
         if self._filter is not None:
             self._filter.advance(np.empty((0, len(speeds))), self._arrived(), first=0)
 
-    def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
-        """Take note of a segment of flight: (M, 14) true states after each physics step, (M, 4) rotor speeds [rad/s].
+    def advance(self, physics: Array, commands: Array, *, on_ground: bool = False) -> None:
+        """Record a segment of flight: (M, 14) true states after each physics step, (M, 4) rotor speeds [rad/s].
 
-        `standing` is the land detector's state of the feet when the segment began.
+        `on_ground` is the land detector's state at the start of the segment.
         """
         if not len(physics):
             return
         first, self._step, self._physics = self._step, self._step + len(physics), physics[-1].copy()
         self._receive(physics, first + 1)
         if self._filter is not None:
-            self._filter.advance(commands, self._arrived(), first, standing=standing)
+            self._filter.advance(commands, self._arrived(), first, on_ground=on_ground)
 
     def state(self) -> Array:
-        """(12,) the state that the controller receives now: paper's order, yaw unwrapped."""
+        """Return (12,) the state that the controller receives now: the paper's order, yaw unwrapped."""
         if self._filter is not None:
             mean = self._filter.estimate(self._step).mean
             received = {
@@ -137,7 +137,7 @@ class Navigation:
 
     @property
     def tallies(self) -> dict[SensorName, Tally]:
-        """What became of each sensor's samples in the estimator; empty without one."""
+        """Counts of each sensor's samples in the estimator; empty without one."""
         return {} if self._filter is None else self._filter.tallies
 
     def _receive(self, physics: Array, first: int) -> None:
@@ -145,7 +145,7 @@ class Navigation:
             self._in_flight += sampler.sample(physics, first)
 
     def _arrived(self) -> list[Sample]:
-        """The samples that have arrived since the last call, the oldest first; the rest stay on their way."""
+        """Return the samples that have arrived since the last call, oldest first; the others stay in transit."""
         arrived = [sample for sample in self._in_flight if sample.arrival <= self._step]
         self._in_flight = [sample for sample in self._in_flight if sample.arrival > self._step]
         return sorted(arrived, key=attrgetter("taken"))

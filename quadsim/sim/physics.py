@@ -1,4 +1,4 @@
-"""The simulator's own state over a number of steps, how it becomes the paper's, and the periods flown as a log."""
+"""The simulator's state over physics steps, its conversion to the paper's state, and flown periods as a log."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ from quadsim.sim.sensing import whole
 from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import N_ROTORS
 
-Integrator = Literal["mujoco", "rk4"]  # who takes the physics steps: MuJoCo, or `quadsim.sim.rigid_body`
+Integrator = Literal["mujoco", "rk4"]  # integrator of the physics steps: MuJoCo, or `quadsim.sim.rigid_body`
 
 
 def steps_per_period(control_period: float, timestep: float) -> int:
-    """How many physics steps make one control period.
+    """Return the number of physics steps in a control period.
 
     Raises:
-        ParameterError: the period is not a whole, positive number of steps.
+        ParameterError: it is not a whole, positive number.
     """
     rule = f"a whole multiple of the physics step of {timestep} s"
     return whole("scenario", "control_period", control_period, control_period / timestep, rule)
 
 
 def inner_steps(rate: float, timestep: float) -> int:
-    """How many physics steps lie between two calls of an inner loop.
+    """Return the number of physics steps between two calls of an inner loop.
 
     Raises:
-        ParameterError: they are not a whole, positive number.
+        ParameterError: it is not a whole, positive number.
     """
     rule = f"such that 1 / rate is a whole multiple of the physics step of {timestep} s"
     return whole("controller.inner", "rate", rate, 1.0 / (rate * timestep), rule)
 
 
 def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
-    """The paper's states (M, 12) from MuJoCo's.
+    """Convert MuJoCo's states to the paper's states (M, 12).
 
-    With Euler-angle rates (Sec. 2.2 takes body rates for them), yaw unwrapped along the rows as by `YawTurns`.
+    They have Euler-angle rates (Sec.  2.2 uses body rates), and a yaw unwrapped along the rows as by `YawTurns`.
 
     Args:
         physics: (M, 14) time, position (world), quaternion wxyz, velocity (world), angular rates (body).
-        yaw: near which turn the first row's yaw is [rad].
+        yaw: the first row's yaw is unwrapped to the turn nearest to it [rad].
     """
     state = np.empty((physics.shape[0], N_STATES))
     euler = quaternion_to_euler(physics[:, 4:8])
@@ -70,18 +70,18 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """What happened over a number of physics steps; M rows, one per step."""
+    """The motion over a number of physics steps; M rows, one per step."""
 
     physics: Array  # (M, 14) MuJoCo's state after each step; see `physics_to_state`
     speeds: Array  # (M, 4) rotor speeds at the start of each step [rad/s]
     wrench: Array | None
     """(M, 6) force, world [N], and torque, body frame about its origin [N m], of all effects but contact, over each
-    step; None where no effect makes any."""
+    step; None if no effect causes any."""
     wind: Array | None  # (M, 3) velocity of the air in the middle of each step, world [m/s]; None without wind
 
     @staticmethod
     def join(parts: Sequence[Segment]) -> Segment:
-        """Segments one after the other as one."""
+        """Concatenate segments."""
         if len(parts) == 1:
             return parts[0]
 
@@ -92,33 +92,33 @@ class Segment:
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """What a control period begins with."""
+    """The data at the start of a control period."""
 
-    k: int  # which period
-    state: Array  # (12,) as measured, or estimated
-    truth: Array  # (12,) as it is
+    k: int  # index of the period
+    state: Array  # (12,) measured or estimated
+    truth: Array  # (12,) true
     reference: Array  # (4,) filtered x, y, z [m], yaw [rad] at t_k
-    preview: Array  # (N, 4) the same at t_{k+1} .. t_{k+N}, as far as it is known.
-    moment: StepInputs  # when it is, and what a controller may know besides; `moment.acting` is u(k-1)
+    preview: Array  # (N, 4) the same at t_{k+1} .. t_{k+N}, as far as it is known
+    moment: StepInputs  # time, and further inputs of a controller; `moment.acting` is u(k-1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlownPeriod:
-    """One control period as it was flown."""
+    """One flown control period."""
 
-    observation: Observation  # what it began with
-    command: Command  # what the controller answered, or what was given instead
+    observation: Observation  # the data at its start
+    command: Command  # the controller's answer, or the command passed to `step`
     speeds: Array  # (4,) the command in force at its end, an earlier one if `command` was missed [rad/s]
     delay: float  # simulated time from the measurement to the command [s]
-    missed: bool  # whether the command came too late to be used
-    step_s: float  # wall time of the controller's step [s]; 0 where the command was given
-    before: Array  # (14,) MuJoCo's state at its begin; see `quadsim.sim.physics.physics_to_state`
+    missed: bool  # whether the command came too late
+    step_s: float  # wall time of the controller's step [s]; 0 if the command was passed in
+    before: Array  # (14,) MuJoCo's state at its start; see `quadsim.sim.physics.physics_to_state`
     segment: Segment  # its physics steps
-    rotors: Array  # (4,) how fast the rotors turned at its end [rad/s]
+    rotors: Array  # (4,) rotor speeds at its end [rad/s]
 
     @property
     def phase(self) -> Phase:
-        """Where the flight stood with the ground."""
+        """The phase of the flight."""
         return self.observation.moment.phase
 
 
@@ -126,9 +126,9 @@ def flight_log(
     samples: Sequence[FlownPeriod], start: Array, speeds: Array, yaw: float, period: float, timestep: float,
     *, quaternions: bool = False,
 ) -> FlightLog:  # fmt: skip
-    """Control periods of a length [s] as a log with plant rows at the physics rate, and attitudes where asked for.
+    """Convert control periods of a length [s] to a log with plant rows at the physics rate.
 
-    At the start were MuJoCo's state (14,), rotor speeds (4,) [rad/s] and a yaw [rad], which tells its turns.
+    The start is given by MuJoCo's state (14,), rotor speeds (4,) [rad/s] and a yaw [rad], for its turns.
     """
     control = _control_log(samples, speeds, period)
     plant = _plant_log(samples, start, speeds, yaw, timestep)
@@ -143,7 +143,7 @@ def flight_log(
 
 
 def one_period(sample: FlownPeriod, timestep: float) -> FlightLog:
-    """One control period as a log of its own: a row, and the plant's rows from its begin to its end, both included."""
+    """Convert one control period to a log: one row, and the plant's rows from its start to its end, both included."""
     moment = sample.observation.moment
     assert moment.acting is not None
     yaw = float(sample.observation.truth[INDEX["yaw"]])
@@ -200,17 +200,17 @@ def _plant_log(
 ) -> PlantLog:
     if not samples:
         return PlantLog(t=_times(1, timestep), state=physics_to_state(start[None], yaw), speeds=initial_speeds[None])
-    flown = Segment.join([sample.segment for sample in samples])
-    physics = np.concatenate([start[None], flown.physics])
+    segment = Segment.join([sample.segment for sample in samples])
+    physics = np.concatenate([start[None], segment.physics])
     return PlantLog(
         t=_times(len(physics), timestep),
         state=physics_to_state(physics, yaw),
-        speeds=np.concatenate([flown.speeds, samples[-1].rotors[None]]),
-        wrench=None if flown.wrench is None else np.concatenate([flown.wrench, flown.wrench[-1:]]),
-        wind=None if flown.wind is None else np.concatenate([flown.wind, flown.wind[-1:]]),
+        speeds=np.concatenate([segment.speeds, samples[-1].rotors[None]]),
+        wrench=None if segment.wrench is None else np.concatenate([segment.wrench, segment.wrench[-1:]]),
+        wind=None if segment.wind is None else np.concatenate([segment.wind, segment.wind[-1:]]),
     )
 
 
 def _times(count: int, spacing: float) -> Array:
-    """Instants k * spacing without the rounding that adding up or a binary fraction leaves."""
+    """Return instants k * spacing, without the rounding of accumulation or binary fractions."""
     return np.round(np.arange(count) * spacing, 9)

@@ -32,7 +32,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 _FULL: Final = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _CONTROL: Final = int(mujoco.mjtState.mjSTATE_CTRL)
 _PLAUSIBLE: Final = 1e6
-"""Largest magnitude of any time [s], position [m], speed [m/s] or rate [rad/s] taken for flight, not divergence."""
+"""Largest magnitude of time [s], position [m], speed [m/s] or rate [rad/s] that is not divergence."""
 _NUMERICAL_WARNINGS: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
     mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -50,17 +50,17 @@ if all(getattr(mujoco, name)() is None for name in dir(mujoco) if name.startswit
 class Plant:
     """A vehicle in MuJoCo: fourth-order Runge-Kutta at a fixed step, commands held in between.
 
-    With `integrator="rk4"` the steps are those of `quadsim.sim.rigid_body` instead.
+    With `integrator="rk4"`, `quadsim.sim.rigid_body` takes the steps instead.
 
-    Without effects rotors have their commanded speed at once, and a whole hold is one call of MuJoCo.  With effects
-    that depend on how the vehicle moves, each step is taken by itself, with forces evaluated in its middle (second
-    order).  Use as a context manager; it owns native memory.
+    Without effects, rotors have their commanded speed at once, and a whole hold is one call of MuJoCo.  With effects
+    that depend on the motion, steps are taken one by one, with forces evaluated at mid-step (second order). Use it as a
+    context manager; it owns native memory.
 
     Attributes:
-        vehicle: what flies, as in its file.
+        vehicle: the vehicle flown, as in its file.
         timestep: physics step [s].
-        effects: what acts on it, resolved; see `quadsim.sim.effects.Effects.resolved`.
-        model: the compiled model, not to be changed.
+        effects: the active effects, resolved; see `quadsim.sim.effects.Effects.resolved`.
+        model: the compiled model; do not change it.
     """
 
     def __init__(
@@ -120,12 +120,12 @@ class Plant:
         self.close()
 
     def close(self) -> None:
-        """Give native memory back."""
+        """Free native memory."""
         self._rollout.close()
 
     @property
     def wind(self) -> WindField | None:
-        """How the air moves; None where it never does."""
+        """The wind field; None if the air never moves."""
         return self._wind
 
     @property
@@ -140,7 +140,7 @@ class Plant:
 
     @property
     def physics(self) -> Array:
-        """(14,) copy of MuJoCo's own state; see `physics_to_state`."""
+        """(14,) copy of MuJoCo's state; see `physics_to_state`."""
         return self._physics[0].copy()
 
     @property
@@ -149,7 +149,7 @@ class Plant:
         return self._speeds.copy()
 
     def reset(self, state: Array, speeds: Array | None = None) -> None:
-        """Put the vehicle at a state (12,) at time zero, at rotor speeds (4,) or hover [rad/s], all else to its start.
+        """Put the vehicle at a state (12,) at time zero, with rotor speeds (4,) or hover [rad/s]; reset all else.
 
         Raises:
             ParameterError: the state is not 12 finite numbers.
@@ -182,7 +182,7 @@ class Plant:
 
     @cached_property
     def _forces(self) -> StepForces:
-        """What acts in each step; made where steps are taken one by one."""
+        """The forces of each step, if steps are taken one by one."""
         shape = outline(self.vehicle)
         return StepForces(self.vehicle, self.effects, timestep=self.timestep, floor=shape.floor, disc=shape.disc)
 
@@ -203,7 +203,7 @@ class Plant:
         return physics[4:8].copy(), physics[11:14].copy()
 
     def applied(self, speeds: Array) -> Array:
-        """The rotor speeds (4,) [rad/s] that a command demands: it saturates at what rotors can do, and at zero."""
+        """Return the command (4,) [rad/s], saturated at the rotors' limits and at zero."""
         return np.clip(speeds, *self._speed_range)
 
     def advance(self, speeds: Array, steps: int) -> Segment:
@@ -225,21 +225,21 @@ class Plant:
         return Segment.join(parts)
 
     def allows(self, changes: Sequence[Change]) -> bool:
-        """Whether it was made for changes of these kinds, as it was for those that it was made with."""
+        """Return whether it was built for changes of these kinds."""
         weighing = not self._reweighed and any(isinstance(change, LOADING) for change in changes)
         return not (weighing or (not self._by_step and any(isinstance(change, PushChange) for change in changes)))
 
     def reschedule(self, changes: Sequence[Change]) -> None:
-        """Schedule these changes, of kinds that it `allows`; past ones are left out."""
+        """Schedule these changes, of kinds that it `allows`; past ones are ignored."""
         self._pending = deque(entry for entry in self._scheduled(changes) if entry[0] >= self._step)
 
     def _scheduled(self, changes: Sequence[Change]) -> list[tuple[int, Change]]:
-        """Changes in the order of time, each with the physics step before which it happens."""
+        """Return the changes in order of time, each with the physics step before which it happens."""
         ordered = sorted(changes, key=lambda change: change.at)
         return [(math.ceil(change.at / self.timestep - 1e-6), change) for change in ordered]
 
     def _change(self) -> None:
-        """Let happen what is due before the next step."""
+        """Apply the changes due before the next step."""
         while self._pending and self._pending[0][0] <= self._step:
             _, change = self._pending.popleft()
             if isinstance(change, RotorChange):
@@ -263,7 +263,7 @@ class Plant:
         apply_mass(self.model, BODY, mass_properties(self.vehicle, load, payloads))
 
     def _hold(self, target: Array, steps: int) -> Segment:
-        """Advance while nothing but the vehicle and the air changes."""
+        """Advance while only vehicle and air change."""
         rotors, timestep = self._rotors, self.timestep
         if rotors.at_once:
             before = middle = np.broadcast_to(target, (steps, N_ROTORS))
@@ -292,7 +292,7 @@ class Plant:
         return Segment(physics=trajectory, speeds=before, wrench=wrench, wind=wind)
 
     def _run(self, thrusts: Array) -> Array:
-        """All steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""
+        """Take all steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""
         steps = len(thrusts)
         states = np.empty((1, steps, self._physics.shape[1]))
         self._rollout.rollout(
@@ -309,7 +309,7 @@ class Plant:
         return states[0]
 
     def _take_steps(self, thrusts: Array, speeds: Array, slopes: Array, wind: Array | None) -> tuple[Array, Array]:
-        """One step after the other, each with the forces of its middle: states (M, 14) and wrenches (M, 6)."""
+        """Take steps one by one, each with the forces of its middle: states (M, 14) and wrenches (M, 6)."""
         model, data, steps = self.model, self._data, len(thrusts)
         mujoco.mj_setState(model, data, self._physics[0], _FULL)
         trajectory, wrench = np.empty((steps, self._physics.shape[1])), np.empty((steps, 6))
@@ -346,7 +346,7 @@ class Plant:
         return trajectory, wrench
 
     def _integrate(self, thrusts: Array, speeds: Array, slopes: Array, wind: Array | None) -> tuple[Array, Array]:
-        """The same as `_take_steps` without MuJoCo, the forces evaluated at each stage of the step."""
+        """Do the same as `_take_steps` without MuJoCo, with forces evaluated at each stage of the step."""
         steps = len(thrusts)
         noises, of_rotors = self._noises(steps) or [[0.0] * 6] * steps, self._of_rotors(speeds, slopes)
         air = [[0.0] * 3] * steps if wind is None else wind.tolist()
@@ -369,17 +369,17 @@ class Plant:
         return None if disturbance is None else disturbance.draw(steps, self.timestep, self._rng).tolist()
 
     def _of_rotors(self, speeds: Array, slopes: Array) -> list[list[float]]:
-        there = self._efficiency > 0.0  # a lost propeller neither drags nor carries momentum
+        there = self._efficiency > 0.0  # a lost propeller has neither drag nor momentum
         return self._forces.of_rotors(speeds * there, slopes * there).tolist()
 
     def _own_wrench(self, since: float, motion: Sequence[float]) -> list[float]:
-        """The sum of the user-defined forces, world [N] and body frame [N m], so long [s] after the hold's begin.
+        """Return the sum of the user-defined forces, world [N] and body frame [N m], a time [s] after the hold's start.
 
-        `motion` (13,) is MuJoCo's state then, but for the time.
+        `motion` (13,) is MuJoCo's state then, without the time.
 
         Raises:
-            ForceError: one is not six finite numbers.
-            RaisedError: one raised.
+            ForceError: a force is not six finite numbers.
+            RaisedError: a force raised an exception.
         """
         physics, time = np.array([0.0, *motion]), self.time + since
         state, total = physics_to_state(physics[None])[0], np.zeros(6)
@@ -396,14 +396,14 @@ class Plant:
         return total.tolist()
 
     def _check(self, trajectory: Array) -> None:
-        if not np.abs(trajectory).max() < _PLAUSIBLE:  # as NaN is not
+        if not np.abs(trajectory).max() < _PLAUSIBLE:  # false for NaN
             plausible = (np.abs(trajectory) < _PLAUSIBLE).all(axis=1)
             time = self.time + self.timestep * (1 + int(np.argmin(plausible)))
-            raise DivergenceError("the plant diverged: its state is not finite or beyond all plausibility", time=time)
+            raise DivergenceError("the plant diverged: its state is not finite or not plausible", time=time)
         counts = self._data.warning.number
         if counts.any() and (raised := [kind.name for kind in _NUMERICAL_WARNINGS if counts[int(kind)]]):
             raise DivergenceError(f"the plant diverged: MuJoCo reports {', '.join(raised)}", time=self.time)
 
 
 def _discard(message: str) -> None:
-    """Receive MuJoCo's warnings, which `Plant._check` reads as counts; else they go to the terminal and a log file."""
+    """Swallow MuJoCo's warnings, which `Plant._check` reads as counts; else they go to the terminal and a log file."""

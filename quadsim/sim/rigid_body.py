@@ -1,7 +1,7 @@
-"""A free rigid body by the classical Runge-Kutta method, every force that follows the motion evaluated at each stage.
+"""A free rigid body by the classical Runge-Kutta method, with motion-dependent forces evaluated at each stage.
 
-MuJoCo's own Runge-Kutta method holds over a step what is applied from outside.  Where the rules of a published
-simulation are to be flown, or the difference is to be measured, this one takes its place.
+MuJoCo's Runge-Kutta method holds external forces over a step.  This integrator replaces it to follow the rules of a
+published simulation, or to measure the difference.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Rates = tuple[list[float], Wrench]
 
 
 def check_free(effects: Effects, changes: Iterable[Change], obstacles: Sequence[Obstacle] = ()) -> None:
-    """Refuse what this integration does not know.
+    """Refuse features that this integrator lacks.
 
     Raises:
-        ParameterError: there is a floor or an obstacle to touch, a load, or drag of MuJoCo's.
+        ParameterError: there is a floor or an obstacle to touch, a load, or MuJoCo's drag.
     """
     unknown = {
         "contact with the ground": effects.ground is not None and effects.ground.contact,
@@ -32,7 +32,7 @@ def check_free(effects: Effects, changes: Iterable[Change], obstacles: Sequence[
         "effects.air.body_drag": effects.air is not None and effects.air.body_drag is not None,
     }
     if names := [name for name, present in unknown.items() if present]:
-        raise ParameterError("plant", "integrator", "rk4", f"mujoco where there is {' and '.join(names)}")
+        raise ParameterError("plant", "integrator", "rk4", f"mujoco with {' and '.join(names)}")
 
 
 class RigidBody:
@@ -40,12 +40,12 @@ class RigidBody:
 
         dp/dt = v,  dq/dt = q (0, w) / 2,  m dv/dt = -m g e_z + R(q) F e_z + f,  J dw/dt = tau + t - w x J w
 
-    with R(q) a polynomial of q, which is made of unit length after each step.  States are MuJoCo's: position, world
-    (3), quaternion wxyz (4), velocity, world (3), body rates (3).
+    with R(q) a polynomial of q, which is normalised after each step.  States are MuJoCo's: position, world (3),
+    quaternion wxyz (4), velocity, world (3), body rates (3).
     """
 
     def __init__(self, vehicle: Vehicle, forces: StepForces, timestep: float) -> None:
-        """Set up, with the forces that follow the motion and the step [s]."""
+        """Prepare for motion-dependent forces and a step [s]."""
         self._mass, self._gravity, self._inertia = vehicle.mass, vehicle.gravity, vehicle.inertia
         torques = vehicle.allocation[1:] / vehicle.thrust_coefficient
         self._torques: list[list[float]] = torques.tolist()
@@ -59,10 +59,10 @@ class RigidBody:
         wind: Sequence[float],
         held: Sequence[float],
     ) -> tuple[list[float], list[float]]:
-        """The state (13,) a step later, and the mean of the forces and torques that acted, as `StepForces.at` has them.
+        """Return the state (13,) one step later, and the mean of the forces and torques, as in `StepForces.at`.
 
-        Of thrusts (4,) [N], a row (6,) of `StepForces.of_rotors`, the velocity (3,) of the air, world [m/s], and force,
-        world [N], and torque, body [N m], (6,) that stay the same over the step.
+        The thrusts are (4,) [N], `of_rotors` is a row (6,) of `StepForces.of_rotors`, then come the velocity (3,) of
+        the air, world [m/s], and a constant force, world [N], and torque, body [N m], (6,).
         """
         h, (f1, f2, f3, f4) = self._step, thrusts
         fixed = f1 + f2 + f3 + f4, [a * f1 + b * f2 + c * f3 + d * f4 for a, b, c, d in self._torques], held

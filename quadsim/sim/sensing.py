@@ -1,4 +1,4 @@
-"""Sensors: from the true motion to samples that arrive late, wrong or never, and what can befall a sensor."""
+"""Sensors: samples of the true motion that arrive late, wrong or never, and faults of sensors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AXES: Final = (0, 1, 2)
 
 
 class SensorName(StrEnum):
-    """What can be measured, three numbers each."""
+    """The measurable quantities, three numbers each."""
 
     POSITION = "position"  # x, y, z [m], world
     VELOCITY = "velocity"  # vx, vy, vz [m/s], world
@@ -39,13 +39,13 @@ class Outliers:
     together.  Huber, "Robust estimation of a location parameter", Annals of Mathematical Statistics 35 (1964), Sec. 1.
     """
 
-    probability: Annotated[Fraction, doc("[-] of a sample being one")]
-    size: Annotated[float, Ge(1.0), Le(1e6), doc("[-] how many times the noise it has")]
+    probability: Annotated[Fraction, doc("[-] probability of an outlier")]
+    size: Annotated[float, Ge(1.0), Le(1e6), doc("[-] factor on the noise")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """When a sensor's samples are taken, when they arrive, and which do not."""
+    """When a sensor's samples are taken and arrive, and which are lost."""
 
     rate: Annotated[
         float, Ge(0.01), Le(1e4), doc("[Hz] samples per second, the first at t = 0; a divisor of the physics rate")
@@ -61,17 +61,17 @@ class Sampling:
 class Sensor(Sampling):
     """One sensor, in the unit of its name (see `SensorName`).
 
-    A sample taken at t = j / rate is value + bias + walk(t) + noise.  It arrives `delay` later, or never.
+    A sample taken at t = j / rate is value + bias + walk(t) + noise.  It arrives `delay` later, or is lost.
     """
 
-    name: SensorName  # what is measured
+    name: SensorName  # the measured quantity
     noise: Vector = (0.0, 0.0, 0.0)  # standard deviation per axis, white from sample to sample
     bias: Vector = (0.0, 0.0, 0.0)  # constant offset per axis
     bias_walk: Vector = (0.0, 0.0, 0.0)
     """The bias's random walk per axis [unit/sqrt(s)]: its variance grows by bias_walk^2 t."""
 
     def stride(self, timestep: float) -> int:
-        """Physics steps from one sample to the next.
+        """Return the physics steps between samples.
 
         Raises:
             ParameterError: the rate does not divide the physics rate.
@@ -80,7 +80,7 @@ class Sensor(Sampling):
         return whole(f"sensors.{self.name}", "rate", self.rate, 1.0 / (self.rate * timestep), rule)
 
     def latency(self, timestep: float) -> int:
-        """Physics steps from taking a sample to its arrival.
+        """Return the physics steps from a sample to its arrival.
 
         Raises:
             ParameterError: the delay is not a whole number of physics steps.
@@ -90,10 +90,10 @@ class Sensor(Sampling):
 
 
 class FaultKind(StrEnum):
-    """What can befall a sensor for a while."""
+    """The kinds of temporary sensor faults."""
 
     DROPOUT = "dropout"  # no samples
-    FREEZE = "freeze"  # every sample repeats the last one that got through before
+    FREEZE = "freeze"  # every sample repeats the last one before the fault
     NAN = "nan"  # samples are not numbers
     BIAS = "bias"  # an offset is added
 
@@ -102,25 +102,25 @@ class FaultKind(StrEnum):
 class SensorFault:
     """A sensor's fault, for all samples taken at start <= t < stop."""
 
-    sensor: SensorName  # which one
-    kind: FaultKind  # what happens
+    sensor: SensorName  # the sensor
+    kind: FaultKind  # the kind
     start: float  # [s]
-    stop: float = math.inf  # [s]; infinite where it is permanent
-    axes: tuple[int, ...] = AXES  # which of the three numbers become NaN
+    stop: float = math.inf  # [s]; infinite for a permanent fault
+    axes: tuple[int, ...] = AXES  # indices of the numbers that become NaN
     offset: Vector = (0.0, 0.0, 0.0)
-    """What is added, in the sensor's unit; a rotation vector in the body frame for attitude."""
+    """The offset, in the sensor's unit; a rotation vector in the body frame for attitude."""
 
     def window(self, timestep: float) -> tuple[int, int | None]:
-        """First physics step that it holds at, and the first that it does not; None where it never ends."""
-        first = math.ceil(self.start / timestep - 1e-6)  # an instant meant to be a step is one, whatever the rounding
+        """Return the first physics step with the fault, and the first after it; None if it never ends."""
+        first = math.ceil(self.start / timestep - 1e-6)  # rounding must not move an instant meant to be a step
         return first, math.ceil(self.stop / timestep - 1e-6) if math.isfinite(self.stop) else None
 
 
 def whole(owner: str, name: str, value: float, count: float, rule: str, *, smallest: int = 1) -> int:
-    """The whole number that a count of physics steps is, which follows from a parameter.
+    """Convert a count of physics steps, derived from a parameter, to a whole number.
 
     Raises:
-        ParameterError: it is none, or too small.
+        ParameterError: it is not whole, or too small.
     """
     steps = round(count)
     if steps < smallest or not math.isclose(steps, count, rel_tol=1e-9, abs_tol=1e-9):
@@ -134,7 +134,7 @@ _COLUMNS = {
     SensorName.ATTITUDE: slice(4, 8),
     SensorName.RATES: slice(11, 14),
 }
-"""Where a sensor's quantity is in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
+"""Position of a sensor's quantity in MuJoCo's state; see `quadsim.sim.physics.physics_to_state`."""
 
 Flags = NDArray[np.bool_]
 Steps = NDArray[np.int64]
@@ -143,22 +143,22 @@ Steps = NDArray[np.int64]
 class Sample(NamedTuple):
     """One sample."""
 
-    sensor: SensorName  # whose
+    sensor: SensorName  # the sensor
     taken: int  # physics step at which it was taken, its time stamp
-    arrival: int  # physics step from which it is known
+    arrival: int  # physics step at which it becomes available
     value: Array  # (3,) in the unit of the sensor's name
 
 
 def truth(name: SensorName, physics: Array) -> Array:
-    """A perfect sensor's samples (M, 3) of MuJoCo's states (M, 14)."""
+    """Return a perfect sensor's samples (M, 3) of MuJoCo's states (M, 14)."""
     values = physics[:, _COLUMNS[name]]
     return quaternion_to_euler(values) if name is SensorName.ATTITUDE else values.copy()
 
 
 class Sampler:
-    """Takes a sensor's samples; the same ones again after a reset, however the time is cut into calls.
+    """Takes a sensor's samples; they are reproducible after a reset, however the time is cut into calls.
 
-    Noise, bias, dropouts and outliers each draw from a generator of their own, so none changes another's draws.
+    Noise, bias, dropouts and outliers have separate random generators, so none changes another's draws.
     """
 
     def __init__(
@@ -176,54 +176,54 @@ class Sampler:
 
     @property
     def watched(self) -> bool:
-        """Whether it knows of any fault, and so what a frozen sensor would repeat."""
+        """Whether it has any fault, and so tracks the sample that a frozen sensor repeats."""
         return bool(self._faults)
 
     def reschedule(self, faults: Sequence[SensorFault]) -> None:
-        """Let these faults, of this sensor and others, take the place of those before."""
+        """Replace the faults; those of other sensors are ignored."""
         of_this = (fault for fault in faults if fault.sensor is self.sensor.name)
         self._faults = tuple((fault, fault.window(self._timestep)) for fault in of_this)
 
     def reset(self) -> None:
-        """Start again, with the same draws."""
+        """Restart with the same draws."""
         self._of_noise, self._of_bias, self._of_dropout, self._of_outliers = copy.deepcopy(self._initial)
         self._walked: Array | None = None
         self._through: Array | None = None
 
     def sample(self, physics: Array, first: int) -> list[Sample]:
-        """The samples taken during a segment of motion, those lost left out.
+        """Return the samples taken during a segment of motion, without lost ones.
 
-        Of MuJoCo's states (M, 14) at successive physics steps, the first of number `first`; segments follow one another
-        from step 0.
+        The segment is given by MuJoCo's states (M, 14) at successive physics steps from step `first`; segments follow
+        one another from step 0.
         """
-        begin = -first % self._stride
-        rows = physics[begin :: self._stride]
+        first_row = -first % self._stride
+        rows = physics[first_row :: self._stride]
         count = len(rows)
         if not count:
             return []
-        taken = np.arange(first + begin, first + len(physics), self._stride)
-        errors = self._walk(count) + self._draw_noise(count) + 0.0  # which leaves no -0
+        taken = np.arange(first + first_row, first + len(physics), self._stride)
+        errors = self._walk(count) + self._draw_noise(count) + 0.0  # turns -0 into 0
         lost = self._of_dropout.random(count) < self.sensor.dropout
-        befallen = [(fault, _within(taken, window)) for fault, window in self._faults]
+        affected = [(fault, _within(taken, window)) for fault, window in self._faults]
         offset, frozen = np.zeros((count, 3)), np.zeros(count, dtype=bool)
-        for fault, held in befallen:
+        for fault, within in affected:
             match fault.kind:
                 case FaultKind.BIAS:
-                    offset[held] += fault.offset
+                    offset[within] += fault.offset
                 case FaultKind.DROPOUT:
-                    lost |= held
+                    lost |= within
                 case FaultKind.FREEZE:
-                    frozen |= held
+                    frozen |= within
         values = self._measure(rows, errors + offset)
-        if befallen:
+        if affected:
             for value, gone, stuck in zip(values, lost, frozen, strict=True):
                 if stuck and self._through is not None:
                     value[:] = self._through
                 elif not gone:
                     self._through = value.copy()
-        for fault, held in befallen:
+        for fault, within in affected:
             if fault.kind is FaultKind.NAN:
-                values[np.ix_(np.flatnonzero(held), np.array(fault.axes))] = np.nan
+                values[np.ix_(np.flatnonzero(within), np.array(fault.axes))] = np.nan
         name, latency = self.sensor.name, self._latency
         return [
             Sample(name, step, step + latency, value)
@@ -232,7 +232,7 @@ class Sampler:
         ]
 
     def _walk(self, count: int) -> Array:
-        """(count, 3) bias at each sample: its constant at the first of all, then a random walk."""
+        """Return (count, 3) the bias at each sample: constant at the first of all, then a random walk."""
         steps = self._step * self._of_bias.standard_normal((count, 3))
         if self._walked is None:
             steps[0] = self._bias

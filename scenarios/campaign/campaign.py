@@ -21,8 +21,9 @@ import pyarrow.compute as pc
 
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.outputs import Growing, growing
+from quadsim.report.figure import Figure
 from scenarios.campaign import store as records
-from scenarios.campaign.campaign_report import write_report
+from scenarios.campaign.campaign_report import overview, write_report
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.rows import make_table, read_table
 from scenarios.campaign.statistics import Judgement, estimate, proportion, worst_flight
@@ -41,6 +42,7 @@ from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario
 
 REPORT_FILES: Final = ("index.html", "campaign.png")
+_JUDGED: Final = 5  # requirements that a repr has
 CHECK_EVERY: Final = 10
 """Flights after which the interval is looked at again, where it decides when to stop; of grids, whole turns."""
 
@@ -72,6 +74,23 @@ class CampaignResult(Result):
     def exit_status(self) -> int:
         """See `Result.exit_status`; 1 where the flights do not support a requirement."""
         return EXIT_DONE if all(judgement.holds for judgement in self.judgements) else EXIT_FAILED
+
+    def __repr__(self) -> str:
+        from scenarios.campaign.campaign_report import verdict_sentence
+
+        lines = [f"<CampaignResult {self.summary['campaign']}: {verdict_sentence(self.summary)}"]
+        for flight in self.summary["worst"][:1]:
+            lines.append(f"worst flight: {flight['flight']}, {flight['verdict']}")
+            if flight["worst_constraint"] is not None:
+                share = f"{flight['worst_margin']:.3g} times half its band"
+                lines.append(f"its worst margin: {flight['worst_constraint']}, {share}")
+        lines += [judgement.sentence for judgement in self.judgements[:_JUDGED]]
+        return "\n ".join([*lines, f"in {self.directory}>"])
+
+    def small_plot(self) -> Figure | None:
+        """See `Result.small_plot`: worst margins, and the parameters that matter."""
+        figure = overview(self.table, self.summary, "")
+        return figure if figure.panels else None
 
     def shown(self) -> Shown:
         """See `Result.shown`."""

@@ -14,10 +14,11 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
+from quadsim.report.figure import BOUND, Bound, Figure, Panel, Series, line_colour
 from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import CampaignFile, Grid
 from scenarios.campaign.plan import Plan, cell
-from scenarios.campaign.rows import DRAW, make_table
+from scenarios.campaign.rows import DRAW, is_number, make_table, numbers
 from scenarios.flight import to_pandas
 from scenarios.progress import Progress, silent
 from scenarios.results import Result, Shown
@@ -86,6 +87,28 @@ class Sweep(Result):
         parts = field.split(".")
         ends = (".".join(parts[-count:]) for count in range(2 if parts[-1].isdigit() else 1, len(parts)))
         return next((end for end in ends if sum(f".{name}".endswith(f".{end}") for name in self.fields) == 1), field)
+
+    def small_plot(self) -> Figure | None:
+        """See `Result.small_plot`: the worst margin over the first field that is a number."""
+        names = [name for name in self.fields if is_number(self.table, name)]
+        if not names:
+            return None
+        x, y, satisfied = (
+            numbers(self.table, names[0]),
+            numbers(self.table, "worst_margin"),
+            self["verdict"] == "satisfied",
+        )
+        points = tuple(
+            Series(x=x[chosen], y=y[chosen], colour=colour, label=label, style="points", width=5.0, marker=marker)
+            for chosen, colour, label, marker in (
+                (satisfied, line_colour(0), "satisfied", "circle"),
+                (~satisfied, BOUND, "not satisfied", "x"),
+            )
+            if chosen.any()
+        )
+        label, zero = "worst margin, as a share of half its band", Bound(value=0.0)
+        panel = Panel(title=label, y_label="share", x_label=names[0], series=points, bounds=(zero,), height=1.4)
+        return Figure(key="sweep", title="", panels=(panel,), columns=1)
 
     def to_json(self) -> list[dict[str, Any]]:
         """A table of columns for each flight."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, get_args, get_type_hints
 
@@ -36,10 +36,7 @@ from scenarios.schema.settings import separate, set_field
 from scenarios.schema.writing import to_toml
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from scenarios.flight import Flight
-    from scenarios.progress import Progress
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +61,8 @@ class _Modelled(_Overrides):
 
 
 if TYPE_CHECKING:
+    from scenarios.flight import Flight
+
     VehicleTable: TypeAlias = _Modelled
     ActualTable: TypeAlias = _Overrides
 else:
@@ -242,6 +241,11 @@ class Scenario:
     def __repr__(self) -> str:
         parts = f"{self.duration:g} s of {self.vehicle.file}, {self.reference.type} by {self.controller.type}"
         return f"<Scenario {self.name}: {parts}\n {self.description}>"
+
+    def _repr_html_(self) -> str:
+        from scenarios.scenario_summary import scenario_html
+
+        return scenario_html(self)
 
     def __dir__(self) -> list[str]:
         """What a user sets and calls, which is what an interactive session completes to."""
@@ -422,24 +426,11 @@ class Scenario:
         # A reference that was passed in as a function has its rows in memory.
         return other.altered(reference=self.reference) if other.reference == self.reference else other
 
-    def fly(
-        self,
-        *,
-        controller: object = None,
-        forces: Sequence[object] = (),
-        reference: Callable[[float], ArrayLike] | None = None,
-        progress: Progress | bool = True,
-    ) -> Flight:
-        """Fly it, with the arguments and errors of `quadsim.fly`.
-
-        Examples:
-            >>> import quadsim
-            >>> quadsim.load("hover").replace({"duration": 1.0}).fly().outcome
-            'satisfied'
-        """
+    def fly(self, **options: Any) -> Flight:
+        """Fly it; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
         from scenarios.app import fly
 
-        return fly(self, controller=controller, forces=forces, reference=reference, progress=progress)
+        return fly(self, **options)
 
     def to_toml(self) -> str:
         """The resolved file: every field, defaults included, with comments; parsing it gives this scenario again."""

@@ -163,7 +163,7 @@ def test_numbers_are_exact_and_none_is_denormal(value: float, text: str) -> None
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_numbers_that_are_none_are_refused(value: float) -> None:
-    with pytest.raises(ValueError, match="no place in C"):
+    with pytest.raises(ValueError, match="cannot be written in C"):
         CText("double").number(value)
 
 

@@ -157,7 +157,7 @@ def test_a_file_is_written_whole_and_replaced_only_on_request(tmp_path: Path) ->
     path = tmp_path / "film.mp4"
     with writing_file(path) as new:
         new.write_text("one")
-    with pytest.raises(OutputError, match="it is already there; choose another file"), writing_file(path):
+    with pytest.raises(OutputError, match="it already exists; choose another file"), writing_file(path):
         pytest.fail("not to be reached")
     with pytest.raises(ValueError, match="half"):
         fail(writing_file(path, overwrite=True), ValueError("half"))

@@ -136,7 +136,7 @@ def test_it_is_drawn(flight: Flight) -> None:
     with pytest.raises(UnknownNameError, match="no signal named 'rol'; did you mean 'roll'"):
         flight.plot("rol")
     page = flight._repr_html_()
-    assert "data:image/png;base64," in page
+    assert "<svg" in page
     assert all(finding.limit.name in page for finding in flight.audit)
 
 
@@ -341,7 +341,24 @@ def test_what_is_handed_out_names_itself_in_a_few_lines() -> None:
     assert first == f"<Flight hover: {flight.outcome}, 1.00 s by constrained"
     name, margin = re.fullmatch(r" worst margin: (\S+) (\S+) .*>", worst).groups()
     assert float(margin) == pytest.approx(min(flight.margins[name]), abs=0.1)
-    assert len(repr(quadsim.compare(flight, flight)).splitlines()) <= 10
+    lines = repr(quadsim.compare(*[flight] * 6)).splitlines()
+    assert lines[0] == "<FlightComparison of 6 flights"
+    assert lines[1].endswith(f": {flight.outcome}")
+    assert lines[2:3] == [worst.removesuffix(">")]
+    assert (len(lines), lines[-1]) == (10, " and 2 more>")
+
+
+def test_a_notebook_shows_tables_and_a_small_plot(hover: Scenario, flight: Flight, tmp_path: Path) -> None:
+    swept = quadsim.sweep(hover, {"controller.horizon": [20, 30]}, workers=1, progress=False)
+    mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "grid", "values": [3.9, 4.0, 4.1]}
+    flown = quadsim.campaign(hover, vary=[mass], flights=3, workers=1, out=tmp_path / "c", progress=False)
+    for shown in (hover, flight, quadsim.compare(flight, flight), swept, flown):
+        page = shown._repr_html_()
+        assert len(page) < 62_000
+        assert "<svg" in page or "data:image/png" in page
+        assert len(repr(shown).splitlines()) <= 10
+    assert repr(flown).splitlines()[0].startswith("<CampaignResult hover: 0 of 3 flights failed")
+    assert "<th>vehicle</th><td>lopes2011</td>" in hover._repr_html_()
 
 
 @pytest.mark.parametrize(

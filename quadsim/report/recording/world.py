@@ -122,8 +122,8 @@ def _part(solid: Solid, colour: Any) -> rr.AsComponents:
         case "cylinder":
             return rr.Cylinders3D(centers=centres, lengths=[2.0 * b], radii=[a], **turned)
         case "capsule":
-            begin = solid.centre - b * solid.turn[:, 2]
-            return rr.Capsules3D(translations=[begin], lengths=[2.0 * b], radii=[a], **turned)
+            bottom = solid.centre - b * solid.turn[:, 2]
+            return rr.Capsules3D(translations=[bottom], lengths=[2.0 * b], radii=[a], **turned)
     half = (a, a, a) if solid.kind == "sphere" else solid.size
     return rr.Ellipsoids3D(centers=centres, half_sizes=[half], **turned)
 

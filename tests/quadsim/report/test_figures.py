@@ -197,7 +197,7 @@ def test_a_run_among_obstacles_is_drawn_from_above_with_its_clearances(short_run
 
 
 def test_every_signal_can_be_drawn(short_run: Run) -> None:
-    figure = flight_figures.signals(short_run, list(SIGNALS))
+    figure = flight_figures.signals([short_run], list(SIGNALS))
     assert [panel.unit for panel in figure.panels] == [signal.unit for signal in SIGNALS.values()]
 
 

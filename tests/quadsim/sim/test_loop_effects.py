@@ -172,9 +172,9 @@ def test_the_estimator_receives_the_saturated_command(vehicle: Vehicle) -> None:
     received: list[Array] = []
 
     class Witness(Navigation):
-        def advance(self, physics: Array, commands: Array, *, standing: bool = False) -> None:
+        def advance(self, physics: Array, commands: Array, *, on_ground: bool = False) -> None:
             received.append(commands[0].copy())
-            super().advance(physics, commands, standing=standing)
+            super().advance(physics, commands, on_ground=on_ground)
 
     navigation = Witness(vehicle, timestep=1e-3, sensors=[], rng=np.random.default_rng(0))
     with Plant(vehicle, limit_speeds=True) as plant:

@@ -143,17 +143,17 @@ def test_the_estimate_is_near_the_truth_and_its_yaw_unwrapped(vehicle: Vehicle, 
     assert build(vehicle).tallies == {}
 
 
-@pytest.mark.parametrize("standing", [True, False])
-def test_the_estimator_alone_minds_that_the_feet_stand(standing: bool, vehicle: Vehicle, physics: Array) -> None:
+@pytest.mark.parametrize("on_ground", [True, False])
+def test_the_estimator_alone_minds_that_the_feet_stand(on_ground: bool, vehicle: Vehicle, physics: Array) -> None:
     cold = np.zeros((200, 4))
     ground = np.tile(physics[:1], (201, 1))
     ground[:, 4:8], ground[:, 8:] = [1.0, 0.0, 0.0, 0.0], 0.0
     for estimator in (None, EstimatorSettings()):
         navigation = build(vehicle, *SENSORS, estimator=estimator)
         navigation.reset(ground[0], cold[0])
-        navigation.advance(ground[1:], cold, standing=standing)
+        navigation.advance(ground[1:], cold, on_ground=on_ground)
         falls = navigation.state()[INDEX["vz"]] < -0.3
-        assert falls == (estimator is not None and not standing)
+        assert falls == (estimator is not None and not on_ground)
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ def fake_worker(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_failing_worker_stops_the_others_and_leaves_nothing(short_run: Run, tmp_path: Path):
     target = tmp_path / "film.mp4"
     target.write_bytes(b"an older film")
-    with pytest.raises(OutputError, match="it is already there; choose another file"):
+    with pytest.raises(OutputError, match="it already exists; choose another file"):
         render_video(short_run.directory, target, workers=2)
     with pytest.raises(OutputError, match="renderer failed: GLError: the picture is lost") as caught:
         render_video(short_run.directory, target, workers=2, overwrite=True)

@@ -111,7 +111,7 @@ def run(
         rows = motion.physics[seed, first + 1 : stop + 1]
         in_flight += [sample for sampler in samplers for sample in sampler.sample(rows, first + 1)]
         arrived = [s for s in in_flight if s.arrival <= stop]
-        filter_.advance(motion.commands[first:stop], arrived, first, standing=first in standing)
+        filter_.advance(motion.commands[first:stop], arrived, first, on_ground=first in standing)
         in_flight = [s for s in in_flight if s.arrival > stop]
         estimate = filter_.estimate(stop)
         true = motion.bias_free_mean(seed, stop)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from quadsim.sim.error_state import OBSERVATION, Estimate, difference, doubt, innovation, retract, update
+from quadsim.sim.error_state import OBSERVATION, Estimate, difference, inflate, innovation, retract, update
 from quadsim.sim.sensing import SensorName
 from quadsim.state import Array
 
@@ -76,7 +76,7 @@ def test_a_sample_outside_the_gate_changes_nothing(estimate: Estimate) -> None:
 @pytest.mark.parametrize("name", list(SensorName))
 def test_doubt_lets_any_sample_pass_and_keeps_the_mean(name: SensorName, estimate: Estimate) -> None:
     far = np.array([0.4, 0.3, -2.0]) if name is SensorName.ATTITUDE else np.array([500.0, -300.0, 200.0])
-    widened = doubt(estimate, name, far, 2.0)
+    widened = inflate(estimate, name, far, 2.0)
     assert np.array_equal(widened.mean, estimate.mean)
     assert np.linalg.eigvalsh(widened.covariance).min() > -1e-9
     after, distance = update(widened, name, far, R, 3.0)
@@ -103,7 +103,7 @@ def test_inflation_includes_the_state_that_misled(
     expected = np.zeros(15)
     for start, share in [*((i, 1.0) for i in seen), *((i, 0.25) for i in leading)]:
         expected[start : start + 3] = share * squares
-    added = doubt(estimate, name, far, 2.0).covariance - estimate.covariance
+    added = inflate(estimate, name, far, 2.0).covariance - estimate.covariance
     np.testing.assert_allclose(added, np.diag(expected), atol=1e-12)
 
 

@@ -1,0 +1,44 @@
+"""A scenario as a notebook shows it: what flies, where, by which controller, and the course over time."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+
+from quadsim.errors import InputError
+from quadsim.report.figure import REFERENCE, Figure, Panel, Series
+from quadsim.report.to_matplotlib import to_html
+from scenarios.loading import assemble
+from scenarios.schema.scenario import Scenario
+
+
+def scenario_html(scenario: Scenario) -> str:
+    """A table of its parts, and its course; where the course cannot be built, why."""
+    controller = scenario.controller
+    bounds = {name: f"{low:g} to {high:g}" for name, (low, high) in getattr(controller, "output_bounds", {}).items()}
+    rows = {
+        "duration": f"{scenario.duration:g} s, {scenario.periods} periods of {scenario.control_period:g} s",
+        "vehicle": str(scenario.vehicle.file),
+        "course": scenario.reference.type,
+        "controller": f"{controller.type}, horizon {controller.horizon}",
+        "output bounds": ", ".join(f"{name} {ends}" for name, ends in bounds.items()),
+        "audited": ", ".join(scenario.audited_names),
+    }
+    table = "".join(f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in rows.items() if text)
+    head = f"<p><b>{escape(scenario.name)}</b>: {escape(scenario.description)}</p><table>{table}</table>"
+    try:
+        return head + to_html(course_figure(scenario))
+    except InputError as error:
+        return f"{head}<p>{escape(str(error))}</p>"
+
+
+def course_figure(scenario: Scenario) -> Figure:
+    """The filtered reference of x, y and z over time."""
+    reference = assemble(scenario).reference(scenario.periods)
+    t = scenario.control_period * np.arange(len(reference), dtype=np.float64)
+    panels = tuple(
+        Panel(title=name, unit="m", series=(Series(x=t, y=column, colour=REFERENCE, label="reference, filtered"),))
+        for name, column in zip("xyz", reference.T[:3], strict=True)
+    )
+    return Figure(key="course", title="", panels=panels, columns=1, end=scenario.duration)
