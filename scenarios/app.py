@@ -224,9 +224,10 @@ def fly(
         forces: forces of one's own that act on the vehicle, besides the scenario's effects: functions
             `force(time, state)`, called once per physics step, that give force x, y, z in the world frame [N] and
             torque in the body frame [N m]; or classes called as MyForce(vehicle, rng=...) whose objects are called so.
-        reference: replaces the scenario's course and its filter: a function `f(t)` of the time [s] that gives x, y, z
-            [m], yaw [rad] (unwrapped), called before the flight for all control instants to the last preview's end.
-            A run directory keeps these samples in `reference.csv`, and its `scenario.toml` flies to the same bits.
+        reference: replaces the course and its filter; the scenario's constraints stay.  A function `f(t)` of the time
+            [s] that gives x, y, z [m], yaw [rad] (unwrapped), called before the flight for all control instants to the
+            end of the last preview.  A run directory keeps these samples in `reference.csv`, and its `scenario.toml`
+            flies to the same bits.
         progress: called with (what, done, total); True for bars on a terminal and elsewhere a line every ten seconds,
             False for none.
 

@@ -61,8 +61,6 @@ class _Modelled(_Overrides):
 
 
 if TYPE_CHECKING:
-    from scenarios.flight import Flight
-
     VehicleTable: TypeAlias = _Modelled
     ActualTable: TypeAlias = _Overrides
 else:

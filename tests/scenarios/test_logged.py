@@ -54,6 +54,8 @@ def test_what_a_controller_logs_is_a_column_with_gaps(hover: Scenario, tmp_path:
     assert schema.field("count").metadata[b"unit"] == b"-"
     assert {*schema.names} - COLUMNS == {"height", "count"}
     assert quadsim.check(run).satisfied == flight.satisfied
+    swept = quadsim.sweep(hover, {"vehicle.mass": [3.9, 4.0]}, controller=Logging, workers=1)
+    assert "aborted" not in swept["verdict"].tolist()
 
 
 def test_nothing_is_logged_without_a_testbed_and_by_the_laws_that_ship(hover: Scenario) -> None:
