@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import math
 import re
 import subprocess
 import sys
@@ -118,7 +119,7 @@ def _bound(found: dict[str, Any], unit: str) -> str:
 
 def scenarios(golden: dict[str, Any]) -> str:
     """The library's scenarios, a table for each group."""
-    head = ("", "scenario", "verdict", "nearest", "RMS error x, y, z [m]")
+    head = ("", "scenario", "verdict", "nearest", "RMS error [m]")
     specs = {name: load_scenario(name) for name in golden}
     parts = []
     for group in get_args(Group):
@@ -133,11 +134,11 @@ def scenarios(golden: dict[str, Any]) -> str:
 
 
 def scenario_cells(entry: dict[str, Any]) -> tuple[str, str, str]:
-    """A scenario's verdict, nearest bound and errors; "-" where the vehicle was lost."""
+    """A scenario's verdict, nearest bound and error of the position; "-" where the vehicle was lost."""
     if "rmse" not in entry:
         return entry["verdict"], "-", "-"
-    errors = ", ".join(f"{error:.3f}" for error in entry["rmse"])
-    return entry["verdict"], f"{entry['nearest']} {entry['margin'] + 0.0:.2f} {entry['unit']}", errors
+    nearest = f"{entry['nearest']} {entry['margin'] + 0.0:.2f} {entry['unit']}"
+    return entry["verdict"], nearest, f"{math.hypot(*entry['rmse'][:3]):.3f}"
 
 
 def papers(reproduction: dict[str, Any]) -> str:

@@ -15,6 +15,7 @@ from typing import Final
 
 _TRACEBACK_LINES: Final = 20  # lines kept of the traceback that ended a flight
 _LONGEST: Final = 500  # characters kept of its message
+_LONGEST_LIST: Final = 150  # characters of a list of names
 _HIDDEN: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 """Unicode categories that control a terminal or are invisible: controls, formats such as direction, surrogates."""
 
@@ -94,7 +95,11 @@ class UnknownNameError(InputError):
         near = meant or difflib.get_close_matches(name, self.allowed, n=1)
         guess = f"; did you mean {' and '.join(map(repr, near))}?" if near else ""
         tail = f"; {hint}" if hint else ""
-        super().__init__(f"no {kind} named {name!r}{guess} (there are: {', '.join(self.allowed)}){tail}")
+        listed = f"there are: {', '.join(self.allowed)}"
+        if len(listed) > _LONGEST_LIST:
+            some = self.allowed[: max(1, listed[:_LONGEST_LIST].count(",") - 1)]
+            listed = f"there are {len(self.allowed)}: {', '.join(some)}, ..."
+        super().__init__(f"no {kind} named {name!r}{guess} ({listed}){tail}")
 
 
 class FileError(InputError):

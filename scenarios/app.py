@@ -99,6 +99,11 @@ app: Final = App(
 _log: Final = logging.getLogger("quadsim")
 
 
+def _examples(*lines: str) -> str:
+    """What the help of a command ends with."""
+    return "\n  ".join(["examples:", *lines])
+
+
 # --- scenarios -----------------------------------------------------------------------------------------------------
 
 
@@ -223,7 +228,8 @@ def fly(
             [s] that gives x, y, z [m], yaw [rad] (unwrapped), called before the flight for all control instants to the
             end of the last preview.  A run directory keeps these samples in `reference.csv`, and its `scenario.toml`
             flies to the same bits.
-        progress: called with (what, done, total); True for bars on a terminal, False for none.
+        progress: called with (what, done, total); True for bars on a terminal and elsewhere a line every ten seconds,
+            False for none.
 
     Raises:
         InputError: the scenario cannot be flown, or the controller or the reference cannot be set up.
@@ -246,7 +252,11 @@ def fly(
         return start(scenario, controller=controller, forces=forces, reference=reference).fly(report)
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim run paper-constrained", "quadsim run hover --set controller.horizon=30 --out runs/short --no-video"
+    )
+)
 def run(
     scenario: ScenarioName,
     /,
@@ -411,7 +421,11 @@ def read(directory: str | Path) -> Flight:
     )
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim check paper-constrained", "quadsim check runs/paper-constrained --junit verdicts.xml"
+    )
+)
 def check(
     target: ScenarioName,
     /,
@@ -475,7 +489,12 @@ def check(
     return audited
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim compare paper-unconstrained paper-constrained --out runs/comparison",
+        "quadsim compare runs/mine runs/other --markdown",
+    )
+)
 def compare(
     *targets: Target,
     out: File | None = None,
@@ -520,7 +539,12 @@ def compare(
     return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared
 
 
-@app.command(name="video")
+@app.command(
+    name="video",
+    help_epilogue=_examples(
+        "quadsim video runs/paper-constrained", "quadsim video runs/paper-constrained --out flight.gif"
+    ),
+)
 def film(
     directory: File,
     /,
@@ -569,9 +593,8 @@ def film(
     if path.suffix not in (".mp4", ".gif"):
         raise ParameterError("", "--out", out, "a file ending in .mp4 or .gif")
     with reporting(progress) as report:
-        render = partial(render_gif, directory, workers=workers)
-        if path.suffix == ".mp4":
-            render = partial(render_video, directory, workers=workers, progress=partial(report, "video"))
+        make = render_video if path.suffix == ".mp4" else render_gif
+        render = partial(make, directory, workers=workers, progress=partial(report, "video"))
         if path.parent != directory:
             render(path, overwrite=overwrite)
         else:  # a product of the run, which its summary lists
@@ -580,7 +603,9 @@ def film(
     return path
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples("quadsim view runs/paper-constrained", "quadsim view runs/paper-constrained --web")
+)
 def view(run: File, /, *, web: Flag = False) -> None:
     """Open a run's recording in the rerun viewer.
 
@@ -619,7 +644,9 @@ def view(run: File, /, *, web: Flag = False) -> None:
     open_viewer(recording, web=web)
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples("quadsim live paper-constrained", "quadsim live robust --against paper-unconstrained")
+)
 def live(
     scenario: ScenarioName,
     /,
@@ -693,7 +720,7 @@ def sweep(
         controller: as of `fly`; a class or a function of a module that other processes can import.
         forces: what acts on it, as of `fly`; the same.
         workers: processes that fly; one per usable core where absent.
-        progress: whether to show a bar on a terminal.
+        progress: as of `fly`.
 
     Returns:
         A table with a row per flight, in the order of the combinations, the last field varying fastest.
@@ -721,7 +748,12 @@ def sweep(
         return fly_sweep(importable(load_scenario(scenario), controller, forces), values, workers, report)
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim campaign paper-robustness --flights 100",
+        "quadsim campaign mine.toml --resume --require 'P(violation) < 0.01 @ 95%'",
+    )
+)
 def campaign(
     campaign: CampaignName,
     /,
@@ -764,7 +796,7 @@ def campaign(
         fields: of a scenario: other fields of a campaign file, as `name`, `failure` or `sampling`.
         controller: of a scenario, as of `sweep`.
         forces: of a scenario, as of `sweep`.
-        progress: whether to show a bar on a terminal, and elsewhere a line now and then.
+        progress: whether to show a bar on a terminal, and elsewhere a line every ten seconds.
 
     Returns:
         The results: `table` (a row per flight), `summary` (estimates with their intervals), `judgements` (of what was
@@ -817,7 +849,12 @@ def campaign(
     return result
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim replay runs/campaigns/paper-robustness --worst",
+        "quadsim replay runs/campaigns/paper-robustness --flight 12 --no-video",
+    )
+)
 def replay(
     campaign: File,
     /,
@@ -877,7 +914,7 @@ def replay(
     return held_against(flown, recorded)
 
 
-@app.command
+@app.command(help_epilogue=_examples("quadsim tune paper-robust", "quadsim tune mine.toml --trials 50 --resume"))
 def tune(
     tuning: TuningName,
     /,
@@ -949,7 +986,7 @@ def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) 
         raise KeyboardInterrupt(f"{directory} has the flights so far, --resume continues it") from None
 
 
-@app.command
+@app.command(help_epilogue=_examples("quadsim reproduce", "quadsim reproduce torrente2021 --junit numbers.xml"))
 def reproduce(
     paper: PaperName | None = None, /, *, junit: File | None = None, progress: Watched = True
 ) -> Reproductions:
@@ -988,7 +1025,12 @@ def reproduce(
 # --- files, code, and what there is --------------------------------------------------------------------------------
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim export paper-constrained --out exported",
+        "quadsim export paper-constrained --out small --precision float --target cortex-m7",
+    )
+)
 def export(
     scenario: ScenarioName,
     /,
@@ -1033,7 +1075,11 @@ def export(
         return in_the_loop.fly_exported(flown, place, **options)  # type: ignore[arg-type]
 
 
-@app.command
+@app.command(
+    help_epilogue=_examples(
+        "quadsim scenario hover > mine.toml", "quadsim scenario --for hummingbird --course figure-eight > mine.toml"
+    )
+)
 def scenario(
     name: ScenarioName | None = None,
     /,
@@ -1096,7 +1142,12 @@ def scenario(
     return results.ScenarioFile(whole.to_toml())
 
 
-@app.command(name="vehicle")
+@app.command(
+    name="vehicle",
+    help_epilogue=_examples(
+        "quadsim vehicle hummingbird --scenario paper-constrained", "quadsim vehicle --template > mine.toml"
+    ),
+)
 def vehicle_report(
     name: VehicleName | None = None,
     /,
@@ -1179,7 +1230,7 @@ def load_vehicle(name: VehicleName) -> Vehicle:
     return read_vehicle(vehicle_path(str(name)))
 
 
-@app.command(name="list")
+@app.command(name="list", help_epilogue=_examples("quadsim list", "quadsim list --json"))
 def catalogue() -> Catalogue:
     """Scenarios, campaigns, tunings, vehicles, controllers, papers and solvers, one line each.
 
@@ -1200,7 +1251,7 @@ def catalogue() -> Catalogue:
     return read_catalogue()
 
 
-@app.command
+@app.command(help_epilogue=_examples("quadsim doctor", "quadsim doctor --json"))
 def doctor() -> Listing:
     """What this machine can do: cores, packages, rendering, viewer, and every QP solver tried on a step.
 

@@ -12,10 +12,11 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from scenarios.campaign.campaign import Standing, Watch
+    from scenarios.console import PlainConsole
 
 Progress = Callable[[str, int, int], None]  # called with (what, done, total) during long work
 
-LINE_EVERY: Final = 30.0  # between two lines of progress where stderr is no terminal [s]
+LINE_EVERY: Final = 10.0  # between two lines of progress where stderr is no terminal [s]
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -24,14 +25,20 @@ def silent(stage: str, done: int, total: int) -> None:
 
 @contextlib.contextmanager
 def reporting(progress: Progress | bool) -> Iterator[Progress]:
-    """What is called with the progress: bars on a terminal, one per stage, none, or the caller's function."""
+    """What is called with the progress: bars on a terminal, one per stage; elsewhere a line at times.
+
+    Without progress nothing is shown; a function of the caller's takes their place.
+    """
     if callable(progress):
         yield progress
         return
     from scenarios.console import stderr
 
-    if not progress or not (screen := stderr()).is_terminal:
+    if not progress:
         yield silent
+        return
+    if not (screen := stderr()).is_terminal:
+        yield _lines(screen)
         return
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
@@ -46,6 +53,19 @@ def reporting(progress: Progress | bool) -> Iterator[Progress]:
             bars.update(tasks[stage], completed=done, total=total)
 
         yield report
+
+
+def _lines(screen: PlainConsole) -> Progress:
+    """What prints how far a stage is, where that was not said for a while."""
+    printed = clock.perf_counter()
+
+    def report(stage: str, done: int, total: int) -> None:
+        nonlocal printed
+        if (now := clock.perf_counter()) - printed >= LINE_EVERY:
+            printed = now
+            screen.print(f"quadsim: {stage} {100 * done // max(total, 1)} %", soft_wrap=True)
+
+    return report
 
 
 @contextlib.contextmanager
@@ -71,7 +91,7 @@ def watching(progress: bool) -> Iterator[Watch]:
 
         def show(standing: Standing) -> None:
             nonlocal printed
-            if clock.perf_counter() - printed > LINE_EVERY or standing.flown == standing.flights:
+            if clock.perf_counter() - printed >= LINE_EVERY or standing.flown == standing.flights:
                 printed = clock.perf_counter()
                 screen.print(_describe(standing), soft_wrap=True)
 

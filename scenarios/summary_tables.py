@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from rich.console import RenderableType
 from rich.table import Table
@@ -23,6 +23,8 @@ from quadsim.report.comparison import (
     violated_by_fallback,
 )
 from scenarios import console
+
+_NAMED: Final = 3  # violated constraints that the first line names
 
 
 def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) -> Iterator[RenderableType]:
@@ -60,13 +62,28 @@ def outcome_line(summary: Mapping[str, Any]) -> Text:
     colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
     if summary["status"] != "completed":
         return console.styled((f"{verdict(summary)}{remark}", colour), f": {summary['reason']}")
-    phrase = "every required constraint holds" if summary["satisfied"] else "a required constraint does not hold"
+    phrase = "every required constraint holds" if summary["satisfied"] else _violations(summary["constraints"])
     if verdict(summary) == "incomplete":
         colour = "green" if remark and as_expected else "yellow"
         return console.styled((f"incomplete, {required(summary).text}{remark}", colour))
     if violated_by_fallback(summary):
         phrase = "but in permanent fallback"
     return console.styled((f"{crash(summary) or 'completed'}, {phrase}{remark}", colour))
+
+
+def _violations(constraints: Sequence[Mapping[str, Any]]) -> str:
+    """Which required constraints do not hold, by how much, and when that was worst."""
+    violated = []
+    for entry in constraints:
+        if entry["required"] and constraint_verdict(entry) == "violated":
+            margin, _ = deciding_margin(entry)
+            by = ""
+            if margin is not None:
+                when = f"{entry['worst_time']:.2f} s" if margin == entry["worst_margin"] else "the samples"
+                by = f" by {_number(-margin)} {entry['unit']} at {when}"
+            violated.append(f"{entry['name']}{by}")
+    more = f" and {len(violated) - _NAMED} more" if len(violated) > _NAMED else ""
+    return ": ".join(filter(None, ["a required constraint does not hold", ", ".join(violated[:_NAMED]) + more]))
 
 
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:

@@ -156,6 +156,29 @@ def test_a_file_that_is_no_text_is_refused(content: bytes, tmp_path: Path) -> No
         assert matches(refusal(load), "@x.toml: cannot be read @")
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "run hovver",
+        "run nowhere.toml",
+        "check runs/none",
+        "run hover --set controller.horizn=3",
+        "run hover --set duration=abc",
+        "run hover --set vehicle.file=lopes",
+        "vehicle lopes",
+        "runn hover",
+        "run hover --fro",
+        "video runs/none",
+    ],
+)
+def test_a_usual_mistake_takes_three_lines_at_most(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of 120 characters, as a terminal breaks them."""
+    assert main(line.split()) == 2
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert len(printed) <= 3 * 120
+
+
 @pytest.mark.parametrize("command", ["run", "check", "scenario", "compare", "campaign"])
 def test_every_command_reports_it_once_and_writes_nothing(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -61,6 +61,8 @@ class _Modelled(_Overrides):
 
 
 if TYPE_CHECKING:
+    from scenarios.flight import Flight
+
     VehicleTable: TypeAlias = _Modelled
     ActualTable: TypeAlias = _Overrides
 else:

@@ -116,7 +116,14 @@ def render_video(
         _film(shot, new, workers, progress)
 
 
-def render_gif(run_directory: Path, path: Path, *, workers: int | None = None, overwrite: bool = False) -> None:
+def render_gif(
+    run_directory: Path,
+    path: Path,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+) -> None:
     """Film a run as a small looping GIF without captions, six times as fast; arguments and errors as `render_video`.
 
     It is rendered at twice its size and scaled down, which smooths its edges.
@@ -126,7 +133,7 @@ def render_gif(run_directory: Path, path: Path, *, workers: int | None = None, o
     shot = Shot(run=str(run_directory), width=960, height=540, fps=fps, speed=speed, count=count, captions=False)
     with _making(path, overwrite) as new:
         film = new.with_suffix(".mp4")
-        backend = _film(shot, film, workers, None)
+        backend = _film(shot, film, workers, progress)
         # small by few colours and little noise
         scaled = "scale=480:-2:flags=area,hqdn3d=3:3:0:0,split[a][b]"
         colours = "[a]palettegen=max_colors=96:stats_mode=diff[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"

@@ -1,0 +1,30 @@
+"""Every command's help says what it does, and ends with two examples that can be typed."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+import pytest
+
+from scenarios.app import app
+from scenarios.cli import main
+
+COMMANDS = ["campaign", "check", "compare", "doctor", "export", "list", "live", "replay", "reproduce", "run"]
+COMMANDS += ["scenario", "tune", "vehicle", "video", "view"]
+
+
+def test_these_are_the_commands() -> None:
+    assert sorted(name for name in app if not name.startswith("-")) == COMMANDS
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_of_a_command_has_two_examples(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    text = re.sub(r" *\n(?! *quadsim )", " ", capsys.readouterr().out.partition("examples:")[2])
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    assert len(lines) == 2
+    for line in lines:
+        words = shlex.split(line.partition(" > ")[0])
+        assert words[:2] == ["quadsim", command]
+        app.meta(words[1:], exit_on_error=False, print_error=False, result_action="return_value")  # parsed, not called
