@@ -51,7 +51,7 @@ _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "pure
 class _Code:
     folder: Annotated[
         str | None,
-        doc("folder searched first for its module, relative to the scenario file; absent: beside that file"),
+        doc("folder searched first for the module, relative to the scenario file; absent: the folder of that file"),
     ] = None
     settings: Annotated[dict[str, Any], doc("further arguments of the call, by name")] = field(default_factory=dict)
 
@@ -67,7 +67,8 @@ class Plugin(ControllerTable, _Code):
     """A user-defined controller, called as MyController(vehicle, period=..., horizon=..., **settings)."""
 
     type: Annotated[
-        str, doc("its code, as package.module:Class, or its name among the entry points quadsim.controllers")
+        str,
+        doc("its code, as package.module:Class, or its name among the entry points quadsim.controllers"),
     ] = field(metadata={"json_schema_extra": _name_no_law})
     horizon: Annotated[Horizon, doc("[periods] N, samples of the reference passed to a step")] = 50
 
@@ -81,12 +82,12 @@ class Plugin(ControllerTable, _Code):
 
 @dataclass(frozen=True, kw_only=True)
 class PluginForce(_Code):
-    """A user-defined force, called once per physics step; see `quadsim.sim.effects.Force`.
+    """User-defined force, called once per physics step; see `quadsim.sim.effects.Force`.
 
     A function force(time, state, **settings), or a class called as MyForce(vehicle, rng=..., **settings).
     """
 
-    type: Annotated[str, doc("its code, as package.module:name")]
+    type: Annotated[str, doc("code of the force, as package.module:name")]
 
     def __post_init__(self) -> None:
         if ":" not in self.type:
