@@ -896,7 +896,7 @@ def replay(
         Traceback (most recent call last):
         quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
     """
-    from scenarios.campaign.campaign import held_against, recorded_flight
+    from scenarios.campaign.campaign import compare_replay, recorded_flight
     from scenarios.flight import require_rendering
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
@@ -913,7 +913,7 @@ def replay(
     with reporting(progress) as report, run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
         flown = replace(Rollout(recorded.scenario).fly(report), directory=directory)
         flown.save(directory, overwrite=overwrite, progress=report, **products)
-    return held_against(flown, recorded)
+    return compare_replay(flown, recorded)
 
 
 @app.command(help_epilogue=_examples("quadsim tune paper-robust", "quadsim tune mine.toml --trials 50 --resume"))

@@ -101,7 +101,7 @@ def _check_code(place: str, settings: Mapping[str, Any], arguments: tuple[str, .
         raise ParameterError("", "type", place, f"of the form {FORM}")
     for name, value in settings.items():
         if not name.isidentifier() or name in arguments:
-            raise ValueError(f"settings.{name} must be named as an argument is, other than {', '.join(arguments)}")
+            raise ValueError(f"settings.{name} must be the name of an argument other than {', '.join(arguments)}")
         if not is_plain(value):
             rule = "a finite number, a text, true or false, or a list or table of them"
             raise ValueError(f"settings.{name} must be {rule}; got {value}")
@@ -286,7 +286,7 @@ def require_importable(law: object, what: str = "controller") -> None:
     for part in code.__qualname__.split("."):
         resolved = getattr(resolved, part, None)
     if code is type(law) or code.__module__ == "__main__" or resolved is not code:
-        rule = "a class or a function at the top of a module other than the script, for workers to import"
+        rule = "a class or a function at the top level of a module other than the script, so that workers can import it"
         raise ParameterError("", what, law, rule)
 
 
@@ -294,7 +294,7 @@ def _code_of(law: Any) -> Any:
     """Return the class or function of a law, directly or in a partial; the class of an object."""
     code = law.func if isinstance(law, functools.partial) else law
     if getattr(law, "args", ()) and code is not law:
-        raise ParameterError("", "controller", law, "a partial with named arguments alone")
+        raise ParameterError("", "controller", law, "a partial with keyword arguments only")
     return code if isinstance(code, type) or inspect.isroutine(code) else type(code)
 
 
