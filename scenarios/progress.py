@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from scenarios.campaign.campaign import Standing, Watch
+    from scenarios.campaign.campaign import CampaignProgress, Watch
     from scenarios.console import PlainConsole
 
 Progress = Callable[[str, int, int], None]  # called with (activity, done, total) during long work
@@ -75,7 +75,7 @@ def watching(progress: bool) -> Iterator[Watch]:
 
     screen, printed = stderr(), clock.perf_counter()
     if not progress:
-        yield lambda standing: None
+        yield lambda state: None
     elif screen.is_terminal:
         from rich.progress import BarColumn, TextColumn
         from rich.progress import Progress as Bars
@@ -84,27 +84,27 @@ def watching(progress: bool) -> Iterator[Watch]:
             TextColumn("flights"), BarColumn(), TextColumn("{task.description}"), console=screen, transient=True
         ) as bars:
             bar = bars.add_task("starting")
-            yield lambda standing: bars.update(
-                bar, completed=standing.flown, total=standing.flights, description=_describe(standing)
+            yield lambda state: bars.update(
+                bar, completed=state.flown, total=state.flights, description=_describe(state)
             )
     else:
 
-        def show(standing: Standing) -> None:
+        def show(state: CampaignProgress) -> None:
             nonlocal printed
-            if clock.perf_counter() - printed >= LINE_EVERY or standing.flown == standing.flights:
+            if clock.perf_counter() - printed >= LINE_EVERY or state.flown == state.flights:
                 printed = clock.perf_counter()
-                screen.print(_describe(standing), soft_wrap=True)
+                screen.print(_describe(state), soft_wrap=True)
 
         yield show
 
 
-def _describe(standing: Standing) -> str:
+def _describe(state: CampaignProgress) -> str:
     """Return flights done, rate, time left and failures in one line."""
     from scenarios.campaign.statistics import interval, proportion
 
-    share = proportion(standing.failed, standing.flown)
-    left = datetime.timedelta(seconds=round((standing.flights - standing.flown) / standing.rate))
+    share = proportion(state.failed, state.flown)
+    left = datetime.timedelta(seconds=round((state.flights - state.flown) / state.rate))
     return (
-        f"{standing.flown}/{standing.flights}, {standing.rate:.2f}/s, {left} left; "
-        f"{standing.failed} failed ({interval(share['lower'], share['upper'])})"
+        f"{state.flown}/{state.flights}, {state.rate:.2f}/s, {left} left; "
+        f"{state.failed} failed ({interval(share['lower'], share['upper'])})"
     )

@@ -48,16 +48,16 @@ CHECK_EVERY: Final = 10
 
 
 @dataclass(frozen=True, kw_only=True)
-class Standing:
+class CampaignProgress:
     """Progress of a campaign."""
 
-    flown: int  # flights that are there
-    flights: int  # that there are to be
-    failed: int  # of those flown
+    flown: int  # flights completed
+    flights: int  # flights in all
+    failed: int  # failures among the completed flights
     rate: float  # flights per second of this session
 
 
-Watch = Callable[[Standing], None]
+Watch = Callable[[CampaignProgress], None]
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -121,7 +121,7 @@ def fly_campaign(
     overwrite: bool = False,
     until_width: float | None = None,
     report: bool = True,
-    watch: Watch = lambda standing: None,
+    watch: Watch = lambda state: None,
 ) -> CampaignResult:
     """Fly a campaign or its missing flights; the rows do not depend on the workers.  See `quadsim.campaign`."""
     if until_width is not None and not 0.0 < until_width < 1.0:
@@ -199,7 +199,7 @@ class _Progress:
                     self.outcomes[row["flight"]] = row["failed"]
                     there, failed = (int(np.count_nonzero(self.outcomes >= least)) for least in (0, 1))
                     rate = self.flown / (clock.perf_counter() - self.started)
-                    self._watch(Standing(flown=there, flights=self.wanted, failed=failed, rate=rate))
+                    self._watch(CampaignProgress(flown=there, flights=self.wanted, failed=failed, rate=rate))
                     if self._is_sure():
                         return
         finally:

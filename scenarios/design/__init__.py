@@ -1,1 +1,1 @@
-"""From a vehicle to a first good flight: what it can do, a controller and a course made for it, and its file."""
+"""From a vehicle to a first good flight: its limits, a controller and a course for it, and the scenario file."""

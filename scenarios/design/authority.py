@@ -1,4 +1,4 @@
-"""What a vehicle's rotors can do about it at hover: thrust and torques in reserve, and how long they take."""
+"""Control authority at hover: thrust and torque reserves of the rotors, and their response time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ AXES: Final = ("x", "y", "z")
 
 @dataclass(frozen=True, kw_only=True)
 class TorqueRange:
-    """The torques about one body axis that hover leaves room for."""
+    """Torques available about one body axis at hover."""
 
     axis: str  # x, y or z
     lowest: float  # torque [N m]
@@ -31,7 +31,7 @@ class TorqueRange:
 
 @dataclass(frozen=True, kw_only=True)
 class Authority:
-    """Figures at hover that a controller's design follows from."""
+    """Figures at hover on which a controller's design is based."""
 
     thrust_to_weight: float  # all rotors at their highest speed, over the weight [-]
     hover_share: float  # where hover lies between the lowest speed, 0, and the highest, 1 [-]

@@ -1,4 +1,4 @@
-"""A scenario made for a vehicle: its controller, a course that it can fly, and where every number comes from."""
+"""A scenario for a vehicle: a controller, a course that it can fly, and the source of every number."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class FirstScenario:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What it was made from: the comments above it."""
+        """Comments above the scenario: the figures it is based on."""
         return tuple(line.removeprefix("#").strip() for line in self.text.partition("\n\n")[0].splitlines())
 
     @property
@@ -93,7 +93,7 @@ class FirstScenario:
 
 
 def first_scenario(vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust") -> FirstScenario:
-    """A scenario that the vehicle flies well, with numbers made from the vehicle's; see `quadsim.scenario`.
+    """Return a scenario that the vehicle flies well, with numbers derived from the vehicle; see `quadsim.scenario`.
 
     `file` is where these are, as the scenario is to name it; `course` is one of `COURSES`, `law` of `LAWS`.
     """
@@ -138,7 +138,7 @@ def _rotors(vehicle: Vehicle) -> str:
 
 
 def _notes(vehicle: Vehicle, tuning: Design, course: str, law: str) -> str:
-    """The comments above the file: what it was made from."""
+    """Return the comments above the file: the figures it is based on."""
     can = tuning.authority
     limits = {
         "lag": f"the rotors' lag: 1 / ({LAG_RATIO:g} (T + tau / 2)), T = {1e3 * can.lag:.3g} ms",
@@ -279,7 +279,7 @@ horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for t
 
 
 def _constraints(vehicle: Vehicle, tuning: Design, size: float) -> str:
-    """What the flight is audited against, whatever its controller; `size` of the course [m]."""
+    """Return the audited constraints, the same for every controller; `size` of the course [m]."""
     tilt, off = _tilt(tuning), _rounded(ROOM * size)
     rounding = _rounded(1e-9 * vehicle.speed_max)
 

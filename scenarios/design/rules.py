@@ -1,4 +1,4 @@
-"""A controller's numbers from a vehicle's: how fast loops may be, and the weights that make them so.
+"""Controller parameters from a vehicle's parameters: bandwidths, and the weights that give them.
 
 1. *Bandwidth.*  From rotor speeds to a place there are four integrators.  The optimum of q x^2 + r u^2 on them is a
    Butterworth pattern of radius w (Anderson and Moore, "Optimal Control", 1990, Sec. 5.4), with
@@ -51,7 +51,7 @@ HEIGHT_STEP: Final = 0.25  # deviation of the height that the whole reserve of t
 HEADING_RATIO: Final = 0.7  # bandwidth of the heading over that of the place
 HEADING_STEP: Final = 0.5  # deviation of the heading that the whole torque in reserve answers [rad]
 LEAST_RESERVE: Final = 1e-6
-"""Acceleration [m/s^2] and angular acceleration [rad/s^2] in reserve below which there is nothing to design."""
+"""Smallest reserve of acceleration [m/s^2] and angular acceleration [rad/s^2] for which a design exists."""
 LONGEST: Final = 2.0  # delays beyond are not looked for [s]
 _HALVINGS: Final = 14
 MOVE_RATIO: Final = 4.0  # frequency at which changes of rotor speeds cost as much as these, over w

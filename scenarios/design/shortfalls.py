@@ -1,4 +1,4 @@
-"""Which bounds of a scenario a vehicle cannot meet, and why."""
+"""Bounds of a scenario that a vehicle cannot meet, with reasons."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SLOWEST_ANSWER: Final = 1.0
 
 
 def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
-    """A line for each bound of a scenario, whatever its own vehicle, that the vehicle cannot meet."""
+    """Return a line for each bound of a scenario that the vehicle cannot meet."""
     spec, can = scenario.controller, authority(vehicle)
     missed: list[str] = []
     if isinstance(spec, Bounded | Baseline) and spec.input_bounds is not None:
@@ -72,7 +72,7 @@ def _inputs(bounds: InputBounds, vehicle: Vehicle, period: float) -> list[str]:
 
 
 def _tilt(name: str, bound: float, can: Authority) -> list[str]:
-    """A tilt [deg] at which the rotors do not carry the weight any more."""
+    """Return a tilt [deg] at which the rotors no longer carry the weight."""
     steady = math.degrees(can.steady_tilt)
     if bound <= steady:
         return []

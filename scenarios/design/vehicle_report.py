@@ -1,4 +1,4 @@
-"""What a vehicle's numbers amount to: hover, margins, the linear model, what a controller can do; as tables."""
+"""Report of a vehicle: hover, margins, the linear model and achievable control, as tables."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _RPM: Final = 60.0 / (2.0 * math.pi)
 
 @dataclass(frozen=True, kw_only=True)
 class Designed:
-    """What a controller made for a vehicle can do; see `scenarios.design.rules`."""
+    """Performance of a controller designed for a vehicle; see `scenarios.design.rules`."""
 
     time_constants: dict[str, float]  # one over the bandwidth of each axis [s]
     limited_by: str  # what the bandwidth of x and y is the limit of: lag, torque or period
@@ -39,7 +39,7 @@ class Designed:
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleSheet:
-    """Figures derived from a vehicle's numbers, all at hover."""
+    """Figures derived from a vehicle's parameters, all at hover."""
 
     weight: float  # m g [N]
     hover_speed: float  # omega_bar [rad/s]
@@ -68,19 +68,19 @@ class VehicleSheet:
 
 @dataclass(frozen=True, kw_only=True)
 class VehicleReport(Result):
-    """What a vehicle can do."""
+    """A vehicle with its derived figures."""
 
     vehicle: Vehicle  # its numbers
     sources: Mapping[str, str]  # of each parameter, as its file names them
     figures: VehicleSheet  # what follows from the numbers
-    scenario: str | None = None  # that it was held against, or None
+    scenario: str | None = None  # scenario that it was compared with, or None
     shortfalls: tuple[str, ...] | None = None
-    """Which bounds of that scenario it cannot meet and why, a sentence each; None without a scenario."""
+    """Bounds of that scenario that it cannot meet, a sentence each; None without a scenario."""
     picture: Path | None = None  # where it was drawn to, or None
 
     @property
     def parameters(self) -> list[tuple[str, Any, str]]:
-        """Name, value and unit of those that the file gives."""
+        """Name, value and unit of the parameters in the file."""
         values = ((name, getattr(self.vehicle, name), unit) for name, unit in VEHICLE_UNITS.items())
         return [(name, value, unit) for name, value, unit in values if value is not None]
 

@@ -1,4 +1,4 @@
-"""A scenario's controller as a directory of self-contained C99; and how far its room for active rows suffices."""
+"""Export of a scenario's controller as self-contained C99, with a test of its room for active rows."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def reach(problem: Problem, room: int, changes: int) -> Reach:
 
 
 FACTS: Final = "export.json"
-"""What an export takes, and how far its room suffices."""
+"""File with an export's memory and the range of its room."""
 
 
 def export(
@@ -175,7 +175,7 @@ def c_controller(scenario: Scenario, precision: Precision = "double", rows: int 
 
 
 def exported_law(scenario: Scenario) -> Exportable:
-    """What is exported: the scenario's controller without what guards it.
+    """Return the exported controller: that of the scenario without its guards.
 
     Raises:
         ExportError: it cannot be exported.
@@ -196,12 +196,12 @@ def _facts(controller: CController) -> dict[str, Any]:
 
 
 def room_sentence(facts: Mapping[str, Any]) -> str:
-    """What the room for active rows costs, and how far from the reference it suffices."""
+    """Return the memory of the room for active rows, and the distance from the reference up to which it suffices."""
     return f"room for {facts['rows']} active rows, {facts['memory_bytes']} bytes of memory; {Reach(**facts['reach'])}"
 
 
 def programs(target: Target, precision: Precision) -> dict[str, str]:
-    """What runs the controller on a machine, by file name."""
+    """Return the files that run the controller on a target, by name."""
     names = ("main.c", "serial.c", "target.h", *target.sources, "LICENSE")
     return {name: part(name) for name in names} | {"Makefile": target.makefile(precision) + part("Makefile")}
 

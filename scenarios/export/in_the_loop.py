@@ -49,7 +49,7 @@ PATIENCE: Final = 120.0  # how long an answer of the emulated processor may take
 
 
 def require_programs(target: Target, what: str) -> None:
-    """Refuse what needs a compiler, or an emulator, that is not here.
+    """Refuse a target whose compiler or emulator is not installed.
 
     Raises:
         MissingProgramError: one is not installed.
@@ -89,13 +89,13 @@ class Program:
         self._process.communicate()
 
     def send(self, data: bytes) -> None:
-        """Send all of it; to a program that has ended nothing."""
+        """Send all bytes; none if the program has ended."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self._process.stdin.write(data)
 
     def receive(self, count: int) -> bytes:
-        """`count` bytes; fewer where the program has ended, or sends nothing for `PATIENCE`."""
+        """Return `count` bytes; fewer if the program has ended, or sends nothing for `PATIENCE`."""
         assert self._process.stdout is not None
         line, data = self._process.stdout.fileno(), b""
         while len(data) < count and select.select([line], [], [], PATIENCE)[0]:
@@ -130,11 +130,11 @@ class Line(Protocol):
     """A serial line."""
 
     def send(self, data: bytes) -> None:
-        """Send all of it."""
+        """Send all bytes."""
         ...
 
     def receive(self, count: int) -> bytes:
-        """`count` bytes; fewer where the other end has closed, or no longer answers."""
+        """Return `count` bytes; fewer if the other end has closed or no longer answers."""
         ...
 
 
@@ -157,7 +157,7 @@ class Frames:
         return data + zlib.crc32(data).to_bytes(4, "little")
 
     def reply(self, data: bytes) -> Reply | None:
-        """The answer that these bytes are; None where they are none."""
+        """Return the answer in these bytes, or None."""
         if len(data) != self._answer.size:
             return None
         mark, number, *command, status, checksum = self._answer.unpack(data)
@@ -174,7 +174,7 @@ class SerialMPC:
         self._number, self._window, self._speeds = 0, np.zeros((0, 4)), np.zeros(N_ROTORS)
 
     def reset(self, speeds: Array) -> None:
-        """Begin anew after u(-1) (4,) [rad/s]."""
+        """Restart after u(-1) (4,) [rad/s]."""
         self._speeds, self._window = np.array(speeds, float), np.zeros((0, 4))
 
     def step(self, time: float, state: Array, reference: Array, acting: Array) -> Reply:

@@ -1,4 +1,4 @@
-"""A flight's periods as test vectors: the controller's inputs, and the exact answers."""
+"""Periods of a flight as test vectors: the controller's inputs and its exact answers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REFUSED: Final = 3  # least status of a period without an optimum
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """K periods of one flight, without a gap."""
+    """K consecutive periods of one flight."""
 
     speeds: Array  # (4,) the command before the first [rad/s]
     state: Array  # (K, 12) as the controller was given it

@@ -1,1 +1,1 @@
-"""Scenarios as Gymnasium environments, what `quadsim.gym` hands out; the only folder that imports gymnasium."""
+"""Scenarios as Gymnasium environments, re-exported by `quadsim.gym`; only this folder imports gymnasium."""

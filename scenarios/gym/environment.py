@@ -34,13 +34,13 @@ from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.scenario import Scenario
 
 Reward = Callable[[Array, Array, Array], float]
-"""From the true state (12,) after a step, the reference (4,) there, and the rotor speeds commanded (4,) [rad/s]."""
+"""Function of the true state (12,) after a step, the reference (4,) and the commanded rotor speeds (4,) [rad/s]."""
 
 
 def nearness(state: Array, reference: Array, speeds: Array) -> float:
-    """The usual reward, exp(-d) in (0, 1], d the distance from the reference [m] and the error of yaw [rad] added up.
+    """Default reward, exp(-d) in (0, 1], with d the distance from the reference [m] plus the yaw error [rad].
 
-    It is never negative, so that no episode is better for ending early.
+    It is never negative, so ending an episode early never pays.
     """
     error = state[list(REFERENCE_STATES)] - reference
     return math.exp(-math.hypot(*error[:3].tolist()) - abs(math.remainder(float(error[3]), math.tau)))
@@ -49,19 +49,19 @@ def nearness(state: Array, reference: Array, speeds: Array) -> float:
 class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     """A scenario, one step per control period.
 
-    Observations and actions are as chosen; see `scenarios.gym.spaces`.  An episode
-    is terminated when the vehicle is lost by a criterion of `[lost]`, has crashed, or has diverged, and truncated at
-    the scenario's duration, which a campaign's `[set]` may change.
+    For observations and actions see `scenarios.gym.spaces`.  An episode is terminated when the vehicle is lost by a
+    criterion of `[lost]`, has crashed, or has diverged, and truncated at the scenario's duration, which a campaign's
+    `[set]` may change.
 
     `info` at each step, and at the start:
 
     - `margins`: signed margin of each constraint at its worst within the step, at the physics rate, in the constraint's
       unit; negative = violated, inf outside its time window.
-    - `margins_sampled`: the same at the end of the step alone, all that a check at the control rate sees.
+    - `margins_sampled`: the margins at the end of the step, as a check at the control rate sees them.
     - `constraint_values`: (m,) g = -margin in the order of `constraint_names`, so that g <= 0 holds; -inf outside.
     - `constraint_violation`: 1 where a required constraint was violated beyond its tolerances, else 0.
-    - `cost`: how many were.
-    - `time` [s], `phase` (`flying`, `landed`, ...), `reason` (why the flight ended; empty while it has not).
+    - `cost`: number of required constraints violated.
+    - `time` [s], `phase` (`flying`, `landed`, ...), `reason` (why the flight ended; empty until then).
 
     Attributes: `scenario` and `limits` of this episode, `actions`, and `observations` with the unit of each entry.
 
@@ -94,19 +94,19 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         """Set up; nothing is flown before `reset`.
 
         Args:
-            scenario: what is flown, or its name or file.
+            scenario: the scenario, or its name or file.
             action: `deviations` from hover, rotor `speeds` [rad/s], or collective thrust and body `rates`.
             observation: parts, of `state`, `preview`, `ahead` and `command`.
-            preview: periods of reference that are observed; the controller's horizon where absent, and at most.
+            preview: observed periods of the reference, at most the controller's horizon (default).
             vary: a campaign, its name or file, whose `[set]` changes the scenario and whose `[[vary]]` is drawn anew
                 at each reset.
-            reward: of a step; see `Reward`.
+            reward: reward of a step; see `Reward`.
             render_mode: `rgb_array` or None; `human` by the wrapper that `gymnasium.make` adds, with pygame.
-            width: of pictures [pixels].
-            height: likewise.
+            width: width of pictures [pixels].
+            height: height of pictures [pixels].
 
         Raises:
-            InputError: one of these is not possible.
+            InputError: an argument is not allowed.
         """
         scenario = preferring_core(load_scenario(scenario))
         self._plan = None if vary is None else _varying(scenario, str(vary))
@@ -153,7 +153,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             options: `flight`, the number of a flight of the campaign that varies something.
 
         Raises:
-            InputError: the seed or an option is not possible.
+            InputError: the seed or an option is not allowed.
         """
         if seed is not None and not (isinstance(seed, int | np.integer) and 0 <= seed <= LARGEST_SEED):
             raise ParameterError("", "seed", seed, f"from 0 to {LARGEST_SEED}")
@@ -219,7 +219,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         )
 
     def controller_action(self) -> Action:
-        """What the scenario's own controller would do now, computed once per period.
+        """Return the command of the scenario's controller at this time, computed once per period.
 
         Where that very action is taken next, the controller's command is flown to the bit, with its plan and status:
         such an episode is the flight of `quadsim run`.
@@ -241,7 +241,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return self._answered[1]
 
     def action_for(self, command: Command) -> Action:
-        """The action equivalent to a command: taken next, that very command is flown, with its plan and status.
+        """Return the action equivalent to a command; taken next, it flies that command with its plan and status.
 
         Raises:
             ParameterError: actions are thrust and rates.
@@ -252,12 +252,12 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return action
 
     def flight(self) -> Flight:
-        """This episode so far as a flight: audited, to be saved and drawn like any other."""
+        """Return the episode so far as an audited flight, which can be saved and plotted."""
         law = self.started.loop.controller
         return replace(self.started.flight(), controller=law.name, solver=law.solver)
 
     def render(self) -> np.ndarray[Any, np.dtype[np.uint8]] | None:
-        """The picture (height, width, 3), drawn by a process of its own; None without a render mode.
+        """Return the picture (height, width, 3), rendered by a separate process; None without a render mode.
 
         Raises:
             RenderingUnavailableError: nothing can render here.
@@ -270,7 +270,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return self._camera.picture(self._truth, self._rotors, self._seen.reference, self.started.loop.time)
 
     def close(self) -> None:
-        """Give native memory and the renderer back."""
+        """Free native memory and the renderer."""
         if self._flight is not None:
             self._flight.close()
         if self._camera is not None:
@@ -291,7 +291,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         return self._plan.of(int(flight))
 
     def _vector(self, seen: Observation) -> Array:
-        """What is observed; beyond its end the reference stays where it is."""
+        """Return the observation; beyond its end the reference keeps its last value."""
         rows, acting = seen.preview, seen.moment.acting
         assert acting is not None
         if len(rows) < self._preview:
@@ -318,7 +318,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
 
 class Agent:
-    """Stands for a controller where actions fly; the scenario's own is built when it is first asked."""
+    """Placeholder for a controller where actions fly; the scenario's controller is built when first needed."""
 
     name, solver = "agent", ""
 
@@ -369,7 +369,7 @@ def environment_id(name: str) -> str:
 
 
 def register_library() -> None:
-    """Register the scenarios that ship; they are right, and not checked."""
+    """Register the shipped scenarios, without checking them."""
     for name in scenario_names():
         scenario = Scenario.parse(read_scenario(scenario_path(name), scenario_path))
         gymnasium.registry.setdefault(environment_id(name), _specification(scenario, scenario=name))

@@ -1,4 +1,4 @@
-"""MPC as a safety filter: an agent's actions pass where the robust MPC's constraints stay feasible after them."""
+"""MPC as a safety filter: it passes actions after which the robust MPC's constraints remain feasible."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from scenarios.gym.spaces import Action
 
 
 class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
-    """Passes an action, or else the nearest one after which the constraints can be held; see `mpc.robust.filter`.
+    """Passes an action, or the nearest one after which the constraints can be satisfied; see `mpc.robust.filter`.
 
     An action that is not finite is never flown: the fallback's command is, until the next one.
 

@@ -1,4 +1,4 @@
-"""What an agent observes, and what its actions are: rotor speeds, deviations from hover, or thrust and body rates."""
+"""Observations and actions of an agent: rotor speeds, deviations from hover, or thrust and body rates."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Entry:
 
 
 class Observations:
-    """The parts that were chosen, one after the other, as float64.
+    """The chosen parts, concatenated, as float64.
 
     - `state`: the twelve states as measured or estimated, `quadsim.state.STATE_NAMES` [m, m/s, rad, rad/s].
     - `preview`: the filtered reference x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+n}, row by row.

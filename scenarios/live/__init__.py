@@ -1,1 +1,1 @@
-"""A flight that a person is part of: inputs are data, stamped with the control period at which they act."""
+"""Interactive flights: user inputs are data, stamped with the control period at which they act."""

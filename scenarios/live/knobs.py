@@ -1,4 +1,4 @@
-"""The fields of a controller that a person may turn in flight, from their declarations."""
+"""Controller fields that a user may change in flight, from their declarations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Knob:
 
 
 def knobs(spec: AnyController) -> tuple[Knob, ...]:
-    """Every field of a controller that has a value, but its type, longer lists and what a user's controller reads."""
+    """Return the fields of a controller, except its type, long lists and settings of user-defined controllers."""
     return tuple(knob for knob in _walk("", spec, (Kind(type=type(spec)),), "") if knob.path != "type")
 
 

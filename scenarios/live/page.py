@@ -1,4 +1,4 @@
-"""The page of a live session, drawn by viser, which is imported here alone.
+"""The page of a live session, drawn by viser, which only this module imports.
 
 All clients see the same page; one drives, the others watch.  Callbacks run in viser's thread and do no more than submit
 inputs, give orders to the pace and change what is shown.
@@ -62,7 +62,7 @@ STYLE: Final = """<style>
 
 
 def _reachable(host: str) -> str:
-    """How others call this machine: where it listens on all its addresses, one of them."""
+    """Return the host name for links to this server; one address if it listens on all."""
     if host not in ("0.0.0.0", "::"):
         return f"[{host}]" if ":" in host else host
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route, contextlib.suppress(OSError):
@@ -130,7 +130,7 @@ class Page:
     # What the thread that flies calls
 
     def show(self, frame: Frame, factor: float) -> None:
-        """Show a period that has been flown."""
+        """Show a flown period."""
         self._frame = frame
         self._remember(frame)
         with _unless_gone():
@@ -160,7 +160,7 @@ class Page:
         self._server.flush()
 
     def ended(self, reason: str | None) -> None:
-        """The flight has ended, with its reason, or has begun anew (None)."""
+        """Show why the flight ended, or that it restarted (None)."""
         if reason is not None:
             self._status.content = _says(f"{reason}. Reset begins anew; Save keeps it.", "bad")
             return
@@ -334,7 +334,7 @@ class Page:
             self._show_knobs(spec)
 
     async def _replace(self, fields: Mapping[str, Any], what: str) -> bool:
-        """Build a controller beside the flight and let it take over; where it cannot be built, report why."""
+        """Build a controller in the background and let it take over; if that fails, report why."""
         try:
             successor = await asyncio.to_thread(self._session.flights[0].successor, fields)
         except InputError as error:
@@ -357,7 +357,7 @@ class Page:
         _send(event.client, f"{self._session.scenario.name}.html", self._server.scene.as_html())
 
     def _between(self, act: Callable[[Session, Any], None]) -> Callable[[Any], None]:
-        """What has something done between two periods, in the thread that flies; `act` takes session and client."""
+        """Return a function that runs `act(session, client)` between two periods, in the flying thread."""
         return lambda event: self._pace.order(lambda session: act(session, event.client))
 
     def _reset(self, session: Session, client: Any) -> None:
@@ -408,7 +408,7 @@ class Page:
             take.visible = client != driver
 
     def _on(self, register: Callable[[Any], Any], act: Callable[[Any], Any]) -> None:
-        """Call for what the driving client does; not for what Python sets, which has no client."""
+        """Call a function for changes by the driving client, not for changes by Python, which have no client."""
 
         async def called(event: Any) -> None:  # a plain function would run in one of many threads
             if event.client is None:

@@ -1,4 +1,4 @@
-"""A live session from its beginning to its saved flight: by a page in a browser, or by a script.
+"""A live session from start to saved flight, with a page in a browser or a script.
 
 `Pace` has the only clock of a session; `Guard` lets in who has its address.
 """
@@ -65,11 +65,11 @@ class Pace:
         self._stop.set()
 
     def order(self, what: Callable[[Session], None]) -> None:
-        """Have something done between two periods, in the thread that flies."""
+        """Run a function between two periods, in the flying thread."""
         self._orders.append(what)
 
     def drive(self, session: Session, view: Page, until: Callable[[Frame], bool] = lambda frame: False) -> None:
-        """Fly until `stop`, or until a frame is the last one; a flight that has ended waits for a reset."""
+        """Fly until `stop` or the last frame; a flight that ended waits for a reset."""
         due, recent = self._now(), deque[float](maxlen=round(2.0 / session.period) + 1)  # two seconds
         while not self._stop.is_set():
             while self._orders:
@@ -112,7 +112,7 @@ class Guard:
         self._host, self.token = host, secrets.token_urlsafe(24)
 
     def refusal(self, headers: Any, path: str, port: int) -> str | None:
-        """Why a request with these headers, this path and query, to this port, is refused; None where it is let in."""
+        """Return why a request with these headers, path and query, to this port, is refused, or None."""
         try:
             host, origin = headers.get("Host", ""), headers.get("Origin")
         except LookupError:  # of the library's headers, where one is there twice
@@ -130,7 +130,7 @@ class Guard:
 
     @contextlib.contextmanager
     def installed(self) -> Iterator[None]:
-        """Have the server that viser starts meanwhile check its requests."""
+        """Make a server that viser starts in this block check its requests."""
         from viser.infra import _infra
 
         library = _infra.websockets.asyncio.server
@@ -218,7 +218,7 @@ def fly_live(
 
 
 def _require_server(host: str, port: int) -> None:
-    """Refuse, before anything is flown, where no page could be served."""
+    """Refuse before the flight if the page cannot be served."""
     if find_spec("viser") is None:
         raise MissingPackageError("quadsim live", "viser", extra="live")
     if not 0 <= port <= 65535:

@@ -38,7 +38,7 @@ FORCE_STEP: Final = 1e-3  # to which pulls are rounded [N]
 
 @dataclass(frozen=True, kw_only=True)
 class Pull:
-    """A spring from the vehicle to a point of the world, held until it is let go."""
+    """A spring from the vehicle to a point in the world, active until released."""
 
     type: Literal["pull"]
     to: Annotated[Vector | None, doc("[m] world; absent to let go")] = None
@@ -82,7 +82,7 @@ class Script:
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """One control period as it was flown, for a view; of each flight, where it has not ended."""
+    """One flown control period, for a view; one entry per flight that has not ended."""
 
     k: int  # which period
     time: float  # when it began [s]
@@ -95,7 +95,7 @@ class Frame:
 
 @dataclass
 class _Hand:
-    """What goes on until it is changed."""
+    """Inputs in force until they are changed."""
 
     pull: Array | None = None  # (3,) to where [m]
     wear: dict[int, float] = field(default_factory=dict)
@@ -118,7 +118,7 @@ class Session:
         self.reset()
 
     def reset(self) -> None:
-        """Start anew at t = 0; inputs that have not acted are dropped."""
+        """Restart at t = 0; pending inputs are dropped."""
         self.close()
         self._queue.clear()
         scenarios = [self.scenario]
@@ -129,7 +129,7 @@ class Session:
         self.reason: str | None = None
 
     def close(self) -> None:
-        """Give back what the flights hold; what was flown stays."""
+        """Free the resources of the flights; their records remain."""
         for flight in self.flights:
             flight.close()
 
@@ -145,7 +145,7 @@ class Session:
 
     @property
     def limits(self) -> tuple[Limit, ...]:
-        """What the flight is audited against."""
+        """Audited constraints of the flight."""
         return tuple(self.flights[0].limits)
 
     def submit(
@@ -196,7 +196,7 @@ class Session:
         )
 
     def play(self, script: Script) -> list[str]:
-        """Fly by a script, as fast as it goes; why inputs were refused.
+        """Fly by a script, as fast as possible; return why inputs were refused.
 
         An input is given when the first period begins that is not before its time.
         """
@@ -209,7 +209,7 @@ class Session:
         return refused
 
     def flight(self, which: int = 0) -> Flight:
-        """What has been flown so far, audited; its scenario flies to the same bits.
+        """Return the flight so far, audited; its scenario flies to the same bits.
 
         Raises:
             InputError: nothing has been flown.
@@ -219,7 +219,7 @@ class Session:
         return self.flights[which].flight()
 
     def _apply(self, table: Mapping[str, Any], successor: Successor | None) -> None:
-        """Let an input act; a controller's event on the first flight alone."""
+        """Apply an input; a controller event only to the first flight."""
         if table.get("type") not in ("pull", "wear", "steer"):
             if table.get("type") == "setpoint":
                 self._held.setpoint = None
@@ -242,7 +242,7 @@ class Session:
                 flight.apply(event)
 
     def _hold(self, refused: list[str]) -> Array:
-        """Let what is held act for one period more; the force of the hand (3,) [N]."""
+        """Apply the inputs in force for one more period; return the force of the pull (3,) [N]."""
         held, force, last = self._held, np.zeros(3), self.flights[0].loop.last
         if last is None:  # where the vehicle is shows once a period has been flown
             return force

@@ -1,4 +1,4 @@
-"""What a live session shows in 3-D: vehicles, thrusts, horizons, reference, path, obstacles, regions and ground.
+"""The 3-D scene of a live session: vehicles, thrusts, horizons, reference, path, obstacles, regions and ground.
 
 Handles are viser's; nothing here imports it.  Everything has few triangles: machines without a graphics card draw too.
 """
@@ -64,7 +64,7 @@ class Stage:
         self._add_space()
 
     def show(self, frame: Frame) -> None:
-        """What changes once in a period."""
+        """Update the objects that change once per period."""
         for i, (sample, horizon) in enumerate(zip(frame.samples, frame.horizons, strict=True)):
             if sample is None:
                 continue
@@ -96,7 +96,7 @@ class Stage:
             handle.visible = limit.start <= frame.time <= limit.stop
 
     def pose(self, frame: Frame, share: float) -> Array:
-        """Draw the vehicles at a share of the period; where the first is (3,) [m]."""
+        """Draw the vehicles at a fraction of the period; return the position of the first (3,) [m]."""
         for sample, handle in zip(frame.samples, self.frames, strict=True):
             if sample is not None:
                 physics = sample.segment.physics
@@ -105,7 +105,7 @@ class Stage:
         return np.asarray(self.frames[0].position)
 
     def reset(self) -> None:
-        """Nothing has been flown."""
+        """Clear the scene for a new flight."""
         self._events, self._ahead.points = 0, _course(self._session)
         for trail, path in zip(self._trails, self._paths, strict=True):
             trail.clear()
@@ -134,7 +134,7 @@ class Stage:
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
-    """A colour of the palette as viser takes it."""
+    """Return a colour of the palette in viser's format."""
     red, green, blue = bytes.fromhex(colour[1:])
     return red, green, blue
 

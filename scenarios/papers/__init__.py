@@ -1,1 +1,1 @@
-"""Numbers that papers publish, one TOML file per paper, and their reproduction by flight."""
+"""Published numbers of papers, one TOML file per paper, and their reproduction by flight."""

@@ -1,4 +1,4 @@
-"""Numbers that papers publish, one TOML file per paper, and these flown: published, ours, difference."""
+"""Published numbers of papers, one TOML file per paper, and their reproduction: published, ours, difference."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Text = Annotated[str, MinLen(1), MaxLen(300)]
 
 @dataclass(frozen=True, kw_only=True)
 class PublishedNumber:
-    """One published number, and the flight that gives ours."""
+    """One published number, and the flight that reproduces it."""
 
     name: Annotated[Text, doc("what it is, for tables")]
     scenario: Annotated[str, doc("a library name, or a path ending in .toml, relative to the paper's file")]
@@ -70,13 +70,13 @@ class PublishedNumber:
 
     @property
     def tolerance(self) -> float:
-        """How far off ours may be [unit]."""
+        """Allowed difference [unit]."""
         return self.absolute if self.absolute is not None else (self.relative or 0.0) * max(map(abs, self.span))
 
 
 @dataclass(frozen=True, kw_only=True)
 class PaperFile:
-    """A paper, with the numbers of it that are reproduced."""
+    """A paper and its reproduced numbers."""
 
     title: Annotated[Text, doc("of the paper")]
     authors: Annotated[Text | None, doc("of the paper; absent where it names none")] = None
@@ -97,7 +97,7 @@ class Paper(PaperFile):
         return self.path.stem
 
     def scenario_of(self, number: PublishedNumber) -> Scenario:
-        """What is flown for a number."""
+        """Return the scenario of a number."""
         beside = self.path.parent / number.scenario
         own_file = number.scenario.endswith(".toml") and beside.is_file()
         path = scenario_path(str(beside) if own_file else number.scenario)
@@ -108,7 +108,7 @@ class Paper(PaperFile):
 
 
 def load_paper(name: str) -> Paper:
-    """Read and check a paper that ships, or a path ending in `.toml`."""
+    """Read and check a shipped paper, or a path ending in `.toml`."""
     path = paper_path(name)
     return Paper(path=path, **vars(parse_table(PaperFile, read_toml(path), path.name, file="paper")))
 
@@ -129,14 +129,14 @@ class Reproduced:
 
     @property
     def within(self) -> bool:
-        """Whether ours is within the file's tolerance; not, where the flight ended early."""
+        """Whether our number is within the file's tolerance; false if the flight ended early."""
         if self.difference is None:
             return False
         beyond = {"equal": abs(self.difference), "at most": self.difference, "at least": -self.difference}
         return beyond[self.spec.relation] <= self.spec.tolerance * (1.0 + 1e-9)
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as plain data."""
+        """Return the number and its reproduction as plain data."""
         spec = self.spec
         return {
             **{name: getattr(spec, name) for name in ("name", "scenario", "set", "measure", "unit", "source")},
@@ -169,7 +169,7 @@ class Reproduced:
         )
 
     def _shown(self, value: float | None, sign: str = "") -> str:
-        """A value to a tenth of the tolerance, or to four digits where there is none."""
+        """Return a value to a tenth of the tolerance, or to four digits without a tolerance."""
         if value is None:
             return ABSENT
         if not self.spec.tolerance:
@@ -191,7 +191,7 @@ class Reproduction:
         return all(number.within for number in self.numbers)
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as plain data."""
+        """Return the number and its reproduction as plain data."""
         about = {name: getattr(self.paper, name) for name in ("name", "title", "authors", "publication")}
         return {**about, "reproduced": self.within, "numbers": [number.to_json() for number in self.numbers]}
 
@@ -224,12 +224,12 @@ class Reproductions(tuple[Reproduction, ...], Result):
         return console.grids([paper.grid for paper in self], left=("number",))
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as plain data."""
+        """Return the number and its reproduction as plain data."""
         return {"reproduced": not self.exit_status, "papers": [paper.to_json() for paper in self]}
 
 
 def reproduce_paper(paper: Paper, progress: Progress = silent) -> Reproduction:
-    """Fly a paper's numbers, each flight once whatever is measured of it; see `quadsim.reproduce`."""
+    """Fly a paper's numbers, every flight only once; see `quadsim.reproduce`."""
     scenarios = [paper.scenario_of(number) for number in paper.numbers]
     summaries: dict[str, dict[str, Any]] = {}
     reproduced, what, count = [], f"{paper.name}: numbers", len(scenarios)

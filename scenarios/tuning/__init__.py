@@ -1,1 +1,1 @@
-"""Tuning: fields searched by Optuna, and an answer measured on draws that did not choose it."""
+"""Tuning: Optuna searches fields; the result is tested on draws that the search did not use."""

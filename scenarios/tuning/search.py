@@ -1,4 +1,4 @@
-"""The search: Optuna proposes candidates, and stops them on draws that all of them share."""
+"""The search: Optuna proposes candidates and prunes them on shared draws."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ JOURNAL_FILE: Final = "journal.log"
 
 
 def require_optuna() -> Any:
-    """Optuna, or MissingPackageError."""
+    """Return Optuna, or raise MissingPackageError."""
     try:
         import optuna
     except ModuleNotFoundError as error:
@@ -46,7 +46,7 @@ class Score:
 
     @property
     def feasible(self) -> bool:
-        """Whether no larger share of its flights has the event than is allowed."""
+        """Whether the share of flights with the event is within the allowed share."""
         return self.excess <= 0.0
 
 
@@ -79,7 +79,7 @@ class Search:
         self._space = {entry.name: _distribution(optuna.distributions, entry) for entry in plan.spec.search}
 
     def run(self) -> pa.Table:
-        """Fly the start, then all batches; the table of their flights."""
+        """Fly the start, then all batches; return the table of their flights."""
         plan = self._plan
         self._fly_missing([START], plan.most)
         if all(_contains(entry, plan.start_values.get(entry.name)) for entry in plan.spec.search):
@@ -94,7 +94,7 @@ class Search:
         return self._store.close(max(self._rows) + 1)
 
     def _judge(self, trials: Sequence[Trial]) -> None:
-        """All trials fly a few draws, those that are not worse than the best go on to more; then all are told."""
+        """Fly a few draws of all trials, continue those not worse than the best, then report all to Optuna."""
         going = list(trials)
         for flights in self._plan.spec.flights:
             self._fly_missing([trial.number for trial in going], flights)
@@ -108,7 +108,7 @@ class Search:
             self.study.tell(trial, score.values if state is None else None, state=state)
 
     def _goes_on(self, trial: Trial, flights: int) -> bool:
-        """Whether a trial flies on: it can still hold the requirement, and the pruner agrees."""
+        """Return whether a trial continues: it can still meet the requirement, and the pruner agrees."""
         rows = self._first(trial.number, flights)
         score = self.scores[trial.number] = self._score(trial.number, rows)
         if score.count > self._plan.requirement.share * self._plan.most:
@@ -121,9 +121,9 @@ class Search:
         return not trial.should_prune()
 
     def _score(self, candidate: int, rows: Sequence[Row]) -> Score:
-        """The start's mean over all draws, and a candidate's mean difference on those that both completed.
+        """Return the start's mean over all draws, plus a candidate's mean difference on draws that both completed.
 
-        So few flights do not count for or against a candidate that happened to fly easy or hard draws.
+        So a candidate that flew only few, easy draws gains no advantage, and hard draws are no disadvantage.
         """
         values, start = self._plan.objectives(rows), self._plan.objectives(self._first(START, self._plan.most))
         whole, met = (np.asarray(np.isfinite(objectives).all(axis=1)) for objectives in (values, start))
@@ -144,7 +144,7 @@ class Search:
         return [self._rows[candidate * self._plan.most + draw] for draw in range(flights)]
 
     def _fly_missing(self, candidates: Sequence[int], flights: int) -> None:
-        """Have candidates fly their first draws, except those already flown.
+        """Fly the first draws of candidates, except those already flown.
 
         Raises:
             InputError: some were flown with other values.
@@ -170,7 +170,7 @@ class Search:
             self._store.flush()
 
     def answer(self) -> tuple[int, list[int]]:
-        """The answer, and the Pareto front by its first objective: of one objective, the best.
+        """Return the chosen candidate and the Pareto front by its first objective; for one objective, the best.
 
         The answer is the point of the front nearest to the best of each objective, as a share of its range, among those
         that are no worse than the start in any.  Where no candidate is feasible, it is the one that fails least.

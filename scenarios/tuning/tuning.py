@@ -1,4 +1,4 @@
-"""A tuning carried out: the search, then the start and the answer on fresh draws.
+"""Execution of a tuning: the search, then start and result on fresh draws.
 
 A tuning as a page that works offline, and as tables for the terminal.
 """
@@ -23,7 +23,7 @@ from quadsim.outputs import SUMMARY_FILE, growing, to_json
 from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from quadsim.report.to_plotly import Plot, embed
-from scenarios.campaign.campaign import Standing, Watch, fly_campaign, put_report
+from scenarios.campaign.campaign import CampaignProgress, Watch, fly_campaign, put_report
 from scenarios.campaign.paired import PairedComparison, compare_pairs
 from scenarios.campaign.plan import plan_differences
 from scenarios.campaign.statistics import judge, label, paired_difference
@@ -46,7 +46,7 @@ _MAY_CHANGE: Final = {"trials", "fresh", "description"}  # where a tuning is res
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class TuningResult(Result):
-    """What came of a tuning.
+    """Result of a tuning.
 
     Attributes:
         directory: where everything is.
@@ -64,12 +64,12 @@ class TuningResult(Result):
 
     @property
     def holds(self) -> bool:
-        """Whether the answer's fresh flights support the requirement."""
+        """Whether the result's fresh flights support the requirement."""
         return bool(self.summary["fresh"]["best"]["requirement"]["holds"])
 
     @property
     def exit_status(self) -> int:
-        """See `Result.exit_status`; 1 where the requirement does not hold."""
+        """See `Result.exit_status`; 1 if the requirement is not met."""
         return EXIT_DONE if self.holds else EXIT_FAILED
 
     def shown(self) -> Shown:
@@ -96,9 +96,9 @@ def fly_tuning(
     resume: bool = False,
     overwrite: bool = False,
     report: bool = True,
-    watch: Watch = lambda standing: None,
+    watch: Watch = lambda state: None,
 ) -> TuningResult:
-    """Search, or continue it, and compare the answer with the start; see `quadsim.tune`.
+    """Search, or resume a search, and compare the result with the start; see `quadsim.tune`.
 
     The same file gives the same answer with any workers and order: a batch is proposed before it flies, and its scores
     are told in the order of its candidates.  A search that is resumed proposes again what it proposed, and flies what
@@ -117,7 +117,7 @@ def fly_tuning(
         files.remove([SUMMARY_FILE, JOURNAL_FILE, f"{JOURNAL_FILE}.lock", *fronts])
         texts = {"tuning.toml": plan.to_toml(), "scenario.toml": plan.start.scenario.to_toml()}
         files.write({file: text.encode() for file, text in {**texts, MANIFEST_FILE: to_json(manifest)}.items()})
-        search = Search(plan, files, lambda **state: watch(Standing(**state)), workers=workers, cluster=cluster)
+        search = Search(plan, files, lambda **state: watch(CampaignProgress(**state)), workers=workers, cluster=cluster)
         table = search.run()
         answer, front = search.answer()
         best = plan.candidate(search.candidates[answer], f"{name}-best")
@@ -147,7 +147,7 @@ def fly_tuning(
 def _summary(
     plan: TuningPlan, search: Search, answer: int, front: Sequence[int], tables: Sequence[pa.Table]
 ) -> Summary:
-    """`summary.json`: the search, and the fresh flights of the start and of the answer."""
+    """Return `summary.json`: the search, and the fresh flights of start and result."""
     shown = {candidate: plan.shown(values) for candidate, values in search.candidates.items()}
     fresh = {"start": tables[0], "best": tables[-1]}
     values = [plan.objectives(table.to_pylist()) for table in fresh.values()]
@@ -186,7 +186,7 @@ def _summary(
 
 
 def _manifest(plan: TuningPlan) -> dict[str, Any]:
-    """What is flown, with what."""
+    """Return the definition of a tuning and the versions that affect it."""
     tables = {k: v for k, v in asdict(plan.spec).items() if k not in _MAY_CHANGE}
     campaign = {k: v for k, v in asdict(plan.start.spec).items() if k not in OWN}
     scenario = plain(plan.start.scenario)
@@ -195,7 +195,7 @@ def _manifest(plan: TuningPlan) -> dict[str, Any]:
 
 
 def _require_same(manifest: Mapping[str, Any], directory: Path) -> None:
-    """Refuse to continue another tuning.
+    """Refuse to resume a different tuning.
 
     Raises:
         FileError: its manifest is damaged.
@@ -229,7 +229,7 @@ _FILES: Final = ("best.toml", "tuning.toml", "scenario.toml", "flights.parquet",
 
 
 def verdict(summary: Summary) -> str:
-    """What is better, by how much, on fresh draws."""
+    """Return which of start and result is better on fresh draws, and by how much."""
     if summary["answer"] == START:
         return f"No candidate of {summary['trials']} was better than the start"
     gains = []
@@ -240,34 +240,34 @@ def verdict(summary: Summary) -> str:
 
 
 def sentences(summary: Summary) -> tuple[str, ...]:
-    """Whether the answer and the start hold the requirement."""
+    """Return the verdicts of start and result on the requirement."""
     names = ("best",) if summary["answer"] == START else ("best", "start")
     return tuple(f"{name}: {summary['fresh'][name]['requirement']['sentence']}" for name in names)
 
 
 def tables(summary: Summary) -> tuple[Grid, Grid]:
-    """The objectives on the draws that chose the answer and on fresh ones, and the values that were found."""
+    """Return the objectives on the search draws and on fresh draws, and the tuned values."""
     objectives = [
         line(
-            label(each["name"], each["unit"]),
-            *_compared(each["start"], each["best"]),
-            *_compared(each["fresh_start"], each["fresh_best"]),
-            f"{format_number(each['lower'])} to {format_number(each['upper'])}",
+            label(entry["name"], entry["unit"]),
+            *_compared(entry["start"], entry["best"]),
+            *_compared(entry["fresh_start"], entry["fresh_best"]),
+            f"{format_number(entry['lower'])} to {format_number(entry['upper'])}",
         )
-        for each in summary["objectives"]
+        for entry in summary["objectives"]
     ]
     values = [
         line(
-            label(each["name"], each["unit"]),
-            Cell(text=", ".join(each["fields"]), mark=Mark.CODE),
-            *(str(v) if isinstance(v, str | bool) else format_number(v) for v in (each["start"], each["best"])),
+            label(entry["name"], entry["unit"]),
+            Cell(text=", ".join(entry["fields"]), mark=Mark.CODE),
+            *(str(v) if isinstance(v, str | bool) else format_number(v) for v in (entry["start"], entry["best"])),
         )
-        for each in summary["search"]
+        for entry in summary["search"]
     ]
     head = ("objective", "start, search", "best, search", "promised", "start, fresh", "best, fresh", "confirmed")
     grid = Grid(
         key="objectives",
-        title="The draws that chose it, and fresh ones",
+        title="Search draws and fresh draws",
         head=(*head, "mean difference, 95 %"),
         lines=tuple(objectives),
         note=f"Search: {summary['search_flights']} flights, each on the first of the same {summary['draws']} draws.",
@@ -318,6 +318,6 @@ def _plot(figure: Any, key: str, title: str, height: int) -> Plot:
 
 
 def _compared(start: float | None, best: float | None) -> tuple[str, str, str]:
-    """Both values, and the change from the one to the other."""
+    """Return both values and the change from the first to the second."""
     change = f"{100.0 * (best - start) / abs(start):+.1f} %" if start and best is not None else ABSENT
     return format_number(start), format_number(best), change

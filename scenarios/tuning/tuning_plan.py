@@ -1,4 +1,4 @@
-"""A tuning ready to be flown: its file, what is to be small, and the campaigns of its start and of each candidate."""
+"""A tuning ready to fly: its file, its objectives, and the campaigns of its start and of each candidate."""
 
 from __future__ import annotations
 
@@ -58,12 +58,12 @@ START: Final = 0  # the candidate that is the scenario as it is
 Searched = Annotated[Uniform | LogUniform | Integer | Choice, Field(discriminator="distribution")]
 OWN: Final = ("name", "description", "flights", "seed")  # fields of a campaign that a tuning has itself
 Values = Mapping[str, Value]
-"""Of a candidate, by the names of the entries of `[[search]]`; empty of the start."""
+"""Values of a candidate, by the names of the entries of `[[search]]`; empty for the start."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Objective:
-    """A number that is to be small."""
+    """A number to minimise."""
 
     name: Annotated[Name, doc("letters, digits, _ and -")]
     expression: Annotated[
@@ -79,7 +79,7 @@ class Objective:
 
 @dataclass(frozen=True, kw_only=True)
 class Fresh:
-    """The draws, new to both, on which the answer is compared with the start."""
+    """Fresh draws, on which the result is compared with the start."""
 
     flights: Annotated[int, Ge(2), Le(MOST_FLIGHTS), doc("of each of the two")] = 300
     seed: Annotated[Seed, doc("of these draws; not that of the search")] = 1
@@ -153,7 +153,7 @@ class TuningPlan:
 
     @property
     def most(self) -> int:
-        """Flights of a candidate that goes on to the end."""
+        """Number of flights of a candidate that is not pruned."""
         return self.spec.flights[-1]
 
     @cached_property
@@ -167,7 +167,7 @@ class TuningPlan:
         return parse_event(self.spec.guard or self.requirement.event.text, self.start.columns)
 
     def objectives(self, rows: Sequence[Row]) -> Array:
-        """(flights, objectives) of some flights; NaN for one that was not completed."""
+        """Return the objectives (flights, objectives) of some flights; NaN for incomplete flights."""
         values = [
             [value_of(objective.expression, row) if row["status"] == "completed" else math.nan for row in rows]
             for objective in self.spec.objectives
@@ -196,7 +196,7 @@ class TuningPlan:
 
     @cached_property
     def start_values(self) -> Values:
-        """The start's values of what is searched; without entries for which it has no single one."""
+        """Return the start's values of the searched entries, without entries that have no single value."""
         values: dict[str, Value] = {}
         for entry in self.spec.search:
             modelled = [1.0 if entry.relative else get_field(merge(self.start.data, {}), path) for path in entry.fields]
@@ -280,7 +280,7 @@ class SearchPlan(Plan):
 
 @contextmanager
 def _field(name: str) -> Iterator[None]:
-    """Name the field of the file in what it raises."""
+    """Name the field of the file in exceptions raised inside."""
     try:
         yield
     except InputError as error:
@@ -288,7 +288,7 @@ def _field(name: str) -> Iterator[None]:
 
 
 def load_tuning(name: str, *, trials: int | None = None, seed: int | None = None) -> TuningPlan:
-    """Read and check a tuning that ships, or a file, with its campaign and scenario; see `quadsim.tune`."""
+    """Read and check a shipped tuning, or a file, with its campaign and scenario; see `quadsim.tune`."""
     path, data = tuning_path(name), read_campaign(name, tuning_path)
     data |= {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     spec = parse_table(TuningFile, data, path.name, file="tuning")

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from scenarios import console
-from scenarios.campaign.campaign import Standing
+from scenarios.campaign.campaign import CampaignProgress
 from scenarios.console import PlainConsole
 from scenarios.progress import reporting, watching
 
@@ -52,7 +52,7 @@ def test_a_campaign_says_a_line_every_ten_seconds(clock: Clock, capsys: pytest.C
     with watching(True) as watch:
         for flown in range(1, 26):
             clock.now = float(flown)
-            watch(Standing(flown=flown, flights=25, failed=0, rate=1.0))
+            watch(CampaignProgress(flown=flown, flights=25, failed=0, rate=1.0))
     starts = [line.partition(",")[0] for line in capsys.readouterr().err.splitlines()]
     assert starts == ["10/25", "20/25", "25/25"]
 

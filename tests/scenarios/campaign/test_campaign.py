@@ -20,8 +20,8 @@ from quadsim.errors import InputError, OutputError
 from quadsim.outputs import SUMMARY_FILE, Growing
 from scenarios.campaign import campaign as module
 from scenarios.campaign import store as records
+from scenarios.campaign.campaign import CampaignProgress, compare_replay, recorded_flight
 from scenarios.campaign.campaign import CampaignResult as Result
-from scenarios.campaign.campaign import Standing, compare_replay, recorded_flight
 from scenarios.campaign.campaign_file import Choice
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.rows import Row, read_table
@@ -117,9 +117,9 @@ def test_what_was_flown_stays_and_the_rest_follows(plan: Plan, whole: Result, tm
         fly_campaign(plan, tmp_path / "again", Alone(backwards=True, stops_after=5))
     manifest = read_manifest(tmp_path / "again")
     assert (manifest["status"], manifest["flown"]) == ("interrupted", 5)
-    seen: list[Standing] = []
+    seen: list[CampaignProgress] = []
     resumed = fly_campaign(plan, tmp_path / "again", Alone(), resume=True, watch=seen.append)
-    assert [standing.flown for standing in seen] == list(range(6, 13))
+    assert [state.flown for state in seen] == list(range(6, 13))
     assert content(resumed) == content(whole)
     assert [session["flights"] for session in resumed.manifest["sessions"]] == [5, 7]
 
