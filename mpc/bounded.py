@@ -140,9 +140,9 @@ class Soft:
     linear: Annotated[
         Price,
         doc(
-            "[1/unit; rad for angles of output_bounds, the row's unit of a polytope] l1: exact where it is above the "
-            "multipliers that hard bounds would have, as 1e8 nearly always is; but what is nearly hard fights back as "
-            "hard where the model errs"
+            "[1/unit; rad for angles of output_bounds, the row's unit of a polytope] l1: exact if larger than the "
+            "multipliers of hard bounds, as 1e8 nearly always is; but a nearly hard bound reacts to model errors like "
+            "a hard one"
         ),
     ] = 2e5
     quadratic: Annotated[Price, doc("[1/unit^2] l2")] = 1e4
@@ -225,7 +225,7 @@ class Polytope:
 class Avoidance(AvoidanceSettings):
     """Half-spaces that keep the vehicle clear of obstacles and inside corridors and the fence."""
 
-    soft: Annotated[Soft | None, doc("[1/m, 1/m^2] what violating one costs; absent: hard")] = None
+    soft: Annotated[Soft | None, doc("[1/m, 1/m^2] cost of violating a constraint; absent: hard")] = None
 
     def space(
         self,
@@ -264,10 +264,10 @@ class FallbackSettings:
     enabled: Annotated[bool, doc("false: the controller handles missing answers itself")] = True
     unseen: Annotated[Positive, doc("[s] longest time that predictions may replace a missing measurement")] = 1.5
     plan_age: Annotated[Positive, doc("[s] longest time that one shifted plan is flown")] = 1.0
-    position: Annotated[Positive, doc("[m] largest distance from that plan")] = 0.5
-    velocity: Annotated[Positive, doc("[m/s] the same of a velocity")] = 1.0
-    angle: Annotated[Positive, doc("[deg] the same of roll, pitch and yaw")] = 11.5
-    rate: Annotated[Positive, doc("[deg/s] the same of their rates")] = 57.3
+    position: Annotated[Positive, doc("[m] largest distance from the plan")] = 0.5
+    velocity: Annotated[Positive, doc("[m/s] largest velocity deviation from the plan")] = 1.0
+    angle: Annotated[Positive, doc("[deg] largest deviation of roll, pitch and yaw from the plan")] = 11.5
+    rate: Annotated[Positive, doc("[deg/s] largest deviation of their rates from the plan")] = 57.3
     hover: Annotated[Positive, doc("[s] longest time in level hover, before the descent")] = 5.0
     sink: Annotated[Positive, doc("[m/s] speed of the descent")] = 0.5
     tilt: Annotated[

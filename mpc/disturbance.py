@@ -54,11 +54,11 @@ class RampSettings:
         Positive | None, doc(f"[rad/s] bandwidth of the torque estimate; absent: {TORQUE_SHARE:g} / control period")
     ] = None
     drag_memory: Annotated[
-        Positive, doc("[s] over which linear drag is fitted to the force, for a nonlinear MPC's predictions")
+        Positive, doc("[s] window for fitting linear drag to the force, for a nonlinear MPC's predictions")
     ] = 1.0
     rotor_lag: Annotated[
         NonNegative | None,
-        doc("[s] rotor time constant; absent: the one that the controller predicts, or 0"),
+        doc("[s] rotor time constant; absent: that of the controller's prediction, or 0"),
     ] = None
     largest_force: Annotated[Positive, doc("[m/s^2] larger estimates are clipped")] = 20.0
     largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 100.0

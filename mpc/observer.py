@@ -44,7 +44,7 @@ class ObserverSettings:
     velocity_noise: Annotated[Positive, doc("[m/s] of a measured velocity")] = 0.05
     rate_noise: Annotated[Positive, doc("[rad/s] of a measured body rate")] = 0.05
     velocity_walk: Annotated[Positive, doc("[m/s] change of a velocity per period that no lasting force causes")] = 0.05
-    rate_walk: Annotated[Positive, doc("[rad/s] same for a body rate")] = 0.05
+    rate_walk: Annotated[Positive, doc("[rad/s] as velocity_walk, for a body rate")] = 0.05
     force_walk: Annotated[Positive, doc("[m/s^2] change of the force's acceleration per period")] = 0.1
     torque_walk: Annotated[Positive, doc("[rad/s^2] change of the torque's angular acceleration per period")] = 0.2
     largest_force: Annotated[Positive, doc("[m/s^2] larger estimates are clipped")] = 5.0

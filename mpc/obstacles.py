@@ -60,7 +60,12 @@ class AvoidanceSettings:
         Le(50),
         doc("[-] half-spaces per predicted instant in the QP, the tightest ones first; more are added if needed"),
     ] = 6
-    iterations: Annotated[int, Ge(1), Le(50), doc("[-] QPs per period at most, each along the last one's plan")] = 3
+    iterations: Annotated[
+        int,
+        Ge(1),
+        Le(50),
+        doc("[-] most QPs per period, each built along the plan of the one before"),
+    ] = 3
 
 
 class Space:

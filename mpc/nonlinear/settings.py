@@ -147,7 +147,7 @@ class Nonlinear(ControllerTable):
         doc("most steps of sequential quadratic programming in a period; 1: the real-time iteration"),
     ] = 1
     shift: Annotated[
-        bool | None, doc("whether the last plan is shifted by a node; absent: where a node is one period")
+        bool | None, doc("whether the last plan is shifted by a node; absent: if a node lasts one period")
     ] = None
     substeps: Annotated[int, Ge(1), Le(100), doc("Runge-Kutta steps per node")] = 1
     inputs: Annotated[Literal["thrust", "speed"], doc("quantity of the inputs, as shares of the rotors' largest")] = (
@@ -163,14 +163,18 @@ class Nonlinear(ControllerTable):
     ] = "error-state"
     terminal: Annotated[
         NonNegative | Literal["none", "lqr"],
-        doc("weight of the last node: none, lqr, or a factor on that of the others"),
+        doc("weight of the last node: none, lqr, or a factor on the weight of the others"),
     ] = "none"
     rotor_lag: Annotated[
         Lag,
         doc('[s] rotor time constant in the prediction, 0 for none; "vehicle": its rotor_rise'),
     ] = 0.0
     drag: Annotated[Drag, doc("[N s/m] linear drag in the prediction, along body x, y, z")] = (0.0, 0.0, 0.0)
-    quadratic_drag: Annotated[Drag, doc("[N s^2/m^2] the same, of each component's square")] = (0.0, 0.0, 0.0)
+    quadratic_drag: Annotated[Drag, doc("[N s^2/m^2] drag on the square of each component")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
     output_bounds: Annotated[
         dict[str, Pair], doc("[m, m/s] lower and upper bound, of positions and velocities by their states' names")
     ] = field(default_factory=dict)

@@ -63,7 +63,7 @@ class TighteningSettings:
     acceleration: Annotated[
         NonNegative, doc("[m/s^2] bound on a disturbance's acceleration along each axis, world frame")
     ] = 0.5
-    angular_acceleration: Annotated[NonNegative, doc("[rad/s^2] same for angular accelerations, body frame")] = 0.5
+    angular_acceleration: Annotated[NonNegative, doc("[rad/s^2] bound on its angular acceleration, body frame")] = 0.5
     turning: Annotated[
         NonNegative, doc("[unit of the state/s^2, rad for angles] largest second derivative of an output at its bound")
     ] = 3.0

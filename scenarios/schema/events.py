@@ -26,9 +26,9 @@ _FAULTS: Final = {"dropout": "gives no samples", "freeze": "is frozen", "nan": "
 
 @dataclass(frozen=True, kw_only=True)
 class SetpointEvent:
-    """The reference leaves the course: an axis that is given holds its value until it is given another one.
+    """The reference leaves the course: each axis given here keeps its value until a later set-point.
 
-    It is not known ahead: the reference goes there by its filter from the next control sample on.
+    The controller does not know it in advance: the reference moves there through its filter from the next sample on.
     """
 
     at: Instant

@@ -26,7 +26,7 @@ class Push:
     type: Annotated[Literal["push"], doc("kind of event: push")] = "push"
     duration: Annotated[Positive, doc("[s] length of the push")]
     force: Annotated[Vector, doc("[N] world frame")]
-    point: Annotated[Vector, doc("[m] where it acts, body frame")] = (0.0, 0.0, 0.0)
+    point: Annotated[Vector, doc("[m] point of application, body frame")] = (0.0, 0.0, 0.0)
 
     def text(self) -> str:
         """Describe the event."""
@@ -68,7 +68,7 @@ class ThrustNoise:
 
     loss: Annotated[NonNegative, doc("[-] mean of the share of thrust lost at full thrust; grows as u^2")] = 0.0
     deviation: Annotated[
-        NonNegative, doc("[-] its standard deviation in each physics step at full thrust; as sqrt(u)")
+        NonNegative, doc("[-] standard deviation per physics step at full thrust; proportional to sqrt(u)")
     ] = 0.0
 
     def applied(self, thrusts: Array, largest: float, rng: np.random.Generator) -> Array:
@@ -88,7 +88,7 @@ class Disturbance:
     force_noise: Annotated[
         NonNegative, doc("[N s^0.5] root of the two-sided spectral density of white noise, each axis")
     ] = 0.0
-    torque_noise: Annotated[NonNegative, doc("[N m s^0.5] the same of the torque")] = 0.0
+    torque_noise: Annotated[NonNegative, doc("[N m s^0.5] as force_noise, for the torque")] = 0.0
 
     def draw(self, steps: int, timestep: float, rng: np.random.Generator) -> Array:
         """(steps, 6) force, world [N], and torque, body [N m], over each step of `timestep` [s]."""

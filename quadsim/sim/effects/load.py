@@ -68,9 +68,9 @@ class MassChange:
 class Load:
     """Differences of the actual vehicle from its file, which the controller still assumes."""
 
-    mass_factor: Annotated[Factor, doc("[-] real mass over that of [actual], or else of [vehicle]")] = 1.0
+    mass_factor: Annotated[Factor, doc("[-] true mass over the mass in [actual], or else in [vehicle]")] = 1.0
     inertia_factor: Annotated[
-        tuple[Factor, ...], Len(3, 3), doc("[-] same for the moments of inertia about body x, y, z")
+        tuple[Factor, ...], Len(3, 3), doc("[-] as mass_factor, for the moments of inertia about body x, y, z")
     ] = (1.0, 1.0, 1.0)
     centre_of_mass: Annotated[Vector, doc("[m] its actual position, body frame")] = (0.0, 0.0, 0.0)
     payloads: Annotated[tuple[Payload, ...], MaxLen(1000), doc("payloads from the start")] = ()

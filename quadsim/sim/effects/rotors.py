@@ -28,21 +28,23 @@ class RotorDynamics:
 
     rise: Annotated[
         Positive | None,
-        doc("[s] time constant while speeding up; absent: the vehicle's, or at once where it states none"),
+        doc("[s] time constant while speeding up; absent: the vehicle's, or no lag if it has none"),
     ] = None
     fall: Annotated[
         Positive | None,
-        doc("[s] time constant while slowing down; absent: the vehicle's, or at once where it states none"),
+        doc("[s] time constant while slowing down; absent: the vehicle's, or no lag if it has none"),
     ] = None
     acceleration: Annotated[Positive | None, doc("[rad/s^2] largest change of a rotor's speed; absent: no limit")] = (
         None
     )
     inertia: Annotated[
         NonNegative | None,
-        doc("[kg m^2] of one rotor: gyroscopic and spin-up torque; absent: the vehicle's, or 0 where it states none"),
+        doc("[kg m^2] of one rotor: gyroscopic and spin-up torque; absent: the vehicle's, or 0 if it has none"),
     ] = None
     efficiency: Annotated[
-        tuple[Fraction, ...], Len(N_ROTORS, N_ROTORS), doc("[-] share of its thrust and torque that each rotor gives")
+        tuple[Fraction, ...],
+        Len(N_ROTORS, N_ROTORS),
+        doc("[-] share of nominal thrust and torque, per rotor"),
     ] = (1.0, 1.0, 1.0, 1.0)
 
     @property
@@ -105,9 +107,9 @@ class RotorLoss:
 
     at: Instant
     type: Annotated[Literal["rotor_loss"], doc("kind of event: rotor_loss")] = "rotor_loss"
-    rotor: Annotated[int, Ge(1), Le(N_ROTORS), doc("which rotor, 1 to 4")]
+    rotor: Annotated[int, Ge(1), Le(N_ROTORS), doc("number of the rotor, 1 to 4")]
     loss: Annotated[float, Gt(0.0), Le(1.0), doc("[-] share of thrust and torque lost; 1 is all of it")]
-    duration: Annotated[Positive | None, doc("[s] after which the rotor is whole again; absent: never")] = None
+    duration: Annotated[Positive | None, doc("[s] time until the rotor recovers; absent: never")] = None
 
     def text(self) -> str:
         """Describe the event."""
@@ -134,7 +136,7 @@ class LagChange:
     at: Instant
     type: Annotated[Literal["rotor_lag"], doc("kind of event: rotor_lag")] = "rotor_lag"
     rise: Annotated[NonNegative, doc("[s] time constant while speeding up; 0: at once")]
-    fall: Annotated[NonNegative | None, doc("[s] time constant while slowing down; absent: the same")] = None
+    fall: Annotated[NonNegative | None, doc("[s] time constant while slowing down; absent: equal to rise")] = None
 
     def text(self) -> str:
         """Describe the event."""

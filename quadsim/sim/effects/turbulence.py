@@ -59,7 +59,7 @@ class Dryden:
     ]
     airspeed: Annotated[
         Annotated[float, Ge(SLOWEST_AIRSPEED), Le(FASTEST_AIRSPEED)] | None,
-        doc("[m/s] at which the turbulence passes the vehicle; absent: the mean wind's speed"),
+        doc("[m/s] speed at which the turbulence passes the vehicle; absent: the mean wind's speed"),
     ] = None
 
     @property

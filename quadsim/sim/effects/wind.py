@@ -38,7 +38,7 @@ class Air:
     ] = None
     linear_drag: Annotated[_Drag, doc("[N s/m] drag of the body per air speed along each body axis")] = (0.0, 0.0, 0.0)
     quadratic_drag: Annotated[
-        _Drag, doc("[N s^2/m^2] drag of the body per square of the air speed along each body axis, axis by axis")
+        _Drag, doc("[N s^2/m^2] drag of the body per squared air speed, along each body axis")
     ] = (0.0, 0.0, 0.0)
     wind: Annotated[Vector, doc("[m/s] mean velocity of the air, world frame")] = (0.0, 0.0, 0.0)
     turbulence: Annotated[Dryden | None, doc("Dryden turbulence; absent: none")] = None
