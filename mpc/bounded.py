@@ -160,7 +160,7 @@ class Polytope:
     the physics rate.
     """
 
-    name: Annotated[str, doc("what reports call it; of several rows name_1, name_2, ...")] = field(
+    name: Annotated[str, doc("name in reports; with several rows name_1, name_2, ...")] = field(
         metadata={"pattern": "^[A-Za-z][A-Za-z0-9_-]*$"}
     )
     of: Annotated[
@@ -172,7 +172,7 @@ class Polytope:
     soft: Annotated[Soft | None, doc("absent: hard")] = None
     tolerance: Annotated[NonNegative, doc("[unit of the row] of the audit, at the physics rate")] = 0.0
     tolerance_sampled: Annotated[NonNegative, doc("[unit of the row] of the audit, at the samples")] = 0.0
-    required: Annotated[bool, doc("false: measured and reported, never a failure")] = True
+    required: Annotated[bool, doc("false: reported only, without effect on the verdict")] = True
 
     def __post_init__(self) -> None:
         for name in self.of:
@@ -323,9 +323,9 @@ class Weighted(ControllerTable):
     input_weights: InputWeights
     terminal: Annotated[
         Literal["lqr"] | None,
-        doc("weight of the last predicted state: lqr, of the Riccati equation; absent: as of all others"),
+        doc("weight of the last predicted state: lqr: from the Riccati equation; absent: the weight of all others"),
     ] = None
-    compiled: Annotated[bool, doc("run the whole law in the compiled C core instead of Python")] = False
+    compiled: Annotated[bool, doc("true: run the whole controller in the compiled C core instead of Python")] = False
 
     def __post_init__(self) -> None:
         require_states(self.output_weights, "output_weights")

@@ -1,4 +1,4 @@
-"""What a controller is to the testbed: one protocol, one answer per control period."""
+"""The controller protocol: one command per control period."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ import numpy as np
 from quadsim.motion import Motion
 from quadsim.state import Array
 
-SOLVED: Final = "solved"  # status of a period whose optimum a QP solver or the core found
+SOLVED: Final = "solved"  # status: a QP solver or the core computed the optimum
 UNCONSTRAINED: Final = "unconstrained"
-"""Status of a period whose unconstrained optimum satisfies every constraint, and so is the constrained one too."""
-COMMANDED: Final = "commanded"  # status of a period in which a law without a solver commanded
+"""Status: the unconstrained optimum satisfies every constraint, so it is also the constrained optimum."""
+COMMANDED: Final = "commanded"  # status: command of a law without a solver
 NOT_CONVERGED: Final = "not_converged"
-"""Status of a period whose QP was solved, but whose plan does not follow the nonlinear dynamics that it linearises."""
-OPTIMAL: Final = frozenset({SOLVED, UNCONSTRAINED, COMMANDED})  # the statuses whose command is the law's own answer
-ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}  # the statuses whose command is flown as answered
+"""Status: the QP was solved, but its plan does not satisfy the nonlinear dynamics that it linearises."""
+OPTIMAL: Final = frozenset({SOLVED, UNCONSTRAINED, COMMANDED})  # statuses whose command is the law's answer
+ACCEPTED: Final = OPTIMAL | {NOT_CONVERGED}  # statuses whose command is applied unchanged
 MISSED: Final = "missed"
-"""Status of a period whose command came after the next period's begin: the one before it went on acting."""
-GAIN: Final = "gain"  # who answered a period: the unconstrained optimum, a product with constant gains
+"""Status: the command arrived after the start of the next period, so the one before stayed in force."""
+GAIN: Final = "gain"  # source of a command: the unconstrained optimum, a product with constant gains
 CORE: Final = "core"  # the exact optimum of `mpc.core`, compiled
 LAW: Final = "law"  # a law without a solver
 FALLBACK: Final = "fallback"  # an earlier plan or command, or the fallback contract
-STOPPED: Final = "stopped"  # nobody: rotors are off
+STOPPED: Final = "stopped"  # no source: the rotors are off
 NO_SOLVER: Final = frozenset({GAIN, CORE, LAW, FALLBACK, STOPPED})
-"""Who may answer besides QP solvers, which go by their names (`mpc.solvers.find_solver`)."""
+"""Sources of a command other than QP solvers, which are recorded by name (`mpc.solvers.find_solver`)."""
 LAW_NAMES: Final = {
     "unconstrained": "unconstrained MPC",
     "constrained": "constrained MPC",
@@ -39,9 +39,9 @@ LAW_NAMES: Final = {
     "pid": "PID",
     "geometric": "geometric control",
 }
-"""What controllers are called where people read, by the names that they record; others go by their own."""
+"""Display names of the built-in controllers, by recorded name; others are shown by their recorded name."""
 LARGEST_SPEED: Final = 1e5
-"""Largest magnitude of a rotor speed command [rad/s] that is taken for a command rather than for a fault."""
+"""Largest magnitude of a valid rotor speed command [rad/s]; a larger one is a fault."""
 
 
 class Signals(Protocol):
@@ -53,27 +53,27 @@ class Signals(Protocol):
 
 
 class Phase(StrEnum):
-    """Where a flight stands with the ground; without a ground it is `flying` throughout."""
+    """Phase of a flight relative to the ground; without a ground always `flying`."""
 
-    LANDED = "landed"  # on the ground, rotors off or on their way there
+    LANDED = "landed"  # on the ground, rotors off or spinning down
     ARMED = "armed"  # on the ground, rotors spinning up for take-off
     FLYING = "flying"
-    CRASHED = "crashed"  # something other than the feet touched the ground; what follows is recorded, not controlled
+    CRASHED = "crashed"  # something other than the feet touched the ground; recorded from then on, no longer controlled
 
 
 @dataclass(frozen=True, kw_only=True)
 class StepInputs:
-    """When a controller is called, and what it may use besides the measured state.
+    """Time of a controller's call, and its inputs besides the measured state.
 
     Attributes:
         time: t_k [s].
-        phase: where the flight stands with the ground.
-        acting: (4,) command in force at t_k, u(k-1) [rad/s]; None where it is the controller's own last one.
-        attitude: (4,) measured quaternion wxyz, body to world, sign continuous from period to period; None where it is
-            to be derived from the state.
-        body_rates: (3,) measured body rates [rad/s]; None as before.
-        motion: the reference from t_k on, where the course knows more than x, y, z, yaw.
-        signals: where `log` writes; None where nothing records.
+        phase: phase relative to the ground.
+        acting: (4,) command in force at t_k, u(k-1) [rad/s]; None if it is the controller's last command.
+        attitude: (4,) measured quaternion wxyz, body to world, sign continuous from period to period; None: derive it
+            from the state.
+        body_rates: (3,) measured body rates [rad/s]; None: derive them from the state.
+        motion: the reference from t_k on, if the course defines more than x, y, z, yaw.
+        signals: recorder for `log`; None if nothing is recorded.
 
     Examples:
         >>> import quadsim
@@ -99,8 +99,8 @@ class StepInputs:
         """Record a number of this period: a column of flight.parquet, and `flight.logged[name]`.
 
         Args:
-            name: an identifier that is no column of flight.parquet; logged twice in a period, the last value counts.
-            value: finite, or NaN, which periods without a value have.
+            name: an identifier that is not a column of flight.parquet; of several values in a period the last counts.
+            value: finite, or NaN, as in periods without a value.
             unit: stored with the column.
 
         Raises:
@@ -111,22 +111,22 @@ class StepInputs:
 
 
 class InnerLoop(Protocol):
-    """A loop inside the control period, faster than it: from commanded rotor speeds to those that rotors are given."""
+    """A faster loop inside the control period, from commanded rotor speeds to those applied."""
 
     @property
     def rate(self) -> float:
-        """How often it is called [Hz]; a whole number of physics steps apart, the first time when a hold begins."""
+        """Rate of calls [Hz], a whole number of physics steps apart; the first at the start of each period."""
         ...
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
-        """The rotor speeds (4,) to hold until the next call; all speeds in rad/s, `rates` (3,) the true body rates."""
+        """Return rotor speeds (4,) to hold until the next call; speeds in rad/s, `rates` (3,) true body rates."""
         ...
 
 
 class SQP(NamedTuple):
-    """How far sequential quadratic programming is from convergence, in the model's own units: m, m/s, rad/s and shares.
+    """Residuals of sequential quadratic programming, in the model's units: m, m/s, rad/s and shares.
 
-    A solved QP says nothing about either.
+    A solved QP does not imply that they are small.
     """
 
     defect: float  # largest |x_{i+1} - f(x_i, u_i)| of the plan, over its nodes and the states' components
@@ -135,29 +135,29 @@ class SQP(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """A controller's answer for one period, and how it was found.
+    """A controller's command for one period, and how it was computed.
 
     Attributes:
         speeds: (4,) rotor speeds to hold for the period [rad/s].
         plan: (N, 4) planned speeds, `plan[0]` being this period's [rad/s].
         status: `solved`, `unconstrained`, `commanded` or `not_converged` (`ACCEPTED`), `landed` or `crashed` where
-            rotors are stopped, or what the back end calls what went wrong.
-        answered_by: who found `speeds`: `gain`, `core`, a QP solver by its name, `law`, `fallback` or `stopped`.
-        iterations: those of whoever answered; of the refused answer in a fallback; 0 for a closed form.
+            rotors are stopped, or the solver's name for its failure.
+        answered_by: source of `speeds`: `gain`, `core`, a QP solver by its name, `law`, `fallback` or `stopped`.
+        iterations: iterations of the solver, also if its answer was rejected; 0 for a closed form.
         active: number of constraints active at the optimum.
         fallback: 0 when `speeds` is this period's optimum, higher = deeper; 1 = the shifted previous plan, or
-            the last command, where that goes on for one that missed its deadline.
+            the last command, if it continues for one that missed its deadline.
         slack: largest softening of an output bound [rad]; 0 while all bounds are hard.
-        reported_primal: largest constraint violation that the QP solver reports [its own scaling]; of this and all
-            below: NaN where there is none.
-        reported_dual: largest gradient of the Lagrangian that the QP solver reports [its own scaling].
+        reported_primal: largest constraint violation that the QP solver reports [in its scaling]; NaN, as for all
+            below, if not available.
+        reported_dual: largest gradient of the Lagrangian that the QP solver reports [in its scaling].
         infeasibility: largest violation of the problem's rows by the plan, soft rows less their slack [row's unit].
         kkt_stationarity: largest entry of the Lagrangian's gradient, computed from the QP.
-        kkt_complementarity: largest product of a multiplier and the distance to its bound, likewise.
-        kkt_dual: largest multiplier whose sign belongs to no bound, likewise.
+        kkt_complementarity: largest product of a multiplier and the distance to its bound, computed from the QP.
+        kkt_dual: largest multiplier with the wrong sign, computed from the QP.
         solve_s: wall time inside the solver [s].
-        sqp: residual of sequential quadratic programming; None for laws without.
-        inner: the inner loop that carries out commands from now on; None for rotors that hold `speeds`.
+        sqp: residuals of sequential quadratic programming; None for other laws.
+        inner: inner loop that executes commands from now on; None: the rotors hold `speeds`.
 
     Examples:
         >>> import numpy as np
@@ -187,19 +187,19 @@ class Command:
 
 
 GROUNDED: Final = frozenset({Phase.LANDED, Phase.CRASHED})
-"""The phases in which a controller stops the rotors instead of flying."""
+"""Phases in which a controller stops the rotors."""
 
 
 def stopped(speeds: Array, horizon: int, phase: Phase) -> Command:
-    """The command of a controller whose rotors stand still, or are about to: `speeds` (4,), status `phase`."""
+    """Return the command of a controller with stopped or stopping rotors: `speeds` (4,), status `phase`."""
     return Command(speeds=speeds, plan=np.tile(speeds, (horizon, 1)), status=str(phase), answered_by=STOPPED)
 
 
 class Controller(Protocol):
     """A feedback law run once per control period.
 
-    One that takes over in flight may have a method `adopt(previous)`, called after `reset` with the controller before
-    it, from which it may copy what it has learnt and planned.
+    A controller that takes over in flight may have a method `adopt(previous)`, called after `reset`, which can copy
+    estimates and the plan from the previous controller.
     """
 
     @property
@@ -214,36 +214,36 @@ class Controller(Protocol):
 
     @property
     def horizon(self) -> int:
-        """N, how many samples of preview `step` is given."""
+        """N, number of preview samples passed to `step`."""
         ...
 
     def reset(self, speeds: Array) -> None:
-        """Forget the past: the next step is the first, after `speeds` u(-1) (4,) [rad/s]."""
+        """Restart: the next step is the first, after `speeds` u(-1) (4,) [rad/s]."""
         ...
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """The command for the period that starts now, of a measured state xi(k) (12,).
+        """Return the command for the period that starts now, from the measured state xi(k) (12,).
 
         The reference (N, 4) is filtered x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.
 
         Raises:
-            FlightError: no command can be given.
+            FlightError: the controller cannot return a command.
         """
         ...
 
     def predict(self, states: Array, plans: Array) -> Array:
-        """Predicted states (K, N, 12) for K measured states (K, 12) and plans (K, N, 4), as the controller saw them.
+        """Return the predicted states (K, N, 12) from K measured states (K, 12) and plans (K, N, 4).
 
-        For pictures alone.  A controller without a model may lack it, and then flies without `horizon.parquet`.
+        Only for pictures.  Optional: without it the run has no `horizon.parquet`.
         """
         ...
 
 
 def check_command(speeds: Array) -> str | None:
-    """What is wrong with rotor speeds that are about to reach the plant, or None."""
+    """Return why rotor speeds are not a valid command, or None."""
     if np.shape(speeds) != (4,):
         return f"the command has shape {np.shape(speeds)}, not (4,)"
-    if np.abs(speeds).max() <= LARGEST_SPEED:  # which no NaN is
+    if np.abs(speeds).max() <= LARGEST_SPEED:  # False for NaN
         return None
     if not np.all(np.isfinite(speeds)):
         return f"the command is not finite: {np.asarray(speeds).tolist()}"
@@ -251,11 +251,11 @@ def check_command(speeds: Array) -> str | None:
 
 
 def law_name(recorded: str) -> str:
-    """What a controller is called where people read, by the name in a run's summary."""
+    """Return the display name of a controller from the name in a run's summary."""
     return LAW_NAMES.get(recorded, recorded)
 
 
 def counts(answered_by: Mapping[str, int]) -> str:
-    """Periods by who answered them, most first: `607 gain, 593 piqp-multistage`; `280 commanded`."""
+    """Return the number of periods per source, largest first: `607 gain, 593 piqp-multistage`; `280 commanded`."""
     ranked = sorted(answered_by.items(), key=lambda entry: -entry[1])
     return ", ".join(f"{count} {COMMANDED if by == LAW else by}" for by, count in ranked)

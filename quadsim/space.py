@@ -245,7 +245,7 @@ class Box(Obstacle):
     """An upright box."""
 
     type: Annotated[Literal["box"], doc("kind of obstacle: box")] = "box"
-    size: Annotated[Sizes, doc("[m] its edges along its own x, y, z")]
+    size: Annotated[Sizes, doc("[m] lengths of its edges along its x, y, z axes")]
     yaw: Annotated[Number, doc("[deg] direction of its x axis, from the world's")] = 0.0
 
     @cached_property
@@ -274,10 +274,10 @@ class Wall(Obstacle):
     """An upright wall with a rectangular window."""
 
     type: Annotated[Literal["wall"], doc("kind of obstacle: wall")] = "wall"
-    size: Annotated[Sizes, doc("[m] thickness along its own x, width along y, height along z")]
-    yaw: Annotated[Number, doc("[deg] of its x axis, which goes through it, from the world's")] = 0.0
+    size: Annotated[Sizes, doc("[m] thickness along its x axis, width along y, height along z")]
+    yaw: Annotated[Number, doc("[deg] angle from the world's x axis to its x axis, which is normal to the wall")] = 0.0
     window: Annotated[Annotated[tuple[Positive, ...], Len(2, 2)], doc("[m] width and height of the opening")]
-    window_centre: Annotated[Pair, doc("[m] along its own y and z, from its centre")] = (0.0, 0.0)
+    window_centre: Annotated[Pair, doc("[m] along its y and z axes, from its centre")] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -311,15 +311,15 @@ class Region:
     """A convex region to stay in: an upright box, or half-spaces."""
 
     position: Annotated[Vector | None, doc("[m] x, y, z of a box's centre, world")] = None
-    size: Annotated[Sizes | None, doc("[m] a box's edges along its own x, y, z")] = None
-    yaw: Annotated[Number, doc("[deg] of a box's x axis, from the world's")] = 0.0
+    size: Annotated[Sizes | None, doc("[m] lengths of the box's edges along its x, y, z axes")] = None
+    yaw: Annotated[Number, doc("[deg] angle from the world's x axis to the box's")] = 0.0
     rows: Annotated[
         Annotated[tuple[Vector, ...], Len(1, MAX_POSITIONS)] | None,
-        doc("instead of a box: one list of three numbers a per half-space a . (x, y, z) <= upper"),
+        doc("instead of a box: a list of three numbers a for each half-space a . (x, y, z) <= upper"),
     ] = None
-    upper: Annotated[tuple[Number, ...] | None, doc("[m, times the length of a] one per row")] = None
-    tolerance: Annotated[NonNegative, doc("[m] of the audit: allowed beyond")] = 0.0
-    required: Annotated[bool, doc("false: measured and reported, never a failure")] = True
+    upper: Annotated[tuple[Number, ...] | None, doc("[m, times the length of a] upper bounds, one per row")] = None
+    tolerance: Annotated[NonNegative, doc("[m] violation that the audit accepts")] = 0.0
+    required: Annotated[bool, doc("false: reported only, without effect on the verdict")] = True
 
     def __post_init__(self) -> None:
         box, polytope = (self.position, self.size), (self.rows, self.upper)
@@ -371,14 +371,14 @@ class Region:
 
 @dataclass(frozen=True, kw_only=True)
 class Corridor(Region):
-    """A convex region to stay in for a window of time, or of the reference's path."""
+    """A convex region to stay in during a window of time, or of the reference's path."""
 
     name: Name = field(metadata=_NAME)
-    start: Annotated[Number, doc("[s] first time it holds")] = 0.0
-    stop: Annotated[Number, doc("[s] last time it holds; absent: the flight's end")] = math.inf
+    start: Annotated[Number, doc("[s] start of the time window")] = 0.0
+    stop: Annotated[Number, doc("[s] end of the time window; absent: the end of the flight")] = math.inf
     path: Annotated[
         Annotated[tuple[NonNegative, ...], Len(2, 2)] | None,
-        doc("[m] instead of start and stop: from where to where the reference is along its path when it holds"),
+        doc("[m] instead of start and stop: window of distances travelled by the reference along its path"),
     ] = None
 
     def __post_init__(self) -> None:

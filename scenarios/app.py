@@ -1,7 +1,7 @@
 """The functions of quadsim: the API of `import quadsim` and the commands of the command line.
 
-A function under `@app.command` is both.  `scenarios.cli` alone prints, and shows the results (`scenarios.results`).
-No heavy import precedes the call of a function.
+A function under `@app.command` is both.  Only `scenarios.cli` prints; it shows the results (`scenarios.results`).
+Heavy imports are inside the functions, so that importing this module is fast.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ _log: Final = logging.getLogger("quadsim")
 
 
 def _examples(*lines: str) -> str:
-    """What the help of a command ends with."""
+    """Return the examples at the end of a command's help."""
     return "\n  ".join(["examples:", *lines])
 
 
@@ -108,14 +108,14 @@ def _examples(*lines: str) -> str:
 
 
 def load(name: str | Path, changes: Changes = ()) -> Scenario:
-    """A scenario of the library, or of a file, checked together with the vehicle and the course that it names.
+    """Load a scenario from the library or a file, and check it together with its vehicle and course.
 
     Args:
         name: a library name, or a path ending in `.toml`.
-        changes: fields to replace: values by dotted path as `Scenario.replace` takes them, or texts as of `--set`.
+        changes: fields to replace: values by dotted path, as in `Scenario.replace`, or texts, as after `--set`.
 
     Raises:
-        InputError: it is missing or malformed, or cannot be flown so.
+        InputError: the scenario is missing, malformed, or cannot be flown with these changes.
 
     Examples:
         >>> import quadsim
@@ -129,13 +129,13 @@ def load(name: str | Path, changes: Changes = ()) -> Scenario:
 
 
 def feasibility(scenario: ScenarioName) -> Feasibility:
-    """Compare a course with the vehicle's limits and the controller's bounds, tightened ones too, without a flight.
+    """Compare a course with the vehicle's limits and the controller's bounds (also the tightened ones), without flying.
 
     Args:
-        scenario: it, or its name or file.
+        scenario: the scenario, or its name or file.
 
     Returns:
-        Peaks of the course, as `tilt` [deg], `problems` where a limit or a bound is passed, and a `sentence`.
+        The peaks of the course, such as `tilt` [deg]; `problems`, the limits and bounds that it exceeds; a `sentence`.
 
     Raises:
         InputError: the course cannot be built.
@@ -154,10 +154,10 @@ def feasibility(scenario: ScenarioName) -> Feasibility:
 
 
 def make_controller(scenario: ScenarioName) -> Controller:
-    """The controller of a scenario, ready for `reset` and `step`, without a simulator.
+    """Return the controller of a scenario, ready for `reset` and `step`, without a simulator.
 
     Raises:
-        InputError: it cannot be made from these numbers.
+        InputError: the controller cannot be built from these numbers.
 
     Examples:
         >>> import numpy as np
@@ -174,7 +174,7 @@ def make_controller(scenario: ScenarioName) -> Controller:
 
 
 def problem(scenario: ScenarioName) -> Problem:
-    """The optimal control problem of a scenario's controller: matrices, weights and constraints as numpy arrays.
+    """Return the optimal control problem of a scenario's controller: matrices, weights and constraints as numpy arrays.
 
     `model` has A (n, n), B (n, 4), u_bar (4,) [rad/s]; `objective` C_r, Q_y, Q_u; `rows` the constraints, lower <=
     C x + D u + E (u - u_before) <= upper.  `condensed()` and `qp(state, reference, u_before)` give the QP.
@@ -184,7 +184,7 @@ def problem(scenario: ScenarioName) -> Problem:
     `controller.avoidance` differ from period to period and are left out.
 
     Raises:
-        InputError: the controller solves none: `nonlinear`, `lqr`, `pid`, `geometric`, or yours.
+        InputError: the controller solves no linear MPC problem: `nonlinear`, `lqr`, `pid`, `geometric`, or yours.
 
     Examples:
         >>> import quadsim
@@ -212,24 +212,25 @@ def fly(
 ) -> Flight:
     """Fly a scenario and audit it, in memory; `run` and `Flight.save` write its run directory.
 
-    Ctrl-C, or a controller or force that raises, ends the flight in order: it is returned as far as it came, with the
-    reason, and its outcome is `aborted`.
+    If you press Ctrl-C, or a controller or force raises, the flight ends early: `fly` returns it up to that time, with
+    the outcome `aborted` and the reason.
 
     Args:
         scenario: the scenario, or its name or file.
-        controller: flies it, instead of the scenario's: a class, called as MyLaw(vehicle, period=..., horizon=...)
-            and with a method `step(now, state, reference)`; a function `law(now, state, reference)` that gives four
+        controller: replaces the scenario's controller: a class, called as MyLaw(vehicle, period=..., horizon=...)
+            and with a method `step(now, state, reference)`; a function `law(now, state, reference)` that returns four
             rotor speeds [rad/s]; an object with such a `step`; or a text `package.module:Class`.  Further arguments of
             a class through `functools.partial`.
-        forces: user-defined forces on the vehicle, besides the scenario's effects: functions
-            `force(time, state)`, called once per physics step, that give force x, y, z in the world frame [N] and
-            torque in the body frame [N m]; or classes called as MyForce(vehicle, rng=...) whose objects are called so.
-        reference: replaces the course and its filter; the scenario's constraints stay.  A function `f(t)` of the time
-            [s] that gives x, y, z [m], yaw [rad] (unwrapped), called before the flight for all control instants to the
-            end of the last preview.  A run directory keeps these samples in `reference.csv`, and its `scenario.toml`
-            flies to the same bits.
-        progress: called with (what, done, total); True for bars on a terminal and elsewhere a line every ten seconds,
-            False for none.
+        forces: user-defined forces on the vehicle, in addition to the scenario's effects: functions
+            `force(time, state)`, called once per physics step, that return the force x, y, z in the world frame [N]
+            and the torque in the body frame [N m]; or classes, called as MyForce(vehicle, rng=...), whose objects
+            are such functions.
+        reference: replaces the course and its filter; the scenario's constraints stay.  A function `f(t)` of time
+            [s] that returns x, y, z [m] and yaw [rad] (unwrapped).  It is called before the flight, for all control
+            instants up to the end of the last preview.  A run directory keeps these samples in `reference.csv`; its
+            `scenario.toml` flies to the same bits.
+        progress: True shows a bar on a terminal, or a line every ten seconds elsewhere; False shows nothing; a function
+            is called with (activity, done, total).
 
     Raises:
         InputError: the scenario cannot be flown, or the controller or the reference cannot be set up.
@@ -275,32 +276,33 @@ def run(
 ) -> Flight:
     """Fly one scenario and write its run directory.
 
-    A flight that was flown is kept: tables and summary first, then what is made from them.
+    The tables and the summary are written first, so a failure in the figures or the video does not lose the flight.
 
     Args:
         scenario: library name, or path to a TOML file.
         out: run directory (default: runs/SCENARIO, or the next free name).
-        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
+        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
-        seed: replace the seed, of everything random in it.
-        video: film it (default: where that can be done).
-        recording: write flight.rrd for the rerun viewer (default: where that can be done).
-        figures: draw it (default: where that can be done).
-        controller: as of `fly`.
-        forces: as of `fly`.
-        reference: as of `fly`.
-        progress: as of `fly`.
+        seed: replace the seed of everything random in the scenario.
+        video: film the flight (default: if possible).
+        recording: write flight.rrd for the rerun viewer (default: if possible).
+        figures: plot the flight (default: if possible).
+        controller: as in `fly`.
+        forces: as in `fly`.
+        reference: as in `fly`.
+        progress: as in `fly`.
 
     Raises:
         InputError: the scenario cannot be flown, or the controller or the reference cannot be set up.
-        RenderingUnavailableError: a video is asked for and cannot be made; nothing was flown.
-        OutputError: the directory cannot be written; or what was asked for by name: its `result` is the flight then.
+        RenderingUnavailableError: a video is requested but cannot be rendered; nothing was flown.
+        OutputError: the directory, or a requested product, cannot be written; in the second case its `result` is the
+            flight.
 
     Examples:
         >>> import tempfile, quadsim
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     flown = quadsim.run("hover", out=folder + "/run", changes={"duration": 0.5}, video=False)
-        ...     flown.outcome, flown.directory.name
+        ...     flight = quadsim.run("hover", out=folder + "/run", changes={"duration": 0.5}, video=False)
+        ...     flight.outcome, flight.directory.name
         ('satisfied', 'run')
     """
     from scenarios import loading, user_code
@@ -318,14 +320,14 @@ def run(
         try:
             flight.save(directory, overwrite=overwrite, progress=report, **products)
         except OutputError as error:
-            if error.path.parent == directory:  # a product that was asked for by name
+            if error.path.parent == directory:  # a product that was requested explicitly
                 error.result = flight
             raise
     return flight
 
 
 def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> AbstractContextManager[Path]:
-    """The directory of a run, reserved: `out`, or `runs/NAME`, or the next free name where that is not replaced."""
+    """Reserve a run directory: `out`, or `runs/NAME`, or the next free name unless `overwrite`."""
     from quadsim.outputs import reserving
 
     if out is not None:
@@ -334,7 +336,7 @@ def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> Abst
 
 
 def _announce(assembly: Assembly, progress: Watched) -> None:
-    """On a terminal, report what the course requires before it is flown; the summary repeats it."""
+    """On a terminal, report the demands of the course before the flight; the summary repeats them."""
     from scenarios import console, feasibility_check
 
     if progress is True and (terminal := console.stderr()).is_terminal:
@@ -352,16 +354,16 @@ def start(
     live: bool = False,
     recorded: bool = True,
 ) -> Rollout:
-    """Build everything that a flight needs, for a script that flies it period by period.
+    """Build a flight for a script that flies it period by period.
 
     Args:
         scenario: the scenario, or its name or file.
-        controller: as of `fly`.
-        forces: as of `fly`.
-        reference: as of `fly`; beyond the scenario's end and its preview it stays at the last sample.
-        live: whether anything may be applied to it that can happen to its vehicle; else what its scenario's events are
-            of, and set-points, stalls, rotor losses and lags, and other controllers.
-        recorded: whether all periods are recorded, some 10 kB each; without them there is no `Rollout.flight`.
+        controller: as in `fly`.
+        forces: as in `fly`.
+        reference: as in `fly`; after the scenario's end and its preview it keeps its last sample.
+        live: whether events of every kind may be applied; otherwise only the kinds among the scenario's events, and
+            set-points, stalls, rotor losses, rotor lags and controller changes.
+        recorded: whether every period is recorded, at about 10 kB; required by `Rollout.flight`.
 
     Raises:
         InputError: the scenario cannot be flown, or the controller cannot be set up.
@@ -382,20 +384,20 @@ def start(
 
 
 def read(directory: str | Path) -> Flight:
-    """A finished run: its log at the scenario's `log_rate`, its audit as it was recorded.
+    """Read a finished run: its log at the scenario's `log_rate`, and its recorded audit.
 
     Args:
-        directory: as `quadsim run` or `Flight.save` wrote it.
+        directory: run directory, written by `quadsim run` or `Flight.save`.
 
     Raises:
-        FileError: it is no run directory, or a file is missing or damaged.
+        FileError: the directory is not a run directory, or a file is missing or damaged.
 
     Examples:
         >>> import tempfile, quadsim
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     flown = quadsim.fly(quadsim.load("hover").replace({"duration": 1.0}))
-        ...     read = quadsim.read(flown.save(folder + "/run", video=False))
-        >>> bool((read.command == flown.command).all()), read.outcome
+        ...     flight = quadsim.fly(quadsim.load("hover").replace({"duration": 1.0}))
+        ...     read = quadsim.read(flight.save(folder + "/run", video=False))
+        >>> bool((read.command == flight.command).all()), read.outcome
         (True, 'satisfied')
     """
     from quadsim.flight import rundir
@@ -435,17 +437,17 @@ def check(
     junit: File | None = None,
     progress: Watched = True,
 ) -> Reaudit:
-    """Audit a scenario (flown first) or a finished run; exit 1 if it fails.
+    """Audit a scenario (flown first) or a finished run; exit 1 if a constraint fails.
 
-    A finished run is audited again from its tables, and compared with its summary and its files' hashes.  This
-    finds damage and mistakes: integrity, not authenticity.  Rewriting every file can make them agree.
+    A finished run is audited again from its tables; the result is compared with its summary, and its files with
+    their hashes.  This finds damage and mistakes, not forgery: someone who rewrites every file can make them agree.
 
     Args:
         target: library name, TOML file, or run directory.
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
-        seed: replace the seed, of everything random in it.
+        seed: replace the seed of everything random in the scenario.
         junit: also write the verdicts as JUnit XML.
-        progress: as of `fly`.
+        progress: as in `fly`.
 
     Raises:
         InputError: the scenario cannot be flown.
@@ -454,8 +456,8 @@ def check(
     Examples:
         >>> import tempfile, quadsim
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     flown = quadsim.fly(quadsim.load("hover").replace({"duration": 1.0}))
-        ...     audited = quadsim.check(flown.save(folder + "/run", video=False))
+        ...     flight = quadsim.fly(quadsim.load("hover").replace({"duration": 1.0}))
+        ...     audited = quadsim.check(flight.save(folder + "/run", video=False))
         >>> audited.satisfied, audited.notes
         (True, ())
     """
@@ -502,17 +504,17 @@ def compare(
     markdown: Flag = False,
     progress: Watched = True,
 ) -> FlightComparison | PairedComparison | Document:
-    """Flights, or two campaigns flight by flight, side by side: table, figures, HTML page.
+    """Compare flights, or two campaigns flight by flight: table, figures, HTML page.
 
     Args:
         targets: run directories, scenarios to fly, or the directories of two campaigns.
-        out: directory of the page, its figures and its table.
-        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
+        out: directory for the page, its figures and its table.
+        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
         markdown: print the table as Markdown.
-        progress: as of `fly`.
+        progress: as in `fly`.
 
     Raises:
-        InputError: something is neither; nothing was flown.
+        InputError: a target is neither a run, a scenario nor a campaign; nothing was flown.
         OutputError: the page cannot be written.
 
     Examples:
@@ -558,24 +560,24 @@ def film(
 
     Args:
         directory: run directory.
-        out: MP4 or GIF file (default: flight.mp4 in the run's directory, replacing an earlier one).
-        overwrite: replace a file that is there.
+        out: MP4 or GIF file (default: flight.mp4 in the run directory, replacing an earlier one).
+        overwrite: replace an existing file.
         workers: rendering processes (default: one per core).
-        progress: as of `fly`.
+        progress: as in `fly`.
 
     Returns:
-        The file.
+        Path of the file.
 
     Raises:
-        InputError: it is no run directory, or the file has another ending.
-        RenderingUnavailableError: nothing can render here.
+        InputError: the directory is not a run directory, or the file ends in neither .mp4 nor .gif.
+        RenderingUnavailableError: this machine cannot render.
         OutputError: the file cannot be written.
 
     Examples:
         >>> import tempfile, quadsim
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     flown = quadsim.fly(quadsim.load("hover").replace({"duration": 0.2}))
-        ...     file = quadsim.film(flown.save(folder + "/run", video=False), workers=1)
+        ...     flight = quadsim.fly(quadsim.load("hover").replace({"duration": 0.2}))
+        ...     file = quadsim.film(flight.save(folder + "/run", video=False), workers=1)
         ...     file.name, file.stat().st_size > 1000
         ('flight.mp4', True)
     """
@@ -609,14 +611,14 @@ def film(
 def view(run: File, /, *, web: Flag = False) -> None:
     """Open a run's recording in the rerun viewer.
 
-    It returns when the viewer is closed or Ctrl-C is pressed.
+    It returns when you close the viewer or press Ctrl-C.
 
     Args:
         run: run directory or .rrd file.
-        web: serve the viewer to a browser instead, to this machine alone.
+        web: serve the viewer to a browser on this machine instead.
 
     Raises:
-        FileError: there is no such recording.
+        FileError: the recording does not exist.
         ViewerUnavailableError: there is no display, or the viewer failed.
 
     Examples:
@@ -640,7 +642,7 @@ def view(run: File, /, *, web: Flag = False) -> None:
     if not recording.is_file():
         raise FileError(path, f"has no {rundir.RECORDING_FILE}; run the scenario again without --no-recording")
     if recording.suffix != ".rrd":
-        raise FileError(path, "is no recording; give a run directory or a file ending in .rrd")
+        raise FileError(path, "is not a recording; give a run directory or a file ending in .rrd")
     open_viewer(recording, web=web)
 
 
@@ -662,20 +664,20 @@ def live(
     changes: Changes = (),
     seed: Whole | None = None,
 ) -> Document:
-    """Fly in the browser: push, turn every knob, keep it as a scenario.
+    """Fly interactively in the browser: push, change every setting, save the flight as a scenario.
 
     Args:
-        scenario: library name, or path to a TOML file; or the directory of a run to fly on from.
-        against: a second vehicle, flown by the controller of this scenario.
+        scenario: library name, or path to a TOML file; or directory of a run to continue.
+        against: scenario whose controller flies a second vehicle beside the first.
         out: run directory (default: runs/SCENARIO-live, or the next free name).
-        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
-        script: TOML file of inputs and times: no browser, as fast as it goes.
-        port: to listen on (default: any free one).
-        host: other than this machine: for a network that you trust.
+        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
+        script: TOML file of timed inputs, flown without a browser and as fast as possible.
+        port: port to listen on (default: any free port).
+        host: address to listen on (default: 127.0.0.1, this machine only); others only on a network that you trust.
         browser: open the browser.
-        video: film what was flown.
+        video: film the flight.
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
-        seed: replace the seed, of everything random in it.
+        seed: replace the seed of everything random in the scenario.
 
     Examples:
         >>> import quadsim
@@ -690,7 +692,7 @@ def live(
     onward = isinstance(scenario, str | Path) and Path(scenario).is_dir()
     if onward:
         if changes or seed is not None:
-            raise ParameterError("", "--set" if changes else "--seed", "given", "absent where a run is flown on")
+            raise ParameterError("", "--set" if changes else "--seed", "given", "absent when a run is continued")
         reaudit(Path(str(scenario)), products=False)
         scenario = stored_scenario(Path(str(scenario)))
     flown = load_scenario(scenario, changes, seed)
@@ -711,16 +713,16 @@ def sweep(
     workers: int | None = None,
     progress: bool = True,
 ) -> Sweep:
-    """Fly a scenario once for every combination of some fields' values, all with the scenario's own seed.
+    """Fly a scenario for every combination of the values of some fields, always with the scenario's seed.
 
     Args:
         scenario: the scenario, or its name or file.
-        values: what to try, by dotted path; a tuple of paths varies together, with one value for all of them or a tuple
-            of one for each.
-        controller: as of `fly`; a class or a function of a module that other processes can import.
-        forces: what acts on it, as of `fly`; the same.
-        workers: processes that fly; one per usable core where absent.
-        progress: as of `fly`.
+        values: values to try, by dotted path; the fields of a tuple of paths vary together, with one common value or a
+            tuple of one value per field.
+        controller: as in `fly`; a class or a function of a module that other processes can import.
+        forces: as in `fly`; importable, like the controller.
+        workers: number of processes (default: one per usable core).
+        progress: as in `fly`.
 
     Returns:
         A table with a row per flight, in the order of the combinations, the last field varying fastest.
@@ -731,8 +733,8 @@ def sweep(
     Examples:
         >>> import quadsim
         >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
-        >>> found = quadsim.sweep(scenario, {"controller.horizon": [20, 40]}, workers=1)
-        >>> found["controller.horizon"].tolist(), found["verdict"].tolist()
+        >>> table = quadsim.sweep(scenario, {"controller.horizon": [20, 40]}, workers=1)
+        >>> table["controller.horizon"].tolist(), table["verdict"].tolist()
         ([20.0, 40.0], ['satisfied', 'satisfied'])
         >>> both = ("controller.output_bounds.roll", "controller.output_bounds.pitch")
         >>> tilt = quadsim.sweep(scenario, {both: [[-2.0, 2.0], [-5.0, 5.0]]}, workers=1)
@@ -776,35 +778,35 @@ def campaign(
     forces: UserForces = (),
     progress: Watched = True,
 ) -> CampaignResult:
-    """Fly a scenario many times with parameters drawn at random.
+    """Fly a scenario many times with randomly drawn parameters.
 
     Args:
-        campaign: a campaign's name, or path to a TOML file; in Python also a scenario, with `vary` and `fields`.
-        out: campaign's directory (default: runs/campaigns/NAME).
-        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
+        campaign: campaign's name, or path to a TOML file; in Python also a scenario, with `vary` and `fields`.
+        out: campaign directory (default: runs/campaigns/NAME).
+        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
         workers: processes (default: one per core).
         cluster: fly on a Dask cluster: its scheduler's address, tcp://HOST:PORT.
-        resume: continue what is there.
-        flights: number of flights, instead of the file's.
-        until_width: stop once the 95 % interval of the failure probability is as narrow as this, e.g. 0.05.
-        require: exit 1 unless the flights support it, e.g. "P(violation) < 0.01 @ 95%"; may be repeated.
+        resume: continue the flights in this directory.
+        flights: number of flights, in place of the file's.
+        until_width: stop once the 95 % interval of the failure probability is this narrow, e.g. 0.05.
+        require: exit 1 unless the flights support this statement, e.g. "P(violation) < 0.01 @ 95%"; may be repeated.
         report: write the report, an HTML page.
         junit: also write the requirements' verdicts as JUnit XML.
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
-        seed: replace the seed, of all draws.
-        vary: of a scenario: what varies, entries as `[[vary]]` of a campaign file.
-        fields: of a scenario: other fields of a campaign file, as `name`, `failure` or `sampling`.
-        controller: of a scenario, as of `sweep`.
-        forces: of a scenario, as of `sweep`.
+        seed: replace the seed of all draws.
+        vary: with a scenario: the quantities to draw, entries as `[[vary]]` of a campaign file.
+        fields: with a scenario: other fields of a campaign file, such as `name`, `failure` or `sampling`.
+        controller: with a scenario: as in `sweep`.
+        forces: with a scenario: as in `sweep`.
         progress: whether to show a bar on a terminal, and elsewhere a line every ten seconds.
 
     Returns:
-        The results: `table` (a row per flight), `summary` (estimates with their intervals), `judgements` (of what was
-        required), and the `directory`.
+        The results: `table` (a row per flight), `summary` (estimates with their intervals), `judgements` (of the
+        requirements), and the `directory`.
 
     Raises:
-        InputError: something cannot be flown so.
-        OutputError: a campaign is there already, or the directory cannot be written.
+        InputError: the campaign, or one of its flights, cannot be set up.
+        OutputError: the directory already has a campaign, or cannot be written.
         KeyboardInterrupt: the user stopped it; the flights so far are kept, and `resume` continues it.
 
     Examples:
@@ -812,8 +814,8 @@ def campaign(
         >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
         >>> mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "uniform", "low": 4.0, "high": 4.4}
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     found = quadsim.campaign(scenario, vary=[mass], flights=3, workers=1, out=folder + "/mass")
-        >>> found.table["verdict"].to_pylist()
+        ...     result = quadsim.campaign(scenario, vary=[mass], flights=3, workers=1, out=folder + "/mass")
+        >>> result.table["verdict"].to_pylist()
         ['satisfied', 'satisfied', 'satisfied']
     """
     from scenarios.campaign.campaign import fly_campaign
@@ -825,17 +827,17 @@ def campaign(
     from scenarios.user_code import importable
 
     if junit is not None and not require:
-        raise ParameterError("", "--junit", junit, "given with --require, whose verdicts it is to hold")
+        raise ParameterError("", "--junit", junit, "given with --require, whose verdicts it writes")
     file = None if junit is None else junit_file(junit)
     requirements = [parse_requirement(text) for text in require]
     if isinstance(campaign, Scenario):
         if changes:
-            raise InputError("changes go with a campaign file; a scenario is changed by its replace")
-        given = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **(fields or {})}
-        given = {name: value for name, value in given.items() if value is not None}
-        plan = make_plan(importable(campaign, controller, forces), given)
+            raise InputError("changes apply to a campaign file; change a scenario by its replace")
+        settings = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **(fields or {})}
+        settings = {name: value for name, value in settings.items() if value is not None}
+        plan = make_plan(importable(campaign, controller, forces), settings)
     elif vary or fields or controller is not None or forces:
-        raise InputError("vary, controller and other fields go with a scenario; a campaign file has its own")
+        raise InputError("vary, controller, forces and fields apply to a scenario; a campaign file sets them itself")
     else:
         plan = load_plan(str(campaign), list(changes), flights=flights, seed=seed)
     for requirement in requirements:
@@ -871,21 +873,21 @@ def replay(
     """Fly one flight of a finished campaign again, with all outputs.
 
     Args:
-        campaign: a campaign's directory.
-        worst: the worst flight (the default).
-        flight: that flight.
+        campaign: campaign directory.
+        worst: replay the worst flight (the default).
+        flight: replay the flight of this number.
         out: run directory (default: runs/CAMPAIGN-N, or the next free name).
-        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
-        video: film it (default: where that can be done).
-        recording: write flight.rrd for the rerun viewer (default: where that can be done).
-        figures: draw it (default: where that can be done).
-        progress: as of `fly`.
+        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
+        video: film the flight (default: if possible).
+        recording: write flight.rrd for the rerun viewer (default: if possible).
+        figures: plot the flight (default: if possible).
+        progress: as in `fly`.
 
     Returns:
-        The flight, and the columns of the campaign's table that it does not agree with, bit for bit.
+        The flight, and the columns of the campaign's table in which it differs by any bit.
 
     Raises:
-        InputError: there is no such campaign or flight.
+        InputError: the campaign or the flight does not exist.
         OutputError: the directory cannot be written.
 
     Examples:
@@ -894,7 +896,7 @@ def replay(
         Traceback (most recent call last):
         quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
     """
-    from scenarios.campaign.campaign import held_against, recorded_flight
+    from scenarios.campaign.campaign import compare_replay, recorded_flight
     from scenarios.flight import require_rendering
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
@@ -911,7 +913,7 @@ def replay(
     with reporting(progress) as report, run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
         flown = replace(Rollout(recorded.scenario).fly(report), directory=directory)
         flown.save(directory, overwrite=overwrite, progress=report, **products)
-    return held_against(flown, recorded)
+    return compare_replay(flown, recorded)
 
 
 @app.command(help_epilogue=_examples("quadsim tune paper-robust", "quadsim tune mine.toml --trials 50 --resume"))
@@ -929,28 +931,28 @@ def tune(
     report: bool = True,
     progress: Watched = True,
 ) -> TuningResult:
-    """Search fields of a scenario; the answer is compared with the start on fresh draws.
+    """Tune fields of a scenario, and compare the result with the start on fresh draws.
 
     Args:
-        tuning: name of a tuning that ships, or path to a TOML file.
-        out: tuning's directory (default: runs/tunings/NAME).
-        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
-        trials: number of candidates, instead of the file's.
-        seed: replace the seed, of the search and of its draws.
+        tuning: name of a shipped tuning, or path to a TOML file.
+        out: tuning directory (default: runs/tunings/NAME).
+        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
+        trials: number of candidates, in place of the file's.
+        seed: replace the seed of the search and of its draws.
         workers: processes (default: one per core).
         cluster: fly on a Dask cluster, as quadsim campaign does.
-        resume: continue what is there.
-        report: write the report, HTML pages.
-        progress: as of `campaign`.
+        resume: continue the flights in this directory.
+        report: write the report, a set of HTML pages.
+        progress: as in `campaign`.
 
     Returns:
-        `best` (the scenario that was found), `summary` (the search and the fresh flights),
-        `comparison` (flight by flight), `holds`, and the `directory`.
+        `best` (the tuned scenario), `summary` (the search and the fresh flights), `comparison` (flight by flight),
+        `holds`, and the `directory`.
 
     Raises:
-        InputError: something cannot be flown so.
+        InputError: the tuning, or one of its flights, cannot be set up.
         MissingPackageError: the extra `tune` is not installed.
-        OutputError: a tuning is there already, or the directory cannot be written.
+        OutputError: the directory already has a tuning, or cannot be written.
         KeyboardInterrupt: the user stopped it; the flights so far are kept, and `resume` continues it.
 
     Examples:
@@ -972,7 +974,7 @@ def tune(
 
 @contextmanager
 def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) -> Iterator[dict[str, Any]]:
-    """What grows in a directory: the options of where, and of its progress; Ctrl-C says what is there."""
+    """Yield the options of a command that adds flights to a directory; Ctrl-C says how to continue."""
     from quadsim.outputs import absolute
     from scenarios.progress import watching
 
@@ -990,23 +992,23 @@ def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) 
 def reproduce(
     paper: PaperName | None = None, /, *, junit: File | None = None, progress: Watched = True
 ) -> Reproductions:
-    """Fly what papers publish: published, ours, difference; exit 1 if one is off.
+    """Reproduce published numbers: published, ours, difference; exit 1 if one is off.
 
     Args:
-        paper: name, or path to a TOML file (default: every paper that ships).
+        paper: name, or path to a TOML file (default: every shipped paper).
         junit: also write each number's verdict as JUnit XML.
-        progress: as of `fly`.
+        progress: as in `fly`.
 
     Returns:
-        A reproduction for each paper: `numbers`, each with `ours`, `difference` and `within`, and a table, `grid`.
+        One reproduction per paper: its `numbers` with `ours`, `difference` and `within`, and a table, `grid`.
 
     Raises:
-        InputError: there is no such paper, or a number of it cannot be flown.
+        InputError: the paper does not exist, or one of its numbers cannot be flown.
 
     Examples:
         >>> import quadsim
-        >>> (found,) = quadsim.reproduce("quadrotor-uav", progress=False)
-        >>> found.within, found.numbers[2].spec.published, round(found.numbers[2].ours, 3)
+        >>> (paper,) = quadsim.reproduce("quadrotor-uav", progress=False)
+        >>> paper.within, paper.numbers[2].spec.published, round(paper.numbers[2].ours, 3)
         (True, 250.0, 250.0)
     """
     from scenarios.junit import junit_file, write_junit
@@ -1016,13 +1018,13 @@ def reproduce(
     file = None if junit is None else junit_file(junit)
     papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
     with reporting(progress) as report:
-        found = Reproductions(reproduce_paper(each, report) for each in papers)
+        reproductions = Reproductions(reproduce_paper(spec, report) for spec in papers)
     if file is not None:
-        write_junit(found, file)
-    return found
+        write_junit(reproductions, file)
+    return reproductions
 
 
-# --- files, code, and what there is --------------------------------------------------------------------------------
+# --- files, code, and the catalogue --------------------------------------------------------------------------------
 
 
 @app.command(
@@ -1044,18 +1046,18 @@ def export(
     changes: Changes = (),
     seed: Whole | None = None,
 ) -> Document | Flight:
-    """Write a scenario's controller as self-contained C99, with its recorded periods.
+    """Export a scenario's controller as self-contained C99, with recorded periods to test it.
 
     Args:
         scenario: library name, or path to a TOML file.
-        out: directory.
-        overwrite: replace an earlier output there, if its summary.json lists all that the directory holds.
-        precision: of all numbers: double or float (default: double).
-        target: what its programs are for: posix, cortex-m7 or cortex-m4f (default: posix).
-        rows: room for so many active rows; memory grows with the square (default: 2.56 per step, at least 64).
-        fly: then fly the scenario with the exported controller on its target, emulated, into runs/SCENARIO-TARGET.
+        out: output directory.
+        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
+        precision: number type, double or float (default: double).
+        target: platform of the test programs: posix, cortex-m7 or cortex-m4f (default: posix).
+        rows: largest number of active constraints; memory grows with its square (default: 2.56 per step, at least 64).
+        fly: then fly the scenario with the exported controller on the emulated target, into runs/SCENARIO-TARGET.
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
-        seed: replace the seed, of everything random in it.
+        seed: replace the seed of everything random in the scenario.
     """
     import json
     import shlex
@@ -1091,19 +1093,19 @@ def scenario(
     controller: str | None = None,
     schema: Flag = False,
 ) -> ScenarioFile:
-    """Print a scenario with all defaults and comments: a start for yours.
+    """Print a scenario with all defaults and comments, as a start for your own.
 
     Args:
         name: library name, or path to a TOML file.
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
-        seed: replace the seed, of everything random in it.
-        vehicle: print one made for this vehicle instead.
-        course: of it: hover, step (of 1 m) or figure-eight, at 60 % of what the vehicle can do (default: hover).
-        controller: of it: robust, lqr, pid or geometric (default: robust).
+        seed: replace the seed of everything random in the scenario.
+        vehicle: print a first scenario for this vehicle instead.
+        course: its course: hover, step (of 1 m) or figure-eight, at 60 % of the vehicle's limits (default: hover).
+        controller: its controller: robust, lqr, pid or geometric (default: robust).
         schema: print the JSON Schema of scenario files instead.
 
     Returns:
-        Its `content`, where every number has its unit or source, and the `scenario` that it is.
+        The `content` of the file, where every number has its unit or source, and the `scenario` itself.
 
     Examples:
         >>> import quadsim
@@ -1137,7 +1139,7 @@ def scenario(
         names = ", ".join(scenario_names())
         raise InputError(f"scenario needs a name or a TOML file, or --schema (there are: {names})")
     whole = loading.assemble(name, changes, seed).resolved.scenario
-    if isinstance(whole.reference, Csv):  # another table may take the place of its own
+    if isinstance(whole.reference, Csv):  # so that you may replace the table
         whole = whole.altered(reference=replace(whole.reference, sha256=None))
     return results.ScenarioFile(whole.to_toml())
 
@@ -1157,29 +1159,29 @@ def vehicle_report(
     out: File | None = None,
     overwrite: Flag = False,
 ) -> VehicleReport | Document:
-    """A vehicle's derived figures, its parameters' sources, its picture.
+    """Report a vehicle's limits and designed gains, and the sources of its parameters; draw it.
 
     Args:
-        name: a shipped vehicle's name, or path to a TOML file.
+        name: shipped vehicle's name, or path to a TOML file.
         template: print a commented vehicle file to fill in instead.
-        scenario: report which of its bounds the vehicle cannot meet.
-        out: PNG file to draw it to, on a floor of 10 cm squares.
-        overwrite: replace a file that is there.
+        scenario: scenario whose bounds the vehicle may be unable to meet; they are listed.
+        out: PNG file for a picture of the vehicle on a floor of 10 cm squares.
+        overwrite: replace an existing file.
 
     Returns:
-        Its numbers with their sources, `figures` that follow from them, `shortfalls` where a scenario is given; or the
-        template.
+        The vehicle's parameters with their sources, the `figures` derived from them, and the `shortfalls` if a scenario
+        is given; or the template.
 
     Raises:
-        InputError: there is no such vehicle or scenario, it cannot fly, or the file has another ending.
-        RenderingUnavailableError: nothing can render here.
+        InputError: the vehicle or scenario does not exist, the vehicle cannot fly, or the file does not end in .png.
+        RenderingUnavailableError: this machine cannot render.
 
     Examples:
         >>> import quadsim
-        >>> can = quadsim.vehicle_report("hummingbird", scenario="paper-constrained")
-        >>> can.figures.designed.limited_by, round(can.figures.designed.time_constants["x, y"], 2)  # [s]
+        >>> report = quadsim.vehicle_report("hummingbird", scenario="paper-constrained")
+        >>> report.figures.designed.limited_by, round(report.figures.designed.time_constants["x, y"], 2)  # [s]
         ('torque', 0.18)
-        >>> can.shortfalls[0]
+        >>> report.shortfalls[0]
         'controller.input_bounds.speed: hover is 453.2 rad/s, the scenario allows 250'
     """
     from quadsim.assets import vehicle_path
@@ -1210,13 +1212,13 @@ def vehicle_report(
 
 
 def load_vehicle(name: VehicleName) -> Vehicle:
-    """The numbers of a vehicle.
+    """Load the parameters of a vehicle.
 
     Args:
-        name: of one that ships, or a path ending in `.toml`.
+        name: shipped vehicle's name, or a path ending in `.toml`.
 
     Raises:
-        InputError: there is none, or it cannot fly.
+        InputError: the vehicle does not exist or cannot fly.
 
     Examples:
         >>> import quadsim
@@ -1232,18 +1234,18 @@ def load_vehicle(name: VehicleName) -> Vehicle:
 
 @app.command(name="list", help_epilogue=_examples("quadsim list", "quadsim list --json"))
 def catalogue() -> Catalogue:
-    """Scenarios, campaigns, tunings, vehicles, controllers, papers and solvers, one line each.
+    """List scenarios, campaigns, tunings, vehicles, controllers, papers and solvers, one per line.
 
     Returns:
-        Each by its name: `scenarios`, with their `description`, `group` and the verdict that they `expect`, and
-        `campaigns`, `tunings`, `vehicles`, `controllers`, `papers` and `solvers`, with a sentence.
+        Mappings by name: `scenarios`, with `description`, `group` and the expected verdict, `expect`; and `campaigns`,
+        `tunings`, `vehicles`, `controllers`, `papers` and `solvers`, with a sentence.
 
     Examples:
         >>> import quadsim
-        >>> found = quadsim.catalogue()
-        >>> [name for name, each in found.scenarios.items() if each.group == "ground"]
+        >>> catalogue = quadsim.catalogue()
+        >>> [name for name, entry in catalogue.scenarios.items() if entry.group == "ground"]
         ['ground-effect', 'hard-landing', 'take-off-and-landing']
-        >>> found.controllers["lqr"]
+        >>> catalogue.controllers["lqr"]
         "infinite-horizon LQR on the hover model, following the reference's velocity"
     """
     from scenarios.catalogue import read_catalogue
@@ -1253,17 +1255,17 @@ def catalogue() -> Catalogue:
 
 @app.command(help_epilogue=_examples("quadsim doctor", "quadsim doctor --json"))
 def doctor() -> Listing:
-    """What this machine can do: cores, packages, rendering, viewer, and every QP solver tried on a step.
+    """Check this machine: cores, packages, rendering, viewer, and every QP solver on a step.
 
     Returns:
-        Checks by section (machine, packages, rendering, viewer, solvers), each a line that a person can act on.
+        Checks by section (machine, packages, rendering, viewer, solvers), one line each, with a remedy where one fails.
 
     Examples:
         >>> import quadsim
-        >>> found = quadsim.doctor()
-        >>> found["solvers"]["piqp-multistage"].startswith("works")
+        >>> checks = quadsim.doctor()
+        >>> checks["solvers"]["piqp-multistage"].startswith("works")
         True
-        >>> sorted(found)
+        >>> sorted(checks)
         ['machine', 'packages', 'rendering', 'solvers', 'viewer']
     """
     from scenarios.machine import capabilities

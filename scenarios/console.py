@@ -51,7 +51,7 @@ def stdout() -> PlainConsole:
 
 
 def stderr() -> PlainConsole:
-    """Stderr."""
+    """Return stderr."""
     return PlainConsole(stderr=True)
 
 
@@ -63,14 +63,14 @@ def show(parts: Iterable[RenderableType], console: PlainConsole | None = None) -
 
 
 def to_text(parts: Iterable[RenderableType]) -> str:
-    """Return the same as text without colours."""
+    """Return sentences and tables as text without colours."""
     console = PlainConsole(width=WIDTH, file=io.StringIO())
     show(parts, console)
     return console.export_text()
 
 
 def to_html(parts: Iterable[RenderableType]) -> str:
-    """Return the same as HTML for a notebook."""
+    """Return sentences and tables as HTML for a notebook."""
     console = PlainConsole(width=WIDTH, file=io.StringIO())
     show(parts, console)
     return console.export_html(inline_styles=True, code_format='<pre style="line-height: normal">{code}</pre>')
@@ -82,7 +82,7 @@ def say(text: str) -> None:
 
 
 def written_to(path: Path) -> Text:
-    """Return the line that says where something was written."""
+    """Return the line with the path of an output."""
     return styled("written to ", (short_path(path), "bold"))
 
 

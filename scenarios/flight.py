@@ -290,23 +290,23 @@ class Flight(Result):
         figures: bool | None = None,
         progress: Progress = silent,
     ) -> Path:
-        """Write the run directory, as `quadsim run` does: tables and summary first, then what is made from them.
+        """Write the run directory, as `quadsim run` does: tables and summary first, then figures, recording and video.
 
         Args:
-            directory: where.
-            overwrite: whether to replace an earlier output there.
-            video: whether to film it; None for where that can be done, True to raise where it fails.
-            recording: whether to write `flight.rrd` for the rerun viewer; likewise.
-            figures: whether to draw it; likewise.
-            progress: called with (what, done, total).
+            directory: run directory.
+            overwrite: whether to replace an earlier output.
+            video: whether to film the flight; None: if possible; True: raise if it fails.
+            recording: whether to write `flight.rrd` for the rerun viewer, as for `video`.
+            figures: whether to plot the flight, as for `video`.
+            progress: called with (activity, done, total).
 
         Returns:
             The directory.
 
         Raises:
-            RenderingUnavailableError: a video is asked for and cannot be made.
-            OutputError: the directory cannot be written or holds something else, the flight was read from a directory,
-                or what was asked for failed; the tables and the summary are there then.
+            RenderingUnavailableError: a video is requested but cannot be rendered.
+            OutputError: the directory cannot be written or contains other files, the flight was read from a directory,
+                or a requested product failed; in that case the tables and the summary are written.
         """
         if self.recorded is not None:
             raise OutputError(directory, f"this flight is on disk already, in {self.directory}; copy that directory")

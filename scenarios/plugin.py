@@ -51,7 +51,7 @@ _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "pure
 class _Code:
     folder: Annotated[
         str | None,
-        doc("folder searched first for its module, relative to the scenario file; absent: beside that file"),
+        doc("folder searched first for the module, relative to the scenario file; absent: the folder of that file"),
     ] = None
     settings: Annotated[dict[str, Any], doc("further arguments of the call, by name")] = field(default_factory=dict)
 
@@ -67,7 +67,8 @@ class Plugin(ControllerTable, _Code):
     """A user-defined controller, called as MyController(vehicle, period=..., horizon=..., **settings)."""
 
     type: Annotated[
-        str, doc("its code, as package.module:Class, or its name among the entry points quadsim.controllers")
+        str,
+        doc("its code, as package.module:Class, or its name among the entry points quadsim.controllers"),
     ] = field(metadata={"json_schema_extra": _name_no_law})
     horizon: Annotated[Horizon, doc("[periods] N, samples of the reference passed to a step")] = 50
 
@@ -81,12 +82,12 @@ class Plugin(ControllerTable, _Code):
 
 @dataclass(frozen=True, kw_only=True)
 class PluginForce(_Code):
-    """A user-defined force, called once per physics step; see `quadsim.sim.effects.Force`.
+    """User-defined force, called once per physics step; see `quadsim.sim.effects.Force`.
 
     A function force(time, state, **settings), or a class called as MyForce(vehicle, rng=..., **settings).
     """
 
-    type: Annotated[str, doc("its code, as package.module:name")]
+    type: Annotated[str, doc("code of the force, as package.module:name")]
 
     def __post_init__(self) -> None:
         if ":" not in self.type:
@@ -100,7 +101,7 @@ def _check_code(place: str, settings: Mapping[str, Any], arguments: tuple[str, .
         raise ParameterError("", "type", place, f"of the form {FORM}")
     for name, value in settings.items():
         if not name.isidentifier() or name in arguments:
-            raise ValueError(f"settings.{name} must be named as an argument is, other than {', '.join(arguments)}")
+            raise ValueError(f"settings.{name} must be the name of an argument other than {', '.join(arguments)}")
         if not is_plain(value):
             rule = "a finite number, a text, true or false, or a list or table of them"
             raise ValueError(f"settings.{name} must be {rule}; got {value}")
@@ -285,7 +286,7 @@ def require_importable(law: object, what: str = "controller") -> None:
     for part in code.__qualname__.split("."):
         resolved = getattr(resolved, part, None)
     if code is type(law) or code.__module__ == "__main__" or resolved is not code:
-        rule = "a class or a function at the top of a module other than the script, for workers to import"
+        rule = "a class or a function at the top level of a module other than the script, so that workers can import it"
         raise ParameterError("", what, law, rule)
 
 
@@ -293,7 +294,7 @@ def _code_of(law: Any) -> Any:
     """Return the class or function of a law, directly or in a partial; the class of an object."""
     code = law.func if isinstance(law, functools.partial) else law
     if getattr(law, "args", ()) and code is not law:
-        raise ParameterError("", "controller", law, "a partial with named arguments alone")
+        raise ParameterError("", "controller", law, "a partial with keyword arguments only")
     return code if isinstance(code, type) or inspect.isroutine(code) else type(code)
 
 

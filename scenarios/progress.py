@@ -1,4 +1,4 @@
-"""How long work reports its progress: as bars on a terminal, as lines elsewhere, or to a function of the caller's."""
+"""Progress of long work: bars on a terminal, lines elsewhere, or calls of a user's function."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from scenarios.campaign.campaign import Standing, Watch
     from scenarios.console import PlainConsole
 
-Progress = Callable[[str, int, int], None]  # called with (what, done, total) during long work
+Progress = Callable[[str, int, int], None]  # called with (activity, done, total) during long work
 
-LINE_EVERY: Final = 10.0  # between two lines of progress where stderr is no terminal [s]
+LINE_EVERY: Final = 10.0  # time between lines of progress if stderr is not a terminal [s]
 
 
 def silent(stage: str, done: int, total: int) -> None:
@@ -25,9 +25,9 @@ def silent(stage: str, done: int, total: int) -> None:
 
 @contextlib.contextmanager
 def reporting(progress: Progress | bool) -> Iterator[Progress]:
-    """What is called with the progress: bars on a terminal, one per stage; elsewhere a line at times.
+    """Yield the function that reports progress: a bar per stage on a terminal, elsewhere a line every `LINE_EVERY`.
 
-    Without progress nothing is shown; a function of the caller's takes their place.
+    False reports nothing; a function replaces both.
     """
     if callable(progress):
         yield progress
@@ -56,7 +56,7 @@ def reporting(progress: Progress | bool) -> Iterator[Progress]:
 
 
 def _lines(screen: PlainConsole) -> Progress:
-    """What prints how far a stage is, where that was not said for a while."""
+    """Return a function that prints the progress of a stage, at most one line per `LINE_EVERY`."""
     printed = clock.perf_counter()
 
     def report(stage: str, done: int, total: int) -> None:
@@ -70,7 +70,7 @@ def _lines(screen: PlainConsole) -> Progress:
 
 @contextlib.contextmanager
 def watching(progress: bool) -> Iterator[Watch]:
-    """What is called with how a campaign stands: a bar on a terminal; elsewhere, as in a batch job, a line at times."""
+    """Yield the function that shows a campaign's progress: a bar on a terminal, elsewhere a line at intervals."""
     from scenarios.console import stderr
 
     screen, printed = stderr(), clock.perf_counter()
@@ -99,7 +99,7 @@ def watching(progress: bool) -> Iterator[Watch]:
 
 
 def _describe(standing: Standing) -> str:
-    """How far it is, how fast, until when, and how it looks."""
+    """Return flights done, rate, time left and failures in one line."""
     from scenarios.campaign.statistics import interval, proportion
 
     share = proportion(standing.failed, standing.flown)

@@ -1,4 +1,4 @@
-"""What a command returns: a result shows itself as tables on a console, as JSON, and as HTML in a notebook."""
+"""Results of commands, shown as tables on a console, as JSON, or as HTML in a notebook."""
 
 from __future__ import annotations
 
@@ -20,44 +20,44 @@ EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
 
 
 class Result:
-    """What the functions of `scenarios.app` return, as far as a person or a program is to read it."""
+    """A result of the functions of `scenarios.app` that users and programs read."""
 
     @property
     def exit_status(self) -> int:
-        """Of the command: 0, or 1 where a constraint, a requirement or a number does not hold."""
+        """Exit status of the command: 0, or 1 where a constraint or requirement is violated, or a number is off."""
         return EXIT_DONE
 
     def shown(self) -> Shown:
-        """Its tables and sentences, in order."""
+        """Return its tables and sentences, in order."""
         raise NotImplementedError
 
     def to_json(self) -> Any:
-        """All of it as plain data, which `--json` prints."""
+        """Return it as plain data, as `--json` prints it."""
         raise NotImplementedError
 
     def show(self) -> None:
-        """Print it."""
+        """Print the result."""
         from scenarios import console
 
         console.show(self.shown())
 
     def text(self) -> str:
-        """What `show` prints, without colours."""
+        """Return the output of `show` without colours."""
         from scenarios import console
 
         return console.to_text(self.shown())
 
     def __repr__(self) -> str:
-        """The first lines of its text."""
+        """Return the first lines of its text."""
         lines = [line.rstrip() for line in self.text().splitlines()]
         return "\n".join([*lines[:9], *(["..."] if len(lines) > 9 else [])])
 
     def small_plot(self) -> Figure | None:
-        """A small plot of it, for notebooks; None for none."""
+        """Return a small plot for notebooks, or None."""
         return None
 
     def _repr_html_(self) -> str:
-        """For notebooks: its tables and its plot."""
+        """Return its tables and its plot for a notebook."""
         from quadsim.report.to_matplotlib import to_html
         from scenarios import console
 
@@ -67,7 +67,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Document(Result):
-    """A text that is shown as it is."""
+    """A text, printed unchanged."""
 
     content: str
     data: Any = None
@@ -87,7 +87,7 @@ class Document(Result):
         return self.content
 
     def to_json(self) -> Any:
-        """Its data, or else the text."""
+        """Return its data, or its text if it has none."""
         return self.content if self.data is None else self.data
 
     def _repr_html_(self) -> str:
@@ -99,18 +99,18 @@ class ScenarioFile(Document):
 
     @property
     def scenario(self) -> Scenario:
-        """To be flown."""
+        """The parsed scenario."""
         from scenarios.loading import parse_scenario
 
         return parse_scenario(tomllib.loads(self.content))
 
     def to_json(self) -> Any:
-        """Its tables."""
+        """Return its tables."""
         return tomllib.loads(self.content) if self.data is None else self.data
 
 
 class Listing(dict[str, Mapping[str, str]], Result):
-    """Names by section, each with a line."""
+    """Names by section, with a line about each."""
 
     def shown(self) -> Shown:
         """See `Result.shown`."""

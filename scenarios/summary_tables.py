@@ -24,11 +24,11 @@ from quadsim.report.comparison import (
 )
 from scenarios import console
 
-_NAMED: Final = 3  # violated constraints that the first line names
+_NAMED: Final = 3  # violated constraints named in the first line
 
 
 def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) -> Iterator[RenderableType]:
-    """Yield all of it, and where it was written."""
+    """Yield the tables and sentences of a summary, and the directory it was written to."""
     simulated = console.styled(f"  {summary['duration']:.2f} s flown")
     yield console.styled((summary["scenario"], "bold"), "  ") + outcome_line(summary) + simulated
     if summary.get("description"):
@@ -47,7 +47,7 @@ def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) ->
     yield from failure_sentences(summary)
     if "reaudit" in summary:
         again = summary["reaudit"]
-        phrase = "as recorded" if again["satisfied"] == summary["satisfied"] else "its verdict is recorded alone"
+        phrase = "as recorded" if again["satisfied"] == summary["satisfied"] else "a different verdict than recorded"
         yield f"audited again from the tables, {again['rate']:g} rows per second: {phrase}"
     if directory is not None:
         yield console.written_to(directory)
@@ -72,7 +72,7 @@ def outcome_line(summary: Mapping[str, Any]) -> Text:
 
 
 def _violations(constraints: Sequence[Mapping[str, Any]]) -> str:
-    """Which required constraints do not hold, by how much, and when that was worst."""
+    """Return the violated required constraints, with the largest violation of each and its time."""
     violated = []
     for entry in constraints:
         if entry["required"] and constraint_verdict(entry) == "violated":
@@ -89,11 +89,11 @@ def _violations(constraints: Sequence[Mapping[str, Any]]) -> str:
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
     """Return every constraint with its bounds, peaks, margin, tolerances and verdict."""
     caption = (
-        "margin: the one that decides, negative = violated, s: at the samples; tolerance: its own; beyond: seconds; "
-        "-: no value there"
+        "margin: the decisive one, negative = violated (s: at the samples); tolerance: accepted violation; "
+        "beyond: time outside bound and tolerance [s]; -: no value"
     )
     if any(not entry["required"] for entry in constraints):
-        caption += ";  * reported, not required by the scenario"
+        caption += "; *: reported only, not required"
     head = ("constraint", "bounds", "sampled", "plant", "margin", "tolerance", "beyond", "verdict")
     lines = []
     for entry in constraints:
@@ -168,7 +168,7 @@ def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
         delay = summary["computation"]["delay_ms"]
         yield (
             f"simulated computation: p50 {delay['p50']:.3g}, p99 {delay['p99']:.3g}, max {delay['max']:.3g} ms; "
-            f"{summary['computation']['missed']} commands too late to be used"
+            f"{summary['computation']['missed']} commands arrived too late"
         )
     if "estimation" in summary:
         rmse = summary["estimation"]["rmse"]

@@ -1,6 +1,6 @@
-"""Controllers, forces and references that a caller passes in, and the scenario that stands for them in a file.
+"""Controllers, forces and references passed in by a caller, and the scenario file that represents them.
 
-It names controllers and forces by the place of their code; a reference becomes a table.
+The file names controllers and forces by the import path of their code; a reference becomes a table.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from scenarios.schema.writing import plain
 
 
 def named(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:
-    """A scenario whose file names the controller and the forces that were passed in."""
+    """Return a scenario whose file names the given controller and forces."""
     changes: dict[str, Any] = {}
     horizon = scenario.controller.horizon
     if isinstance(controller, str):
@@ -36,10 +36,10 @@ def named(scenario: Scenario, controller: object, forces: Sequence[object] = ())
 
 
 def importable(scenario: Scenario, controller: object, forces: Sequence[object] = ()) -> Scenario:
-    """The same, of code that other processes import by its place.
+    """Return the scenario of `named` for code that other processes can import.
 
     Raises:
-        ParameterError: they cannot.
+        ParameterError: the code cannot be imported.
     """
     if controller is not None and not isinstance(controller, str):
         require_importable(controller)
@@ -49,14 +49,14 @@ def importable(scenario: Scenario, controller: object, forces: Sequence[object] 
 
 
 def following(assembly: Assembly, reference: object) -> Assembly:
-    """The assembly whose course is a function of the time [s], sampled at t_0 .. t_{K+N}, without a filter.
+    """Return the assembly with a function of time [s] as course, sampled at t_0 .. t_{K+N}, without a filter.
 
     Raises:
-        InputError: it does not give x, y, z [m], yaw [rad], or raised.
+        InputError: the function raises, or does not return x, y, z [m], yaw [rad].
     """
     scenario = assembly.scenario
     if not callable(reference):
-        raise ParameterError("", "reference", reference, "a function f(t) that gives x, y, z [m], yaw [rad]")
+        raise ParameterError("", "reference", reference, "a function f(t) that returns x, y, z [m], yaw [rad]")
     specs = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
     samples = scenario.periods + max(spec.horizon for spec in specs) + 1
     t = scenario.control_period * np.arange(samples, dtype=np.float64)
@@ -78,7 +78,7 @@ def _pose(reference: Callable[[float], Any], time: float) -> Array:
 def set_up(
     assembly: Assembly, controller: object, forces: Sequence[object], reference: object = None
 ) -> tuple[Assembly, Controller | None, list[Force] | None]:
-    """The scenario's parts with the reference, and the controller and the forces as the closed loop takes them.
+    """Return the assembly with the reference, and the controller and forces for the closed loop.
 
     Raises:
         InputError: the controller, a force or the reference cannot be set up.

@@ -136,11 +136,13 @@ class Limit:
     ] = field(metadata={"json_schema_extra": {"enum": [*SIGNALS]}})
     lower: Annotated[Number, doc("[unit of the signal] lower bound; both absent: the controller's")] = -math.inf
     upper: Annotated[Number, doc("[unit of the signal] upper bound; both absent: the controller's")] = math.inf
-    tolerance: Annotated[NonNegative, doc("[unit of the signal] allowed beyond, at the physics rate")] = 0.0
-    tolerance_sampled: Annotated[NonNegative, doc("[unit of the signal] allowed beyond, at the control samples")] = 0.0
-    required: Annotated[bool, doc("false: measured and reported, never a failure")] = True
-    start: Annotated[Number, doc("[s] first time it holds")] = 0.0
-    stop: Annotated[Number, doc("[s] last time it holds; absent: the flight's end")] = math.inf
+    tolerance: Annotated[NonNegative, doc("[unit of the signal] violation accepted at the physics rate")] = 0.0
+    tolerance_sampled: Annotated[NonNegative, doc("[unit of the signal] violation accepted at the control samples")] = (
+        0.0
+    )
+    required: Annotated[bool, doc("false: reported only, without effect on the verdict")] = True
+    start: Annotated[Number, doc("[s] start of the time window")] = 0.0
+    stop: Annotated[Number, doc("[s] end of the time window; absent: the end of the flight")] = math.inf
 
     def __post_init__(self) -> None:
         self._check_signal()

@@ -401,7 +401,7 @@ _SOLVER: Final[tuple[_Line, ...]] = (
 _COMPUTATION: Final[tuple[_Line, ...]] = (
     ("command after its measurement, median", "ms", _number("computation", "delay_ms", "p50")),
     ("command after its measurement, maximum", "ms", _number("computation", "delay_ms", "max")),
-    ("commands too late to be used", "", _number("computation", "missed", wrong=Mark.WARN)),
+    ("commands arrived too late", "", _number("computation", "missed", wrong=Mark.WARN)),
 )
 _TIMES: Final[tuple[_Line, ...]] = (
     ("deadline", "ms", _number("controller", "deadline_ms")),

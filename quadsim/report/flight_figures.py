@@ -1,4 +1,4 @@
-"""Flights -> their figures: one flight in the colours of its rotors and parts, several overlaid in a colour each."""
+"""Figures of flights: one flight in the colours of its rotors and axes, or several overlaid in one colour each."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ PAPER_FIGURES: Final = {
     "paper-unconstrained": ("figure2_", "figure3_"),
     "paper-constrained": ("figure4_", "figure5_"),
 }
-"""Before the keys of the figures of states and of inputs, by scenario: their numbers in the paper."""
+"""Prefixes of the keys of the state and input figures, by scenario: their numbers in the paper."""
 _REFERENCE: Final[dict[str, Any]] = {"colour": REFERENCE, "label": "reference, filtered", "dashed": True, "width": 1.1}
-_NEAR: Final = 3.0  # clearance [m] below which a moving obstacle is drawn, and up to which curves are shown
-_MOVES: Final = 0.1  # span of a course [m] from which on it moves along an axis
-_EVERY: Final = 0.25  # how often it is drawn [s]
-_MOST_NAMED: Final = 9  # obstacles and regions of which each is named in the legend
-_DIRECTIONS: Final = 300  # in which the points of a solid are taken whose hull is drawn
+_NEAR: Final = 3.0  # clearance [m] below which a moving obstacle is drawn; upper limit of the curves
+_MOVES: Final = 0.1  # smallest span of a course [m] that counts as motion along an axis
+_EVERY: Final = 0.25  # time between drawings of it [s]
+_MOST_NAMED: Final = 9  # largest number of obstacles and regions named in the legend
+_DIRECTIONS: Final = 300  # number of directions that sample the hull of a solid
 
 
 def write_figures(run: Run, directory: Path) -> list[Path]:
-    """Write the figures of one run as PNG; none where no control period was flown.
+    """Write the figures of one run as PNG; none if no control period was flown.
 
     The two scenarios of the paper carry its figure numbers in their file names, e.g. `figure4_states.png`.
 
@@ -76,7 +76,7 @@ def write_figures(run: Run, directory: Path) -> list[Path]:
 
 
 def page_figures(runs: Sequence[Run]) -> list[Figure | Scene]:
-    """What a page shows of runs that flew at least one control period; nothing without such a run."""
+    """Return a page's figures of the runs that flew at least one control period."""
     flown = [run for run in runs if run.log.control.t.size]
     if not flown:
         return []
@@ -87,7 +87,7 @@ def page_figures(runs: Sequence[Run]) -> list[Figure | Scene]:
 
 
 def overview(runs: Sequence[Run]) -> Figure:
-    """Position, roll and pitch of runs, and between which speeds their rotors turned."""
+    """Plot position, roll, pitch and the range of rotor speeds of runs."""
     names = ("x", "roll", "y", "pitch", "z")
     speeds = tuple(
         Band(
@@ -100,18 +100,18 @@ def overview(runs: Sequence[Run]) -> Figure:
         )
         for i, name, run in _flown(runs)
     )
-    rotors = Panel(title="lowest to highest rotor speed", unit="rad/s", bands=speeds, bounds=_bounds(runs, "speed"))
+    rotors = Panel(title="range of rotor speeds", unit="rad/s", bands=speeds, bounds=_bounds(runs, "speed"))
     return _timed("comparison", "", (*(_signal(runs, name) for name in names), rotors), runs)
 
 
 def signals(runs: Sequence[Run], names: Sequence[str]) -> Figure:
-    """Signals of the audit over time, and `xy`, the first run's path from above, a panel each."""
+    """Plot signals of the audit over time, and `xy`, the first run's path from above, one panel each."""
     panels = tuple(_above(runs[0]) if name == "xy" else _signal(runs, name) for name in names)
     return _timed("signals", "", panels, runs, columns=1)
 
 
 def states(runs: Sequence[Run]) -> Figure:
-    """Position and attitude; tilt and quaternion too where an attitude may turn upside down."""
+    """Plot position and attitude; also tilt and quaternion if the vehicle may turn upside down."""
     plants = [run.log.plant for run in runs]
     if all(plant.attitude is None for plant in plants):
         panels = [_signal(runs, name) for name in ("x", "roll", "y", "pitch", "z", "yaw")]
@@ -131,7 +131,7 @@ def states(runs: Sequence[Run]) -> Figure:
 
 
 def inputs(runs: Sequence[Run]) -> Figure:
-    """Rotor speeds and their steps: all rotors of one run in one panel; of several runs, a panel for each rotor."""
+    """Plot rotor speeds and their steps: one panel for a single run, one panel per rotor for several."""
     titles = {"speed": "rotor speed", "slew": "step per period"}
     if len(runs) == 1:
         panels = [replace(_signal(runs, name), title=title, height=1.3) for name, title in titles.items()]
@@ -149,13 +149,13 @@ def inputs(runs: Sequence[Run]) -> Figure:
 
 
 def times(runs: Sequence[Run]) -> Figure:
-    """Clock times against the deadline, iterations and active constraints."""
+    """Plot computation times against the deadline, iterations and active constraints."""
     panels = []
     for what, key in (("whole step", "step_ms"), ("optimum alone", "solve_ms")):
         curves, title = [], what
         for i, label, run in _flown(runs):
             values = getattr(run.log.timing, key)
-            # a clock may read 0, which has no place on a logarithmic axis
+            # a clock may read 0, which a logarithmic axis cannot show
             shown = np.where(values > 0.0, values, np.nan)
             curves.append(_of_run(i, label, run.log.timing.t, shown, style="points", width=2.0))
             if len(runs) == 1:
@@ -166,7 +166,7 @@ def times(runs: Sequence[Run]) -> Figure:
         )
         bounds = tuple(Bound(value=deadline, start=0.0, stop=_end(runs)) for deadline in sorted(deadlines))
         panels.append(Panel(title=title, y_label="time [ms]", y_log=True, series=tuple(curves), bounds=bounds))
-    for title, key in (("iterations, of whoever answered", "iterations"), ("active constraints", "active")):
+    for title, key in (("solver iterations", "iterations"), ("active constraints", "active")):
         counts = tuple(
             _of_run(i, label, run.log.control.t, getattr(run.log.control, key).astype(float), style="steps")
             for i, label, run in _flown(runs)
@@ -176,7 +176,7 @@ def times(runs: Sequence[Run]) -> Figure:
 
 
 def effects(run: Run) -> list[Figure]:
-    """Commanded and acting rotor speeds, forces, torques, wind, errors of the measured state: those that there are."""
+    """Plot, as far as recorded: commanded and actual rotor speeds, forces, torques, wind, measurement errors."""
     plant, control = run.log.plant, run.log.control
     commanded = commanded_speeds(run.log)
     panels = (
@@ -192,7 +192,7 @@ def effects(run: Run) -> list[Figure]:
 
 
 def space(run: Run) -> list[Figure]:
-    """A flight among obstacles and regions from above, and how far it stays clear of each; none without any."""
+    """Plot a flight among obstacles and regions from above, and its clearances; no figure without any."""
     if not has_space(run.limits):
         return []
     limits = [limit for limit in run.limits if isinstance(limit, SpaceLimit)]
@@ -212,7 +212,7 @@ def space(run: Run) -> list[Figure]:
 
 
 def xy(run: Run) -> list[Figure]:
-    """A flight from above where its course moves in x and y at one height, and `space` does not show it."""
+    """Plot a flight from above if its course moves in x and y at one height, and `space` does not show it."""
     course = run.log.control.reference[:, :3]
     spans = course.max(axis=0) - course.min(axis=0)
     planar = spans[:2].min() > _MOVES and spans[2] < LEAST_SPANS["m"]
@@ -220,7 +220,7 @@ def xy(run: Run) -> list[Figure]:
 
 
 def _above(run: Run) -> Panel:
-    """A flight and its course from above, among obstacles and the edges of regions."""
+    """Plot a flight and its course from above, with obstacles and the edges of regions."""
     areas = []
     for limit in run.limits:
         if not isinstance(limit, SpaceLimit) or not isinstance(limit.shape, Obstacle):
@@ -252,7 +252,7 @@ def _point(place: Array, label: str, colour: str, **looks: Any) -> Series:
 
 
 def path(runs: Sequence[Run]) -> Scene:
-    """Flights and their courses in space, among obstacles where they are at first, and the edges of regions."""
+    """Draw flights and courses in space, with obstacles at their start and the edges of regions."""
     solids, paths = [], []
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
     for limits in dict.fromkeys(run.limits for run in runs if has_space(run.limits)):
@@ -271,7 +271,7 @@ def path(runs: Sequence[Run]) -> Scene:
 
 
 def _signal(runs: Sequence[Run], name: str) -> Panel:
-    """A signal of the audit with references and bounds, and of a run alone the state as measured where that differs."""
+    """Plot a signal of the audit with reference and bounds; for a single run also the measured state if it differs."""
     signal, curves = SIGNALS[name], []
     for run in distinct_courses(runs) if name in REFERENCE_NAMES else ():
         curves.append(Series(x=run.log.control.t, y=reference_curve(run.log.control, name), **_REFERENCE))
@@ -286,7 +286,7 @@ def _signal(runs: Sequence[Run], name: str) -> Panel:
             continue
         for j, values in enumerate(np.atleast_2d(sampled.T)):
             curve = _of_run(i, label, control.t, values, style="steps")
-            if sampled.ndim == 2:  # where rotors turn alike, each is seen beneath the next
+            if sampled.ndim == 2:  # equal curves of several rotors stay visible beneath one another
                 curve = replace(curve, colour=line_colour(j), label=f"rotor {j + 1}", width=2.2 - 0.5 * j)
             curves.append(curve)
     return Panel(title=name, unit=signal.unit, series=tuple(curves), bounds=_bounds(runs, name))
@@ -297,8 +297,8 @@ def _of_run(i: int, label: str, x: Array, y: Array, **looks: Any) -> Series:
 
 
 def _several(title: str, unit: str, t: Array, values: Array, names: Sequence[str]) -> Panel:
-    """Curves (M, n) in one panel with a legend of its own."""
-    first = 4 - len(names)  # x, y and z look alike with and without w
+    """Plot curves (M, n) in one panel with its own legend."""
+    first = 4 - len(names)  # x, y and z have the same colours with and without w
     curves = [
         Series(x=t, y=column, colour=line_colour(first + i), label=name, width=1.0)
         for i, (name, column) in enumerate(zip(names, values.T, strict=True))
@@ -307,9 +307,9 @@ def _several(title: str, unit: str, t: Array, values: Array, names: Sequence[str
 
 
 def _acting(rotor: int, t: Array, commanded: Array, speeds: Array) -> Panel:
-    """The commanded and the acting speed of a rotor."""
+    """Plot commanded and actual speed of a rotor."""
     command = Series(x=t, y=commanded[:, rotor], colour=REFERENCE, label="commanded", style="steps", width=1.0)
-    acting = Series(x=t, y=speeds[:, rotor], colour=line_colour(0), label="acting", width=1.0)
+    acting = Series(x=t, y=speeds[:, rotor], colour=line_colour(0), label="actual", width=1.0)
     return Panel(title=f"rotor {rotor + 1}", unit="rad/s", series=(command, acting))
 
 
@@ -324,7 +324,7 @@ def _end(runs: Sequence[Run]) -> float:
 
 
 def _flown(runs: Sequence[Run]) -> Iterator[tuple[int, str, Run]]:
-    """Number, name and run of those that flew a period; a run alone is `flight`."""
+    """Return number, name and run of runs that flew a period; a single run is named `flight`."""
     names = ("flight",) if len(runs) == 1 else run_names(runs)
     return ((i, name, run) for i, (name, run) in enumerate(zip(names, runs, strict=True)) if run.log.control.t.size)
 

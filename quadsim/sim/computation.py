@@ -14,7 +14,7 @@ from quadsim.fields import Instant, Positive
 
 @dataclass(frozen=True, kw_only=True)
 class Stall:
-    """The computer stops answering for a while; a command being computed waits until it resumes."""
+    """The computer stalls for a while; a command being computed waits until it resumes."""
 
     at: Instant
     type: Annotated[Literal["stall"], doc("kind of event: stall")] = "stall"

@@ -54,7 +54,7 @@ class Sampling:
         float, Ge(0.0), Le(10.0), doc("[s] from taking a sample to its arrival, a whole number of physics steps")
     ] = 0.0
     dropout: Annotated[Fraction, doc("[-] probability of a sample being lost")] = 0.0
-    outliers: Annotated[Outliers | None, doc("absent: none")] = None
+    outliers: Annotated[Outliers | None, doc("absent: no outliers")] = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Campaigns flown: what is missing is flown, rows are saved as they come, the whole is summed up.
+"""Campaign execution: fly missing flights, save rows as they arrive, summarise the whole.
 
 Beside it, one of its flights flown again.
 """
@@ -44,12 +44,12 @@ from scenarios.schema.scenario import Scenario
 REPORT_FILES: Final = ("index.html", "campaign.png")
 _JUDGED: Final = 5  # requirements that a repr has
 CHECK_EVERY: Final = 10
-"""Flights after which the interval is looked at again, where it decides when to stop; of grids, whole turns."""
+"""Flights between checks of the interval, if it decides when to stop; for grids, whole repetitions."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """How far a campaign is."""
+    """Progress of a campaign."""
 
     flown: int  # flights that are there
     flights: int  # that there are to be
@@ -62,7 +62,7 @@ Watch = Callable[[Standing], None]
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class CampaignResult(Result):
-    """What came of a campaign."""
+    """Result of a campaign."""
 
     directory: Path  # where everything is
     manifest: dict[str, Any]  # what was flown, with what
@@ -88,7 +88,7 @@ class CampaignResult(Result):
         return "\n ".join([*lines, f"in {self.directory}>"])
 
     def small_plot(self) -> Figure | None:
-        """See `Result.small_plot`: worst margins, and the parameters that matter."""
+        """See `Result.small_plot`: worst margins and relevant parameters."""
         figure = overview(self.table, self.summary, "")
         return figure if figure.panels else None
 
@@ -99,11 +99,11 @@ class CampaignResult(Result):
         return campaign_lines(self.summary, self.judgements, self.directory)
 
     def to_json(self) -> dict[str, Any]:
-        """`summary.json`, and the verdict on each requirement."""
+        """Return `summary.json` and the verdict on each requirement."""
         return {**self.summary, "requirements": [judgement.to_json() for judgement in self.judgements]}
 
     def to_pandas(self) -> Any:
-        """The table as a pandas DataFrame.
+        """Return the table as a pandas DataFrame.
 
         Raises:
             MissingPackageError: pandas is not installed.
@@ -123,7 +123,7 @@ def fly_campaign(
     report: bool = True,
     watch: Watch = lambda standing: None,
 ) -> CampaignResult:
-    """Fly a campaign, or what is missing of it, to the same rows by any workers; see `quadsim.campaign`."""
+    """Fly a campaign or its missing flights; the rows do not depend on the workers.  See `quadsim.campaign`."""
     if until_width is not None and not 0.0 < until_width < 1.0:
         raise ParameterError("", "--until-width", until_width, "between 0 and 1")
     engine = "local" if cluster is None else "dask"
@@ -164,7 +164,7 @@ def fly_campaign(
 
 
 class _Progress:
-    """A session: what is there, what is still to be flown, and what is waiting to be written."""
+    """A session of flying: rows on disk, missing flights, and rows not yet written."""
 
     def __init__(self, plan: Plan, files: Growing, *, until_width: float | None, watch: Watch) -> None:
         self._plan, self._width, self._watch = plan, until_width, watch
@@ -178,11 +178,11 @@ class _Progress:
 
     @property
     def missing(self) -> list[int]:
-        """The flights to be flown."""
+        """Return the missing flights."""
         return [] if self._is_sure() else list(np.flatnonzero(self.outcomes < 0).tolist())
 
     def fly(self, workers: int | None, cluster: str | None) -> None:
-        """Fly what is missing, until nothing is, or the interval is narrow enough.
+        """Fly missing flights until the campaign is complete or the interval is narrow enough.
 
         Raises:
             InputError: it is so before flights that a finished campaign has.
@@ -206,7 +206,7 @@ class _Progress:
             self.store.flush()
 
     def _is_sure(self) -> bool:
-        """Whether the interval is narrow enough after the first n flights, for the smallest such n.
+        """Return whether the interval is narrow enough after the first n flights, for the smallest such n.
 
         Only flights without a gap before them count, so that the answer does not depend on which came back first.
         """
@@ -224,7 +224,7 @@ class _Progress:
 
 
 def put_report(files: Growing, names: Sequence[str], write: Callable[[Path], object] | None) -> None:
-    """Put what a function writes into a directory there, file by file; without one, remove an earlier report.
+    """Move the files that a function writes into a directory; without a function, remove an earlier report.
 
     Raises:
         OutputError: they cannot be written.
@@ -249,7 +249,7 @@ class Recorded:
 
 
 def recorded_flight(directory: Path, number: int | None) -> Recorded:
-    """A flight of a campaign's directory; the worst one where no number is given; see `quadsim.replay`."""
+    """Return a flight of a campaign directory, by default the worst; see `quadsim.replay`."""
     plan = stored_plan(directory)
     table = read_flights(directory / FLIGHTS_FILE, plan.schema)
     number = worst_flight(table) if number is None else number
@@ -275,7 +275,7 @@ class Replay(Result):
 
     @property
     def exit_status(self) -> int:
-        """See `Result.exit_status`; 1 where its numbers are not the campaign's."""
+        """See `Result.exit_status`; 1 if its numbers differ from the campaign's."""
         return EXIT_FAILED if self.differing else EXIT_DONE
 
     def shown(self) -> Shown:
@@ -290,12 +290,12 @@ class Replay(Result):
             yield f"flight {number}: {count} columns, each the same as in the campaign"
 
     def to_json(self) -> dict[str, Any]:
-        """`summary.json` of the flight as it was flown now."""
+        """Return `summary.json` of the new flight."""
         return self.flight.to_json()
 
 
-def held_against(flight: Flight, recorded: Recorded) -> Replay:
-    """A campaign's flight that was flown again, beside what the campaign has of it."""
+def compare_replay(flight: Flight, recorded: Recorded) -> Replay:
+    """Compare a replayed flight with the campaign's record of it."""
     row = recorded.plan.row_of(recorded.number, flight)
     (again,) = make_table([row], recorded.plan.schema).to_pylist()
     differing = [name for name, value in recorded.row.items() if name not in again or again[name] != value]

@@ -1,4 +1,4 @@
-"""The campaign file: what is flown, how often, what varies and is a failure; and what is drawn for each flight.
+"""The campaign file: scenario, number of flights, varied fields, failure; and the draws of each flight.
 
 Each flight's own generator is seeded by `SeedSequence([campaign seed, flight])`, so that neither the number of flights
 nor the worker matters; spread samplings take the points of `scipy.stats.qmc` in order instead.  Points in the unit
@@ -30,14 +30,14 @@ Seed = Annotated[int, Ge(0), Le(LARGEST_SEED)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$"), MaxLen(60)]
 Unit = Annotated[str, MaxLen(20), doc("of the values, for tables and plots")]
 Value = bool | Whole | Number | str | list[Number]
-"""What can be drawn from a list: whatever a field of a scenario may be, but for tables."""
+"""Values of a list to draw from: any value of a scenario's field except tables."""
 MOST_FLIGHTS: Final = 1_000_000
 _TAIL: Final = 1e-3  # share of a distribution beyond the values taken as its ends
 
 
 @dataclass(frozen=True, kw_only=True)
 class Varied:
-    """What every entry of `[[vary]]` has, and of `[[search]]`."""
+    """Common fields of the entries of `[[vary]]` and `[[search]]`."""
 
     name: Annotated[Name, doc("letters, digits, _ and -; the column `draw.NAME` of the results")]
     fields: Annotated[
@@ -54,11 +54,11 @@ class Varied:
     distribution: str
 
     def quantile(self, share: float) -> Value:
-        """The value below which a share, from 0 to less than 1, of the distribution lies; of a list, in its order."""
+        """Return the quantile of a share from 0 to less than 1; for a list, in its order."""
         raise NotImplementedError
 
     def extremes(self) -> list[Value]:
-        """The values at the ends, or all of a list: if these can be flown, the others can."""
+        """Return the values at the ends, or all of a list: if these can be flown, so can the others."""
         raise NotImplementedError
 
 
@@ -162,7 +162,7 @@ class _Listed(Varied):
 
 @dataclass(frozen=True, kw_only=True)
 class Choice(_Listed):
-    """One of several values, each with its own weight."""
+    """One of several values, with a weight each."""
 
     distribution: Literal["choice"]
     weights: Annotated[
@@ -185,7 +185,7 @@ class Choice(_Listed):
 
 @dataclass(frozen=True, kw_only=True)
 class Grid(_Listed):
-    """Every value in turn; several grids make every combination, the last one changing fastest."""
+    """Every value in turn; several grids give every combination, the last one changing fastest."""
 
     distribution: Literal["grid"]
 
@@ -199,7 +199,7 @@ def _require_range(low: float, high: float) -> None:
 
 
 def check_fields(entries: Sequence[Varied], table: str, owners: dict[str, str]) -> None:
-    """Refuse fields that two entries replace, and those that are not to be replaced.
+    """Refuse fields that two entries replace, and fields that may not be replaced.
 
     `table` names the entries; `owners` has who replaces a field, and gets the entries' own.
     """
@@ -217,7 +217,7 @@ def check_fields(entries: Sequence[Varied], table: str, owners: dict[str, str]) 
 
 @dataclass(frozen=True, kw_only=True)
 class FlightLimits:
-    """What one flight may take before it is ended, as a result with the verdict `timeout` or `memory`."""
+    """Limits of one flight; beyond them it ends with the verdict `timeout` or `memory`."""
 
     flight: Annotated[Positive, doc("[s] wall clock of a flight")] = 600.0
     memory: Annotated[float, Ge(100.0), Le(1e9), doc("[MB] of the flight's process, beyond what it starts with")] = (
@@ -282,16 +282,16 @@ class CampaignFile:
 
     @property
     def cells(self) -> int:
-        """Combinations that the grids make; 1 without any."""
+        """Number of combinations of the grids; 1 without any."""
         return math.prod(len(entry.values) for entry in self.vary if isinstance(entry, Grid))
 
     def to_toml(self) -> str:
-        """The file with every field, defaults included; reading it gives this campaign again."""
+        """Return the file with every field, defaults included; reading it gives this campaign."""
         return to_toml(self)
 
 
 class Draws:
-    """The drawn values of a campaign's flights; the same for the same file, in any process and order."""
+    """Drawn values of a campaign's flights; they depend only on the file, not on process or order."""
 
     def __init__(self, spec: CampaignFile) -> None:
         self._spec = spec
@@ -304,11 +304,11 @@ class Draws:
                 repeat *= len(entry.values)
 
     def seed(self, flight: int) -> int:
-        """The seed of a flight's scenario, a whole number of 63 bits."""
+        """Return the seed of a flight's scenario, a whole number of 63 bits."""
         return int(self._sequence(flight).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
     def values(self, flight: int) -> dict[str, Value]:
-        """What is drawn for a flight, by the names of the entries of `[[vary]]`."""
+        """Return the drawn values of a flight, by the names of the entries of `[[vary]]`."""
         if self._spread is None:
             point = np.random.default_rng(self._sequence(flight).spawn(1)[0]).random(len(self._spec.vary))
         else:

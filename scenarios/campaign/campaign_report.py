@@ -1,4 +1,4 @@
-"""What came of a campaign: its outcome in a sentence, its tables, its figure, and a page that works offline."""
+"""Report of a campaign: outcome in a sentence, tables, figure, and a page that works offline."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _ALWAYS: Final = ("failure", "violation", "lost")  # events that are listed even
 
 
 def campaign_lines(summary: Summary, judgements: Sequence[Judgement], directory: Path) -> Iterator[RenderableType]:
-    """What came of a campaign, as a console shows it."""
+    """Return the report for a console."""
     from scenarios import console
 
     where = console.short_path(directory)
@@ -72,7 +72,7 @@ def _brief(grid: Grid) -> Grid:
 
 
 def verdict_sentence(summary: Summary) -> str:
-    """How many flights failed, and how sure that is: `37 of 1000 flights failed: 3.7 % (95 %: 2.6 to 5.1 %)`."""
+    """Return the failures with their confidence interval: `37 of 1000 flights failed: 3.7 % (95 %: 2.6 to 5.1 %)`."""
     failure = summary["events"]["failure"]
     text = f"{failure['count']} of {count_of(failure['flights'], 'flight')} failed"
     if failure["flights"]:
@@ -83,7 +83,7 @@ def verdict_sentence(summary: Summary) -> str:
 
 
 def driver_sentence(summary: Summary) -> str:
-    """The varied parameters on which the worst margin, or else failure, depends beyond chance, the strongest first."""
+    """Return the parameters on which the worst margin, or else failure, depends significantly, strongest first."""
     outcome = "worst_margin" if any(related["worst_margin"] for related in drivers(summary).values()) else "failed"
     sure = {
         name: related[outcome]
@@ -100,7 +100,7 @@ def _grid(key: str, head: Sequence[str], lines: Iterable[tuple[Cell, ...]], note
 
 
 def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
-    """How often each event that happened did; `failure` names the events that count as failure."""
+    """Return the frequency of each event that happened; `failure` names the events that count as failure."""
     sure, counted = f"{100.0 * summary['confidence']:g} %", f" ({', '.join(failure)})" if failure else ""
     head = ("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}")
     lines = (
@@ -118,7 +118,7 @@ def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
 
 
 def constraint_table(summary: Summary) -> Grid:
-    """How often each constraint did not hold, and by how much at worst."""
+    """Return the number of violations and the worst margin of each constraint."""
     sure, lines = f"{100.0 * summary['confidence']:g} % interval", []
     for name, constraint in summary["constraints"].items():
         failed, worst = constraint["not_satisfied"], (ABSENT, ABSENT)
@@ -135,7 +135,7 @@ def constraint_table(summary: Summary) -> Grid:
 
 
 def metric_table(summary: Summary) -> Grid:
-    """How every metric is distributed."""
+    """Return the distribution of every metric."""
     measures = ("mean", "sd", "min", "p5", "p50", "p95", "p99", "max")
     lines = (
         line(label(name, metric["unit"]), *(format_number(metric[m]) for m in measures), str(metric["flights"]))
@@ -146,7 +146,7 @@ def metric_table(summary: Summary) -> Grid:
 
 
 def worst_table(summary: Summary, directory: str) -> Grid:
-    """The worst flights, and how to fly one again."""
+    """Return the worst flights and the commands that replay them."""
     worst = summary["worst"]
     lines = (
         line(
@@ -166,7 +166,7 @@ def worst_table(summary: Summary, directory: str) -> Grid:
 
 
 def worst_draws_table(summary: Summary) -> Grid:
-    """Parameters of the worst flights, a column for each."""
+    """Return the parameters of the worst flights, one column each."""
     worst = summary["worst"]
     lines = (
         line(label(name, parameter["unit"]), *(_drawn(flight["draws"][name]) for flight in worst))
@@ -176,7 +176,7 @@ def worst_draws_table(summary: Summary) -> Grid:
 
 
 def replay_command(directory: str, flight: int) -> str:
-    """The command that flies one flight of a campaign again."""
+    """Return the command that replays a flight of a campaign."""
     return f"quadsim replay {shlex.quote(directory)} --flight {flight}"
 
 
@@ -189,7 +189,7 @@ def _shares(share: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def driver_table(summary: Summary) -> Grid:
-    """How the worst margin and failure depend on each varied parameter."""
+    """Return how the worst margin and failure depend on each varied parameter."""
     lines = (
         line(label(name, related["unit"]), *_association(related["worst_margin"]), *_association(related["failed"]))
         for name, related in drivers(summary).items()
@@ -205,7 +205,7 @@ def driver_table(summary: Summary) -> Grid:
 
 
 def group_table(summary: Summary) -> Grid:
-    """How often flights failed over each varied parameter, lowest values first; of none or all failed, no lines."""
+    """Return failures over each varied parameter, lowest values first; no lines if none or all flights failed."""
     failure = summary["events"]["failure"]
     listed = {}
     for name, parameter in summary["parameters"].items() if 0 < failure["count"] < failure["flights"] else ():
@@ -236,7 +236,7 @@ _FILES: Final = (
     *("campaign.toml", "scenario.toml", "flights.parquet", "timing.parquet", "summary.json", "manifest.json"),
     "campaign.png",
 )
-"""What the page links to, where it is there."""
+"""Files that the page links to, if they exist."""
 _MARGINS: Final = (
     "The worst margin is that of a flight's required constraints, tolerance included, as a share of half the "
     "constraint's band: 1 in the middle, 0 (dashed) at the end of what is allowed, negative beyond. What is measured "
@@ -250,7 +250,7 @@ MAIN_METRICS: Final = (
     *(f"rmse.{name}" for name in ("x", "y", "z", "yaw")),
     *("peak_tilt", "total_variation", "fallback_periods"),
 )
-"""What a reader of a campaign looks for first."""
+"""Metrics shown first."""
 _BINS: Final = 40
 _MOST_SCATTERS: Final = 3  # in the overview
 _MOST_POINTS: Final = 9000  # of one verdict in all scatters of a page, which has a few MB then
@@ -307,7 +307,7 @@ def overview(table: pa.Table, summary: Summary, title: str) -> Figure:
 
 
 def histograms(table: pa.Table) -> list[Panel]:
-    """How the main metrics that differ between flights are distributed, by verdict."""
+    """Plot the distribution of the main metrics that differ between flights, by verdict."""
     panels = []
     for name in MAIN_METRICS:
         values = numbers(table, name)
@@ -377,7 +377,7 @@ def scatters(table: pa.Table) -> list[Panel]:
 
 
 def _ends(finite: Array) -> tuple[float, float]:
-    """The smallest and the largest of some values, without those far out."""
+    """Return the smallest and largest value without outliers."""
     q1, q3 = np.percentile(finite, [25, 75])
     reach = _FENCE * (q3 - q1) or np.inf
     inside = finite[(finite >= q1 - reach) & (finite <= q3 + reach)]

@@ -1,4 +1,4 @@
-"""What may happen in a flight, as text: `lost`, `violation`, `rmse.z > 0.5`.
+"""Events of a flight as text: `lost`, `violation`, `rmse.z > 0.5`.
 
 One rule for what is not known: where a flight has no value, the event holds, since the flight did not show otherwise.
 """
@@ -28,7 +28,7 @@ INCOMPLETE: Final = "incomplete"  # of a flight that ended before it reached a r
 
 
 class Verdict(NamedTuple):
-    """What is to be known of a verdict."""
+    """Properties of a verdict."""
 
     badness: int  # its place among the worst flights: the larger, the worse
     colour: str
@@ -65,7 +65,7 @@ EVENT_NAMES: Final = tuple(_NAMED)
 
 
 class Event(NamedTuple):
-    """Something that a flight's row shows to have happened, or not."""
+    """An event, whose occurrence a flight's row shows."""
 
     text: str  # in its standard form: a name of `EVENT_NAMES`, or `COLUMN OP NUMBER`
     column_name: str
@@ -98,7 +98,7 @@ class Event(NamedTuple):
 
 
 def parse_event(text: str, columns: Mapping[str, pa.DataType] | None = None) -> Event:
-    """An event from its text.
+    """Parse an event from its text.
 
     Args:
         text: a name of `EVENT_NAMES`, e.g. `failure` or `lost`, where `failed`, `violated` and `crashed` mean the same

@@ -1,4 +1,4 @@
-"""Two campaigns flown on the same draws: is the second better, and how sure is that?
+"""Two campaigns flown on the same draws: is the second significantly better?
 
 Flights of one number have the same drawn values and random numbers, so they are compared in pairs: this detects
 far smaller differences than two campaigns side by side would.
@@ -59,7 +59,7 @@ Differences = tuple[tuple[str, Any, Any], ...]
 
 @dataclass(frozen=True, kw_only=True)
 class EventComparison:
-    """In how many pairs an event happened to both flights, to one alone, and to none."""
+    """Numbers of pairs in which an event happened to both flights, to only one, and to none."""
 
     event: str
     both: int
@@ -77,7 +77,7 @@ class EventComparison:
 
     @property
     def pairs(self) -> int:
-        """All pairs."""
+        """Number of pairs."""
         return self.both + self.only_a + self.only_b + self.neither
 
 
@@ -94,7 +94,7 @@ class MetricComparison:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class PairedComparison(Result):
-    """What two campaigns on the same draws show of each other."""
+    """Comparison of two campaigns on the same draws."""
 
     names: tuple[str, str]  # of the first and the second campaign
     flights: int  # pairs
@@ -117,7 +117,7 @@ class PairedComparison(Result):
 
     @property
     def sentence(self) -> str:
-        """The verdict with its numbers."""
+        """Return the verdict with its numbers."""
         (a, b), failure = self.names, self.events[0]
         phrase = f"{b} is {self.verdict} than {a}"
         if self.verdict == "not distinguishable":
@@ -129,7 +129,7 @@ class PairedComparison(Result):
 
     @property
     def pairing(self) -> str:
-        """What the pairs have in common, and what they have not."""
+        """Return the common and the differing settings of the pairs."""
         phrase = f"Pairs share {', '.join(('their seed', *self.shared_draws))}"
         if self.own_draws:
             phrase += f"; one campaign alone draws {', '.join(self.own_draws)}"
@@ -141,14 +141,14 @@ class PairedComparison(Result):
 
     @property
     def difference_tables(self) -> tuple[Grid, ...]:
-        """The fields in which the campaigns' scenarios and draws differ; no table where none does."""
+        """Return the fields in which the campaigns' scenarios and draws differ; no table without differences."""
         lines = tuple(line(field, shown(a), shown(b)) for field, a, b in self.differences or ())
         grid = Grid(key="differences", title="What differs", head=("field", *self.names), lines=lines)
         return (grid,) if lines else ()
 
     @property
     def tables(self) -> tuple[Grid, Grid]:
-        """Events, and metrics."""
+        """Return the tables of events and metrics."""
         return _event_table(self), _metric_table(self)
 
     def shown(self) -> Shown:
@@ -163,7 +163,7 @@ class PairedComparison(Result):
             yield console.written_to(self.page)
 
     def to_markdown(self) -> str:
-        """What differs, the verdict, and its tables."""
+        """Return differences, verdict and tables as Markdown."""
         head = [f"# {self.names[1]} against {self.names[0]}\n", f"{self.pairing}\n"]
         verdict = [*map(section, self.difference_tables), f"{self.sentence}\n", *map(section, self.tables)]
         return "\n".join([*head, *verdict])
@@ -191,7 +191,7 @@ class PairedComparison(Result):
         return directory / PAGE_FILE
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data for a file; differences are of the second campaign less the first."""
+        """Return plain data for a file; differences are second campaign minus first."""
         return {
             "names": list(self.names),
             "verdict": self.verdict,

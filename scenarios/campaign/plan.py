@@ -1,4 +1,4 @@
-"""A campaign ready to be flown: its file, its scenario, and from these the scenario and the row of each flight."""
+"""A campaign ready to fly: its file and scenario, which define the scenario and the row of each flight."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ class Plan:
 
     @property
     def _table(self) -> str:
-        """What messages call its entries."""
+        """Name of the entries in messages."""
         return "sweep" if self.one_seed else "vary"
 
     @cached_property
     def draws(self) -> Draws:
-        """What is random about it."""
+        """Random draws of the campaign."""
         return Draws(self.spec)
 
     @cached_property
@@ -69,7 +69,7 @@ class Plan:
 
     @property
     def flies_user_code(self) -> bool:
-        """Whether a controller or a force of the user's flies, in some flight at least."""
+        """Whether any flight uses a user-defined controller or force."""
         drawn = {field for entry in self.spec.vary for field in entry.fields}
         chosen = not drawn.isdisjoint(("controller", "controller.type", "forces"))
         return chosen or isinstance(self.scenario.controller, Plugin) or bool(self.scenario.forces)
@@ -82,7 +82,7 @@ class Plan:
 
     @cached_property
     def failure(self) -> tuple[Event, ...]:
-        """The events of which any one makes a flight fail."""
+        """Events that count as failure of a flight."""
         try:
             return tuple(parse_event(text, self.columns) for text in self.spec.failure)
         except InputError as error:
@@ -110,7 +110,7 @@ class Plan:
         return {"flight": flight, "seed": self.draws.seed(flight), **drawn}
 
     def check(self) -> None:
-        """Refuse, before anything is flown, what cannot be.
+        """Refuse, before the first flight, values that cannot be flown.
 
         Raises:
             InputError: a value of an entry of `[[vary]]`, at the end of its range, cannot be flown; none of the first
@@ -132,7 +132,7 @@ class Plan:
         raise InputError(f"none of the first {len(refusals)} flights can be flown, the first since {refusals[0]}")
 
     def fly(self, flight: int) -> Row:
-        """The row of a flight; one that cannot be flown has one too, with its reason."""
+        """Return the row of a flight; a flight that cannot be flown has a row with the reason."""
         started = clock.perf_counter()
         try:
             flown = Rollout(self.of(flight)).fly()
@@ -155,7 +155,7 @@ class Plan:
                 yield row if "flight" in row else self.failed(flights[place], row["reason"], row["verdict"])
 
     def row_of(self, flight: int, flown: Flight, wall_s: float = 0.0) -> Row:
-        """The row of a flight that was flown, in that time [s]."""
+        """Return the row of a flight that took `wall_s` [s] to compute."""
         machine = processor_name()
         return self._row(
             flight, flown_row(flown.log, flown.findings, verdict=flown.outcome, wall_s=wall_s, machine=machine)
@@ -203,7 +203,7 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
 
 
 def make_plan(scenario: Scenario, data: Mapping[str, Any]) -> Plan:
-    """A campaign of a scenario that is there already, its other fields given as in a file."""
+    """Return a campaign of a given scenario, with its other fields as in a file."""
     spec = parse_campaign({"name": scenario.name, **data, "scenario": scenario.name}, source="campaign")
     plan = Plan(spec, Assembly(scenario).with_vehicle)
     plan.check()
@@ -274,7 +274,7 @@ def column_type(entry: Varied) -> pa.DataType:
 
 
 def cell(value: Value) -> Value | str:
-    """A drawn value as it stands in the results: whole numbers as numbers, lists and tables as texts."""
+    """Return a drawn value as in the results: whole numbers as numbers, lists and tables as texts."""
     if isinstance(value, bool | str):
         return value
     return float(value) if isinstance(value, int | float) else str(value)

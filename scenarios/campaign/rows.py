@@ -26,7 +26,7 @@ from scenarios.campaign.events import HARMLESS, INCOMPLETE, VERDICTS, Event, Fla
 Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
 DRAW: Final = "draw."  # how the columns of drawn values begin
 MARGIN, TIME_VIOLATED, SATISFIED = "margin.", "time_violated.", "satisfied."
-"""How the columns of a constraint begin, before its name."""
+"""Prefixes of the columns of a constraint."""
 _MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
 _COMMANDED: Final = ("speed", "slew")  # signals that the controller sets itself
 _FLOAT, _WHOLE = pa.float64(), pa.int64()
@@ -57,7 +57,7 @@ _TIMING: Final = [
     *_fields(_FLOAT, "ms", "step_p50_ms", "step_p99_ms"),
 ]
 TIMES: Final = tuple(field.name for field in _TIMING)
-"""What a clock measured of a flight, and where; it stands in a table of its own."""
+"""Clock times of a flight and its machine, in a separate table."""
 Summary = Mapping[str, Any]
 Texts = np.ndarray[Any, np.dtype[np.object_]]
 _NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
@@ -82,7 +82,7 @@ def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[L
 
 
 def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall_s: float, machine: str) -> Row:
-    """What a campaign keeps of a flight, whose plant rows are at the physics rate, and of its audit."""
+    """Return the row of a flight, with plant rows at the physics rate, and its audit."""
     row: Row = {
         "status": log.status,
         "verdict": verdict,
@@ -132,7 +132,7 @@ def make_table(rows: Iterable[Row], schema: pa.Schema) -> pa.Table:
 
 
 def split_times(table: pa.Table) -> tuple[pa.Table, pa.Table]:
-    """What a seed determines, and what a clock measured, by flight."""
+    """Return the columns that a seed determines and those of clock times, by flight."""
     return table.drop_columns([*TIMES]), table.select(["flight", *TIMES])
 
 

@@ -1,4 +1,4 @@
-"""What a campaign's flights show, and with which confidence; how shares are put into words; requirements on them.
+"""Statistics of a campaign's flights with their confidence, their wording, and requirements on them.
 
 Flights are taken as independent draws.  Draws spread evenly (Latin hypercube, Sobol', Halton) make estimates vary less
 than that, so that the intervals are then wider than they need be.
@@ -160,7 +160,7 @@ _PERMUTATIONS: Final = 9999
 
 @dataclass(frozen=True, kw_only=True)
 class Dependence:
-    """How an outcome depends on a number."""
+    """Dependence of an outcome on a number."""
 
     rho: float  # Spearman's rank correlation, from -1 to 1
     p: float  # its two-sided p-value
@@ -233,11 +233,11 @@ FAILURE: Final = parse_event("failure")
 WORST_FLIGHTS: Final = 10
 _PERCENTILES: Final = {"min": 0, "p5": 5, "p50": 50, "p95": 95, "p99": 99, "max": 100}
 _GROUPS: Final = ((50, 5), (12, 3))
-"""Flights from which a varied parameter's values are looked at in this many groups of about equal size."""
+"""Numbers of flights from which a varied parameter is split into this many groups of about equal size."""
 
 
 def estimate(table: pa.Table) -> dict[str, Any]:
-    """Everything in a campaign's summary about its flights, as plain data for JSON.
+    """Return the part of a campaign's summary about its flights, as plain data for JSON.
 
     Keys: `flights`; `confidence` of every interval; `verdicts`, flights of each; `events` and `constraints`, by name,
     as `proportion`, a constraint's being that it did not hold, among the flights that reached it or were lost before;
@@ -365,7 +365,9 @@ def drivers(summary: Summary) -> dict[str, Mapping[str, Any]]:
     They are ordered by how `worst_margin` depends on them, or else `failed`.
     """
     related = {
-        name: found for name, found in summary["parameters"].items() if found.get("worst_margin") or found.get("failed")
+        name: effect
+        for name, effect in summary["parameters"].items()
+        if effect.get("worst_margin") or effect.get("failed")
     }
 
     def weakness(parameter: tuple[str, Mapping[str, Any]]) -> tuple[float, float]:
@@ -428,7 +430,7 @@ class Requirement:
 
 @dataclass(frozen=True, kw_only=True)
 class Judgement:
-    """Whether the flights support a requirement."""
+    """Judgement of a requirement by the flights."""
 
     requirement: Requirement
     count: int  # flights in which the event happened
@@ -439,7 +441,7 @@ class Judgement:
 
     @property
     def sentence(self) -> str:
-        """The judgement with its numbers."""
+        """Return the judgement with its numbers."""
         required = self.requirement
         share = f" ({percent(self.count / self.flights)})" if self.flights else ""
         phrase = (
@@ -484,7 +486,7 @@ def parse_requirement(text: str) -> Requirement:
 
 
 def judge(table: pa.Table, requirement: Requirement) -> Judgement:
-    """Hold a campaign's flights, `flights.parquet`, against a requirement.
+    """Judge a requirement by a campaign's flights, `flights.parquet`.
 
     It holds when the one-sided Clopper-Pearson bound at its confidence is on the required side; so it takes
     flights enough, and no flights support nothing.  Incomplete flights do not count (`rows.is_counted`).

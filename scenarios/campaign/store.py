@@ -1,4 +1,4 @@
-"""A campaign's directory while it grows: nothing that was flown is lost, or there twice, whatever is killed.
+"""A growing campaign directory: no flight is lost or stored twice, whichever process is killed.
 
 Rows are appended as files of their own below `parts/`.  When all is flown the parts become `flights.parquet` and
 `timing.parquet`, and go.  The manifest has what was flown, by which code, and how far it is.
@@ -69,7 +69,7 @@ class Store:
         self._flushed = clock.perf_counter()
 
     def table(self) -> pa.Table:
-        """All flights that are there, each once, sorted.
+        """Return all stored flights, once each, sorted.
 
         Raises:
             FileError: a file is damaged or of another campaign.
@@ -89,18 +89,18 @@ class Store:
         return whole.take(first)
 
     def counted(self) -> int:
-        """Flights of the final table that is there; 0 where there is none."""
+        """Number of flights in the final table; 0 without one."""
         path = self._directory / FLIGHTS_FILE
         return read_table(path).num_rows if path.is_file() else 0
 
     def add(self, row: Row) -> None:
-        """Add a row, which may wait in memory until `flush`, though not for long."""
+        """Add a row; it may stay in memory until `flush`, for a short time."""
         self._waiting.append(row)
         if clock.perf_counter() - self._flushed > FLUSH_S:
             self.flush()
 
     def flush(self) -> None:
-        """Append the rows that wait."""
+        """Append the rows in memory."""
         self._flushed = clock.perf_counter()
         self.append(self._waiting)
         self._waiting = []  # not before: by Ctrl-C it is appended once more, to the same file
@@ -128,7 +128,7 @@ class Store:
         return table
 
     def _parts(self) -> list[str]:
-        """The parts that are there, by their names relative to the directory."""
+        """Return the paths of the parts, relative to the directory."""
         return sorted(f"{PARTS_DIR}/{path.name}" for path in (self._directory / PARTS_DIR).glob("part-*.parquet"))
 
 
@@ -139,7 +139,7 @@ def _encoded(table: pa.Table) -> bytes:
 
 
 def start(plan: Plan, files: Growing, session: Mapping[str, Any], *, flying: bool) -> dict[str, Any]:
-    """The manifest of a campaign that begins, or is resumed, with the files that define it, itself the last of them.
+    """Start or resume a campaign: write the files that define it, the manifest last, and return the manifest.
 
     Raises:
         FileError: it is damaged.
@@ -183,7 +183,7 @@ def write(manifest: Mapping[str, Any], files: Growing) -> None:
 
 
 def require_same(plan: Plan, directory: Path) -> None:
-    """Refuse to continue a campaign by another one.
+    """Refuse to continue a campaign with a different one.
 
     Raises:
         FileError: there is none, or it is damaged.
@@ -209,12 +209,12 @@ def require_same(plan: Plan, directory: Path) -> None:
 
 
 def other_than_flew(manifest: Mapping[str, Any], plan: Plan) -> list[str]:
-    """Of what `flown_by` states, that which is not as when a campaign was begun."""
+    """Return the entries of `flown_by` that changed since the campaign started."""
     return [name for name, value in flown_by(plan).items() if manifest.get(name) != value]
 
 
 def flown_by(plan: Plan) -> dict[str, Any]:
-    """What numbers come from besides the campaign's own files; imports code of the user."""
+    """Return versions and hashes of everything outside the campaign's files that affects numbers; imports user code."""
     controller = plan.scenario.controller
     return {
         "code": code_digest(),
@@ -227,7 +227,7 @@ def flown_by(plan: Plan) -> dict[str, Any]:
 
 @functools.cache
 def code_digest() -> str:
-    """SHA-256 of everything of ours that numbers come from: code, models, scenarios, and whether there is a core."""
+    """Return the SHA-256 of all quadsim files that affect numbers: code, models, scenarios, and the core's presence."""
     code = _digest([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
     return code if why_missing() is None else f"{code}, without the core"
 
@@ -277,7 +277,7 @@ def is_campaign(directory: Path) -> bool:
 
 
 def stored_plan(directory: Path) -> Plan:
-    """The campaign that a directory holds, from its own files.
+    """Load the campaign of a directory from its files.
 
     Raises:
         FileError: it is none, or a file is missing or not the one that was flown.
@@ -293,5 +293,5 @@ def stored_plan(directory: Path) -> Plan:
 
 
 def _stored(plan: Plan) -> CampaignFile:
-    """The campaign's file as its directory has it, with the scenario beside it."""
+    """Return the campaign file in its directory, with the scenario beside it."""
     return replace(plan.spec, scenario=SCENARIO_FILE, set={})

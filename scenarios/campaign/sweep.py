@@ -1,4 +1,4 @@
-"""Sweeps: a scenario flown once for every combination of some fields' values, as a tidy table."""
+"""Sweeps: flights of a scenario for every combination of the values of some fields, as a tidy table."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Sweep(Result):
     table: pa.Table
 
     def __getitem__(self, column: str) -> np.ndarray[Any, Any]:
-        """(flights,) of a column by its name.
+        """Return a column (flights,) by name.
 
         Raises:
             UnknownNameError: there is none.
@@ -53,11 +53,11 @@ class Sweep(Result):
         return np.asarray(self.table[column].to_numpy())
 
     def __len__(self) -> int:
-        """Flights."""
+        """Return the number of flights."""
         return int(self.table.num_rows)
 
     def _ipython_key_completions_(self) -> list[str]:
-        """For notebooks: what can stand in the brackets."""
+        """Return the column names, for completion in a notebook."""
         return list(self.table.column_names)
 
     def to_arrow(self) -> pa.Table:
@@ -65,7 +65,7 @@ class Sweep(Result):
         return self.table
 
     def to_pandas(self) -> Any:
-        """The table as a pandas DataFrame.
+        """Return the table as a pandas DataFrame.
 
         Raises:
             MissingPackageError: pandas is not installed.
@@ -83,7 +83,7 @@ class Sweep(Result):
         yield console.table(title, head, lines, left=("verdict", "worst_constraint"))
 
     def _brief(self, field: str) -> str:
-        """The end of a field's path, where no other field has it."""
+        """Return the last part of a field's path if it is unique."""
         parts = field.split(".")
         ends = (".".join(parts[-count:]) for count in range(2 if parts[-1].isdigit() else 1, len(parts)))
         return next((end for end in ends if sum(f".{name}".endswith(f".{end}") for name in self.fields) == 1), field)
@@ -111,7 +111,7 @@ class Sweep(Result):
         return Figure(key="sweep", title="", panels=(panel,), columns=1)
 
     def to_json(self) -> list[dict[str, Any]]:
-        """A table of columns for each flight."""
+        """Return a table with one line per flight."""
         return [*self.table.to_pylist()]
 
 
@@ -150,7 +150,7 @@ def fly_sweep(
 
 
 def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> Grid:
-    """The values of a field, or of several together, each checked alone."""
+    """Return the values of a field, or of several together, after checking each."""
     owner = fields if isinstance(fields, str) else f"({', '.join(fields)})"
     if isinstance(tried, str) or not hasattr(tried, "__len__") or not len(tried):
         raise ParameterError("sweep", owner, tried, "a list of values to try")
@@ -166,7 +166,7 @@ def _grid(fields: str | tuple[str, ...], tried: Sequence[Any]) -> Grid:
 
 
 def _swept(entries: Sequence[Grid]) -> dict[str, pa.Array]:
-    """The columns of what was tried, by the dotted path of each number or text."""
+    """Return the columns of the swept values, by the dotted path of each number or text."""
     rows = []
     for combination in itertools.product(*(entry.values for entry in entries)):
         together = {tuple(entry.fields): value for entry, value in zip(entries, combination, strict=True)}

@@ -102,11 +102,9 @@ class Filtered:
 
 @dataclass(frozen=True, kw_only=True)
 class Started(Filtered):
-    """A course that begins at a time of its own."""
+    """A course with a start time."""
 
-    start: Annotated[NonNegative, doc("[s] when the course begins; until then it is the initial position and yaw")] = (
-        0.0
-    )
+    start: Annotated[NonNegative, doc("[s] start of the course; before it, the initial position and yaw")] = 0.0
 
     def build(self, initial: Array, gravity: float) -> Course:
         """As `Filtered.build`."""
@@ -122,7 +120,7 @@ class Point:
     """A point to fly through."""
 
     position: Annotated[Vector, doc("[m] x, y, z, world")]
-    yaw: Annotated[Number | None, doc("[deg] yaw there; that of the point before if absent")] = None
+    yaw: Annotated[Number | None, doc("[deg] yaw there; absent: yaw of the point before")] = None
 
 
 def poses_of(points: Sequence[Point], initial: Array) -> Array:

@@ -56,7 +56,7 @@ class Csv(Started):
     ]
     sha256: Annotated[
         Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")] | None,
-        doc("hash of the file, recorded when it is read; another content is refused"),
+        doc("hash of the file, recorded when it is read; a file with another hash is refused"),
     ] = None
 
     @property

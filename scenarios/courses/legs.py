@@ -31,8 +31,8 @@ from scenarios.courses.course import (
 class Waypoint(Point):
     """A point to fly to in a straight line at constant speed, and how long to stay there."""
 
-    hold: Annotated[NonNegative, doc("[s] how long to stay there")] = 0.0
-    speed: Annotated[Speed | None, doc("[m/s] of the leg; that of the course if absent")] = None
+    hold: Annotated[NonNegative, doc("[s] time to stay there")] = 0.0
+    speed: Annotated[Speed | None, doc("[m/s] speed of the leg; absent: speed of the course")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class Waypoints(Started):
     """Straight legs at constant speed, from the initial position from one point to the next."""
 
     type: Annotated[Literal["waypoints"], doc("kind of course: straight legs between points")]
-    speed: Annotated[Speed, doc("[m/s] along a leg, unless its point gives its own")] = 1.0
+    speed: Annotated[Speed, doc("[m/s] speed along a leg, unless its point has one")] = 1.0
     points: Annotated[tuple[Waypoint, ...], Len(1, MOST_POINTS), doc("the points, in order")]
 
     def __post_init__(self) -> None:
@@ -66,9 +66,9 @@ class Waypoints(Started):
 class Turn:
     """A turn on the spot at constant rate."""
 
-    start: Annotated[NonNegative, doc("[s] when it begins; a turn that is not over then ends")]
-    yaw: Annotated[Number, doc("[deg] where it ends; 360 is a whole turn from 0")]
-    rate: Annotated[Speed, doc("[deg/s] how fast it turns, in either direction")]
+    start: Annotated[NonNegative, doc("[s] start of the turn, and end of an unfinished earlier one")]
+    yaw: Annotated[Number, doc("[deg] final yaw; 360 is a whole turn from 0")]
+    rate: Annotated[Speed, doc("[deg/s] yaw rate, in either direction")]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -97,15 +97,15 @@ def fly_round(loop: Loop, *, turn_time: float, turns: float, ramp: float, yaw: f
 
 @dataclass(frozen=True, kw_only=True)
 class _Round(Started):
-    period: Annotated[Time | None, doc("[s] of one turn at full speed; either period or speed")] = None
+    period: Annotated[Time | None, doc("[s] time of one turn at full speed; either period or speed")] = None
     speed: Annotated[Speed | None, doc("[m/s] along the path at full speed; either period or speed")] = None
-    turns: Annotated[Number, doc("[-] how many turns; negative: reversed")] = 1.0
+    turns: Annotated[Number, doc("[-] number of turns; negative: reversed")] = 1.0
     ramp: Annotated[
-        NonNegative, doc("[s] over which it gains its speed smoothly, and loses it at the end; 0 for at once")
+        NonNegative, doc("[s] time of the smooth acceleration, and of the deceleration at the end; 0: at once")
     ] = 5.0
-    height: Annotated[Number | None, doc("[m] z where it begins; the initial one if absent")] = None
-    yaw: Annotated[Number | None, doc("[deg] held throughout; the initial one if absent")] = None
-    yaw_along_path: Annotated[bool, doc("whether yaw follows the direction of travel instead")] = False
+    height: Annotated[Number | None, doc("[m] z at the start; absent: initial z")] = None
+    yaw: Annotated[Number | None, doc("[deg] constant yaw; absent: initial yaw")] = None
+    yaw_along_path: Annotated[bool, doc("true: yaw follows the direction of travel instead")] = False
 
     def __post_init__(self) -> None:
         require_one(period=self.period, speed=self.speed)
@@ -153,9 +153,9 @@ class _Round(Started):
 class _Circular(_Round):
     radius: Annotated[Positive, doc("[m] seen from above")]
     centre: Annotated[
-        Pair | None, doc("[m] x, y, world; if absent, such that the course begins at the initial position")
+        Pair | None, doc("[m] x, y, world; absent: such that the course starts at the initial position")
     ] = None
-    angle: Annotated[Number, doc("[deg] where on the circle it begins, seen from the centre; 0 is +x")] = 0.0
+    angle: Annotated[Number, doc("[deg] start on the circle, seen from the centre; 0 is +x")] = 0.0
 
     @property
     def climb_per_turn(self) -> float:
@@ -188,7 +188,7 @@ class Helix(_Circular):
     """A circle that climbs in proportion to the angle flown."""
 
     type: Annotated[Literal["helix"], doc("kind of course: a circle that climbs")]
-    climb: Annotated[Number, doc("[m] gained per turn; negative: lost")]
+    climb: Annotated[Number, doc("[m] height gained per turn; negative: lost")]
 
     @property
     def climb_per_turn(self) -> float:
@@ -202,9 +202,9 @@ class FigureEight(_Round):
 
     type: Annotated[Literal["figure_eight"], doc("kind of course: a level lemniscate of Gerono")]
     length: Annotated[Positive, doc("[m] from end to end, through the crossing")]
-    width: Annotated[Positive | None, doc("[m] across; half the length if absent")] = None
+    width: Annotated[Positive | None, doc("[m] across; absent: half the length")] = None
     speed: Annotated[Speed | None, doc("[m/s] at the crossing, where it is largest; either period or speed")] = None
-    centre: Annotated[Pair | None, doc("[m] x, y of the crossing, world; the initial position if absent")] = None
+    centre: Annotated[Pair | None, doc("[m] x, y of the crossing, world; absent: the initial position")] = None
     angle: Annotated[Number, doc("[deg] direction of the length; 0 is +x")] = 0.0
 
     @property

@@ -40,7 +40,7 @@ class MinimumSnap(Started):
     type: Annotated[Literal["minimum_snap"], doc("kind of course: least snap through points")]
     points: Annotated[tuple[Point, ...], Len(1, MOST_POINTS), doc("the points, in order")]
     times: Annotated[
-        tuple[Time, ...] | None, doc("[s] after start, when each point is passed; either times or speed")
+        tuple[Time, ...] | None, doc("[s] after start, times at which the points are passed; either times or speed")
     ] = None
     speed: Annotated[Speed | None, doc("[m/s] average on the straight line between points; either times or speed")] = (
         None

@@ -145,18 +145,18 @@ class _Ramped(Started):
     speed: Annotated[
         Speed,
         doc(
-            "[m/s] v, the product of radius and rate that would be reached without ramps; the phase's own top rate is "
-            "somewhat higher"
+            "[m/s] v, the product of radius and rate that would be reached without ramps; the highest rate of the "
+            "phase is slightly higher"
         ),
     ]
     acceleration: Annotated[Speed, doc("[m/s^2] a, along the path, of radius and phase")] = 1.0
-    radius: Annotated[Positive, doc("[m] r, seen from above; of a lemniscate half its length")]
-    ramp: Annotated[Time, doc("[s] T, over which the acceleration grows; below speed / acceleration")] = 2.0
+    radius: Annotated[Positive, doc("[m] r, seen from above; for a lemniscate half its length")]
+    ramp: Annotated[Time, doc("[s] T, time over which the acceleration grows; below speed / acceleration")] = 2.0
     heading: Annotated[
         Literal["free", "held"],
-        doc("free: no rate is left about body z, and the heading drifts; held: the initial yaw"),
+        doc("free: zero rate about body z, so the heading drifts; held: the initial yaw"),
     ] = "free"
-    sampling: Annotated[Time, doc("[s] step of the rectangle sums that make the phase")] = 0.02
+    sampling: Annotated[Time, doc("[s] step of the rectangle rule that integrates the phase")] = 0.02
 
     def __post_init__(self) -> None:
         if self.response_time:
@@ -198,7 +198,7 @@ class RampedCircle(_Ramped):
     type: Annotated[Literal["ramped_circle"], doc("kind of course: a circle flown up to a speed and back to rest")]
     plane: Annotated[
         Literal["level", "vertical"],
-        doc("vertical: upside down at the top, where it is fast enough; the heading is free"),
+        doc("vertical: upside down at the top if fast enough; the heading is free"),
     ] = "level"
 
     def __post_init__(self) -> None:

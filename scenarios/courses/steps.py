@@ -21,9 +21,9 @@ from scenarios.courses.course import Course, Filtered
 class Window:
     """A value held strictly between two instants.  Eq. (30)."""
 
-    start: Annotated[Number, doc("[s] when it begins; at that instant the value does not hold yet")]
-    stop: Annotated[Number, doc("[s] when it ends; at that instant the value holds no longer")]
-    value: Annotated[Number, doc("[m], or [deg] for yaw, held in between")]
+    start: Annotated[Number, doc("[s] start, exclusive: at that instant the axis does not yet have the value")]
+    stop: Annotated[Number, doc("[s] end, exclusive: at that instant the axis no longer has the value")]
+    value: Annotated[Number, doc("[m], or [deg] for yaw: the value in between")]
 
     def __post_init__(self) -> None:
         if not self.start < self.stop:

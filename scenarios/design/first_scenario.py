@@ -78,7 +78,7 @@ class FirstScenario:
 
     @property
     def scenario(self) -> Scenario:
-        """To be flown."""
+        """The parsed scenario."""
         from scenarios.loading import parse_scenario
 
         return parse_scenario(self.to_data())

@@ -1,4 +1,4 @@
-"""What all tables of the scenario file share: strictness, kinds of numbers, and how their fields are declared.
+"""Common parts of all tables of the scenario file: strictness, number types, declaration of fields.
 
 A table is a frozen dataclass, its only declaration; see `quadsim.fields`.
 """
@@ -22,16 +22,16 @@ LARGEST_SEED: Final = 2**63 - 1  # the largest whole number that every reader of
 STRICT: Final = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 _FIRST: Final = {"at": 0, "type": 1}
-"""Fields that stand first in a table, which may have been added to those of a dataclass."""
+"""Fields that come first in a table, even where a subclass adds them."""
 
 
 def is_table(kind: object) -> TypeGuard[type[Any]]:
-    """Whether a type is one of tables."""
+    """Return whether a type is a table."""
     return isinstance(kind, type) and dataclasses.is_dataclass(kind)
 
 
 def fields_of(table: type[Any]) -> dict[str, FieldInfo]:
-    """The fields of a table by their names, with types, limits, defaults and descriptions."""
+    """Return the fields of a table by name, with types, limits, defaults and descriptions."""
     return _declared(table)  # type: ignore[arg-type]
 
 

@@ -1,4 +1,4 @@
-"""`base = "paper-constrained"`: a scenario file that holds only its differences from another one."""
+"""`base = "paper-constrained"`: a scenario file with only its differences from another one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scenarios.plugin import located
 from scenarios.schema.settings import note_changes, state_bounds
 
 LARGEST_FILE: Final = 8_000_000
-"""Size [bytes] of the largest file that is read; the longest scenario there can be is smaller."""
+"""Size [bytes] of the largest file that is read; the longest possible scenario is smaller."""
 
 
 def locate_files(data: dict[str, Any], directory: Path) -> None:
@@ -35,7 +35,7 @@ def read_scenario(
     locate: Callable[[dict[str, Any], Path], None] = locate_files,
     above: tuple[Path, ...] = (),
 ) -> dict[str, Any]:
-    """A scenario file's tables, merged over those of its base, and that one's base, and so on.
+    """Return a scenario file's tables, merged over its base, the base of that, and so on.
 
     `find` gives the file that a name means; `locate` makes the paths in a base independent of its folder, in place;
     `above` are the files that led here.
@@ -60,7 +60,7 @@ def read_scenario(
     locate(inherited, base.parent)
     if "controller" in data:
         state_bounds(inherited, data["controller"])
-    # The base's place in the library is its own.
+    # Group and expected verdict are not inherited.
     merged = merge({key: value for key, value in inherited.items() if key not in ("group", "expect")}, data)
     if "description" not in data:
         note_changes(merged, data)
@@ -68,13 +68,13 @@ def read_scenario(
 
 
 def _find_base(path: Path, name: str, find: Callable[[str], Path]) -> Path:
-    """A base beside the file that names it, or elsewhere."""
+    """Return the path of a base: beside the file that names it, or in the library."""
     beside = path.parent / name
     return beside if name.endswith(".toml") and beside.is_file() else find(name)
 
 
 def replaced_tables(path: Path, find: Callable[[str], Path]) -> dict[str, str]:
-    """Tables that stand instead of their base's, being of another `type`: what that was, and where, by their names."""
+    """Return, by name, tables that replace the base's because their `type` differs: the old type and its file."""
     data = _read(path)
     if "base" not in data:
         return {}
@@ -85,14 +85,14 @@ def replaced_tables(path: Path, find: Callable[[str], Path]) -> dict[str, str]:
 
 
 def retyped(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, str]:
-    """The type that each table had which is of another one afterwards, by the table's name."""
+    """Return the former type of each table whose type changes, by the table's name."""
     kinds = {name: table["type"] for name, table in before.items() if isinstance(table, dict) and "type" in table}
     now = {name: table.get("type", kinds.get(name)) for name, table in after.items() if isinstance(table, dict)}
     return {name: kind for name, kind in kinds.items() if name in now and now[name] != kind}
 
 
 def read_whole(path: Path) -> dict[str, Any]:
-    """The tables of a scenario file that has no base, as the one in a run's directory: no other file is read for it.
+    """Return the tables of a scenario file without a base, as in a run directory; no other file is read.
 
     Raises:
         FileError: it cannot be read, or has a base.
@@ -104,7 +104,7 @@ def read_whole(path: Path) -> dict[str, Any]:
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """One table over another, field by field.
+    """Merge one table over another, field by field.
 
     A table of another `type` replaces the base's; entries of a list that have names are merged by name, new ones come
     after them; every other value replaces the base's.
@@ -128,7 +128,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """A file's tables, if a person can have meant it as a scenario."""
+    """Return a file's tables; refuse a file that is too large."""
     size = path.stat().st_size
     if size > LARGEST_FILE:
         raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
@@ -139,7 +139,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _named(value: Any) -> bool:
-    """Whether a value is a list of tables that all have names, each its own."""
+    """Return whether a value is a list of tables with distinct names."""
     if not (isinstance(value, list) and value and all(isinstance(entry, dict) for entry in value)):
         return False
     names = [entry.get("name") for entry in value]

@@ -1,4 +1,4 @@
-"""`[controller]`: the table of a controller, of the law that it names; a new one is a line here."""
+"""`[controller]`: the table of the law named by its type; add a new law to the union here."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from scenarios.schema.writing import plain
 
 
 def _law(controller: object) -> str | None:
-    """Which of the laws below a table is of; anything else is left for the message."""
+    """Return the tag of a table's law; an unknown law is left for the message."""
     law_name = controller.get("type") if isinstance(controller, Mapping) else getattr(controller, "type", None)
     if not isinstance(law_name, str):
         return None
@@ -52,18 +52,18 @@ TABLES: Final = {tag.tag: table for table, tag in map(get_args, get_args(get_arg
 LAWS: Final = tuple(name for name in TABLES if name != FORM)
 """The names of built-in controllers."""
 AnyController = Annotated[_Table, _OrName()]
-"""Any of the laws, distinguished by its type; one whose fields all have defaults may be given by its name alone."""
+"""Any law, distinguished by its type; a law whose fields all have defaults may be given by name only."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Holder:
-    """A table that has a controller, for messages to name it."""
+    """A table with a controller, so that messages name the field."""
 
     controller: AnyController
 
 
 def changed(controller: AnyController, fields: Mapping[str, Any]) -> AnyController:
-    """A controller of which some fields, by dotted path, have other values; with a `type` it is replaced whole.
+    """Return a controller with new values of some fields, by dotted path; a `type` replaces the whole table.
 
     Raises:
         ScenarioError: a field is not there, or its value is not allowed.

@@ -1,4 +1,4 @@
-"""`[[events]]`: what happens in flight, "at t = 12 s rotor 2 loses 20 %"."""
+"""`[[events]]`: timed events during the flight, "at t = 12 s rotor 2 loses 20 %"."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class SetpointEvent:
 
     at: Instant
     type: Annotated[Literal["setpoint"], doc("kind of event: setpoint")] = "setpoint"
-    x: Annotated[Number | None, doc("[m] world; absent: as before")] = None
-    y: Annotated[Number | None, doc("[m] world; absent: as before")] = None
-    z: Annotated[Number | None, doc("[m] world, upwards; absent: as before")] = None
-    yaw: Annotated[Number | None, doc("[deg]; absent: as before")] = None
+    x: Annotated[Number | None, doc("[m] world; absent: unchanged")] = None
+    y: Annotated[Number | None, doc("[m] world; absent: unchanged")] = None
+    z: Annotated[Number | None, doc("[m] world, upwards; absent: unchanged")] = None
+    yaw: Annotated[Number | None, doc("[deg]; absent: unchanged")] = None
 
     def __post_init__(self) -> None:
         if not self.values:
@@ -44,26 +44,26 @@ class SetpointEvent:
 
     @property
     def values(self) -> dict[str, float]:
-        """What is given, by the names of the axes; [m] and [rad]."""
+        """New values by axis [m, rad]."""
         values = {name: getattr(self, name) for name in REFERENCE_NAMES}
         scales = {"yaw": math.radians(1.0)}
         return {name: scales.get(name, 1.0) * value for name, value in values.items() if value is not None}
 
     def text(self) -> str:
-        """What happens, in words."""
+        """Return the event in words."""
         return f"set-point {', '.join(f'{name} {getattr(self, name):g} {_UNITS[name]}' for name in self.values)}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerEvent:
-    """The controller becomes another one, which goes on from what the one before it has learnt and planned."""
+    """The controller changes; the new one continues from the estimates and the plan of the one before."""
 
     at: Instant
     type: Annotated[Literal["controller"], doc("kind of event: controller")] = "controller"
     fields: Annotated[
         dict[str, Any],
         Len(1, 1000),
-        doc("fields of [controller], dotted, and their values from then on; with a type among them, all of it"),
+        doc("new values of fields of [controller], by dotted path; a type among them replaces the whole table"),
     ]
 
     def __post_init__(self) -> None:
@@ -73,7 +73,7 @@ class ControllerEvent:
                 raise ParameterError("", f"fields.{name}", value, rule)
 
     def text(self) -> str:
-        """What happens, in words."""
+        """Return the event in words."""
         return f"controller: {', '.join(f'{name} = {value}' for name, value in self.fields.items())}"
 
 
@@ -86,15 +86,15 @@ class SensorFaultEvent:
     sensor: Annotated[SensorText, doc("which sensor")]
     fault: Annotated[
         Literal["dropout", "freeze", "nan", "bias"],
-        doc("no samples, the last one again and again, samples that are no numbers, or an offset"),
+        doc("no samples, the last sample repeated, NaN samples, or an offset"),
     ]
-    duration: Annotated[Positive, doc("[s] how long")]
+    duration: Annotated[Positive, doc("[s] duration of the fault")]
     axes: Annotated[
         Annotated[tuple[Literal["x", "y", "z"], ...], Len(1, 3)] | None,
-        doc("of nan: which of its three numbers; absent: all"),
+        doc("for nan: affected axes; absent: all"),
     ] = None
     offset: Annotated[
-        Vector | None, doc("of a bias: [m], [m/s], [deg] or [deg/s], by axis, world frame or body axes")
+        Vector | None, doc("for bias: [m], [m/s], [deg] or [deg/s], by axis, world frame or body axes")
     ] = None
 
     def __post_init__(self) -> None:
@@ -106,7 +106,7 @@ class SensorFaultEvent:
             raise ParameterError("", "axes", list(self.axes), "different ones")
 
     def text(self) -> str:
-        """What happens, in words."""
+        """Return the event in words."""
         return f"the {self.sensor} sensor {_FAULTS[self.fault]}"
 
 

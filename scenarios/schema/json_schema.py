@@ -22,11 +22,11 @@ BASE: Final = {
     "description": "a scenario's name, or a path ending in .toml, over which this file is merged field by field",
 }
 _TABLES: Final = "#/$defs/"
-_PARTIAL: Final = "Partial"  # how the names of tables begin of which a part may be given
+_PARTIAL: Final = "Partial"  # prefix of tables that may be given in part
 
 
 class _SchemaOfToml(GenerateJsonSchema):
-    """Fields under their own names alone, and none that is null: TOML leaves out what is absent."""
+    """Schema without titles and nulls: TOML leaves out absent fields."""
 
     schema_dialect = DIALECT
 
@@ -35,7 +35,7 @@ class _SchemaOfToml(GenerateJsonSchema):
         return False
 
     def nullable_schema(self, schema: core_schema.NullableSchema) -> dict[str, Any]:
-        """What a field may be where it is not absent."""
+        """Return the schema of a present value."""
         return self.generate_inner(schema["schema"])
 
     def dataclass_schema(self, schema: core_schema.DataclassSchema) -> dict[str, Any]:
@@ -48,7 +48,7 @@ class _SchemaOfToml(GenerateJsonSchema):
         return json_schema
 
     def field_is_required(self, field: Any, total: bool) -> bool:
-        """Whether a table has to state a field: its type too, although Python's default is its only value."""
+        """Whether a table must state a field; this includes its type, although that has only one value."""
         named = field.get("name") == "type" and field["schema"].get("default") != DEFAULT
         return named or super().field_is_required(field, total)
 
@@ -89,7 +89,7 @@ def scenario_schema() -> dict[str, Any]:
 
 
 def _loosened(schema: Any) -> Any:
-    """A part of the schema with nothing required, and of several kinds any that fits."""
+    """Return a part of the schema with nothing required and any fitting kind allowed."""
     if isinstance(schema, list):
         return [_loosened(entry) for entry in schema]
     if isinstance(schema, str):

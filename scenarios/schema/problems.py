@@ -1,4 +1,4 @@
-"""What is wrong with a scenario file, in lines a person can act on: each says what the declaration allows."""
+"""Messages about the errors in a scenario file: one line per field, with the allowed values."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from scenarios.schema.base import STRICT, fields_of, is_table
 
 Table = TypeVar("Table")
 
-_LISTS: Final = (list, tuple, Sequence)  # types that are lists in a file
+_LISTS: Final = (list, tuple, Sequence)  # types written as lists in a file
 _TAGS: Final = ("type", "distribution")  # fields that distinguish tables
 _NAMES: Final = {float: "number", int: "whole number", str: "text"}
 _LIMITS: Final = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
@@ -33,43 +33,43 @@ _REASONS: Final = {
     "controller.compiled": " with this controller: only MPC with fixed matrices (unconstrained, constrained, robust) "
     "can be compiled"
 }
-"""Why some fields are not there where a reader may expect them."""
+"""Reasons why a controller lacks a field that a reader may expect."""
 _KNOWN: Final = frozenset(get_args(core_schema.ErrorType))  # pydantic's kinds of error; a custom one states its rule
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """One of the types that a value may have."""
+    """One of the allowed types of a value."""
 
-    type: Any  # less its annotations
-    metadata: tuple[Any, ...] = ()  # these annotations
+    type: Any  # without its annotations
+    metadata: tuple[Any, ...] = ()  # the annotations
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Names of the fields, of a table."""
+        """Names of a table's fields; none for other kinds."""
         return tuple(fields_of(self.type)) if is_table(self.type) else ()
 
     @property
     def is_list(self) -> bool:
-        """Whether it is a list in a file."""
+        """Whether it is written as a list in a file."""
         return (get_origin(self.type) or self.type) in _LISTS
 
     @property
     def entries(self) -> tuple[Kind, ...]:
-        """What a list, or a table with names of the writer's choice, holds."""
+        """Kinds of the entries of a list, or of a table with free names."""
         origin, arguments = get_origin(self.type), get_args(self.type)
         return kinds_of(arguments[0] if origin is tuple else arguments[-1]) if origin in (*_LISTS, dict) else ()
 
     @property
     def choices(self) -> tuple[Any, ...]:
-        """The values that there are, where they are listed."""
+        """Allowed values, if they are enumerated."""
         if isinstance(self.type, type) and issubclass(self.type, Enum):
             return tuple(member.value for member in self.type)
         return get_args(self.type) if get_origin(self.type) is Literal else ()
 
     @property
     def labels(self) -> set[str]:
-        """What pydantic calls this kind among several."""
+        """Names that pydantic gives this kind in a union."""
         tags = {note.tag for note in self.metadata if isinstance(note, Tag)}
         for name in {*_TAGS} & {*self.fields}:
             tags |= {str(choice) for kind in kinds_of(fields_of(self.type)[name].annotation) for choice in kind.choices}
@@ -77,16 +77,16 @@ class Kind:
 
     @property
     def limits(self) -> dict[str, Any]:
-        """Its limits, by the names that annotated_types has for them."""
+        """Limits by the names of annotated_types."""
         return dict(_limits(self.metadata))
 
     @property
     def lengths(self) -> tuple[int, float]:
-        """The least and the largest number of entries of a list, or characters of a text."""
+        """Smallest and largest number of a list's entries or a text's characters."""
         return self.limits.get("min_length") or 0, self.limits.get("max_length") or math.inf
 
     def __str__(self) -> str:
-        """What is allowed, as the end of "must be ..."."""
+        """Return what is allowed, to end the sentence "must be ..."."""
         if self.choices:
             *rest, last = ("false" if choice is False else repr(choice) for choice in self.choices)
             return f"one of {', '.join(rest)} or {last}" if rest else last
@@ -104,7 +104,7 @@ class Kind:
 
 
 def _limits(notes: Iterable[Any]) -> Iterator[tuple[str, Any]]:
-    """The limits that notes of a field set, by annotated_types' and pydantic's names for them."""
+    """Yield the limits in a field's annotations, by the names of annotated_types and pydantic."""
     for note in notes:
         if isinstance(note, FieldInfo):
             yield from _limits(note.metadata)
@@ -131,23 +131,23 @@ class Place:
     """A place in the file."""
 
     names: tuple[str, ...]  # from the root; an entry of a list by its name, or else by its index
-    kinds: tuple[Kind, ...]  # what may stand there; none where nothing may
-    given: Any  # what stands there
+    kinds: tuple[Kind, ...]  # allowed kinds; empty where nothing is allowed
+    given: Any  # the value in the file
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Names of all fields of the tables that may stand there."""
+        """Names of all fields of the tables allowed there."""
         return tuple(dict.fromkeys(name for kind in self.kinds for name in kind.fields))
 
     @property
     def is_of_wrong_length(self) -> bool:
-        """Whether a list is given that is too short or too long."""
+        """Whether the value is a list that is too short or too long."""
         lists = [kind.lengths for kind in self.kinds if kind.is_list]
         return isinstance(self.given, list) and not any(low <= len(self.given) <= high for low, high in lists)
 
 
 def find(path: Sequence[int | str], data: Any, root: type[Any]) -> Place:
-    """The place of a path of pydantic's in a file that is to be a `root`."""
+    """Return the place of one of pydantic's paths in a file of type `root`."""
     names: list[str] = []
     kinds: tuple[Kind, ...] = (Kind(type=root),)
     for part in path:
@@ -164,12 +164,12 @@ def find(path: Sequence[int | str], data: Any, root: type[Any]) -> Place:
             names.append(part)
             data = data.get(part) if isinstance(data, Mapping) else None
             inner = [kinds_of(field.annotation, tuple(field.metadata)) for field in fields]
-            kinds = tuple(kind for each in inner or [kind.entries for kind in kinds] for kind in each)
+            kinds = tuple(kind for group in inner or [kind.entries for kind in kinds] for kind in group)
     return Place(names=tuple(names), kinds=kinds, given=data)
 
 
 def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...]:
-    """All that a field's type allows, less None, which is a field that is absent."""
+    """Return the kinds that a field's type allows, without None, which means absent."""
     origin = get_origin(annotation)
     if origin is Annotated:
         inner, *notes = get_args(annotation)
@@ -179,10 +179,10 @@ def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...
     return () if annotation is NoneType else (Kind(type=annotation, metadata=metadata),)
 
 
-_MOST_LINES: Final = 20  # problems that one message names; it only counts the rest
+_MOST_LINES: Final = 20  # problems listed in one message; the rest are counted
 _MOST_ENTRIES: Final = 10
 _LONGEST: Final = 200
-"""Entries, and characters, that a message shows of what was given."""
+"""Entries and characters of a given value that a message shows."""
 _DEEPEST_SHOWN: Final = 4
 
 
@@ -190,7 +190,7 @@ class ScenarioError(InputError):
     """A scenario file that cannot be flown.
 
     Attributes:
-        problems: one line per field, each naming it, what was given and what is allowed.
+        problems: one line per field, with its name, the given value and the allowed ones.
     """
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
@@ -201,10 +201,10 @@ class ScenarioError(InputError):
 
 
 def parse_table(kind: type[Table], data: Mapping[str, Any], source: str, *, file: str = "scenario") -> Table:
-    """Nested tables as the table that a class declares.
+    """Parse nested tables as an instance of a table class.
 
     Raises:
-        ScenarioError: naming every field that is wrong; the message starts with `source`.
+        ScenarioError: the message starts with `source` and names every invalid field.
     """
     try:
         table: Table = adapter(cast(Any, kind)).validate_json(json.dumps(data, default=lambda _: math.inf))
@@ -215,7 +215,7 @@ def parse_table(kind: type[Table], data: Mapping[str, Any], source: str, *, file
 
 @functools.cache
 def adapter(kind: Any) -> TypeAdapter[Any]:
-    """What reads tables of a kind: strictly, and none of their fields unknown."""
+    """Return the strict parser of a table class, which refuses unknown fields."""
     kind.__pydantic_config__ = STRICT  # of tables within, too
     return TypeAdapter(kind)
 
@@ -223,14 +223,14 @@ def adapter(kind: Any) -> TypeAdapter[Any]:
 def describe_all(
     error: ValidationError, data: Mapping[str, Any], root: type[Any], *, file: str = "scenario"
 ) -> list[str]:
-    """A line about each wrong field; of a list, that it is too long, or else which of its entries are wrong.
+    """Return a line about each invalid field; for a list, that it is too long, or its invalid entries.
 
-    Fields that are missing come last: what is missing may only be misspelt.  Arguments as for `describe`.
+    Missing fields come last, since they may only be misspelt.  Arguments as for `describe`.
     """
     lines: dict[tuple[str, ...], str] = {}
     whole: set[tuple[str, ...]] = set()  # lists of a wrong length, whose entries do not matter
     for details in sorted(error.errors(include_url=False), key=lambda details: details["type"] == "missing"):
-        for i, part in enumerate(details["loc"]):  # entries of a list that is too long are wrong beside the point
+        for i, part in enumerate(details["loc"]):  # where a list is too long, its entries do not matter
             if isinstance(part, int) and find(details["loc"][:i], data, root).is_of_wrong_length:
                 details = {**details, "loc": details["loc"][:i], "type": "too_long"}
                 break
@@ -247,7 +247,7 @@ def describe_all(
 
 
 def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *, file: str = "scenario") -> str:
-    """One line about one field of a file that is to be a `root`: its name, what is allowed, what was given."""
+    """Return one line about a field of a file of type `root`: its name, the allowed and the given value."""
     place = find(details["loc"], data, root)
     field, kind, given = ".".join(place.names), details["type"], place.given
     if kind == "missing":
@@ -265,7 +265,7 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *,
         if isinstance(cause, UnknownNameError):
             return f"{field}.{cause.kind}: {cause}"
         return ".".join([*place.names, str(cause)])
-    choices = [str(choice) for each in place.kinds for choice in each.choices]
+    choices = [str(choice) for allowed in place.kinds for choice in allowed.choices]
     rule = " or ".join(dict.fromkeys(map(str, place.kinds)))
     if kind.startswith("union_tag"):
         quoted = details["ctx"][
@@ -282,7 +282,7 @@ def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *,
 
 
 def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
-    """What was given, as it would be written in Python, cut to what a line can take."""
+    """Return a given value as Python source, shortened to fit on a line."""
     if isinstance(value, datetime.date | datetime.time):
         text = value.isoformat()
     elif isinstance(value, int) and value.bit_length() > 64:  # Python does not write out very long ones
@@ -292,10 +292,10 @@ def shown(value: object, depth: int = _DEEPEST_SHOWN) -> str:
     elif isinstance(value, Mapping | list) and depth == 0:
         text = "..."
     elif isinstance(value, Mapping):
-        entries = [f"{shown(key)}: {shown(each, depth - 1)}" for key, each in islice(value.items(), _MOST_ENTRIES)]
+        entries = [f"{shown(key)}: {shown(entry, depth - 1)}" for key, entry in islice(value.items(), _MOST_ENTRIES)]
         text = "{" + ", ".join([*entries, *(["..."] if len(value) > _MOST_ENTRIES else [])]) + "}"
     elif isinstance(value, list):
-        entries = [shown(each, depth - 1) for each in value[:_MOST_ENTRIES]]
+        entries = [shown(entry, depth - 1) for entry in value[:_MOST_ENTRIES]]
         text = "[" + ", ".join([*entries, *(["..."] if len(value) > _MOST_ENTRIES else [])]) + "]"
     else:
         text = repr(value)

@@ -41,10 +41,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class _Overrides:
-    """Parameters of `quadsim.vehicle.Vehicle`, each of which may be absent; units as in the vehicle's file."""
+    """Parameters of `quadsim.vehicle.Vehicle`, all optional; units as in the vehicle file."""
 
     def overrides(self) -> dict[str, Any]:
-        """The parameters that are given."""
+        """The parameters that are set."""
         values = {name: getattr(self, name) for name in VEHICLE_UNITS}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -55,7 +55,7 @@ _PARAMETERS: Final = [(name, _VEHICLE_TYPES[name] | None, field(default=None)) f
 
 @dataclass(frozen=True, kw_only=True)
 class _Modelled(_Overrides):
-    """Which vehicle file, and what in it to replace, for the model and the plant alike; units as in the file."""
+    """Vehicle file, and parameters that replace those of the file, in model and plant; units as in the file."""
 
     file: Annotated[str, doc("a shipped vehicle's name, or a path ending in .toml, relative to the scenario file")]
 
@@ -70,25 +70,25 @@ else:
     ActualTable = make_dataclass("ActualTable", _PARAMETERS, bases=(_Overrides,), frozen=True, kw_only=True)
     VehicleTable.__doc__ = _Modelled.__doc__
     ActualTable.__doc__ = (
-        "The vehicle as it really is, where that is not as modelled: the plant has it, the controller does not know it."
+        "True parameters where they differ from the model: the plant uses them, the controller does not know them."
     )
     VehicleTable.__module__ = ActualTable.__module__ = __name__
 
 
 @dataclass(frozen=True, kw_only=True)
 class Initial:
-    """Where the flight starts, at rest."""
+    """Pose at the start of the flight, at rest."""
 
     position: Annotated[Vector, doc("[m] x, y, z in the world frame")] = (0.0, 0.0, 0.0)
     euler: Annotated[Vector, doc("[deg] roll, pitch, yaw")] = (0.0, 0.0, 0.0)
-    cold: Annotated[bool, doc("whether it starts on the ground with rotors at rest, u(-1) = 0; else from hover")] = (
+    cold: Annotated[bool, doc("true: start on the ground with rotors at rest, u(-1) = 0; false: start from hover")] = (
         False
     )
     on_reference: Annotated[
         bool,
         doc(
-            "whether it starts with velocity, attitude and body rates of the reference at t = 0 instead; only with "
-            "courses that state them (ramped_circle, ramped_lemniscate)"
+            "true: start with the velocity, attitude and body rates of the reference at t = 0; only for courses that "
+            "define them (ramped_circle, ramped_lemniscate)"
         ),
     ] = False
 
@@ -107,8 +107,8 @@ class Simulation:
     integrator: Annotated[
         Integrator,
         doc(
-            "mujoco: MuJoCo's Runge-Kutta step, forces that follow the motion held over it; rk4: that of a "
-            "free rigid body with all forces evaluated at each stage, for the rules of published simulations"
+            "mujoco: MuJoCo's Runge-Kutta step, with motion-dependent forces held over the step; rk4: Runge-Kutta "
+            "step of a free rigid body with all forces evaluated at each stage, as in published simulations"
         ),
     ] = "mujoco"
     limit_speeds: Annotated[bool, doc("whether rotors saturate at the vehicle's speed_min and speed_max")] = False
@@ -126,18 +126,20 @@ Off = Annotated[Literal[False], BeforeValidator(_false_alone)]
 
 @dataclass(frozen=True, kw_only=True)
 class Lost:
-    """When the flight is lost and ends, by the true state at each control sample; false switches a criterion off."""
+    """Criteria on the true state, at the control samples, that end the flight as lost; false switches one off."""
 
     tilt: Annotated[
         Annotated[float, Gt(0.0), Le(180.0)] | Off,
         doc(
-            "[deg] between the thrust axis and the vertical; at 120, half the thrust pulls down; false for "
-            "loops and flips"
+            "[deg] largest angle between the thrust axis and the vertical; at 120, half the thrust pulls down; false "
+            "for loops and flips"
         ),
     ] = 120.0
-    distance: Annotated[Positive | Off, doc("[m] from the reference at the same time")] = 100.0
-    depth: Annotated[Positive | Off, doc("[m] below the lowest of the start and the reference so far")] = 50.0
-    speed: Annotated[Positive | Off, doc("[m/s] in any direction")] = 50.0
+    distance: Annotated[Positive | Off, doc("[m] largest distance from the reference at the same time")] = 100.0
+    depth: Annotated[Positive | Off, doc("[m] largest depth below the lowest point of start and reference so far")] = (
+        50.0
+    )
+    speed: Annotated[Positive | Off, doc("[m/s] highest speed in any direction")] = 50.0
 
     @property
     def limits(self) -> dict[str, float]:
@@ -147,19 +149,19 @@ class Lost:
 
 LONGEST_FLIGHT: Final = 86_400.0
 MOST_STEPS: Final = 10_000_000
-"""Physics steps, and planned steps (periods times horizon), that one flight may take: each is held in memory."""
+"""Physics steps, and planned steps (periods times horizon), that one flight may take: all are kept in memory."""
 
 
 Verdict = Literal["satisfied", "violated", "lost", "aborted", "incomplete"]
 BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate_z", "speed", "slew")
-"""Signals that controllers may have bounds on."""
+"""Signals that controllers can bound."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Scenario:
-    """A flight: what flies, where, by which controller, and what is required of it."""
+    """A flight: vehicle, course, controller, effects, events and constraints."""
 
-    name: Annotated[str, MaxLen(80), doc("letters a-z, digits and . _ -; names the run's directory")] = field(
+    name: Annotated[str, MaxLen(80), doc("letters a-z, digits and . _ -; names the run directory")] = field(
         metadata={"pattern": r"^[a-z0-9][a-z0-9._-]*$"}
     )
     description: Annotated[str, doc("one line for `quadsim list`")]
@@ -167,26 +169,26 @@ class Scenario:
     expect: Annotated[
         Verdict,
         doc(
-            "its verdict, if all is right: satisfied (flown to its end, every required constraint holds), violated "
-            "(one does not, the vehicle crashes, or the controller ends in permanent fallback), lost (the flight ends "
-            "early, by a criterion of [lost] or otherwise), incomplete (it ends before the window of one begins)"
+            "expected verdict: satisfied (flown to its end, every required constraint satisfied), violated (one "
+            "violated, the vehicle crashes, or the controller ends in permanent fallback), lost (the flight ends "
+            "early, by a criterion of [lost] or otherwise), incomplete (it ends before a constraint's window starts)"
         ),
     ] = "satisfied"
     duration: Annotated[
         float,
         Gt(0.0),
         Le(LONGEST_FLIGHT),
-        doc("[s] whole control periods; absent: to the end of a course of turns or ramps"),
+        doc("[s] whole control periods; absent: until the course ends, if it has an end"),
     ] = math.inf
     control_period: Annotated[
         float,
         Gt(0.0),
         Le(10.0),
-        doc("[s] tau_s, time for which a command is held, a whole number of physics steps"),
+        doc("[s] tau_s, time for which a command is held; a whole number of physics steps"),
     ]
-    seed: Annotated[int, Ge(0), Le(LARGEST_SEED), doc("of everything random; recorded with the flight")] = 0
+    seed: Annotated[int, Ge(0), Le(LARGEST_SEED), doc("seed of everything random; recorded with the flight")] = 0
     log_rate: Annotated[
-        float, Ge(0.01), Le(1e6), doc("[Hz] rows of plant.parquet; the audit sees every physics step")
+        float, Ge(0.01), Le(1e6), doc("[Hz] row rate of plant.parquet; the audit uses every physics step")
     ] = 200.0
     vehicle: VehicleTable
     actual: ActualTable | None = None
@@ -198,31 +200,31 @@ class Scenario:
     forces: Annotated[
         tuple[PluginForce, ...],
         MaxLen(MOST_ENTRIES),
-        doc("your own forces on the vehicle, each code that is called once per physics step"),
+        doc("user-defined forces on the vehicle, called once per physics step"),
     ] = ()
     computation: Annotated[ComputationTime | None, doc("absent: commands take no time")] = None
     sensors: Annotated[SensorsSpec | None, doc("absent: the controller receives the true state")] = None
     estimator: Annotated[
-        EstimatorSpec | None, doc("absent: the controller receives the sensors' samples as they arrive")
+        EstimatorSpec | None, doc("absent: the controller receives the raw samples of the sensors")
     ] = None
-    events: Annotated[tuple[Event, ...], MaxLen(MOST_EVENTS), doc("what happens in flight")] = ()
+    events: Annotated[tuple[Event, ...], MaxLen(MOST_EVENTS), doc("timed events during the flight")] = ()
     lost: Lost = Lost()
     obstacles: Annotated[
         tuple[Annotated[AnyObstacle, Field(discriminator="type")], ...],
         MaxLen(MOST_ENTRIES),
-        doc("what the vehicle, a ball of its extent, must not touch: a touch is a crash"),
+        doc("solids; the vehicle, as a ball of radius vehicle.extent, crashes when it touches one"),
     ] = ()
     corridors: Annotated[
         tuple[Corridor, ...],
         MaxLen(MOST_ENTRIES),
-        doc("convex regions to stay in, each for a window of time or of the path"),
+        doc("convex regions to stay in during a window of time or of the path"),
     ] = ()
     keep_in: Annotated[Fence | None, doc("a convex region to stay in throughout; absent: none")] = None
     constraints: Annotated[
         tuple[Limit, ...],
         MaxLen(MOST_ENTRIES),
         doc(
-            "what the flight is audited against beside the controller's own bounds; an entry without bounds takes the "
+            "audited constraints, in addition to the controller's bounds; an entry without bounds takes the "
             "controller's"
         ),
     ] = ()
@@ -248,25 +250,25 @@ class Scenario:
         return scenario_html(self)
 
     def __dir__(self) -> list[str]:
-        """What a user sets and calls, which is what an interactive session completes to."""
+        """Return the fields and methods for users, for completion in an interactive session."""
         return [name for name in super().__dir__() if name in _FOR_USERS or name.startswith("__")]
 
     @property
     def ends_with_course(self) -> bool:
-        """Whether its duration is that of its course, and stated nowhere."""
+        """Whether the duration comes from the course rather than from the file."""
         return bool(vars(self).get("ends_with_course", False))
 
     def altered(self, **fields: Any) -> Scenario:
-        """The same with other values of whole fields, which nothing checks against one another; lists are tuples."""
+        """Return a copy with other values of whole fields, without checking consistency; lists become tuples."""
         other = copy.copy(self)
         vars(other).update({name: tuple(value) if isinstance(value, list) else value for name, value in fields.items()})
         return other
 
     def require_consistent(self) -> None:
-        """Refuse fields that do not go together, each of which may stand by itself.
+        """Refuse fields that are valid alone but inconsistent.
 
         Raises:
-            ValueError: so they are.
+            ValueError: two fields contradict each other.
         """
         for name, value, unit in (
             ("control_period", self.control_period, self.plant.timestep),
@@ -294,7 +296,7 @@ class Scenario:
             ("planned steps", self.periods * max(spec.horizon for spec in specs)),
         ):
             if count > MOST_STEPS:
-                raise ValueError(f"duration must make at most {MOST_STEPS} {what}; got {count} of them")
+                raise ValueError(f"duration must make at most {MOST_STEPS} {what}; got {count}")
         if self.initial.cold and not (self.effects.ground is not None and self.effects.ground.contact):
             raise ValueError("initial.cold must be false where effects.ground gives no floor to stand on; got true")
         check_sensing(self.sensors, self.estimator, timestep=self.plant.timestep)
@@ -310,7 +312,7 @@ class Scenario:
 
     @property
     def polytopes(self) -> tuple[Polytope, ...]:
-        """Those of its controller."""
+        """Polytopes of the controller."""
         return self.controller.polytopes
 
     @property
@@ -345,7 +347,7 @@ class Scenario:
 
     @property
     def controller_changes(self) -> list[tuple[float, AnyController]]:
-        """Each controller that takes over from the one before it, and when [s], in order of time."""
+        """Time [s] of each controller change and the new controller, in order of time."""
         changes: list[tuple[float, AnyController]] = []
         events = (event for event in self.events if isinstance(event, ControllerEvent))
         for event in sorted(events, key=lambda event: event.at):
@@ -353,7 +355,7 @@ class Scenario:
         return changes
 
     def controller_at(self, time: float) -> AnyController:
-        """The controller that flies at a time [s]."""
+        """Return the controller active at a time [s]."""
         controller = self.controller
         for at, spec in self.controller_changes:
             if at <= time + 1e-9:
@@ -362,12 +364,12 @@ class Scenario:
 
     @property
     def regions(self) -> tuple[Corridor | Fence, ...]:
-        """The corridors, then the fence."""
+        """Corridors, then the fence."""
         return (*self.corridors, *([] if self.keep_in is None else [self.keep_in]))
 
     @property
     def periods(self) -> int:
-        """K, control periods in the flight."""
+        """K, number of control periods in the flight."""
         return steps_per_period(self.duration, self.control_period)
 
     @property
@@ -382,10 +384,10 @@ class Scenario:
 
     @classmethod
     def parse(cls, data: Mapping[str, Any], *, source: str = "scenario") -> Scenario:
-        """Check a scenario given as nested tables.
+        """Parse and check a scenario given as nested tables.
 
         Raises:
-            ScenarioError: naming every field that is wrong.
+            ScenarioError: the message names every invalid field.
         """
         if isinstance(data.get("controller"), str):
             data = {**data, "controller": {"type": data["controller"]}}
@@ -397,15 +399,15 @@ class Scenario:
             raise InputError(f"a scenario must be one that can be written: {error}") from error
 
     def replace(self, changes: Mapping[Any, Any]) -> Scenario:
-        """A scenario that differs in some fields; this one stays as it is.
+        """Return a scenario with other values of some fields; this one is unchanged.
 
         Args:
-            changes: new values by dotted path, as for `--set`: an entry of a list of tables by its name, or else its
-                index.  Units as in the file; None for a field that is to be absent.  A tuple of paths gets one value
-                for all, or a tuple with a value for each.
+            changes: new values by dotted path, as after `--set`: an entry of a list of tables by its name, or else its
+                index.  Units as in the file; None removes a field.  A tuple of paths takes one value for all, or a
+                tuple of one value per path.
 
         Raises:
-            InputError: there is no such field, or a value is not allowed.
+            InputError: a field does not exist, or a value is not allowed.
 
         Examples:
             >>> import quadsim
@@ -427,13 +429,13 @@ class Scenario:
         return other.altered(reference=self.reference) if other.reference == self.reference else other
 
     def fly(self, **options: Any) -> Flight:
-        """Fly it; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
+        """Fly the scenario; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
         from scenarios.app import fly
 
         return fly(self, **options)
 
     def to_toml(self) -> str:
-        """The resolved file: every field, defaults included, with comments; parsing it gives this scenario again."""
+        """Return the resolved file: every field, defaults included, with comments; parsing it gives this scenario."""
         return to_toml(self)
 
 

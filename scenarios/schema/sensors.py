@@ -1,4 +1,4 @@
-"""`[sensors.position]` and so on, and `[estimator]`: what is measured, and how the state is estimated.
+"""`[sensors.position]` and the other sensors, and `[estimator]`.
 
 Numbers to start from:
 
@@ -25,8 +25,8 @@ from quadsim.sim.error_state import EstimatorSettings
 from quadsim.sim.sensing import Sampling, Sensor, SensorName
 
 Deviations = NonNegative | Annotated[tuple[NonNegative, ...], Len(3, 3)]
-"""One standard deviation for all three axes, or one each."""
-Offsets = Number | Vector  # one offset for all three axes, or one each
+"""One standard deviation for all three axes, or one per axis."""
+Offsets = Number | Vector  # one offset for all three axes, or one per axis
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +70,7 @@ AnySensorSpec = PositionSpec | VelocitySpec | AttitudeSpec | RatesSpec
 
 @dataclass(frozen=True, kw_only=True)
 class SensorsSpec:
-    """What measures the state; a sensor left out is perfect, or not there where there is an estimator."""
+    """Sensors of the state; without an estimator a missing sensor is perfect, with one it is absent."""
 
     position: Annotated[PositionSpec | None, doc("[m] in the world frame")] = None
     velocity: Annotated[VelocitySpec | None, doc("[m/s] in the world frame")] = None
@@ -78,7 +78,7 @@ class SensorsSpec:
     rates: Annotated[RatesSpec | None, doc("[deg/s] body rates")] = None
 
     def present(self) -> dict[SensorName, AnySensorSpec]:
-        """The sensors that there are."""
+        """Return the sensors of the scenario."""
         named = {name: getattr(self, name.value) for name in SensorName}
         return {name: spec for name, spec in named.items() if spec is not None}
 
@@ -94,7 +94,7 @@ def check_sensing(sensors: SensorsSpec | None, estimator: EstimatorSpec | None, 
     """Refuse sensors that do not fit the physics step, or that an estimator cannot work with.
 
     Raises:
-        ValueError: beginning with the field's name.
+        ValueError: the message starts with the field's name.
     """
     present = {} if sensors is None else sensors.present()
     for name, spec in present.items():

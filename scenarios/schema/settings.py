@@ -1,4 +1,4 @@
-"""Fields of a scenario's tables by dotted path: what `--set` replaces, and what a campaign draws."""
+"""Fields of a scenario's tables by dotted path, as `--set` replaces them and a campaign draws them."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any, Final
 from quadsim.assets import DEEPEST, parse_toml
 from quadsim.errors import InputError, ParameterError, UnknownNameError
 
-_CHANGED: Final = " (changed: "  # how the end of a description begins that says what was changed
+_CHANGED: Final = " (changed: "  # start of the list of changes at the end of a description
 NOT_DESCRIBED: Final = ("name", "description", "group", "expect", "seed")
-"""Fields that a description says nothing about."""
+"""Fields whose changes a description does not list."""
 _LONGEST: Final = 60  # characters of a value that a description shows
 
 
@@ -19,7 +19,7 @@ def apply_setting(data: dict[str, Any], setting: str) -> None:
     """Apply one `dotted.path=value` to a scenario's tables; see `set_field`.
 
     Raises:
-        ParameterError: the text is not of that form, or the path goes through something that is no table.
+        ParameterError: the text is not of that form, or the path leads through something that is not a table.
     """
     path, equals, text = setting.partition("=")
     keys = path.strip().split(".")
@@ -42,11 +42,11 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
 
     An entry of a list of tables is addressed by its name, as in `constraints.roll.upper`, or, where it has none, by its
     index, as in `events.0.at`; a number of a list by its index, as in `initial.euler.2`.
-    None is a field that is to be absent.  `source` of the request, and what was `given`, are for the message.
+    None removes the field.  `source` and `given`, the request as written, are for the message.
 
     Raises:
-        ParameterError: the path goes through something that is no table.
-        UnknownNameError: a list has no such entry.
+        ParameterError: the path leads through something that is not a table.
+        UnknownNameError: a list does not have the entry.
     """
     if path in ("controller", "controller.type"):
         state_bounds(data, value if path == "controller" else {"type": value})
@@ -63,7 +63,7 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
 
 
 def separate(changes: Mapping[Any, Any], *, source: str) -> dict[str, Any]:
-    """Changes by field: a tuple of fields shares one value, or has a tuple with a value for each of them.
+    """Return changes by field: a tuple of fields shares one value, or has a tuple of one value per field.
 
     Raises:
         ParameterError: a tuple of values has another length than its fields.
@@ -82,7 +82,7 @@ def separate(changes: Mapping[Any, Any], *, source: str) -> dict[str, Any]:
 
 
 def state_bounds(data: dict[str, Any], controller: Any) -> None:
-    """Write a controller's bounds into the constraints that take them, where another law without these replaces it."""
+    """Write the bounds that constraints took from a controller into them, when a law without these replaces it."""
     before, after = data.get("controller"), {"type": controller} if isinstance(controller, str) else controller
     if not (isinstance(before, dict) and isinstance(after, dict)) or after.get("type") in (None, before.get("type")):
         return
@@ -101,7 +101,7 @@ def _table(data: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 
 def note_change(data: dict[str, Any], path: str, value: Any) -> None:
-    """Say in a scenario's description, where it has one, that a field was changed, and to what; the last one counts."""
+    """Note the new value of a field in a scenario's description, if it has one; a later change replaces an earlier."""
     description = data.get("description")
     if not isinstance(description, str) or path in NOT_DESCRIBED:
         return
@@ -113,19 +113,19 @@ def note_change(data: dict[str, Any], path: str, value: Any) -> None:
 
 
 def note_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> None:
-    """The same of all fields of some tables that were merged over the scenario's."""
+    """Note every field of tables that were merged over a scenario's; see `note_change`."""
     for path, value in leaves(changes):
         note_change(data, path, value)
 
 
 def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:
-    """The fields in which nested tables differ, by dotted path, with the value of each; None where one has no such."""
+    """Return fields in which nested tables differ: dotted path and both values, None where one lacks the field."""
     a, b = dict(leaves(first, entries=True)), dict(leaves(second, entries=True))
     return [(path, a.get(path), b.get(path)) for path in {**a, **b} if a.get(path) != b.get(path)]
 
 
 def leaves(data: Mapping[str, Any], above: str = "", *, entries: bool = False) -> Iterator[tuple[str, Any]]:
-    """Numbers, texts and lists of nested tables, by dotted path as of `set_field`; of lists, if so, all `entries`."""
+    """Yield numbers, texts and lists of nested tables by dotted path, as in `set_field`; `entries`: also of lists."""
     for key, value in data.items():
         below: Any = value
         if isinstance(value, list | tuple) and value and all(isinstance(e, Mapping) and "name" in e for e in value):
@@ -139,7 +139,7 @@ def leaves(data: Mapping[str, Any], above: str = "", *, entries: bool = False) -
 
 
 def shown(value: Any) -> str:
-    """A value on one line, numbers to six digits; None for a field that is absent."""
+    """Return a value on one line, numbers to six digits; None is an absent field."""
     if value is None:
         return "absent"
     text = f"{value:.6g}" if isinstance(value, float) else json.dumps(value, default=str)
@@ -148,7 +148,7 @@ def shown(value: Any) -> str:
 
 
 def get_field(data: dict[str, Any], path: str) -> Any:
-    """The value of a field; None where it is absent.
+    """Return the value of a field, or None where it is absent.
 
     Raises:
         ParameterError, UnknownNameError: as `set_field`.
@@ -162,7 +162,7 @@ def get_field(data: dict[str, Any], path: str) -> Any:
 
 
 def _holder(data: dict[str, Any], through: list[str], *, source: str, given: str) -> dict[str, Any] | list[Any]:
-    """The table or list at the end of a path."""
+    """Return the table or list at the end of a path."""
     holder: Any = data
     for depth, key in enumerate(through):
         if isinstance(holder, list):
@@ -177,7 +177,7 @@ def _holder(data: dict[str, Any], through: list[str], *, source: str, given: str
 
 
 def _index(entries: list[Any], where: str, key: str) -> int:
-    """The place of a list's entry, by its name, or else its index."""
+    """Return the position of a list's entry from its name, or from its index."""
     names = [str(entry.get("name", i)) if isinstance(entry, dict) else str(i) for i, entry in enumerate(entries)]
     if key not in names:
         raise UnknownNameError(f"entry of {where}", key, names)

@@ -17,29 +17,29 @@ from pydantic.fields import FieldInfo
 from scenarios.schema.base import fields_of, is_table
 
 WIDTH: Final = 120
-"""No line is longer for its comment's sake: a comment that does not fit beside its field stands above it."""
+"""Longest line with a comment; a comment that does not fit beside its field is written above it."""
 _LONG: Final = 76  # a list that is longer takes a line per entry
 
 
 def headline(model: type[Any]) -> str:
-    """What a table is, in one line: the first of its class's docstring, less its full stop."""
+    """Return the first line of a table class's docstring, without its full stop."""
     return (model.__doc__ or "").strip().partition("\n")[0].removesuffix(".")
 
 
 def tables_in(annotation: Any) -> tuple[type[Any], ...]:
-    """The kinds of table that a field's type is or holds: several for a union of them, none for numbers and texts."""
+    """Return the table classes in a field's type: several for a union, none for numbers and texts."""
     if is_table(annotation):
         return (annotation,)
     return tuple(model for argument in get_args(annotation) for model in tables_in(argument))
 
 
 def is_absent(value: object) -> bool:
-    """Whether a field with this value is left out of a file: one without a value, or an infinite bound."""
+    """Return whether a file leaves out a field with this value: None, or an infinite bound."""
     return value is None or (isinstance(value, float) and math.isinf(value))
 
 
 def plain(value: Any) -> Any:
-    """Tables and lists as JSON and TOML hold them, without what is absent."""
+    """Return tables and lists as in JSON and TOML, without absent fields."""
     if is_table(type(value)):
         value = {name: getattr(value, name) for name in fields_of(type(value))}
     if isinstance(value, Mapping):
@@ -48,12 +48,12 @@ def plain(value: Any) -> Any:
 
 
 def to_toml(model: Any) -> str:
-    """A model as a TOML document."""
+    """Return a table as a TOML document."""
     return "\n".join(_lines(model, "", set())) + "\n"
 
 
 def _lines(model: Any, path: str, explained: set[object]) -> Iterator[str]:
-    """A table: first its numbers, texts and small lists, then the tables below it, each in the model's order."""
+    """Yield the lines of a table: numbers, texts and small lists, then its subtables, in order of declaration."""
     below: list[tuple[str, Any, str]] = []
     for name, field in sorted(fields_of(type(model)).items(), key=_type_first):
         value, kinds = getattr(model, name), tables_in(field.annotation)
@@ -88,7 +88,7 @@ def _lines(model: Any, path: str, explained: set[object]) -> Iterator[str]:
 
 
 def _about_entries(kinds: Sequence[type[Any]]) -> Iterator[str]:
-    """The comments of the tables in a small list; of several kinds the fields' names alone."""
+    """Yield the comments on the tables in a small list; for several kinds only the fields' names."""
     for kind in kinds:
         if len(kinds) > 1:
             names = ", ".join(_labelled(name, info) for name, info in sorted(fields_of(kind).items(), key=_type_first))
@@ -104,7 +104,7 @@ def _type_first(field: tuple[str, FieldInfo]) -> bool:
 
 
 def _labelled(name: str, info: FieldInfo) -> str:
-    """A field's name, and of one that distinguishes types its value too."""
+    """Return a field's name; for a type field with its value."""
     choices = get_args(info.annotation) if get_origin(info.annotation) is Literal else ()
     return f'{name} = "{choices[0]}"' if name == "type" and len(choices) == 1 else name
 
@@ -114,7 +114,7 @@ def _pair(name: str, value: Any) -> str:
 
 
 def _text(value: Any) -> str:
-    """A number, a text, or a list or small table of them."""
+    """Return a number, a text, a list or a small table as TOML."""
     if is_table(type(value)):
         value = {name: entry for name in fields_of(type(value)) if not is_absent(entry := getattr(value, name))}
     if isinstance(value, Mapping):
@@ -127,7 +127,7 @@ def _text(value: Any) -> str:
 
 
 def _commented(text: str, comment: str) -> list[str]:
-    """A line with its comment beside it, or above it where that is long."""
+    """Return a line with its comment beside it, or above it if it is long."""
     line = f"{text}  # {comment}" if comment else text
     return [line] if len(line) <= WIDTH and "\n" not in text else [*_wrapped(comment), text]
 

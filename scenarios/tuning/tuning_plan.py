@@ -205,7 +205,7 @@ class TuningPlan:
         return values
 
     def check(self) -> None:
-        """Refuse, before anything is flown, what cannot be.
+        """Refuse, before the first flight, values that cannot be flown.
 
         Raises:
             InputError: an entry of `[[search]]`, at an end of its range, cannot be flown, or changes what flights are

@@ -179,7 +179,7 @@ def test_a_custom_law_flies(hover: Scenario) -> None:
     [
         (3.0, "a class or an object with a method step"),
         (lambda state, reference: state, r"or a function law.*; got the function .*<lambda>\(state, reference\)"),
-        (functools.partial(Gentle, 0.5), "named arguments alone"),
+        (functools.partial(Gentle, 0.5), "keyword arguments only"),
         (functools.partial(Gentle, shade=0.5), "unexpected keyword argument 'shade'"),
     ],
 )
@@ -315,7 +315,7 @@ def test_a_custom_law_is_sent_to_other_processes_by_its_place(
     def local(now: StepInputs, state: Array, reference: Array) -> Array:
         return np.zeros(4)
 
-    for law, message in ((local, "at the top of a module"), (object(), "at the top of a module")):
+    for law, message in ((local, "at the top level of a module"), (object(), "at the top level of a module")):
         with pytest.raises(ParameterError, match=message):
             quadsim.sweep(hover, {"vehicle.mass": [4.0]}, controller=law, workers=1)
 

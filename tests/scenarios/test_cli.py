@@ -183,7 +183,7 @@ LOST = ["--set", "initial.euler=[60.0, 0.0, 0.0]"]
         (LOST, "lost", True, "lost, as the scenario expects: at t = 0.000 s"),
     ],
 )
-def test_the_outcome_is_held_against_what_the_scenario_expects(
+def test_the_outcome_is_compared_with_what_the_scenario_expects(
     here: Path, capsys: pytest.CaptureFixture[str], settings: list[str], expect: str, as_expected: bool, line: str
 ) -> None:
     """What was expected changes no exit status: 0 is for constraints that hold."""

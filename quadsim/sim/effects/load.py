@@ -53,7 +53,7 @@ Factor = Annotated[float, Ge(0.05), Le(20.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class MassChange:
-    """The vehicle's own mass changes; payloads stay."""
+    """The vehicle's mass, without payloads, changes."""
 
     at: Instant
     type: Annotated[Literal["mass"], doc("kind of event: mass")] = "mass"

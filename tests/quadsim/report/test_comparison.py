@@ -142,7 +142,7 @@ def test_markdown_has_a_line_per_row_and_escapes_bars(short_run: Run, worse_run:
         ("aborted", 1.0, "lost", "lost, as expected", Mark.NONE),
     ],
 )
-def test_a_verdict_is_held_against_the_one_the_scenario_states(
+def test_a_verdict_is_compared_with_the_one_the_scenario_states(
     bare_run: Run, status: str, margin: float, expected: str, text: str, mark: Mark
 ) -> None:
     constraints = [with_margin(bare_run.summary["constraints"][0], margin)]

@@ -21,7 +21,7 @@ from quadsim.outputs import SUMMARY_FILE, Growing
 from scenarios.campaign import campaign as module
 from scenarios.campaign import store as records
 from scenarios.campaign.campaign import CampaignResult as Result
-from scenarios.campaign.campaign import Standing, held_against, recorded_flight
+from scenarios.campaign.campaign import Standing, compare_replay, recorded_flight
 from scenarios.campaign.campaign_file import Choice
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.rows import Row, read_table
@@ -363,14 +363,14 @@ def test_a_replayed_flight_gives_the_campaigns_numbers(by_two: Result) -> None:
     for number in (None, 0, 7):
         recorded = recorded_flight(by_two.directory, number)
         flight = Rollout(recorded.scenario).fly()
-        assert held_against(flight, recorded).differing == []
+        assert compare_replay(flight, recorded).differing == []
         assert flight.log.control.t.size == 10
 
 
 def test_a_replay_reports_when_numbers_differ(whole: Result, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded = recorded_flight(whole.directory, 3)
     other = replace(recorded, row={**recorded.row, "rmse.z": 0.0, "draw.mass": 0.0, "gone": 1.0})
-    assert sorted(held_against(Rollout(other.scenario).fly(), other).differing) == ["draw.mass", "gone", "rmse.z"]
+    assert sorted(compare_replay(Rollout(other.scenario).fly(), other).differing) == ["draw.mass", "gone", "rmse.z"]
     monkeypatch.setattr(records, "code_digest", lambda: "sha256:other")
     assert recorded_flight(whole.directory, 3).notes == ["other code flew that campaign, so numbers may differ"]
 
