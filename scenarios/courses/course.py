@@ -1,4 +1,4 @@
-"""What a course is: a position and a yaw at any time; and what the tables `[reference]` of all types share."""
+"""Courses: a position and a yaw at any time; common fields of the tables `[reference]`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from quadsim.state import Array
 EXACT: Final = (0.0, 0.0, 0.0, 0.0)
 MOST_POINTS: Final = 200  # points or turns of one course; a longer one is a table, `type = "csv"`
 CLOSEST: Final = 1e-3
-"""Least distance [m] between points that a speed leads from one to the other, and least time [s] between points."""
+"""Smallest distance [m] between points joined at a speed, and smallest time [s] between points."""
 
 Speed = Annotated[float, Ge(1e-3), Le(1e4)]  # of travel [m/s], or of turning [deg/s]
 Time = Annotated[float, Ge(CLOSEST), Le(1e6)]
@@ -28,7 +28,7 @@ Derivatives = Callable[[Array], tuple[Array, Array]]
 
 @dataclass(frozen=True, kw_only=True)
 class Path:
-    """Poses from a beginning at time 0 to an end."""
+    """Poses from time 0 to an end."""
 
     pose: Callable[[Array], Array]  # times (M,) within [0, duration] [s] -> (M, 4) x, y, z [m], yaw [rad], world
     duration: float  # [s]
@@ -53,7 +53,7 @@ class Course:
 
 
 def begin(path: Path, *, start: float, initial: Array) -> Course:
-    """The course that is `initial` (4,) until `start` [s], then the path, and stays at the path's end.
+    """Return the course that is `initial` (4,) until `start` [s], then follows the path and stays at its end.
 
     A path that begins elsewhere makes the course jump at its start.
     """
@@ -92,7 +92,7 @@ class Filtered:
     response_time: Annotated[NonNegative, doc("[s] tau_r of Eq. (31); 0 for no filter")] = 0.0
 
     def build(self, initial: Array, gravity: float) -> Course:
-        """The course before its filter, from the initial pose (4,) x, y, z [m], yaw [rad]; gravity in m/s^2.
+        """Return the course before its filter, from the initial pose (4,) x, y, z [m], yaw [rad]; gravity in m/s^2.
 
         Raises:
             InputError: its file is wrong, or it does not suit the initial pose.
@@ -111,7 +111,7 @@ class Started(Filtered):
         return begin(self.path(initial, gravity), start=self.start, initial=initial)
 
     def path(self, initial: Array, gravity: float) -> Path:
-        """What begins at `start`; arguments and errors as of `build`."""
+        """Return the path that starts at `start`; arguments and errors as in `build`."""
         raise NotImplementedError
 
 
@@ -124,7 +124,7 @@ class Point:
 
 
 def poses_of(points: Sequence[Point], initial: Array) -> Array:
-    """(n, 4) x, y, z [m], yaw [rad] of points; a yaw that is left out is that before."""
+    """Return x, y, z [m], yaw [rad] of points (n, 4); a missing yaw is that of the point before."""
     poses, yaw = [], float(initial[3])
     for point in points:
         yaw = yaw if point.yaw is None else math.radians(point.yaw)
@@ -133,7 +133,7 @@ def poses_of(points: Sequence[Point], initial: Array) -> Array:
 
 
 def require_one(**fields: object) -> None:
-    """Refuse two fields of which not exactly one is given."""
+    """Refuse two fields unless exactly one is given."""
     first, second = fields
     present = {name: value for name, value in fields.items() if value is not None}
     if len(present) != 1:
@@ -141,7 +141,7 @@ def require_one(**fields: object) -> None:
 
 
 def require_apart(points: Sequence[Point], advice: str) -> None:
-    """Refuse points at the place of the point before: no speed leads from one to the other."""
+    """Refuse consecutive points at the same position, which no speed can join."""
     for i, (before, after) in enumerate(pairwise(points), start=1):
         if math.dist(before.position, after.position) < CLOSEST:
             rule = f"{CLOSEST} m or more from {list(before.position)}, the point before it ({advice})"

@@ -26,7 +26,7 @@ VELOCITY_HEADER: Final = ("vx", "vy", "vz")
 LARGEST: Final = 1e6  # largest magnitude of a number in the table, as in the scenario file
 MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
 ROUNDED: Final = range(2, 8)
-"""Decimals of a rounded column: with fewer its numbers are exact, with more nobody can know."""
+"""Decimals of a rounded column: with fewer its numbers are exact, with more rounding cannot be detected."""
 LARGEST_FILE: Final = 64_000_000  # size [bytes] of the largest file that is read
 
 
@@ -61,7 +61,7 @@ class Csv(Started):
 
     @property
     def content(self) -> bytes | None:
-        """The file's content of a table made by `tabulated`; None where it is read from the file."""
+        """Content of the file of a table made by `tabulated`; None if it is read from a file."""
         content: bytes | None = vars(self).get("content")
         return content
 
@@ -74,7 +74,7 @@ class Csv(Started):
         return begin(through_rows(table), start=self.start + float(table.t[0]), initial=initial)
 
     def located(self, directory: FilePath) -> Csv:
-        """The table's whole path and its hash, so that a resolved scenario defines its flight.
+        """Return the table with absolute path and hash, so that a resolved scenario defines its flight.
 
         Raises:
             FileError: what is there is no such table.
@@ -86,7 +86,7 @@ class Csv(Started):
 
 
 def tabulated(file: str, t: Array, poses: Array) -> Csv:
-    """A course of poses (n, 4) x, y, z [m], yaw [rad] at times t (n,) [s], its file's content in memory.
+    """Return a course of poses (n, 4) x, y, z [m], yaw [rad] at times t (n,) [s], with its file in memory.
 
     Every digit is written, with an exponent: no column looks rounded.
     """
@@ -117,7 +117,7 @@ def read_table(path: FilePath) -> Table:
 
 
 def parse_table(path: FilePath, content: bytes) -> Table:
-    """The rows of a file's content.
+    """Parse the rows of a file's content.
 
     Yaw that changes by more than half a turn between rows is taken as wrapped, and unwrapped.
 
@@ -157,7 +157,7 @@ def parse_table(path: FilePath, content: bytes) -> Table:
 
 
 def through_rows(table: Table) -> Path:
-    """A path from the first row, whose time becomes 0, to the last.
+    """Return the path from the first row, whose time becomes 0, to the last.
 
     Straight lines between rows, or where the table has velocities the cubics that meet them (cubic Hermite
     interpolation); yaw is straight either way.
@@ -177,7 +177,7 @@ def through_rows(table: Table) -> Path:
 
 
 def _resolution(cells: Iterable[str]) -> float:
-    """One unit of the last decimal that a column is written with, or 0 where that does not look like rounding."""
+    """Return one unit of a column's last decimal, or 0 if the column does not look rounded."""
     decimals = 0
     for cell in cells:
         digits, _, exponent = cell.strip().lower().partition("e")
@@ -206,7 +206,7 @@ def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, .
 
 
 def _header_text(header: tuple[str, ...]) -> str:
-    """What a header is, without its words: who names a file in a scenario may not be the one whose file it is."""
+    """Describe a header without quoting it: the author of a scenario may not own the file that it names."""
     known = [name for name in header if name in POSE_HEADER + VELOCITY_HEADER]
     return f"{len(header)} columns, {','.join(known) if known else 'none'} of them" if header else "none"
 

@@ -1,4 +1,4 @@
-"""The reference as it is followed: a course through its filter, which set-points may replace in flight."""
+"""The followed reference: a filtered course, which set-points may replace in flight."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ class FollowedCourse:
         return row
 
     def preview(self, k: int, n: int) -> Array:
-        """(n, 4) the same at t_{k+1} .. t_{k+n}, as far as it is known at t_k."""
+        """Return x, y, z [m], yaw [rad] (n, 4) at t_{k+1} .. t_{k+n}, as known at t_k."""
         self._extend(k + 1 + n)
         rows: Array = self._rows[k + 1 : k + 1 + n]
         return rows
 
     def set(self, k: int, values: Mapping[str, float]) -> None:
-        """A set-point that is given at t_k, by the names of its axes [m, rad]."""
+        """Apply a set-point at t_k, by the names of its axes [m, rad]."""
         self._extend(k + 1)
         self._setpoint |= {REFERENCE_NAMES.index(name): value for name, value in values.items()}
         self._rows = self._rows[: k + 1]
 
     def _extend(self, count: int) -> None:
-        """Know that many rows, or more."""
+        """Compute at least that many rows."""
         while len(self._samples) < count:
             t = self._period * np.arange(len(self._samples), len(self._samples) + _BLOCK, dtype=np.float64)
             self._samples = np.concatenate([self._samples, self._course.sample(t)])

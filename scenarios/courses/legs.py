@@ -29,7 +29,7 @@ from scenarios.courses.course import (
 
 @dataclass(frozen=True, kw_only=True)
 class Waypoint(Point):
-    """A point to fly to in a straight line at constant speed, and how long to stay there."""
+    """A point to fly to in a straight line at constant speed, with a time to stay."""
 
     hold: Annotated[NonNegative, doc("[s] time to stay there")] = 0.0
     speed: Annotated[Speed | None, doc("[m/s] speed of the leg; absent: speed of the course")] = None

@@ -1,4 +1,4 @@
-"""Courses that go round: circle, helix, figure eight, with a smooth entry and exit."""
+"""Closed courses: circle, helix, figure eight, with a smooth start and end."""
 
 from __future__ import annotations
 
@@ -125,16 +125,16 @@ class _Round(Started):
 
     @property
     def turn_time(self) -> float:
-        """Of one turn at full speed [s]."""
+        """Time of one turn at full speed [s]."""
         return self.period or self.turn_length / (self.speed or math.inf)
 
     @property
     def until(self) -> float:
-        """When it is over [s]."""
+        """Time of its end [s]."""
         return self.start + abs(self.turns) * self.turn_time + self.ramp
 
     def loop(self, initial: Array, height: float) -> Loop:
-        """The curve that is flown, from a height [m] on; otherwise as `path`."""
+        """Return the curve, starting at a height [m]; otherwise as `path`."""
         raise NotImplementedError
 
     def path(self, initial: Array, gravity: float) -> Path:
@@ -198,7 +198,7 @@ class Helix(_Circular):
 
 @dataclass(frozen=True, kw_only=True)
 class FigureEight(_Round):
-    """A level lemniscate of Gerono, begun at its crossing."""
+    """A level lemniscate of Gerono, starting at its crossing."""
 
     type: Annotated[Literal["figure_eight"], doc("kind of course: a level lemniscate of Gerono")]
     length: Annotated[Positive, doc("[m] from end to end, through the crossing")]
@@ -214,7 +214,7 @@ class FigureEight(_Round):
 
     @property
     def turn_length(self) -> float:
-        """As if the speed of the crossing, where it is largest, were kept [m]."""
+        """Length of a turn at the speed of the crossing, where it is largest [m]."""
         return 2.0 * math.pi * math.hypot(0.5 * self.length, 2.0 * self.half_width)
 
     def loop(self, initial: Array, height: float) -> Loop:

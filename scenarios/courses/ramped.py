@@ -171,13 +171,13 @@ class _Ramped(Started):
 
     @property
     def until(self) -> float:
-        """When it is over [s]; see `ramped_phase`."""
+        """Time of its end [s]; see `ramped_phase`."""
         parts = (self.ramp, self.speed / self.acceleration - self.ramp)
         rising, constant, turning = (math.ceil(time / self.sampling - 1e-9) for time in (*parts, 2.0 * self.ramp))
         return self.start + self.sampling * (2 * rising + 2 * constant + turning)
 
     def curve(self, yaw: float) -> Curve:
-        """What is flown, with an initial yaw [rad]."""
+        """Return the curve for an initial yaw [rad]."""
         raise NotImplementedError
 
     def path(self, initial: Array, gravity: float) -> Path:

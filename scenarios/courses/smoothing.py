@@ -1,4 +1,4 @@
-"""The filter between a course and the controller, Eq. (31), and what a rounded table may have been before."""
+"""The filter between a course and the controller, Eq. (31), and the smoothing of rounded tables."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def smooth(values: Array, *, initial: float, response_time: float, period: float
 
 
 def within_rounding(values: Array, resolution: float, breaks: NDArray[np.bool_]) -> Array:
-    """The smoothest values that samples y (M,) may have been before they were rounded to a resolution; 0 for none.
+    """Return the smoothest values that round to the samples y (M,) at a resolution; 0: not rounded.
 
     Whittaker-Henderson smoothing (Eilers 2003), min |z - y|^2 + w |D z|^2 with D the fourth differences, piece by
     piece, with the largest weight w of `_WEIGHTS` that leaves every value within the resolution of what it was.  Breaks

@@ -75,7 +75,7 @@ def steps(t: Array, windows: Sequence[Window], elsewhere: float) -> Array:
 
 
 def switches(windows: Sequence[Window], elsewhere: float, *, initial: float) -> list[tuple[float, float, float]]:
-    """Where a piecewise constant reference steps: time [s], value before and value after, in order of time.
+    """Return the steps of a piecewise constant reference: time [s], value before and after, in order of time.
 
     Of windows that overlap, the last holds; the first step is counted from `initial`, where the output is at time 0.
     """

@@ -35,4 +35,4 @@ ReferenceTable = Annotated[
     | Annotated[Csv, Tag("csv")],
     Discriminator(_kind),
 ]
-"""The desired course, of the kind that its field `type` names; a new one is a line here."""
+"""The desired course, of the kind named by its field `type`; add a new kind to this union."""

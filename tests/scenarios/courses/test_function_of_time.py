@@ -71,7 +71,7 @@ def test_it_takes_the_place_of_a_course_that_ends_the_flight_and_of_its_filter()
 @pytest.mark.parametrize(
     ("reference", "problem"),
     [
-        (3.0, r"reference must be a function f\(t\) that gives x, y, z \[m\], yaw \[rad\]; got 3\.0"),
+        (3.0, r"reference must be a function f\(t\) that returns x, y, z \[m\], yaw \[rad\]; got 3\.0"),
         (
             lambda t: [0.0] * 3,
             r"f\(0\) must be four numbers within \+-1e\+06: x, y, z \[m\], yaw \[rad\]; got \[0\.0, ",
