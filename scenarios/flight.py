@@ -262,8 +262,8 @@ class Flight(Result):
         """Draw signals over time with their references and bounds, one panel each.
 
         Args:
-            signals: names that constraints can have, as `x`, `tilt`, `speed`, and `xy` for the path from above;
-                position and attitude where none is given.
+            signals: names that constraints can have, as `x`, `tilt`, `speed`, names in `logged`, and `xy` for the path
+                from above; position and attitude by default.
 
         Returns:
             The matplotlib axes, top to bottom; `axes[0].figure` is the figure, which is pyplot's.
@@ -275,8 +275,8 @@ class Flight(Result):
         from quadsim.report.to_matplotlib import draw
 
         for name in signals:
-            if name not in (*SIGNALS, "xy"):
-                raise UnknownNameError("signal", name, (*SIGNALS, "xy"))
+            if name not in (known := (*SIGNALS, "xy", *self.logged)):
+                raise UnknownNameError("signal", name, known)
         figure = draw_signals([self.run], signals or ("x", "y", "z", "roll", "pitch", "yaw"))
         return draw(figure, interactive=True).axes
 

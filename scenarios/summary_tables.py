@@ -89,7 +89,7 @@ def _violations(constraints: Sequence[Mapping[str, Any]]) -> str:
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
     """Return every constraint with its bounds, peaks, margin, tolerances and verdict."""
     caption = (
-        "margin: the decisive one, negative = violated (s: at the samples); tolerance: accepted violation; "
+        "margin: the decisive one, negative beyond the bound (s: at the samples); tolerance: accepted violation; "
         "beyond: time outside bound and tolerance [s]; -: no value"
     )
     if any(not entry["required"] for entry in constraints):

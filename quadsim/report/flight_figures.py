@@ -105,8 +105,11 @@ def overview(runs: Sequence[Run]) -> Figure:
 
 
 def signals(runs: Sequence[Run], names: Sequence[str]) -> Figure:
-    """Plot signals of the audit over time, and `xy`, the first run's path from above, one panel each."""
-    panels = tuple(_above(runs[0]) if name == "xy" else _signal(runs, name) for name in names)
+    """Plot signals of the audit or of the controller's log over time, and `xy`, the first run's path from above."""
+    panels = tuple(
+        _above(runs[0]) if name == "xy" else _signal(runs, name) if name in SIGNALS else _logged(runs, name)
+        for name in names
+    )
     return _timed("signals", "", panels, runs, columns=1)
 
 
@@ -294,6 +297,13 @@ def _signal(runs: Sequence[Run], name: str) -> Panel:
 
 def _of_run(i: int, label: str, x: Array, y: Array, **looks: Any) -> Series:
     return Series(x=x, y=y, colour=line_colour(i), label=label, group=f"run{i}", **looks)
+
+
+def _logged(runs: Sequence[Run], name: str) -> Panel:
+    """Plot a signal that the controller logged."""
+    logs = [(i, label, run.log.control) for i, label, run in _flown(runs) if name in run.log.control.logged]
+    curves = tuple(_of_run(i, label, log.t, log.logged[name][1]) for i, label, log in logs)
+    return Panel(title=name, unit=logs[0][2].logged[name][0] if logs else "", series=curves)
 
 
 def _several(title: str, unit: str, t: Array, values: Array, names: Sequence[str]) -> Panel:

@@ -208,7 +208,7 @@ def _parse_row(path: FilePath, number: int, row: list[str], header: tuple[str, .
 def _header_text(header: tuple[str, ...]) -> str:
     """Describe a header without quoting it: the author of a scenario may not own the file that it names."""
     known = [name for name in header if name in POSE_HEADER + VELOCITY_HEADER]
-    return f"{len(header)} columns, {','.join(known) if known else 'none'} of them" if header else "none"
+    return f"{len(header)} columns (known: {','.join(known) if known else 'none'})" if header else "none"
 
 
 def _short(text: str) -> str:

@@ -90,3 +90,12 @@ def test_a_signal_that_cannot_be_logged_ends_the_flight(
     assert flight.log.reason is not None
     assert flight.log.reason.endswith(problem)
     assert any("now.log(name, value)" in line for line in flight.log.traceback)
+
+
+def test_a_logged_signal_is_plotted(hover: Scenario) -> None:
+    flight = hover.fly(controller=Logging)
+    (axes,) = flight.plot("height")
+    assert axes.get_ylabel() == "height [m]"
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), flight.logged["height"])
+    with pytest.raises(quadsim.QuadsimError, match="height"):
+        flight.plot("heigth")
