@@ -59,7 +59,7 @@ class UnconstrainedMPC:
         self._offset = self.gains.L @ problem.model.u_bar
 
     def reset(self, speeds: Array) -> None:
-        """Do nothing: the law has no memory."""
+        """No effect: the law is stateless."""
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Evaluate Eq. (22), rotors off while landed; see `quadsim.controller.Controller.step`."""

@@ -100,7 +100,7 @@ class StepInputs:
 
         Args:
             name: an identifier that is not a column of flight.parquet; of several values in a period the last counts.
-            value: finite, or NaN, as in periods without a value.
+            value: a finite number, or NaN (used for periods without a value).
             unit: stored with the column.
 
         Raises:

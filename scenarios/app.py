@@ -228,7 +228,7 @@ def fly(
         reference: replaces the course and its filter; the scenario's constraints stay.  A function `f(t)` of time
             [s] that returns x, y, z [m] and yaw [rad] (unwrapped).  It is called before the flight, for all control
             instants up to the end of the last preview.  A run directory keeps these samples in `reference.csv`; its
-            `scenario.toml` flies to the same bits.
+            `scenario.toml` reproduces the flight bit for bit.
         progress: True shows a bar on a terminal, or a line every ten seconds elsewhere; False shows nothing; a function
             is called with (activity, done, total).
 
@@ -1069,7 +1069,7 @@ def export(
     directory = exporter.export(flown, out, overwrite=overwrite, rows=rows, **options)  # type: ignore[arg-type]
     room = exporter.room_sentence(json.loads((directory / exporter.FACTS).read_text()))
     make = f"make -C {shlex.quote(str(directory))} check"
-    text = f"{precision}: {room}\nWrote {directory}: {make} compiles it and runs its recorded periods"
+    text = f"{precision}: {room}\nWrote {directory}: {make} compiles it and checks its recorded periods"
     if not fly:
         return results.Document(f"{text}\n", {"directory": str(directory)})
     _log.info(text.replace("\n", "; "))

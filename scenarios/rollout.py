@@ -160,7 +160,7 @@ class Rollout:
         self.close()
 
     def close(self) -> None:
-        """Release the plant's memory; the flight so far stays, and cannot continue."""
+        """Release the plant's resources; the recorded flight is kept, and no further steps are possible."""
         self._events.close()
         self._plant.close()
 
@@ -279,7 +279,7 @@ class Rollout:
         return {name: -math.inf if math.isnan(value) else value for name, value in beyond.items()}
 
     def flight(self) -> Flight:
-        """Return the flight so far, audited; its scenario has the same length and flies to the same bits."""
+        """Return the flight so far, audited; its scenario has the same length and reproduces it bit for bit."""
         scenario = self._events.flown()
         self.loop.quaternions = needs_quaternions(scenario)
         log = self.loop.log()

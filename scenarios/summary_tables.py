@@ -58,7 +58,7 @@ def outcome_line(summary: Mapping[str, Any]) -> Text:
     expected, as_expected = summary.get("expected", "satisfied"), summary.get("as_expected", True)
     remark = ""
     if expected != "satisfied":
-        remark = ", as the scenario expects" if as_expected else f", where the scenario expects it {expected}"
+        remark = ", as the scenario expects" if as_expected else f"; the scenario expects: {expected}"
     colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
     if summary["status"] != "completed":
         return console.styled((f"{verdict(summary)}{remark}", colour), f": {summary['reason']}")
@@ -89,7 +89,7 @@ def _violations(constraints: Sequence[Mapping[str, Any]]) -> str:
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
     """Return every constraint with its bounds, peaks, margin, tolerances and verdict."""
     caption = (
-        "margin: the decisive one, negative beyond the bound (s: at the samples); tolerance: accepted violation; "
+        "margin: the decisive one, negative = beyond the bound (s: at the samples); tolerance: accepted violation; "
         "beyond: time outside bound and tolerance [s]; -: no value"
     )
     if any(not entry["required"] for entry in constraints):

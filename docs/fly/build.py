@@ -27,7 +27,9 @@ HERE = Path(__file__).resolve().parent
 SITE = HERE.parents[1] / "site"
 CACHE = Path(sys.prefix) / "fly"
 """Where npm installs."""
-PACKAGES = {"@mujoco/mujoco": "3.14.0", "three": "0.187.0", "esbuild": "0.28.2"}
+PACKAGES = {"@mujoco/mujoco": "3.14.0", "three": "0.187.0", "esbuild": "0.28.2", "@fontsource/stix-two-math": "5.3.0"}
+FONT = CACHE / "node_modules/@fontsource/stix-two-math"
+"""For formulas, where the reader's machine has no font with a MATH table."""
 CONTROLLERS = {"constrained": "paper-constrained", "unconstrained": "paper-unconstrained", "robust": "robust"}
 """Buttons, and the scenarios whose controllers they switch to."""
 CLANG = [
@@ -142,6 +144,8 @@ def main() -> None:
     text = page.read_text(encoding="utf-8")
     assert LEFT_OUT in text, "docs/fly.md has no place for the link"
     page.write_text(text.replace(LEFT_OUT, LINK), encoding="utf-8")
+    shutil.copy(FONT / "files/stix-two-math-latin-400-normal.woff2", SITE / "assets/math.woff2")
+    shutil.copy(FONT / "LICENSE", SITE / "assets/LICENSE-math.txt")
 
 
 if __name__ == "__main__":

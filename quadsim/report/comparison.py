@@ -138,7 +138,7 @@ def verdict_cell(summary: Summary) -> Cell:
         return Cell(text=word)
     if summary.get("as_expected"):
         return Cell(text=f"{word}, as expected", mark=Mark.GOOD if word == "satisfied" else Mark.NONE)
-    return Cell(text=f"{word}, expected: {expected}", mark=Mark.BAD)
+    return Cell(text=f"{word} (expected {expected})", mark=Mark.BAD)
 
 
 def required(summary: Summary) -> Cell:
@@ -343,7 +343,7 @@ def _refused(summary: Summary) -> Cell:
 
 _FLIGHT: Final[tuple[_Line, ...]] = (
     ("outcome", "", outcome),
-    ("verdict on the flight", "", verdict_cell),
+    ("verdict", "", verdict_cell),
     ("required constraints", "", required),
     ("audit", "", lambda summary: Cell(text="; ".join(summary.get("audit_notes", ())) or "as the controller bounds")),
     ("why no optimum", "", _text(lambda summary: "; ".join(failure_sentences(summary)) or ABSENT)),

@@ -191,7 +191,7 @@ def _eight_limit(vehicle: Vehicle, tuning: Design) -> str:
 def _course(course: str, vehicle: Vehicle, tuning: Design) -> tuple[str, float | None, float]:
     """The table `[reference]`, the flight's duration [s], None to the end of the course, and its size [m]."""
     if course == "hover":
-        return "[reference]  # no windows: every axis stays at its initial position, yaw at 0\n", 4.0, STEP
+        return "[reference]  # no steps: every axis holds its initial position, yaw at 0\n", 4.0, STEP
     if course == "step":
         slowest = min(tuning.bandwidth, tuning.height)
         response = round(3.0 / (STEP_RATIO * slowest), 2)
@@ -253,7 +253,7 @@ all torque in reserve answers {math.degrees(HEADING_STEP):.3g} deg or more
 speed = {speed}  # 1 / ({speed**-0.5:.3g} rad/s)^2: with it four integrators have the bandwidth w, (g beta)^2 x / w^8
 
 [controller.output_bounds]
-roll = {[-tilt, tilt]}  # deg: what the hover model stands, or {limit:.3g} deg, \
+roll = {[-tilt, tilt]}  # deg: the limit of the linear model, or {limit:.3g} deg, \
 what {100 * THRUST_SHARE:g} % of the thrust holds
 pitch = {[-tilt, tilt]}  # as roll
 """

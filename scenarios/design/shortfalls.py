@@ -66,7 +66,7 @@ def _inputs(bounds: InputBounds, vehicle: Vehicle, period: float) -> list[str]:
         time = f"{needed * period / up:.3g} s" if up else "for ever"
         missed.append(
             f"controller.input_bounds.slew: {up:g} rad/s per period take {time} from hover to the highest speed, "
-            f"{needed:.4g} rad/s more; tilt and height are answered too late"
+            f"{needed:.4g} rad/s more; too slow to control tilt and height"
         )
     return missed
 

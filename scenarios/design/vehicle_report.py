@@ -184,7 +184,7 @@ def vehicle_tables(report: VehicleReport) -> list[Grid]:
                 (name, ", ".join(f"{number:g}" for number in np.atleast_1d(value)), unit, report.sources[name])
                 for name, value, unit in report.parameters
             ],
-            note="short names of sources are spelt out at the head of the vehicle's file",
+            note="the vehicle file's header expands the source abbreviations",
         ),
     ]
     if report.shortfalls is not None:
@@ -231,12 +231,12 @@ def _abilities(sheet: VehicleSheet) -> list[tuple[str, ...]]:
         sinks,
         ("tilt bound", format_number(made.tilt_bound), "deg"),
         ("largest level acceleration within it", format_number(made.level_acceleration), "m/s^2"),
-        ("level speed at which the air turns it over", *speed),
+        ("level speed at which aerodynamic moments overturn it", *speed),
         *(
             (f"time constant of {labels.get(axis, axis)}", format_number(time), "s")
             for axis, time in made.time_constants.items()
         ),
-        ("delay that it stands beyond what it knows of", format_number(made.delay_margin), "s"),
+        ("additional delay that the loop tolerates", format_number(made.delay_margin), "s"),
         ("control period", format_number(made.period), "s"),
     ]
 

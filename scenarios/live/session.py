@@ -1,4 +1,4 @@
-"""A live session: one queue of inputs, flown period by period, saved as a scenario that flies to the same bits.
+"""A live session: one queue of inputs, flown period by period, saved as a scenario that reproduces it bit for bit.
 
 No clock, no view and no socket in here.  Inputs come from any thread; what happens to the vehicle depends on the
 scenario and on the periods at which they act alone.
@@ -209,7 +209,7 @@ class Session:
         return refused
 
     def flight(self, which: int = 0) -> Flight:
-        """Return the flight so far, audited; its scenario flies to the same bits.
+        """Return the flight so far, audited; its scenario reproduces it bit for bit.
 
         Raises:
             InputError: nothing has been flown.

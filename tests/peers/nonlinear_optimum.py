@@ -58,8 +58,8 @@ class Agreement:
     @property
     def checks(self) -> tuple[Check, ...]:
         """The worst of each."""
-        name = f"{self.case.name}: inputs, as shares of the largest"
-        both = (("converged, at random states", self.optima), ("real-time iterations", self.steps))
+        name = f"{self.case.name}: inputs, relative to the largest"
+        both = (("converged solutions from random states", self.optima), ("real-time iterations", self.steps))
         return tuple(
             Check(what=f"{name}; {differences.size} {what}", peer="casadi", measured=float(differences.max()),
                   allowed=ALLOWED)

@@ -27,7 +27,7 @@ def test_optima_are_those_of_do_mpc(hold: Callable[[Check], None]) -> None:
     assert len(pairs) == STATES[PAPER]
     assert all(result.solved for result, _ in pairs)
     apart = max(np.abs(result.inputs - ours).max() for result, ours in pairs)
-    hold(Check(what="converged inputs, as shares of the largest", peer="do-mpc", measured=apart, allowed=ALLOWED))
+    hold(Check(what="converged inputs, relative to the largest", peer="do-mpc", measured=apart, allowed=ALLOWED))
 
 
 def test_do_mpc_is_given_the_same_problem() -> None:

@@ -170,7 +170,7 @@ LOST = ["--set", "initial.euler=[60.0, 0.0, 0.0]"]
 @pytest.mark.parametrize(
     ("settings", "expect", "as_expected", "line"),
     [
-        ([], "violated", False, "completed, every required constraint holds, where the scenario expects it violated"),
+        ([], "violated", False, "completed, every required constraint holds; the scenario expects: violated"),
         (VIOLATED, "satisfied", False, "completed, a required constraint does not hold: speed by 42.8 rad/s  0.50 s"),
         (
             VIOLATED,
@@ -178,7 +178,7 @@ LOST = ["--set", "initial.euler=[60.0, 0.0, 0.0]"]
             True,
             "does not hold: speed by 42.8 rad/s, as the scenario expects",
         ),
-        (VIOLATED, "lost", False, "does not hold: speed by 42.8 rad/s, where the scenario expects it lost"),
+        (VIOLATED, "lost", False, "does not hold: speed by 42.8 rad/s; the scenario expects: lost"),
         (LOST, "satisfied", False, "lost: at t = 0.000 s"),
         (LOST, "lost", True, "lost, as the scenario expects: at t = 0.000 s"),
     ],

@@ -60,6 +60,6 @@ int main(void)
         target_print(line);
         failed |= wrong;
     }
-    target_print(failed ? "wrong: a status or a command is not the recorded one\n" : "right\n");
+    target_print(failed ? "wrong: a status or a command is not the recorded one\n" : "every recorded period agrees\n");
     return failed;
 }

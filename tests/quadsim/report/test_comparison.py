@@ -138,7 +138,7 @@ def test_markdown_has_a_line_per_row_and_escapes_bars(short_run: Run, worse_run:
     [
         ("completed", 1.0, "satisfied", "satisfied, as expected", Mark.GOOD),
         ("completed", -1.0, "violated", "violated, as expected", Mark.NONE),
-        ("completed", 1.0, "lost", "satisfied, expected: lost", Mark.BAD),
+        ("completed", 1.0, "lost", "satisfied (expected lost)", Mark.BAD),
         ("aborted", 1.0, "lost", "lost, as expected", Mark.NONE),
     ],
 )

@@ -107,7 +107,7 @@ def test_hostile_names_are_text_and_other_courses_and_verdicts_are_pointed_out(s
     page = write_comparison([renamed(short_run, HOSTILE), other], tmp_path / "out")
     text = page.read_text()
     assert "The runs follow 2 different courses" in text
-    assert 'verdict: <span class="bad">satisfied, expected: lost</span>' in text
+    assert 'verdict: <span class="bad">satisfied (expected lost)</span>' in text
     assert "<script>alert" not in text
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
     assert (page.parent / "script-alert-1-script-more-quoted").is_dir()

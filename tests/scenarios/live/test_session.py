@@ -1,4 +1,4 @@
-"""What a person does in a session is data: the saved scenario flies to the same bits."""
+"""What a person does in a session is data: the saved scenario reproduces the flight bit for bit."""
 
 from __future__ import annotations
 
