@@ -62,7 +62,8 @@ def outcome_line(summary: Mapping[str, Any]) -> Text:
     colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
     if summary["status"] != "completed":
         return console.styled((f"{verdict(summary)}{remark}", colour), f": {summary['reason']}")
-    phrase = "every required constraint holds" if summary["satisfied"] else _violations(summary["constraints"])
+    held = "every required constraint holds" if summary["constraints"] else "no constraint was audited"
+    phrase = held if summary["satisfied"] else _violations(summary["constraints"])
     if verdict(summary) == "incomplete":
         colour = "green" if remark and as_expected else "yellow"
         return console.styled((f"incomplete, {required(summary).text}{remark}", colour))

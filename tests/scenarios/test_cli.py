@@ -163,6 +163,11 @@ def test_a_violated_constraint_that_is_not_required_is_status_0(here: Path, caps
     assert "exceeded*" in capsys.readouterr().out
 
 
+def test_a_flight_without_constraints_says_that_nothing_was_audited() -> None:
+    flight = quadsim.load("hover", {"duration": 0.5, "constraints": []}).fly(controller=lambda *_: [192.8] * 4)
+    assert flight.text().splitlines()[0] == "hover  completed, no constraint was audited  0.50 s flown"
+
+
 VIOLATED = ["--set", "constraints.speed.upper=150.0"]
 LOST = ["--set", "initial.euler=[60.0, 0.0, 0.0]"]
 
