@@ -675,7 +675,7 @@ def live(
         port: port to listen on (default: any free port).
         host: address to listen on (default: 127.0.0.1, this machine only); others only on a network that you trust.
         browser: open the browser.
-        video: film the flight.
+        video: film the session.
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
         seed: replace the seed of everything random in the scenario.
 

@@ -254,7 +254,7 @@ class Rollout:
         return self._events.successor(fields)
 
     def margins(self, sample: FlownPeriod | None = None) -> dict[str, float]:
-        """Return the smallest signed margin of each constraint within one period; negative = violated.
+        """Return the smallest signed margin of each constraint within one period; negative = beyond the bound.
 
         At the physics rate, both ends included, in the constraint's unit; NaN outside its time window.
 

@@ -186,7 +186,7 @@ class Limit:
         return (t >= self.start - 1e-9) & (t <= self.stop + 1e-9)
 
     def margin(self, values: Array) -> Array:
-        """Return (K,) the signed distance to the nearer bound, the smallest over rotors; negative = violated."""
+        """Return (K,) the signed distance to the nearer bound, the smallest over rotors; negative = beyond it."""
         margin = np.minimum(values - self.lower, self.upper - values)
         return margin if margin.ndim == 1 else margin.min(axis=1)
 

@@ -8,7 +8,7 @@ Everything stands on one timeline, `sim_time`, the simulated time:
                         flights that may turn upside down quaternion and body_rates as well
     reference/NAME      what x, y, z and yaw should be
     limits/NAME         the bounds, drawn with their signal
-    margins/NAME        signed distance to the nearer bound at the control samples; negative = violated
+    margins/NAME        signed distance to the nearer bound at the control samples; negative = beyond the bound
     verdicts/NAME       its verdict: holds, active, violated
     solver/NAME         what each step of the controller took and answered
     effects/NAME        external force and torque, wind, commands that rotors do not follow at once; where there are any
