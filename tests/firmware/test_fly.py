@@ -116,7 +116,8 @@ def test_a_pulled_and_pushed_vehicle_returns_to_its_target(tab: Any, name: str) 
         return [most, flight.lost]; }"""
     )
     assert lost is None
-    assert (tilt > np.radians(6.0)) == (name == "unconstrained"), "the tilt bound holds in the others"
+    # Soft bounds yield by a degree to a pull whose length is the browser's; without bounds it is 20 deg.
+    assert (tilt > np.radians(8.0)) == (name == "unconstrained"), "the tilt bound of 5 deg limits the others"
     position, target = tab.evaluate("[Array.from(quadsim.flight.data.qpos.slice(0, 3)), quadsim.flight.target]")
     assert position == pytest.approx(target, abs=0.1)
 
