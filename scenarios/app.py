@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from quadsim.controller import Controller
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
-    from scenarios.assembly import Assembly
     from scenarios.campaign.campaign import CampaignResult, Replay
     from scenarios.campaign.paired import PairedComparison
     from scenarios.campaign.sweep import Sweep
@@ -61,6 +60,7 @@ if TYPE_CHECKING:
     Fields: TypeAlias = Mapping[str, Any]
     Draws: TypeAlias = Sequence[Mapping[str, Any]]
     Watched: TypeAlias = Progress | bool
+    Flown: TypeAlias = Callable[[Flight], object] | None
 else:  # as cyclopts reads them: it resolves all annotations where a command is declared
 
     def _one_of(names: Any) -> Any:
@@ -85,7 +85,7 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
     Changes = Annotated[Sequence[str], Parameter(name="--set")]
     Whole = Annotated[int, Parameter(converter=_whole)]
     Flag = Annotated[bool, Parameter(negative="")]
-    UserCode = UserForces = UserReference = Fields = Draws = Watched = Annotated[Any, Parameter(parse=False)]
+    UserCode = UserForces = UserReference = Fields = Draws = Watched = Flown = Annotated[Any, Parameter(parse=False)]
 
 app: Final = App(
     name="quadsim",
@@ -273,6 +273,7 @@ def run(
     forces: UserForces = (),
     reference: UserReference = None,
     progress: Watched = True,
+    flown: Flown = None,
 ) -> Flight:
     """Fly one scenario and write its run directory.
 
@@ -291,6 +292,7 @@ def run(
         forces: as in `fly`.
         reference: as in `fly`.
         progress: as in `fly`.
+        flown: called with the flight as soon as its tables are written, before figures, recording and video.
 
     Raises:
         InputError: the scenario cannot be flown, or the controller or the reference cannot be set up.
@@ -307,22 +309,41 @@ def run(
     """
     from scenarios import loading, user_code
     from scenarios.flight import require_rendering
-    from scenarios.progress import reporting
     from scenarios.rollout import Rollout
 
     if video:
         require_rendering()
     parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces, reference)
-    _announce(parts[0], progress)
-    products: dict[str, Any] = {"video": video, "recording": recording, "figures": figures}
-    with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory, reporting(progress) as report:
-        flight = replace(Rollout(*parts).fly(report), directory=directory)
-        try:
-            flight.save(directory, overwrite=overwrite, progress=report, **products)
-        except OutputError as error:
-            if error.path.parent == directory:  # a product that was requested explicitly
-                error.result = flight
-            raise
+    products = {"video": video, "recording": recording, "figures": figures}
+    with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory:
+        return _fly_into(directory, Rollout(*parts), products, overwrite=overwrite, progress=progress, flown=flown)
+
+
+def _fly_into(
+    directory: Path,
+    rollout: Rollout,
+    products: Mapping[str, bool | None],
+    *,
+    overwrite: bool,
+    progress: Watched,
+    flown: Flown,
+) -> Flight:
+    """Fly, write the tables, call `flown`, and add the products."""
+    from scenarios.progress import reporting
+
+    with reporting(progress) as report:
+        flight = replace(rollout.fly(report), directory=directory)
+        wanted = flight.write_tables(directory, overwrite=overwrite)
+    if flown is not None:
+        flown(flight)
+    if wanted:
+        with reporting(progress) as report:
+            try:
+                flight.add_products(directory, progress=report, **products)
+            except OutputError as error:
+                if error.path.parent == directory:  # a product that was requested explicitly
+                    error.result = flight
+                raise
     return flight
 
 
@@ -333,16 +354,6 @@ def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> Abst
     if out is not None:
         return reserving(out, overwrite=overwrite)
     return reserving(Path("runs") / name, overwrite=overwrite, free=not overwrite)
-
-
-def _announce(assembly: Assembly, progress: Watched) -> None:
-    """On a terminal, report the demands of the course before the flight; the summary repeats them."""
-    from scenarios import console, feasibility_check
-
-    if progress is True and (terminal := console.stderr()).is_terminal:
-        required = feasibility_check.report(assembly)
-        fits = feasibility_check.fitting(assembly) if required.problems else ""
-        console.show([f"{required.sentence} {fits}".rstrip()], terminal)
 
 
 def start(
@@ -482,7 +493,6 @@ def check(
             _log.info("%s: %s", target, note)
     else:
         assembly = loading.assemble(target, changes, seed)
-        _announce(assembly, progress)
         with reporting(progress) as report:
             flight = Rollout(assembly).fly(report)
         audited = reaudit.Reaudit(summary=dict(flight.summary), findings=flight.findings, satisfied=flight.satisfied)
@@ -869,6 +879,7 @@ def replay(
     recording: bool | None = None,
     figures: bool | None = None,
     progress: Watched = True,
+    flown: Flown = None,
 ) -> Replay:
     """Fly one flight of a finished campaign again, with all outputs.
 
@@ -882,6 +893,7 @@ def replay(
         recording: write flight.rrd for the rerun viewer (default: if possible).
         figures: plot the flight (default: if possible).
         progress: as in `fly`.
+        flown: as in `run`.
 
     Returns:
         The flight, and the columns of the campaign's table in which it differs by any bit.
@@ -898,7 +910,6 @@ def replay(
     """
     from scenarios.campaign.campaign import compare_replay, recorded_flight
     from scenarios.flight import require_rendering
-    from scenarios.progress import reporting
     from scenarios.rollout import Rollout
 
     if video:
@@ -909,11 +920,11 @@ def replay(
     recorded = recorded_flight(Path(campaign), flight)
     for note in recorded.notes:
         _log.info(note)
-    products: dict[str, Any] = {"video": video, "recording": recording, "figures": figures}
-    with reporting(progress) as report, run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
-        flown = replace(Rollout(recorded.scenario).fly(report), directory=directory)
-        flown.save(directory, overwrite=overwrite, progress=report, **products)
-    return compare_replay(flown, recorded)
+    products = {"video": video, "recording": recording, "figures": figures}
+    with run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
+        rollout = Rollout(recorded.scenario)
+        again = _fly_into(directory, rollout, products, overwrite=overwrite, progress=progress, flown=flown)
+    return compare_replay(again, recorded)
 
 
 @app.command(help_epilogue=_examples("quadsim tune paper-robust", "quadsim tune mine.toml --trials 50 --resume"))

@@ -38,11 +38,20 @@ def _parse(
     command, bound, ignored = app.parse_args(words, exit_on_error=False, print_error=False)
     if json and "progress" in ignored:
         bound.arguments["progress"] = False
+    if not json and "flown" in ignored:
+        bound.arguments["flown"] = _show_verdict
     return command, bound, json
 
 
-def _show(result: object, json: bool) -> int:
-    """Print a result; returns its exit status."""
+def _show_verdict(flight: Result) -> None:
+    """Print a flight before its figures and its film are made."""
+    from scenarios import console
+
+    console.show(flight.shown())
+
+
+def _show(result: object, json: bool, *, judged: bool) -> int:
+    """Print a result, or what is left of it after the verdict; returns its exit status."""
     if isinstance(result, Path):
         from scenarios.console import short_path
 
@@ -51,6 +60,10 @@ def _show(result: object, json: bool) -> int:
         return 0
     if json:
         print(serialising.dumps(result.to_json(), indent=2))
+    elif judged:
+        from scenarios import console
+
+        console.show(result.outputs())
     else:
         result.show()
     return result.exit_status
@@ -68,10 +81,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parsed: Any = app.meta(words, exit_on_error=False, print_error=False, result_action="return_value")
             if parsed is not None:  # as after --help
                 command, bound, json = parsed
+                judged = "flown" in bound.arguments
                 try:
-                    status = _show(command(*bound.args, **bound.kwargs), json)
+                    status = _show(command(*bound.args, **bound.kwargs), json, judged=judged)
                 except QuadsimError as error:  # a failure may carry a partial result
-                    _show(error.result, json)
+                    _show(error.result, json, judged=judged)
                     raise
         sys.stdout.flush()
         return status

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
+import shlex
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from pathlib import Path
 from typing import IO, Any, Final
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, RenderableType
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -17,6 +22,7 @@ from quadsim.errors import printable
 from quadsim.report.table import Cell, Grid, Mark
 
 WIDTH: Final = 120  # characters, without a terminal
+_UNBOUNDED: Final = 10_000  # characters, more than any table has
 _STYLES: Final = {Mark.BEST: "bold", Mark.GOOD: "green", Mark.WARN: "yellow", Mark.BAD: "red"}
 
 
@@ -56,10 +62,29 @@ def stderr() -> PlainConsole:
 
 
 def show(parts: Iterable[RenderableType], console: PlainConsole | None = None) -> None:
-    """Print sentences, which a terminal may wrap, and tables, which fit its width."""
+    """Print sentences, wrapped at spaces, and tables; messages on a stderr that is no terminal have one line each."""
     console = stdout() if console is None else console
+    on_one_line = console.stderr and not console.is_terminal
     for part in parts:
+        if isinstance(part, str | Text) and not on_one_line:
+            part = _wrapped(styled(part) if isinstance(part, str) else part, console.width)
         console.print(part, soft_wrap=isinstance(part, str | Text))
+
+
+def _wrapped(text: Text, width: int) -> Text:
+    """Break lines at spaces; a word that is longer than a line, such as a path, stays whole."""
+    if text.no_wrap:
+        return text
+    lines = []
+    for line in text.split(allow_blank=True):
+        starts, plain = [0], line.plain
+        for word in re.finditer(r"\S+", plain):
+            if plain[starts[-1] : word.start()].strip() and cell_len(plain[starts[-1] : word.end()]) > width:
+                starts.append(word.start())
+        lines += line.divide(starts[1:])
+    for line in lines:
+        line.rstrip()
+    return Text("\n").join(lines)
 
 
 def to_text(parts: Iterable[RenderableType]) -> str:
@@ -86,6 +111,13 @@ def written_to(path: Path) -> Text:
     return styled("written to ", (short_path(path), "bold"))
 
 
+def to_open(path: Path, program: str = "open") -> Text:
+    """Return a command that opens an output, on one line to copy."""
+    line = styled((f"{program} {shlex.quote(short_path(path))}", "bold"))
+    line.no_wrap = True
+    return line
+
+
 def short_path(path: Path) -> str:
     """Shorten a path: relative to the current directory if it is inside."""
     with contextlib.suppress(ValueError, OSError):  # it is outside, or the current directory is gone
@@ -100,16 +132,40 @@ def table(
     *,
     caption: str | None = None,
     left: Collection[str] = (),
-    rigid: bool = False,
+    spare: Sequence[str] = (),
 ) -> Table:
-    """Return a table; its first column and those in `left` hold words; cells of a `rigid` one are not wrapped."""
-    table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=0, pad_edge=False)
-    table.caption, table.caption_justify = caption, "left"
+    """Return a table; its first column and those in `left` hold words.
+
+    Where it is too wide, it does without the columns in `spare`, in this order, and then wraps the names in the first
+    column instead of cells in the others; without `spare` it wraps cells.
+    """
+    table = _SparingTable(
+        title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=0, pad_edge=False
+    )
+    table.caption, table.caption_justify, table.spare = caption, "left", spare
     for i, name in enumerate(head):
-        table.add_column(name, justify="right" if i and name not in left else "left", no_wrap=rigid or not i)
+        table.add_column(
+            name, justify="right" if i and name not in left else "left", no_wrap=bool(i) if spare else not i
+        )
+        table.columns[-1].overflow = "fold"
     for line in lines:
         table.add_row(*line)
     return table
+
+
+class _SparingTable(Table):
+    """A table that does without some columns where the console is too narrow for all of them."""
+
+    spare: Sequence[str] = ()
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """See `rich.table.Table`."""
+        shown = copy(self)
+        for name in self.spare:
+            if Measurement.get(console, options.update(width=_UNBOUNDED), shown).maximum <= options.max_width:
+                break
+            shown.columns = [column for column in shown.columns if column.header != name]
+        yield from Table.__rich_console__(shown, console, options)
 
 
 def cell(cell: Cell) -> Text:

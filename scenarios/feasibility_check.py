@@ -19,6 +19,7 @@ from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
 from quadsim.state import STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course
+from scenarios.courses.csv_course import Csv
 from scenarios.courses.smoothing import within_rounding
 from scenarios.schema.events import SetpointEvent
 
@@ -38,11 +39,21 @@ def report(assembly: Assembly) -> Feasibility:
     Raises:
         InputError: the course cannot be built.
     """
-    return _required(assembly.course, assembly, duration=_followed(assembly.scenario))
+    course, followed = assembly.course, _followed(assembly.scenario)
+    required = _required(course, assembly, duration=followed)
+    sentence = required.sentence
+    if followed < course.end < math.inf and not _sampled(assembly.scenario):
+        sentence += f" It lasts until {course.end:g} s, but the flight follows it for {followed:g} s."
+    return replace(required, sentence=sentence, advice=fitting(assembly) if required.problems else "")
+
+
+def _sampled(scenario: Scenario) -> bool:
+    """Return whether the course was sampled for this flight, to the end of its last preview."""
+    return isinstance(scenario.reference, Csv) and scenario.reference.content is not None
 
 
 def fitting(assembly: Assembly) -> str:
-    """Find the speed, size or response time at which a course that exceeds limits or bounds would be within them.
+    """Find two ways to fly a course that exceeds limits or bounds within them, by speed, response time or size.
 
     The course is flown more slowly, made smaller about its start, or filtered more, to the nearest percent; jumps are
     excluded as in `report`.
@@ -69,10 +80,10 @@ def fitting(assembly: Assembly) -> str:
     ways = []
     if (share := _largest(slower)) is not None:
         ways.append(f"at {100.0 * share:.0f} % of its speed")
-    if (share := _largest(smaller)) is not None:
-        ways.append(f"at {100.0 * share:.0f} % of its size")
     if filtered_by > 0.0 and (share := _largest(smoother)) is not None:
         ways.append(f"with a response time of {filtered_by / share:.3g} s")
+    if len(ways) < 2 and (share := _largest(smaller)) is not None:
+        ways.append(f"at {100.0 * share:.0f} % of its size")
     return f"It would fit {', or '.join(ways)}." if ways else ""
 
 

@@ -312,31 +312,52 @@ class Flight(Result):
             raise OutputError(directory, f"this flight is on disk already, in {self.directory}; copy that directory")
         if video:
             require_rendering()
-        target, started = absolute(directory), clock.perf_counter() - self.simulate_s
+        if self.write_tables(directory, overwrite=overwrite):
+            self.add_products(directory, video=video, recording=recording, figures=figures, progress=progress)
+        return Path(directory)
 
-        def wall_s() -> dict[str, float]:
-            return {"simulate": self.simulate_s, "total": clock.perf_counter() - started}
+    def write_tables(self, directory: str | Path, *, overwrite: bool = False) -> bool:
+        """Write the run directory without figures, recording and video; errors as `save`.
 
-        def write_tables(*, overwrite: bool) -> None:
-            with writing(target, overwrite=overwrite) as partial:
+        Returns:
+            Whether products may follow: Ctrl-C here is heeded, but loses no flight.
+        """
+        started = clock.perf_counter() - self.simulate_s
+
+        def write(*, overwrite: bool) -> None:
+            with writing(directory, overwrite=overwrite) as partial:
                 (partial / rundir.SCENARIO_FILE).write_text(self.scenario.to_toml(), encoding="utf-8")
                 course = self.scenario.reference
                 if isinstance(course, Csv) and course.content is not None:
                     (partial / course.file).write_bytes(course.content)
                 write_log(partial, self.log, plant_stride=self.scenario.plant_stride, metadata=self.metadata)
-                summary = to_json({**self.summary, "wall_s": wall_s()})
+                wall_s = {"simulate": self.simulate_s, "total": clock.perf_counter() - started}
+                summary = to_json({**self.summary, "wall_s": wall_s})
                 (partial / rundir.SUMMARY_FILE).write_text(summary, encoding="utf-8")
 
         try:
-            write_tables(overwrite=overwrite)
-        except KeyboardInterrupt:  # no flight that was flown is lost by it
-            write_tables(overwrite=True)
-            video = recording = figures = False
+            write(overwrite=overwrite)
+        except KeyboardInterrupt:
+            write(overwrite=True)
+            return False
+        return True
+
+    def add_products(
+        self,
+        directory: str | Path,
+        *,
+        video: bool | None = None,
+        recording: bool | None = None,
+        figures: bool | None = None,
+        progress: Progress = silent,
+    ) -> None:
+        """Add figures, recording and video to the run directory; arguments and errors as `save`."""
+        target, started = absolute(directory), clock.perf_counter()
+        before = rundir.read_summary(target)["wall_s"]["total"]
         failed = _add_products(self, target, {"recording": recording, "figures": figures, "video": video}, progress)
-        amend(target, {"wall_s": wall_s()})
+        amend(target, {"wall_s": {"total": before + clock.perf_counter() - started}})
         for name, problem in failed.items():
             raise OutputError(target / name, f"{problem}; all else is there")
-        return Path(directory)
 
     @property
     def exit_status(self) -> int:
@@ -347,7 +368,20 @@ class Flight(Result):
         """See `Result.shown`."""
         from scenarios.summary_tables import summary_tables
 
-        return summary_tables(self.to_json(), self.directory)
+        return summary_tables(self.to_json())
+
+    def outputs(self) -> Shown:
+        """See `Result.outputs`."""
+        from scenarios import console
+
+        if self.directory is None:
+            return
+        yield console.written_to(self.directory)
+        for name in (rundir.VIDEO_FILE, rundir.FIGURES_DIR):
+            if (self.directory / name).exists():
+                yield console.to_open(self.directory / name)
+        if (self.directory / rundir.RECORDING_FILE).exists():
+            yield console.to_open(self.directory, "quadsim view")
 
     def to_json(self) -> dict[str, Any]:
         """Return `summary.json`, the recorded one if the flight is on disk."""

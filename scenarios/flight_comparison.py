@@ -81,7 +81,8 @@ class FlightComparison(Result):
         ]
         yield console.table("comparison", ["", *self.names], lines)
         if self.page is not None:
-            yield console.styled("every number, plots and films: ", (console.short_path(self.page), "bold"))
+            yield "every number, plots and films:"
+            yield console.to_open(self.page)
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return one row per quantity, with a text for each flight."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import signal
+import threading
 import time as clock
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Final
@@ -38,7 +40,8 @@ def reporting(progress: Progress | bool) -> Iterator[Progress]:
         yield silent
         return
     if not (screen := stderr()).is_terminal:
-        yield _lines(screen)
+        with _lines(screen) as tell:
+            yield lambda stage, done, total: tell(f"{stage} {100 * done // total} %" if total > 1 else stage)
         return
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
@@ -49,23 +52,35 @@ def reporting(progress: Progress | bool) -> Iterator[Progress]:
 
         def report(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)
+                tasks[stage] = bars.add_task(stage)
+            bars.update(tasks[stage], completed=done, total=total if total > 1 or done else None)  # None: it pulses
 
         yield report
 
 
-def _lines(screen: PlainConsole) -> Progress:
-    """Return a function that prints the progress of a stage, at most one line per `LINE_EVERY`."""
-    printed = clock.perf_counter()
+@contextlib.contextmanager
+def _lines(screen: PlainConsole) -> Iterator[Callable[[str], None]]:
+    """Yield a function that takes what is done now; the latest is printed every `LINE_EVERY`, also while it lasts."""
+    from scenarios import console
 
-    def report(stage: str, done: int, total: int) -> None:
-        nonlocal printed
-        if (now := clock.perf_counter()) - printed >= LINE_EVERY:
-            printed = now
-            screen.print(f"quadsim: {stage} {100 * done // max(total, 1)} %", soft_wrap=True)
+    now, started, over = "starting", clock.monotonic(), threading.Event()
 
-    return report
+    def tell(text: str) -> None:
+        nonlocal now
+        now = text
+
+    def tick() -> None:
+        signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # they are for the thread that works
+        while not over.wait(LINE_EVERY):
+            console.show([f"quadsim: {now} after {clock.monotonic() - started:.0f} s"], screen)
+
+    ticking = threading.Thread(target=tick, daemon=True)
+    ticking.start()
+    try:
+        yield tell
+    finally:
+        over.set()
+        ticking.join()
 
 
 @contextlib.contextmanager
@@ -73,7 +88,7 @@ def watching(progress: bool) -> Iterator[Watch]:
     """Yield the function that shows a campaign's progress: a bar on a terminal, elsewhere a line at intervals."""
     from scenarios.console import stderr
 
-    screen, printed = stderr(), clock.perf_counter()
+    screen = stderr()
     if not progress:
         yield lambda state: None
     elif screen.is_terminal:
@@ -88,14 +103,8 @@ def watching(progress: bool) -> Iterator[Watch]:
                 bar, completed=state.flown, total=state.flights, description=_describe(state)
             )
     else:
-
-        def show(state: CampaignProgress) -> None:
-            nonlocal printed
-            if clock.perf_counter() - printed >= LINE_EVERY or state.flown == state.flights:
-                printed = clock.perf_counter()
-                screen.print(_describe(state), soft_wrap=True)
-
-        yield show
+        with _lines(screen) as tell:
+            yield lambda state: tell(f"flights {_describe(state)}")
 
 
 def _describe(state: CampaignProgress) -> str:

@@ -31,6 +31,10 @@ class Result:
         """Return its tables and sentences, in order."""
         raise NotImplementedError
 
+    def outputs(self) -> Shown:
+        """Return the last lines: what was written, and the commands that open it."""
+        return ()
+
     def to_json(self) -> Any:
         """Return it as plain data, as `--json` prints it."""
         raise NotImplementedError
@@ -39,13 +43,13 @@ class Result:
         """Print the result."""
         from scenarios import console
 
-        console.show(self.shown())
+        console.show([*self.shown(), *self.outputs()])
 
     def text(self) -> str:
         """Return the output of `show` without colours."""
         from scenarios import console
 
-        return console.to_text(self.shown())
+        return console.to_text([*self.shown(), *self.outputs()])
 
     def __repr__(self) -> str:
         """Return the first lines of its text."""
@@ -62,7 +66,7 @@ class Result:
         from scenarios import console
 
         plot = self.small_plot()
-        return console.to_html(self.shown()) + ("" if plot is None else to_html(plot))
+        return console.to_html([*self.shown(), *self.outputs()]) + ("" if plot is None else to_html(plot))
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 from rich.console import RenderableType
@@ -25,17 +24,18 @@ from quadsim.report.comparison import (
 from scenarios import console
 
 _NAMED: Final = 3  # violated constraints named in the first line
+_SPARE: Final = ("beyond", "sampled", "plant", "bounds")  # columns that a narrow console does without, in this order
 
 
-def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) -> Iterator[RenderableType]:
-    """Yield the tables and sentences of a summary, and the directory it was written to."""
+def summary_tables(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
+    """Yield the tables and sentences of a summary."""
     simulated = console.styled(f"  {summary['duration']:.2f} s flown")
     yield console.styled((summary["scenario"], "bold"), "  ") + outcome_line(summary) + simulated
     if summary.get("description"):
         yield summary["description"]
     yield from summary.get("traceback", ())
     if "course" in summary:
-        yield summary["course"]["sentence"]
+        yield f"{summary['course']['sentence']} {summary['course'].get('advice', '')}".rstrip()
     if summary["tracking"]:
         yield _tracking_table(summary["tracking"])
     if summary["constraints"]:
@@ -49,8 +49,6 @@ def summary_tables(summary: Mapping[str, Any], directory: Path | None = None) ->
         again = summary["reaudit"]
         phrase = "as recorded" if again["satisfied"] == summary["satisfied"] else "a different verdict than recorded"
         yield f"audited again from the tables, {again['rate']:g} rows per second: {phrase}"
-    if directory is not None:
-        yield console.written_to(directory)
 
 
 def outcome_line(summary: Mapping[str, Any]) -> Text:
@@ -90,15 +88,15 @@ def _violations(constraints: Sequence[Mapping[str, Any]]) -> str:
 def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
     """Return every constraint with its bounds, peaks, margin, tolerances and verdict."""
     caption = (
-        "margin: the decisive one, negative = beyond the bound (s: at the samples); tolerance: accepted violation; "
+        "margin: the decisive one, negative = beyond the bound (s: at the samples); within: the tolerance; "
         "beyond: time outside bound and tolerance [s]; -: no value"
     )
     if any(not entry["required"] for entry in constraints):
         caption += "; *: reported only, not required"
-    head = ("constraint", "bounds", "sampled", "plant", "margin", "tolerance", "beyond", "verdict")
+    head = ("constraint", "bounds", "sampled", "plant", "margin", "beyond", "verdict")
     lines = []
     for entry in constraints:
-        margin, tolerance = deciding_margin(entry)
+        margin, _ = deciding_margin(entry)
         at_samples = "" if margin == entry["worst_margin"] else " s"
         lines.append(
             (
@@ -106,19 +104,20 @@ def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
                 _range(entry["lower"], entry["upper"]),
                 *(_number(entry[name]) for name in ("peak_sampled", "peak_plant")),
                 f"{_number(margin)}{at_samples}",
-                _number(tolerance),
                 _number(entry["time_violated"]),
                 _verdict(entry),
             )
         )
-    return console.table("audit at the physics rate", head, lines, caption=caption, left=("verdict",), rigid=True)
+    return console.table("audit at the physics rate", head, lines, caption=caption, left=("verdict",), spare=_SPARE)
 
 
 def _verdict(entry: Mapping[str, Any]) -> Text:
     verdict = constraint_verdict(entry)
+    margin, tolerance = deciding_margin(entry)
     if verdict == "violated":
         return console.styled(("VIOLATED", "red") if entry["required"] else ("exceeded*", "yellow"))
-    return console.styled((VERDICT_TEXT[verdict], "green" if verdict == "satisfied" else "yellow"))
+    within = f" (within {_number(tolerance)})" if margin is not None and margin < 0.0 else ""
+    return console.styled((f"{VERDICT_TEXT[verdict]}{within}", "green" if verdict == "satisfied" else "yellow"))
 
 
 def _tracking_table(tracking: Mapping[str, Any]) -> Table:

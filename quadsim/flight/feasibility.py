@@ -59,6 +59,7 @@ class Feasibility:
     problems: tuple[str, ...]
     """One line per exceeded limit or bound; empty for a course that can be flown exactly."""
     sentence: str  # summary for the user
+    advice: str = ""  # the speed, response time or size that would be within limits and bounds, in a sentence
 
 
 def demand(
@@ -215,14 +216,16 @@ def _sentence(
     jumps: Sequence[float],
     problems: Sequence[str],
 ) -> str:
+    if problems:
+        more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
+        return f"The course cannot be followed exactly: {problems[0]}{more}."
     bound = "" if allowed is None else f" (bound {allowed:.4g} deg)"
     times = ", ".join(f"{time:g}" for time in jumps[:4]) + (", ..." if len(jumps) > 4 else "")
     turned = f", a yaw of {round(peaks['yaw'], 1):g} deg" if peaks["yaw"] > 0.5 else ""
-    subject = f"The course steps (at t = {times} s); the rest requires" if jumps else "The course requires"
-    sentence = (
+    subject = f"The course steps (at {times} s); the rest requires" if jumps else "The course requires"
+    return (
         f"{subject} up to {round(peaks['tilt'], 2):g} deg of tilt{bound}, "
         f"{round(peaks['velocity'], 2):g} m/s{turned}, "
         f"and rotor speeds of {peaks['rotor_min']:.4g} to {peaks['rotor_max']:.4g} rad/s "
-        f"(limits {vehicle.speed_min:.4g} and {vehicle.speed_max:.4g} rad/s)."
+        f"(limits {vehicle.speed_min:.4g} and {vehicle.speed_max:.4g})."
     )
-    return f"{sentence} It cannot be followed exactly: {'; '.join(problems)}." if problems else sentence

@@ -280,14 +280,18 @@ class Replay(Result):
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
+        return self.flight.shown()
+
+    def outputs(self) -> Shown:
+        """See `Result.outputs`; before them, whether the numbers are the campaign's."""
         from scenarios import console
 
-        yield from self.flight.shown()
         number, count = self.recorded.number, len(self.recorded.row)
         if self.differing:
             yield console.styled((f"flight {number} differs from the campaign's in {', '.join(self.differing)}", "red"))
         else:
             yield f"flight {number}: {count} columns, each the same as in the campaign"
+        yield from self.flight.outputs()
 
     def to_json(self) -> dict[str, Any]:
         """Return `summary.json` of the new flight."""

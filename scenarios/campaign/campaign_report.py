@@ -62,6 +62,8 @@ def campaign_lines(summary: Summary, judgements: Sequence[Judgement], directory:
     for judgement in judgements:
         yield console.styled((judgement.sentence, "green" if judgement.holds else "red"))
     yield console.written_to(directory)
+    if (directory / PAGE_FILE).exists():
+        yield console.to_open(directory / PAGE_FILE)
 
 
 def _brief(grid: Grid) -> Grid:

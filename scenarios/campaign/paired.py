@@ -160,7 +160,7 @@ class PairedComparison(Result):
         yield self.sentence
         yield from console.grids(self.tables)
         if self.page is not None:
-            yield console.written_to(self.page)
+            yield console.to_open(self.page)
 
     def to_markdown(self) -> str:
         """Return differences, verdict and tables as Markdown."""

@@ -11,7 +11,7 @@ from mpc.robust.settings import Robust
 from quadsim.vehicle import Vehicle
 from scenarios.assembly import Assembly
 from scenarios.design.authority import Authority, authority
-from scenarios.feasibility_check import fitting, report
+from scenarios.feasibility_check import report
 from scenarios.schema.scenario import Scenario
 
 SLOWEST_ANSWER: Final = 1.0
@@ -41,10 +41,9 @@ def shortfalls(scenario: Scenario, vehicle: Vehicle) -> tuple[str, ...]:
     if any("hover is" in line for line in missed):  # the course's rotor speeds would repeat it
         return tuple(missed)
     assembly = Assembly(scenario)
-    problems = report(assembly).problems
-    missed += [f"the course requires {problem}" for problem in problems]
-    fits = fitting(assembly) if problems else ""
-    return (*missed, fits) if fits else tuple(missed)
+    required = report(assembly)
+    missed += [f"the course requires {problem}" for problem in required.problems]
+    return (*missed, required.advice) if required.advice else tuple(missed)
 
 
 def _inputs(bounds: InputBounds, vehicle: Vehicle, period: float) -> list[str]:

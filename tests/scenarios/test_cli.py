@@ -8,6 +8,7 @@ import shutil
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -18,6 +19,7 @@ from quadsim import __version__
 from quadsim.assets import vehicle_names
 from quadsim.errors import RenderingUnavailableError
 from quadsim.flight import rundir
+from scenarios import flight
 from scenarios.app import app
 from scenarios.campaign.plan import read_campaign
 from scenarios.catalogue import campaign_names, scenario_names, tuning_names
@@ -144,6 +146,25 @@ def test_run_prints_tables_and_where_the_files_are(here: Path, capsys: pytest.Ca
     assert "written to runs/hover" in printed.out
     assert printed.err == ""
     assert rundir.read_summary(here / "runs" / "hover")
+
+
+def test_run_prints_the_verdict_before_its_film_and_what_to_open_at_its_end(
+    here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before, make = [], flight._add_products
+
+    def slow(*arguments: Any) -> dict[str, str]:
+        before.append(capsys.readouterr().out)
+        assert rundir.read_summary(here / "runs" / "hover")["verdict"] == "satisfied"
+        return make(*arguments)
+
+    monkeypatch.setattr(flight, "_add_products", slow)
+    assert main(["run", "hover", *SHORT, "--no-video", "--no-figures"]) == EXIT_DONE
+    assert before[0].startswith("hover  completed, every required constraint holds  0.50 s flown\n")
+    assert capsys.readouterr().out == "written to runs/hover\nquadsim view runs/hover\n"
+    assert main(["run", "hover", *SHORT, "--no-video", "--no-figures", "--json"]) == EXIT_DONE
+    assert before[1] == ""
+    assert json.loads(capsys.readouterr().out)["products"] == {"flight.rrd": "made"}
 
 
 def test_settings_and_seed_reach_the_flight(here: Path, capsys: pytest.CaptureFixture[str]) -> None:

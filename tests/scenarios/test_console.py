@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import copy
+import io
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from rich.console import RenderableType
 from rich.text import Text
 
 from quadsim.errors import printable
 from quadsim.report.table import Cell, Grid, Mark, Row, to_markdown
 from scenarios import console
 from scenarios.junit import write_cases
-from scenarios.summary_tables import summary_tables
+from scenarios.summary_tables import audit_table, summary_tables
 
 NASTY = ("[/bold]", "[link=file:///decoy]x[/link]", "\x1b[2J\x1b]0;title\x07", "a\r\nquadsim: all is well", "\ud800")
 
@@ -41,7 +44,8 @@ def test_a_foreign_summary_is_shown_as_text(nasty: str, short_run: Any, capsys: 
     cells = tuple(Cell(text=nasty, mark=mark) for mark in (Mark.NONE, Mark.BAD))
     row = Row(group=nasty, label="outcome", unit=nasty, cells=cells, headline=True)
     grid = Grid(key="k", title=nasty, head=(nasty, nasty), lines=(cells,), note=nasty)
-    parts = [*summary_tables(summary, Path(nasty.encode(errors="replace").decode())), *console.grids([grid])]
+    path = Path(nasty.encode(errors="replace").decode())
+    parts = [*summary_tables(summary), console.written_to(path), console.to_open(path), *console.grids([grid])]
     parts += [*console.listing({nasty: {nasty: nasty}}), console.table(nasty, [nasty], [[nasty]])]
     console.show(parts)
     console.say(nasty)
@@ -51,6 +55,36 @@ def test_a_foreign_summary_is_shown_as_text(nasty: str, short_run: Any, capsys: 
     output = capsys.readouterr()
     assert is_plain(output.out + output.err)
     assert output.out.count(printable(nasty)) > 20
+
+
+def shown(parts: Iterable[RenderableType], width: int) -> list[str]:
+    """The lines on a console of that width."""
+    screen = console.PlainConsole(file=io.StringIO(), width=width)
+    console.show(parts, screen)
+    return [line.rstrip() for line in screen.export_text().splitlines()]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_sentences_break_at_spaces_and_paths_and_commands_stay_whole(short_run: Any, width: int) -> None:
+    path, words = Path("/", *["folder"] * 30), ["constraint"] * 40
+    sentence = f"{' '.join(words)} {path} {' '.join(words)}"
+    lines = shown([sentence, Text(sentence)], width)
+    assert " ".join(lines).split() == [*words, str(path), *words] * 2
+    assert [line for line in lines if len(line) > width] == [str(path)] * 2
+    assert shown([console.to_open(path / "a flight.mp4")], width) == [f"open '{path}/a flight.mp4'"]
+    assert max(map(len, shown(summary_tables(short_run.summary), width))) <= width
+
+
+@pytest.mark.parametrize("width", [60, 80, 120])
+def test_a_verdict_is_never_cut_and_names_the_tolerance_that_it_needs(short_run: Any, width: int) -> None:
+    roll, *others = copy.deepcopy(short_run.summary["constraints"])
+    roll |= {"name": "roll_of_the_" + "vehicle" * 5, "worst_margin": -0.04, "worst_margin_sampled": 0.0}
+    text = "\n".join(lines := shown([audit_table([roll, *others])], width))
+    assert "holds (within 0.05)" in text
+    assert "-0.04" in text
+    assert text.count("not reached") == 4
+    assert max(map(len, lines)) <= width
+    assert ("beyond verdict" in text) == (width == 120)
 
 
 @pytest.mark.parametrize("nasty", [*NASTY, "\x0b", "\uffff", "\ufffe"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,13 @@ import numpy as np
 import pytest
 from support import scenario_table
 
+import quadsim
 from quadsim.flight.feasibility import Feasibility
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.assembly import Assembly
+from scenarios.catalogue import scenario_names
+from scenarios.console import PlainConsole, show
 from scenarios.feasibility_check import fitting, report
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.scenario import Scenario
@@ -34,9 +38,28 @@ def test_the_papers_course_steps_and_what_its_filter_leaves_is_beyond_the_bound(
     assert finding.jumps == (0.0, 10.0, 20.0, 40.0)
     assert finding.tilt == pytest.approx(20.0, abs=0.1)
     assert [problem.split()[0] for problem in finding.problems] == ["roll", "roll", "pitch", "pitch"]
-    assert finding.sentence.startswith(
-        "The course steps (at t = 0, 10, 20, 40 s); the rest requires up to 19.96 deg of tilt (bound 5 deg), "
-    )
+    assert finding.sentence == "The course cannot be followed exactly: roll up to 19.07 deg (bound 5) and 3 more."
+    assert finding.advice == "It would fit with a response time of 10.2 s, or at 25 % of its size."
+    assert finding.advice == fitting(Assembly(made))
+
+
+def test_a_note_on_a_shipped_course_has_at_most_two_lines() -> None:
+    for name in scenario_names():
+        result = report(Assembly(load_scenario(name)))
+        screen = PlainConsole(file=io.StringIO(), width=80)
+        show([f"{result.sentence} {result.advice}".rstrip()], screen)
+        assert len(screen.export_text().splitlines()) <= 2, (name, result)
+        assert bool(result.advice or "not flyable" in result.sentence) == bool(result.problems)
+
+
+def test_a_course_that_the_flight_cuts_is_reported(vehicle: Vehicle, tmp_path: Path) -> None:
+    eight = scenario({"type": "figure_eight", "length": 6.0, "period": 12.0, "turns": 1.5, "ramp": 4.0})
+    table = rounded(tmp_path / "eight.csv", poses_of(eight), 4)
+    cut = " It lasts until 20.95 s, but the flight follows it for 10 s."
+    assert found(table, vehicle, duration=10.0).sentence.endswith(cut)
+    assert "lasts" not in found(table, vehicle, duration=21.0).sentence
+    sampled = quadsim.fly(scenario(table, duration=1.0), reference=lambda t: [0.0, 0.0, 0.0, 0.0], progress=False)
+    assert "lasts" not in sampled.summary["course"]["sentence"]
 
 
 def test_a_circle_requires_the_tilt_of_the_closed_form(vehicle: Vehicle) -> None:
@@ -144,5 +167,5 @@ def test_filtered_steps_would_fit_with_a_slower_filter_or_smaller(vehicle: Vehic
     steps = {"response_time": 3.0, "y": [{"start": 1.0, "stop": 15.0, "value": 2.0}]}
     advice = fitting(Assembly(scenario(steps), vehicle))
     time = 3.0 * math.sqrt(2.0 / (vehicle.gravity * math.tan(math.radians(5.0))))
-    assert advice.startswith("It would fit at ")
-    assert float(advice.removesuffix(" s.").rpartition(" ")[2]) == pytest.approx(time, rel=0.06)
+    assert advice.startswith("It would fit with a response time of ")
+    assert float(advice.partition(" s,")[0].rpartition(" ")[2]) == pytest.approx(time, rel=0.06)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import time as clock
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -13,48 +14,46 @@ from scenarios.console import PlainConsole
 from scenarios.progress import reporting, watching
 
 
-class Clock:
-    """Shows what it is told."""
-
-    now = 0.0
-
-    def perf_counter(self) -> float:
-        return self.now
-
-
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
-    clock = Clock()
-    monkeypatch.setattr("scenarios.progress.clock", clock)
-    return clock
+def lines(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], list[str]]]:
+    """Has a line come often, and returns the lines once two more have come."""
+    monkeypatch.setattr("scenarios.progress.LINE_EVERY", 0.02)
+    shown = io.StringIO()
+    monkeypatch.setattr(console, "stderr", lambda: PlainConsole(stderr=True, file=shown))
+
+    def wait() -> list[str]:
+        there, deadline = shown.getvalue().count("\n"), clock.monotonic() + 20.0
+        while shown.getvalue().count("\n") < there + 2 and clock.monotonic() < deadline:
+            clock.sleep(0.01)
+        return shown.getvalue().splitlines()
+
+    yield wait
+    there = shown.getvalue()
+    clock.sleep(0.1)
+    assert shown.getvalue() == there, "it is over"
 
 
-def test_elsewhere_a_line_comes_every_ten_seconds(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_elsewhere_lines_say_what_is_done_however_long_it_takes(lines: Callable[[], list[str]]) -> None:
     with reporting(True) as report:
-        for second in range(1, 31):
-            clock.now = float(second)
-            report("flight" if second < 25 else "video", second, 40)
-    assert capsys.readouterr().err.splitlines() == [
-        "quadsim: flight 25 %",
-        "quadsim: flight 50 %",
-        "quadsim: video 75 %",
-    ]
+        assert lines()[-1] == "quadsim: starting after 0 s"
+        report("flight", 10, 40)
+        assert lines()[-1] == "quadsim: flight 25 % after 0 s"
+        report("figures", 0, 1)
+        assert lines()[-1] == "quadsim: figures after 0 s"
 
 
-def test_no_progress_is_silent(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_progress_is_silent(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("scenarios.progress.LINE_EVERY", 0.01)
     with reporting(False) as report:
-        clock.now = 100.0
         report("flight", 1, 2)
+        clock.sleep(0.1)
     assert capsys.readouterr().err == ""
 
 
-def test_a_campaign_says_a_line_every_ten_seconds(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_campaign_says_how_far_it_is(lines: Callable[[], list[str]]) -> None:
     with watching(True) as watch:
-        for flown in range(1, 26):
-            clock.now = float(flown)
-            watch(CampaignProgress(flown=flown, flights=25, failed=0, rate=1.0))
-    starts = [line.partition(",")[0] for line in capsys.readouterr().err.splitlines()]
-    assert starts == ["10/25", "20/25", "25/25"]
+        watch(CampaignProgress(flown=10, flights=25, failed=0, rate=1.0))
+        assert lines()[-1].startswith("quadsim: flights 10/25, 1.00/s, 0:00:15 left; 0 failed (")
 
 
 def test_a_terminal_has_bars(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,6 +64,7 @@ def test_a_terminal_has_bars(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, "stderr", lambda: screen)
     with reporting(True) as report:
         report("flight", 1, 4)
+        report("figures", 0, 1)
         report("video", 3, 4)
     assert "flight" in shown.getvalue()
     assert "75 %" in shown.getvalue()

@@ -10,7 +10,6 @@ import pytest
 import quadsim
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
-from scenarios import console
 from scenarios.cli import main
 from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
 from scenarios.design.shortfalls import shortfalls
@@ -78,13 +77,11 @@ def test_the_command_reports_them_where_a_scenario_is_named(capsys: pytest.Captu
     assert "shortfalls" not in json.loads(capsys.readouterr().out)
 
 
-def test_the_speed_at_which_a_course_fits_is_reported_before_the_flight(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(console.PlainConsole, "is_terminal", True)
+def test_the_note_on_a_course_stands_once_after_the_verdict(capsys: pytest.CaptureFixture[str]) -> None:
     settings = ["reference.period=6.0", "reference.start=0.0", "duration=4.0"]
     main(["check", "hummingbird-figure-eight", *(part for setting in settings for part in ("--set", setting))])
-    notice = capsys.readouterr().err.partition("\n")[0]
-    assert "It cannot be followed exactly: roll up to" in notice
-    assert notice.endswith(" % of its size.")
-    assert " It would fit at " in notice
+    printed = capsys.readouterr()
+    verdict, _, after = printed.out.partition("4.00 s flown")
+    assert "The course cannot be followed exactly: roll up to" not in verdict + printed.err
+    assert after.count("The course cannot be followed exactly: roll up to") == 1
+    assert after.count("It would fit") == 1
