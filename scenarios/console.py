@@ -13,7 +13,7 @@ from typing import IO, Any, Final
 
 from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
@@ -75,7 +75,7 @@ def _wrapped(text: Text, width: int) -> Text:
     """Break lines at spaces; a word that is longer than a line, such as a path, stays whole."""
     if text.no_wrap:
         return text
-    lines = []
+    lines: list[Text] = []
     for line in text.split(allow_blank=True):
         starts, plain = [0], line.plain
         for word in re.finditer(r"\S+", plain):
@@ -144,10 +144,8 @@ def table(
     )
     table.caption, table.caption_justify, table.spare = caption, "left", spare
     for i, name in enumerate(head):
-        table.add_column(
-            name, justify="right" if i and name not in left else "left", no_wrap=bool(i) if spare else not i
-        )
-        table.columns[-1].overflow = "fold"
+        justify: JustifyMethod = "right" if i and name not in left else "left"
+        table.add_column(name, justify=justify, overflow="fold", no_wrap=bool(i) if spare else not i)
     for line in lines:
         table.add_row(*line)
     return table

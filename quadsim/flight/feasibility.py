@@ -59,7 +59,7 @@ class Feasibility:
     problems: tuple[str, ...]
     """One line per exceeded limit or bound; empty for a course that can be flown exactly."""
     sentence: str  # summary for the user
-    advice: str = ""  # the speed, response time or size that would be within limits and bounds, in a sentence
+    advice: str  # the speed, response time or size that would be within limits and bounds, in a sentence
 
 
 def demand(
@@ -154,7 +154,7 @@ def assess(
     }
     problems = _problems(needed, vehicle, bounds, tightened or {})
     sentence = _sentence(peaks, vehicle, min(tilts, default=None), jumps, problems)
-    return Feasibility(**peaks, jumps=tuple(jumps), problems=problems, sentence=sentence)
+    return Feasibility(**peaks, jumps=tuple(jumps), problems=problems, sentence=sentence, advice="")
 
 
 def _attitudes(pushed: Array, yaw: Array) -> Array:
