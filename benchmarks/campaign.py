@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from functools import partial
 from pathlib import Path
 
 from timing import Record, options, run
@@ -15,6 +16,7 @@ from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import Plan
 from scenarios.campaign.rows import read_table
 from scenarios.campaign.store import FLIGHTS_FILE, TIMES_FILE
+from scenarios.progress import Progress
 from scenarios.schema.scenario import Scenario
 
 
@@ -41,15 +43,17 @@ def campaign(scenario: Scenario, solver: str, flights: int, workers: int) -> Rec
     }
 
 
-def measure(quick: bool) -> list[Record]:
+def measure(quick: bool, report: Progress) -> list[Record]:
     """Campaigns by one worker and by two, by PIQP and by the core where there is one, in turns."""
     rounds, flights = (1, 2) if quick else (3, 40)
     solvers = ["piqp", "core"] if why_missing() is None else ["piqp"]
-    results = []
+    cases = (("paper-constrained", 1), ("paper-constrained", 2), ("robust", 2))
+    results: list[Record] = []
     for _ in range(rounds):
-        for name, workers in (("paper-constrained", 1), ("paper-constrained", 2), ("robust", 2)):
+        for name, workers in cases:
             scenario = load(name).replace({"duration": 0.5, "constraints": []} if quick else {})
             for solver in solvers:
+                report("campaigns", len(results), rounds * len(cases) * len(solvers))
                 results.append(campaign(scenario.replace({"controller.solver": solver}), solver, flights, workers))
     return results
 
@@ -57,7 +61,7 @@ def measure(quick: bool) -> list[Record]:
 def main() -> None:
     """Fly, print and write."""
     chosen = options(__doc__)
-    run(lambda: measure(chosen.quick), "What campaigns cost", chosen.json)
+    run(partial(measure, chosen.quick), "What campaigns cost", chosen.json)
 
 
 if __name__ == "__main__":

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import tempfile
+from functools import partial
 from pathlib import Path
 
 from timing import Record, Stopwatch, options, run
 
 from quadsim.report.film.video import render_video, rendering_backend, worker_count
 from scenarios.app import load
+from scenarios.progress import Progress
 from scenarios.rollout import Rollout
 
 FPS = 30
 
 
-def measure(name: str, quick: bool, workers: int | None) -> list[Record]:
+def measure(name: str, quick: bool, workers: int | None, report: Progress) -> list[Record]:
     """One record: seconds until the first frame is there, and from then on per frame [ms].
 
     Raises:
@@ -26,8 +28,13 @@ def measure(name: str, quick: bool, workers: int | None) -> list[Record]:
     with tempfile.TemporaryDirectory() as scratch:
         directory = Path(scratch) / "run"
         rollout = Rollout(load(name).replace({"duration": seconds, "constraints": []}))
-        rollout.fly().save(directory, video=False, recording=False, figures=False)
+        rollout.fly(report).save(directory, video=False, recording=False, figures=False)
         watch = Stopwatch()
+
+        def reached(done: int, total: int) -> None:
+            reports.append((done, total, watch.elapsed))
+            report("film", done, total)
+
         render_video(
             directory,
             directory / "film.mp4",
@@ -35,7 +42,7 @@ def measure(name: str, quick: bool, workers: int | None) -> list[Record]:
             width=width,
             height=height,
             fps=FPS,
-            progress=lambda done, total: reports.append((done, total, watch.elapsed)),
+            progress=reached,
         )
         wall = watch.elapsed
     frames, start = reports[0][1], reports[0][2]
@@ -60,7 +67,7 @@ def main() -> None:
         scenario={"default": "paper-constrained", "help": "default: %(default)s"},
         workers={"type": int, "metavar": "N", "help": "processes (default: one per core)"},
     )
-    run(lambda: measure(chosen.scenario, chosen.quick, chosen.workers), f"A film of {chosen.scenario}", chosen.json)
+    run(partial(measure, chosen.scenario, chosen.quick, chosen.workers), f"A film of {chosen.scenario}", chosen.json)
 
 
 if __name__ == "__main__":

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from timing import Record, Stopwatch, options, run, undisturbed
 
 from quadsim.sim.loop import complete
 from scenarios.app import load
 from scenarios.assembly import Assembly
+from scenarios.progress import Progress
 from scenarios.rollout import closed_loop
 
 
-def measure(name: str, quick: bool) -> list[Record]:
+def measure(name: str, quick: bool, report: Progress) -> list[Record]:
     """Seconds of each part, the median over flights by turns with and without clocks around the parts."""
     scenario = load(name).replace({"duration": 2.0, "constraints": []}) if quick else load(name)
     assembly = Assembly(scenario)
@@ -23,8 +26,10 @@ def measure(name: str, quick: bool) -> list[Record]:
     with assembly.plant() as plain, assembly.plant() as watched, undisturbed():
         pieces.watch(watched, "advance", "physics")
         pieces.watch(watched, "state", "measurement")
-        for _ in range(1 if quick else 5):
+        rounds = 1 if quick else 5
+        for i in range(rounds):
             for plant in (plain, watched):
+                report("flights", 2 * i + (plant is watched), 2 * rounds)
                 for laps in pieces.laps.values():
                     laps.clear()
                 navigation, watch = assembly.navigation(), Stopwatch()
@@ -55,7 +60,7 @@ def measure(name: str, quick: bool) -> list[Record]:
 def main() -> None:
     """Fly, print and write."""
     chosen = options(__doc__, scenario={"default": "paper-constrained", "help": "default: %(default)s"})
-    run(lambda: measure(chosen.scenario, chosen.quick), f"A flight of {chosen.scenario}", chosen.json)
+    run(partial(measure, chosen.scenario, chosen.quick), f"A flight of {chosen.scenario}", chosen.json)
 
 
 if __name__ == "__main__":

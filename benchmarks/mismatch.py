@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +21,7 @@ from quadsim.state import INDEX, POSITION
 from scenarios.app import load
 from scenarios.catalogue import scenario_path
 from scenarios.many import fly_many
+from scenarios.progress import Progress
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
@@ -110,12 +112,13 @@ def fly(scenario: Scenario) -> Record:
     }
 
 
-def measure(quick: bool, workers: int | None) -> list[Record]:
+def measure(quick: bool, workers: int | None, report: Progress) -> list[Record]:
     """A record of each flight, in order."""
     flights = cells(quick)
     rows: dict[int, Record] = {}
     with closing(fly_many([scenario for *_, scenario in flights], fly, workers=workers)) as answers:
-        for place, row in answers:
+        for flown, (place, row) in enumerate(answers, 1):
+            report("flights", flown, len(flights))
             if "fate" not in row:
                 raise QuadsimError(f"{', '.join(flights[place][:2])}: {row['verdict']} ({row['reason']})")
             rows[place] = row
@@ -153,7 +156,7 @@ def draw(records: Sequence[Record], path: Path) -> None:
 def main() -> None:
     """Fly, print and write."""
     chosen = options(__doc__, workers={"type": int, "metavar": "N", "help": "processes (default: one per core)"})
-    records = run(lambda: measure(chosen.quick, chosen.workers), "What each controller survives", chosen.json)
+    records = run(partial(measure, chosen.quick, chosen.workers), "What each controller survives", chosen.json)
     if chosen.json is not None:
         draw(records, chosen.json.with_suffix(".png"))
 

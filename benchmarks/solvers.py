@@ -24,6 +24,7 @@ from quadsim.state import Array, make_state
 from scenarios.app import load
 from scenarios.assembly import Assembly
 from scenarios.catalogue import read_catalogue
+from scenarios.progress import Progress
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
@@ -76,14 +77,14 @@ def entries(scenario: Scenario) -> dict[str, Scenario]:
     return usable
 
 
-def measure(name: str, quick: bool) -> list[Record]:
+def measure(name: str, quick: bool, report: Progress) -> list[Record]:
     """A record of each solver on a scenario."""
     scenario = load(name)
     if not isinstance(scenario.controller, Constrained | Robust):
         raise InputError(f"{name} is flown by no MPC of fixed matrices; choose a constrained or a robust one")
     if quick:
         scenario = scenario.replace({"duration": 2.0, "controller.horizon": 10, "constraints": []})
-    flight = Rollout(scenario).fly()
+    flight = Rollout(scenario).fly(report)
     log = flight.log.control
     candidates: dict[str, Replayed] = {}
     setup: dict[str, float] = {}
@@ -109,6 +110,7 @@ def measure(name: str, quick: bool) -> list[Record]:
             between=fly_a_period,
             repeats=1 if quick else 3,
             rng=np.random.default_rng(scenario.seed),
+            progress=report,
         )
     exact = candidates.get("core", next(iter(candidates.values()))).commands
     return [
@@ -160,7 +162,9 @@ def main() -> None:
     shipped = ["paper-constrained", "robust"]
     chosen = options(__doc__, scenario={"nargs": "+", "default": shipped, "help": "default: %(default)s"})
     records = run(
-        lambda: [r for name in chosen.scenario for r in measure(name, chosen.quick)], "QP solvers", chosen.json
+        lambda report: [row for name in chosen.scenario for row in measure(name, chosen.quick, report)],
+        "QP solvers",
+        chosen.json,
     )
     if chosen.json is not None:
         draw(records, chosen.json.with_suffix(".png"))

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +30,7 @@ from scenarios.design.first_scenario import first_scenario
 from scenarios.feasibility_check import report
 from scenarios.loading import parse_scenario
 from scenarios.many import fly_many
+from scenarios.progress import Progress
 from scenarios.rollout import Rollout
 
 Table = dict[str, Any]
@@ -185,7 +187,7 @@ def merged(flights: Sequence[Record]) -> Record:
     }
 
 
-def measure(quick: bool, workers: int | None) -> list[Record]:
+def measure(quick: bool, workers: int | None, report: Progress) -> list[Record]:
     """A record of each course, speed and controller."""
     cells = [(world, speed, law) for world, entry in WORLDS.items() for speed in entry.speeds for law in LAWS]
     if quick:
@@ -193,7 +195,8 @@ def measure(quick: bool, workers: int | None) -> list[Record]:
     flights = [(*cell, seed) for cell in cells for seed in range(WORLDS[cell[0]].seeds)]
     rows: dict[tuple[str, float, str], list[tuple[int, Record]]] = {cell: [] for cell in cells}
     with closing(fly_many(flights, fly, workers=workers)) as answers:
-        for place, row in answers:
+        for flown, (place, row) in enumerate(answers, 1):
+            report("flights", flown, len(flights))
             if "bound" not in row:
                 raise QuadsimError(f"{flights[place]}: {row['verdict']} ({row['reason']})")
             rows[flights[place][:3]].append((place, row))
@@ -242,7 +245,7 @@ def draw(records: Sequence[Record], path: Path) -> None:
 def main() -> None:
     """Fly, print and write."""
     chosen = options(__doc__, workers={"type": int, "metavar": "N", "help": "processes (default: one per core)"})
-    records = run(lambda: measure(chosen.quick, chosen.workers), "Where linear control ends", chosen.json)
+    records = run(partial(measure, chosen.quick, chosen.workers), "Where linear control ends", chosen.json)
     if chosen.json is not None:
         draw(records, chosen.json.with_suffix(".png"))
 

@@ -21,6 +21,7 @@ from quadsim.errors import QuadsimError
 from quadsim.flight.metrics import percentiles
 from quadsim.state import Array
 from scenarios.machine import machine, versions
+from scenarios.progress import Progress, reporting, silent
 
 Record = dict[str, Any]
 
@@ -35,15 +36,18 @@ def options(about: str | None, **extra: Mapping[str, Any]) -> argparse.Namespace
     return parser.parse_args()
 
 
-def run(measure: Callable[[], list[Record]], title: str, file: Path | None) -> list[Record]:
+def run(measure: Callable[[Progress], list[Record]], title: str, file: Path | None) -> list[Record]:
     """Measure, print the records as a table and, where there is a file, write them with machine and versions.
+
+    `measure` reports its progress, of which stderr gets a line every ten seconds.
 
     Wrong input ends the script with exit status 2 and one message.
     """
     try:
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
-        records = measure()
+        with reporting(True, bars=False) as report:
+            records = measure(report)
         if file is not None:
             data = {"records": records, "machine": machine(), "versions": versions()}
             file.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
@@ -121,6 +125,7 @@ def time_in_turns(
     between: Callable[[], object],
     repeats: int,
     rng: np.random.Generator,
+    progress: Progress = silent,
 ) -> dict[str, Array]:
     """Put the same questions to all candidates, in turns, so that other load on the machine affects all of them.
 
@@ -130,6 +135,7 @@ def time_in_turns(
         between: what a flight does between two answers, which leaves in the caches what it leaves there in a flight.
         repeats: passes over all questions.
         rng: decides the order within each segment.
+        progress: called between segments.
 
     Returns:
         Each candidate's times of its questions in order, the median of the repeats [ms].
@@ -137,7 +143,8 @@ def time_in_turns(
     laps: dict[str, list[list[float]]] = {name: [[] for _ in range(repeats)] for name in candidates}
     with undisturbed():
         for i in range(repeats):
-            for segment in segments:
+            for j, segment in enumerate(segments):
+                progress("solvers", i * len(segments) + j, repeats * len(segments))
                 gc.collect()
                 for name in rng.permutation(list(candidates)).tolist():
                     prepare, answer = candidates[name]

@@ -24,6 +24,7 @@ from typing import Any, Final, get_args
 from PIL import Image
 
 from scenarios.loading import load_scenario
+from scenarios.progress import reporting
 from scenarios.schema.scenario import Group
 
 ROOT: Final = Path(__file__).resolve().parent.parent
@@ -73,12 +74,14 @@ def commands(name: str) -> list[list[str]]:
 def make(name: str) -> None:
     """Run the commands of a name; what prints its JSON has it saved."""
     MADE.mkdir(parents=True, exist_ok=True)
+    tells = name in (*BENCHMARKS, "campaigns", "tunings")  # how far it is
     for command in commands(name):
-        if name in ("papers", "first-flights"):
-            done = subprocess.run(command, cwd=ROOT, check=True, text=True, stdout=subprocess.PIPE)
+        with reporting(not tells) as report:
+            report(name, 0, 1)
+            stdout = subprocess.PIPE if name in ("papers", "first-flights") else None
+            done = subprocess.run(command, cwd=ROOT, check=True, text=True, stdout=stdout)
+        if stdout:
             (MADE / f"{name}.json").write_text(done.stdout, encoding="utf-8")
-        else:
-            subprocess.run(command, cwd=ROOT, check=True)
 
 
 def markdown(head: Sequence[str], rows: Iterable[Row]) -> str:

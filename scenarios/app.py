@@ -1056,6 +1056,7 @@ def export(
     fly: Flag = False,
     changes: Changes = (),
     seed: Whole | None = None,
+    progress: Watched = True,
 ) -> Document | Flight:
     """Export a scenario's controller as self-contained C99, with recorded periods to test it.
 
@@ -1069,15 +1070,19 @@ def export(
         fly: then fly the scenario with the exported controller on the emulated target, into runs/SCENARIO-TARGET.
         changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
         seed: replace the seed of everything random in the scenario.
+        progress: as in `fly`.
     """
     import json
     import shlex
 
     from scenarios import loading, results
     from scenarios.export import exporter, in_the_loop
+    from scenarios.progress import reporting
 
     flown, options = loading.load_scenario(scenario, changes, seed), {"precision": precision, "target": target}
-    directory = exporter.export(flown, out, overwrite=overwrite, rows=rows, **options)  # type: ignore[arg-type]
+    with reporting(progress) as report:
+        report("export", 0, 1)
+        directory = exporter.export(flown, out, overwrite=overwrite, rows=rows, **options)  # type: ignore[arg-type]
     room = exporter.room_sentence(json.loads((directory / exporter.FACTS).read_text()))
     make = f"make -C {shlex.quote(str(directory))} check"
     text = f"{precision}: {room}\nWrote {directory}: {make} compiles it and checks its recorded periods"
@@ -1085,7 +1090,7 @@ def export(
         return results.Document(f"{text}\n", {"directory": str(directory)})
     _log.info(text.replace("\n", "; "))
     with run_directory(f"{flown.name}-{target}", None, overwrite=False) as place:
-        return in_the_loop.fly_exported(flown, place, **options)  # type: ignore[arg-type]
+        return in_the_loop.fly_exported(flown, place, progress=progress, **options)  # type: ignore[arg-type]
 
 
 @app.command(

@@ -90,10 +90,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except CycloptsError as error:
-        print(f"quadsim: {_brief(str(error))}", file=sys.stderr)
+        _complain(error)
         return EXIT_WRONG_INPUT
     except QuadsimError as error:
-        print(f"quadsim: {_brief(str(error))}", file=sys.stderr)
+        _complain(error)
         return error.exit_status
     except SystemExit as error:  # raised by imported code; in flight it would abort the flight
         if isinstance(error.__context__, BrokenPipeError):  # rich's way to end
@@ -119,26 +119,37 @@ def _at_home(word: str) -> str:
     return word if match is None else (match[1] or "") + os.path.expanduser(match[2])  # noqa: PTH111
 
 
-def _brief(message: str) -> str:
-    """Shorten a message to some twenty lines for a terminal."""
-    lines = printable(message, keep="\n").split("\n")
+def _complain(error: Exception) -> None:
+    """Print some twenty lines of a message."""
+    from scenarios import console
+
+    lines = printable(f"quadsim: {error}", keep="\n").split("\n")
     shown = [line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]} ..." for line in lines[:_MOST_LINES]]
-    return "\n".join([*shown, *([f"... and {len(lines) - _MOST_LINES} more"] if len(lines) > _MOST_LINES else [])])
+    more = [f"... and {len(lines) - _MOST_LINES} more"] if len(lines) > _MOST_LINES else []
+    console.show([*shown, *more], console.stderr())
+
+
+class _Notices(logging.Handler):
+    """Prints each message once, above the bars of progress."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._shown: set[str] = set()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See `logging.Handler.emit`."""
+        from scenarios import console
+
+        message = record.getMessage()
+        if message not in self._shown:
+            self._shown.add(message)
+            console.say(message)
 
 
 @contextlib.contextmanager
 def _notices() -> Iterator[None]:
     """Show notices on stderr, each once: which user code was imported, and what failed."""
-    logger, handler, shown = logging.getLogger("quadsim"), logging.StreamHandler(), set[str]()
-
-    def shown_first(record: logging.LogRecord) -> bool:
-        record.msg, record.args = printable(record.getMessage()), ()
-        first = record.msg not in shown
-        shown.add(record.msg)
-        return first
-
-    handler.setFormatter(logging.Formatter("quadsim: %(message)s"))
-    handler.addFilter(shown_first)
+    logger, handler = logging.getLogger("quadsim"), _Notices()
     before = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

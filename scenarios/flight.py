@@ -550,6 +550,7 @@ def _add_products(
         with product(rundir.VIDEO_FILE, requested["video"]) as folder:
             from quadsim.report.film.video import render_video
 
+            progress("video", 0, 1)  # until the renderer has started
             render_video(
                 directory, folder / rundir.VIDEO_FILE, progress=lambda done, total: progress("video", done, total)
             )

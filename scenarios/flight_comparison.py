@@ -121,6 +121,7 @@ def compare_flights(
             stack.enter_context(reserving(out, overwrite=overwrite))
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
         runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
+        progress("comparison", 0, 1)
         page = None if out is None else write_comparison(runs, out, overwrite=overwrite)
     return FlightComparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page)
 

@@ -26,10 +26,11 @@ def silent(stage: str, done: int, total: int) -> None:
 
 
 @contextlib.contextmanager
-def reporting(progress: Progress | bool) -> Iterator[Progress]:
+def reporting(progress: Progress | bool, *, bars: bool = True) -> Iterator[Progress]:
     """Yield the function that reports progress: a bar per stage on a terminal, elsewhere a line every `LINE_EVERY`.
 
-    False reports nothing; a function replaces both.
+    False reports nothing; a function replaces both.  Without `bars` a terminal has the lines too, which take no time
+    from what is being timed.
     """
     if callable(progress):
         yield progress
@@ -39,7 +40,7 @@ def reporting(progress: Progress | bool) -> Iterator[Progress]:
     if not progress:
         yield silent
         return
-    if not (screen := stderr()).is_terminal:
+    if not (screen := stderr()).is_terminal or not bars:
         with _lines(screen) as tell:
             yield lambda stage, done, total: tell(f"{stage} {100 * done // total} %" if total > 1 else stage)
         return
@@ -47,13 +48,13 @@ def reporting(progress: Progress | bool) -> Iterator[Progress]:
     from rich.progress import Progress as Bars
 
     columns = (TextColumn("{task.description:<10}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"))
-    with Bars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=screen, transient=True) as bars:
+    with Bars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=screen, transient=True) as stages:
         tasks: dict[str, TaskID] = {}
 
         def report(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
-                tasks[stage] = bars.add_task(stage)
-            bars.update(tasks[stage], completed=done, total=total if total > 1 or done else None)  # None: it pulses
+                tasks[stage] = stages.add_task(stage)
+            stages.update(tasks[stage], completed=done, total=total if total > 1 or done else None)  # None: it pulses
 
         yield report
 
@@ -104,7 +105,7 @@ def watching(progress: bool) -> Iterator[Watch]:
             )
     else:
         with _lines(screen) as tell:
-            yield lambda state: tell(f"flights {_describe(state)}")
+            yield lambda state: tell(f"flights {_describe(state)}" if state.flown < state.flights else "report")
 
 
 def _describe(state: CampaignProgress) -> str:

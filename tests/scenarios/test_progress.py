@@ -54,6 +54,8 @@ def test_a_campaign_says_how_far_it_is(lines: Callable[[], list[str]]) -> None:
     with watching(True) as watch:
         watch(CampaignProgress(flown=10, flights=25, failed=0, rate=1.0))
         assert lines()[-1].startswith("quadsim: flights 10/25, 1.00/s, 0:00:15 left; 0 failed (")
+        watch(CampaignProgress(flown=25, flights=25, failed=0, rate=1.0))
+        assert lines()[-1] == "quadsim: report after 0 s"
 
 
 def test_a_terminal_has_bars(monkeypatch: pytest.MonkeyPatch) -> None:
