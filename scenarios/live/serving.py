@@ -17,6 +17,7 @@ import webbrowser
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from importlib.util import find_spec
@@ -30,6 +31,7 @@ from scenarios.app import run_directory
 from scenarios.catalogue import scenario_names
 from scenarios.live.session import Frame, Session, read_script
 from scenarios.loading import load_scenario
+from scenarios.progress import reporting
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Document
 from scenarios.schema.controllers import AnyController
 from scenarios.schema.scenario import Scenario
@@ -192,11 +194,12 @@ def fly_live(
         run_directory(f"{scenario.name}-live", out, overwrite=overwrite) as directory,
         closing(Session(scenario, against)) as session,
     ):
-        replaced = overwrite
+        replaced, refused = overwrite, list[str]()
 
         def save(session: Session) -> str:
             nonlocal replaced
-            session.flight().save(directory, overwrite=replaced, video=video)
+            with reporting(True) as report:
+                session.flight().save(directory, overwrite=replaced, video=video, progress=report)
             replaced = True  # the next time it is this session's own
             return console.short_path(directory)
 
@@ -206,15 +209,21 @@ def fly_live(
             if inputs is None:
                 _serve(session, save, **place)
             else:
-                for reason in session.play(inputs):
-                    console.say(f"refused: {reason}")
+                with reporting(True) as report:
+                    refused = session.play(inputs, report)
+                for reason in refused:
+                    first, *others = reason.split("\n")
+                    console.show([f"quadsim: refused: {script}: {first}", *others], console.stderr())
         except KeyboardInterrupt:  # what was flown is saved
             print(file=sys.stderr)
         text, seconds = "", session.k * session.period
         if session.k:
-            text = f"{save(session)}: {seconds:.2f} s, {session.flight().outcome}\n"
-        status = EXIT_DONE if session.reason is None else EXIT_FAILED
-        return Document(text, {"directory": str(directory), "duration": seconds, "reason": session.reason}, status)
+            save(session)
+            flight = replace(session.flight(), directory=directory)
+            text = "".join(f"{line}\n" for line in (next(iter(flight.shown())), *flight.outputs()))
+        status = EXIT_DONE if session.reason is None and not refused else EXIT_FAILED
+        facts = {"directory": str(directory), "duration": seconds, "reason": session.reason, "refused": refused}
+        return Document(text, facts, status)
 
 
 def _require_server(host: str, port: int) -> None:

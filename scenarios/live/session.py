@@ -26,14 +26,17 @@ from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
 from scenarios.flight_events import Successor
 from scenarios.limits import with_bounds_stated
+from scenarios.progress import Progress, silent
 from scenarios.rollout import Rollout
 from scenarios.schema.controllers import AnyController
+from scenarios.schema.events import Event
 from scenarios.schema.problems import parse_table
 from scenarios.schema.scenario import Scenario
 
 STIFFNESS: Final = 0.4  # of the spring that a person pulls by, in weights of the vehicle per metre
 STRONGEST: Final = 0.3  # largest pull in weights of the vehicle
 FORCE_STEP: Final = 1e-3  # to which pulls are rounded [N]
+HELD: Final = ("pull", "wear", "steer")  # inputs in force until they are changed; the others are events
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +67,11 @@ class Steer:
 @dataclass(frozen=True, kw_only=True)
 class _Held:
     input: Annotated[Pull | Wear | Steer, Field(discriminator="type")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Declared:
+    inputs: list[Annotated[Event | Pull | Wear | Steer, Field(discriminator="type")]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +121,7 @@ class Session:
 
     def __init__(self, scenario: Scenario, against: AnyController | None = None) -> None:
         self.scenario, self._against = preferring_core(scenario), against
-        self._queue: deque[tuple[Mapping[str, Any], str | None, Successor | None]] = deque()
+        self._queue: deque[tuple[Mapping[str, Any], str | None, Successor | None, str]] = deque()
         self.flights: tuple[Rollout, ...] = ()
         self.reset()
 
@@ -149,13 +157,18 @@ class Session:
         return tuple(self.flights[0].limits)
 
     def submit(
-        self, table: Mapping[str, Any], *, subject: str | None = None, successor: Successor | None = None
+        self,
+        table: Mapping[str, Any],
+        *,
+        subject: str | None = None,
+        successor: Successor | None = None,
+        name: str = "",
     ) -> None:
         """Let a `Pull`, `Wear`, `Steer`, or an event without its time, happen from the next period on; from any thread.
 
-        An earlier input of the same subject that has not acted yet is dropped.
+        An earlier input of the same subject that has not acted yet is dropped.  A refusal begins with the name.
         """
-        self._queue.append((dict(table), subject, successor))
+        self._queue.append((dict(table), subject, successor, name))
 
     def advance(self) -> Frame:
         """Fly one control period.
@@ -167,13 +180,13 @@ class Session:
             raise InputError(f"the flight has ended: {self.reason}")
         refused: list[str] = []
         taken = [self._queue.popleft() for _ in range(len(self._queue))]
-        last = {subject: i for i, (_, subject, _) in enumerate(taken)}
-        for i, (table, subject, successor) in enumerate(taken):
+        last = {subject: i for i, (_, subject, *_) in enumerate(taken)}
+        for i, (table, subject, successor, name) in enumerate(taken):
             if subject is None or last[subject] == i:
                 try:
                     self._apply(table, successor)
                 except InputError as error:
-                    refused.append(str(error))
+                    refused.append(f"{name}{error}")
         pull, shown = self._hold(refused), []
         for flight in self.flights:
             sample, margins, horizon = None, {}, None
@@ -195,16 +208,21 @@ class Session:
             refused=tuple(refused),
         )
 
-    def play(self, script: Script) -> list[str]:
-        """Fly by a script, as fast as possible; return why inputs were refused.
+    def play(self, script: Script, progress: Progress = silent) -> list[str]:
+        """Fly by a script, as fast as possible; return which inputs were refused, when, and why.
 
         An input is given when the first period begins that is not before its time.
         """
         refused: list[str] = []
-        waiting = deque(sorted(script.inputs, key=lambda entry: float(entry["at"])))
-        while self.reason is None and self.k * self.period < script.duration - 1e-9:
-            while waiting and waiting[0]["at"] <= self.k * self.period + 1e-9:
-                self.submit({name: value for name, value in waiting.popleft().items() if name != "at"})
+        waiting = deque(sorted(enumerate(script.inputs), key=lambda entry: float(entry[1]["at"])))
+        while self.reason is None and (time := self.k * self.period) < script.duration - 1e-9:
+            progress("session", self.k, round(script.duration / self.period))
+            while waiting and waiting[0][1]["at"] <= time + 1e-9:
+                i, entry = waiting.popleft()
+                self.submit(
+                    {key: value for key, value in entry.items() if key != "at"},
+                    name=f"inputs.{i} at t = {time:.3f} s: ",
+                )
             refused += self.advance().refused
         return refused
 
@@ -220,7 +238,7 @@ class Session:
 
     def _apply(self, table: Mapping[str, Any], successor: Successor | None) -> None:
         """Apply an input; a controller event only to the first flight."""
-        if table.get("type") not in ("pull", "wear", "steer"):
+        if table.get("type") not in HELD:
             if table.get("type") == "setpoint":
                 self._held.setpoint = None
             if table.get("type") == "controller":
@@ -273,8 +291,15 @@ class Session:
 
 
 def read_script(path: str | Path) -> Script:
-    """Read a script."""
-    return parse_table(Script, read_toml(Path(path)), str(path), file="script")
+    """Read a script.
+
+    Raises:
+        InputError: it is malformed, or an input is wrong whatever the scenario.
+    """
+    script = parse_table(Script, read_toml(Path(path)), str(path), file="script")
+    inputs = [{k: v for k, v in entry.items() if k != "at" or entry.get("type") not in HELD} for entry in script.inputs]
+    parse_table(_Declared, {"inputs": inputs}, str(path), file="script")
+    return script
 
 
 def _horizon(flight: Rollout, sample: FlownPeriod) -> Array | None:

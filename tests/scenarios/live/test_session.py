@@ -20,7 +20,7 @@ from scenarios.live.knobs import knobs
 from scenarios.live.serving import LATE, Pace
 from scenarios.live.session import STRONGEST, Frame, Session, read_script
 from scenarios.loading import load_scenario
-from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT
+from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.writing import plain
@@ -236,6 +236,12 @@ def test_the_script_on_the_page_is_saved_as_a_run_that_flies_to_the_same_bytes(
         ("duration = 1\ninputs = [{ at = 2.0 }]", "inputs.0.at must be below duration"),
         ("duration = 1\ninputs = 3", "inputs must be a list"),
         ("duration = 1\nspeed = 3", "speed is not a field"),
+        (
+            "duration = 1\ninputs = [{ at = 0.0, type = 'pull' }, { at = 0.0, type = 'wear', rotor = 5, loss = 0.1 }]",
+            r"script.toml: inputs.1.rotor must be a whole number >= 1 and <= 4; got 5",
+        ),
+        ("duration = 1\ninputs = [{ at = 0.0, type = 'setpoint', X = 1.0 }]", "inputs.0.X is not a field"),
+        ("duration = 1\ninputs = [{ at = 0.0, type = 'nonsense' }]", "inputs.0.type must be one of"),
         ("duration = ", "is not valid TOML"),
     ],
 )
@@ -244,6 +250,25 @@ def test_a_script_that_is_none_is_refused(tmp_path: Path, text: str, refusal: st
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=refusal):
         read_script(path)
+
+
+def test_an_input_that_is_refused_in_flight_is_named_with_its_time_and_status_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A wind cannot push a vehicle whose file states no drag; the session goes on."""
+    script, out = tmp_path / "script.toml", tmp_path / "run"
+    wind = "{ at = 0.12, type = 'wind', velocity = [1.0, 0.0, 0.0] }"
+    push = "{ at = 0.2, type = 'push', duration = 0.3, force = [0.0, 15.0, 0.0] }"
+    script.write_text(f"duration = 1.0\ninputs = [{push}, {wind}]", encoding="utf-8")
+    assert main(["live", "hover", "--script", str(script), "--out", str(out)]) == EXIT_FAILED
+    printed = capsys.readouterr()
+    refused = f"quadsim: refused: {script}: inputs.1 at t = 0.150 s: effects.air.rotor_drag must be positive"
+    assert printed.err.splitlines()[0].startswith(refused)
+    line, *opened = printed.out.splitlines()
+    assert line.startswith("hover  completed, a required constraint does not hold: hold_x by ")
+    assert line.endswith(" s  1.00 s flown")
+    assert opened[0] == f"written to {out}"
+    assert opened[-1] == f"quadsim view {out}"
 
 
 def test_a_finished_run_is_flown_on_unless_check_refuses_it_and_none_of_its_code_is_imported(
