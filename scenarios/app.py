@@ -309,6 +309,7 @@ def run(
     """
     from scenarios import loading, user_code
     from scenarios.flight import require_rendering
+    from scenarios.progress import reporting
     from scenarios.rollout import Rollout
 
     if video:
@@ -316,27 +317,28 @@ def run(
     parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces, reference)
     products = {"video": video, "recording": recording, "figures": figures}
     with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory:
-        return _fly_into(directory, Rollout(*parts), products, overwrite=overwrite, progress=progress, flown=flown)
+        with reporting(progress) as report:
+            flight = replace(Rollout(*parts).fly(report), directory=directory)
+        _write(flight, directory, products, overwrite=overwrite, progress=progress, flown=flown)
+    return flight
 
 
-def _fly_into(
+def _write(
+    flight: Flight,
     directory: Path,
-    rollout: Rollout,
     products: Mapping[str, bool | None],
     *,
     overwrite: bool,
     progress: Watched,
     flown: Flown,
-) -> Flight:
-    """Fly, write the tables, call `flown`, and add the products."""
+) -> None:
+    """Write the tables, call `flown`, and add the products."""
     from scenarios.progress import reporting
 
-    with reporting(progress) as report:
-        flight = replace(rollout.fly(report), directory=directory)
-        wanted = flight.write_tables(directory, overwrite=overwrite)
+    more = flight.write_tables(directory, overwrite=overwrite)
     if flown is not None:
         flown(flight)
-    if wanted:
+    if more:
         with reporting(progress) as report:
             try:
                 flight.add_products(directory, progress=report, **products)
@@ -344,7 +346,6 @@ def _fly_into(
                 if error.path.parent == directory:  # a product that was requested explicitly
                     error.result = flight
                 raise
-    return flight
 
 
 def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> AbstractContextManager[Path]:
@@ -910,6 +911,7 @@ def replay(
     """
     from scenarios.campaign.campaign import compare_replay, recorded_flight
     from scenarios.flight import require_rendering
+    from scenarios.progress import reporting
     from scenarios.rollout import Rollout
 
     if video:
@@ -922,8 +924,9 @@ def replay(
         _log.info(note)
     products = {"video": video, "recording": recording, "figures": figures}
     with run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
-        rollout = Rollout(recorded.scenario)
-        again = _fly_into(directory, rollout, products, overwrite=overwrite, progress=progress, flown=flown)
+        with reporting(progress) as report:
+            again = replace(Rollout(recorded.scenario).fly(report), directory=directory)
+        _write(again, directory, products, overwrite=overwrite, progress=progress, flown=flown)
     return compare_replay(again, recorded)
 
 
