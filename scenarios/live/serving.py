@@ -24,10 +24,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import parse_qs, urlsplit
 
+from quadsim.controller import law_name
 from quadsim.errors import MissingPackageError, ParameterError, QuadsimError
 from scenarios import console
 from scenarios.app import run_directory
 from scenarios.catalogue import scenario_names
+from scenarios.flight import Flight
 from scenarios.live.session import Frame, Session, read_script
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Document
@@ -49,11 +51,12 @@ class Pace:
     Attributes:
         speed: simulated over real time that is aimed at.
         paused: whether only single periods are flown.
+        waiting: whether it is paused until somebody looks.
     """
 
-    def __init__(self, now: Callable[[], float] = clock.monotonic) -> None:
+    def __init__(self, now: Callable[[], float] = clock.monotonic, *, waiting: bool = False) -> None:
         self._now, self._stop, self._single = now, threading.Event(), threading.Semaphore(0)
-        self.speed, self.paused = 1.0, False
+        self.speed, self.paused, self.waiting = 1.0, waiting, waiting
         self._orders: deque[Callable[[Session], None]] = deque()
 
     def single(self) -> None:
@@ -192,12 +195,13 @@ def fly_live(
         run_directory(f"{scenario.name}-live", out, overwrite=overwrite) as directory,
         closing(Session(scenario, against)) as session,
     ):
-        replaced = overwrite
+        replaced, one = overwrite, threading.Lock()
 
-        def save(session: Session) -> str:
+        def save(flight: Flight) -> str:
             nonlocal replaced
-            session.flight().save(directory, overwrite=replaced, video=video)
-            replaced = True  # the next time it is this session's own
+            with one:  # at a time
+                flight.save(directory, overwrite=replaced, video=video)
+                replaced = True  # the next time it is this session's own
             return console.short_path(directory)
 
         try:
@@ -212,7 +216,8 @@ def fly_live(
             print(file=sys.stderr)
         text, seconds = "", session.k * session.period
         if session.k:
-            text = f"{save(session)}: {seconds:.2f} s, {session.flight().outcome}\n"
+            flight = session.flight()
+            text = f"{save(flight)}: {seconds:.2f} s, {flight.outcome}\n"
         status = EXIT_DONE if session.reason is None else EXIT_FAILED
         return Document(text, {"directory": str(directory), "duration": seconds, "reason": session.reason}, status)
 
@@ -232,7 +237,7 @@ def _require_server(host: str, port: int) -> None:
         raise ParameterError("", "--host", host, "an address of this machine") from error
 
 
-def _serve(session: Session, save: Callable[[Session], str], *, host: str, port: int, browser: bool) -> None:
+def _serve(session: Session, save: Callable[[Flight], str], *, host: str, port: int, browser: bool) -> None:
     """Show the page and fly until Ctrl-C; controllers of the library for the same vehicle and period may take over."""
     from scenarios.live.page import Page
 
@@ -246,8 +251,8 @@ def _serve(session: Session, save: Callable[[Session], str], *, host: str, port:
         other = load_scenario(name)
         same = (other.vehicle, other.control_period) == (scenario.vehicle, scenario.control_period)
         if same and other.controller not in [*others.values(), scenario.controller]:
-            others[f"{other.controller.type} of {name}"] = other.controller
-    pace = Pace()
+            others[f"{name} ({law_name(other.controller.type)})"] = other.controller
+    pace = Pace(waiting=True)
     with closing(Page(session, pace, save=save, host=host, port=port, others=others)) as page:
         print(f"Open {page.address}  (Ctrl-C ends the session and saves it)", flush=True)
         if browser:
