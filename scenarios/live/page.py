@@ -31,7 +31,7 @@ from scenarios.live import readout
 from scenarios.live.knobs import TURNED, Knob, Value, knobs
 from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
-from scenarios.live.stage import Stage
+from scenarios.live.stage import FLAT, Stage
 from scenarios.schema.controllers import AnyController
 from scenarios.schema.events import SensorText
 from scenarios.schema.writing import plain
@@ -118,6 +118,9 @@ class Page:
         self._server.gui.set_panel_label(f"quadsim live: {session.scenario.name}")
         self._server.gui.main_panel.dock_right()
         self.stage = Stage(self._server.scene, session)
+        self._away = self.stage.unit * np.array([-4.0, -6.0, 3.0])
+        start = np.asarray(session.flights[0].loop.course.row(0)[:3])
+        self._server.initial_camera.position, self._server.initial_camera.look_at = start + self._away, start
         self._fields: dict[str, tuple[Knob, Any]] = {}
         self._groups: list[Any] = []  # folders of fields
         self._rest: list[tuple[Any, Any]] = []  # widgets, and what they are at the start of a flight
@@ -274,8 +277,15 @@ class Page:
         gui.add_html(readout.block(readout.STEER, "why"))
         here = np.asarray(self._session.flights[0].loop.course.row(0)[:3])
         self._handle = scene.add_transform_controls(
-            "/target", scale=3.0 * self.stage.unit, position=here, disable_rotations=True, disable_sliders=True
+            "/target",
+            scale=3.0 * self.stage.unit,
+            position=here,
+            disable_rotations=True,
+            disable_sliders=True,
+            visible=False,  # it would lie over the vehicle, and take its pulls
         )
+        arrows = gui.add_checkbox("Arrows to drag", False)
+        self._on(arrows.on_update, lambda event: setattr(self._handle, "visible", event.target.value))
         self._place = gui.add_vector3("Set-point [m]", tuple(map(float, here)), step=0.1)
         self._rest.append((self._place, self._place.value))
         self._on(self._handle.on_update, lambda event: self._set_point(event.target.position))
@@ -466,12 +476,17 @@ class Page:
         if self._frame is None and self._pace.waiting:  # the clock starts with the first page
             self._pace.waiting = self._pace.paused = False
             self._announce()
-        away = self.stage.unit * np.array([-4.0, -6.0, 3.0])
         upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
-        aim = self._aims[client.client_id] = np.array([0.0, 0.0, -0.5 * np.linalg.norm(away)]) * upright
-        _look(client.camera, np.asarray(self.stage.frames[0].position) + aim, away)
-        if upright:  # which has no keys
-            self._on(client.scene.on_click(), self._clicked)
+        aim = np.array([0.0, 0.0, -0.36 * np.linalg.norm(self._away)]) * upright
+
+        async def moved(camera: Any) -> None:
+            if not np.allclose(camera.position, 3.0):  # viser's own place, until the page hears of ours
+                self._aims.setdefault(client.client_id, aim)
+
+        client.camera.on_update(moved)
+        if upright:  # it has no Shift key, and viser's clicks of the scene ignore touches
+            floor = client.scene.add_box("/tapped", dimensions=(200.0, 200.0, 1e-3), opacity=0.001, **FLAT)
+            self._on(floor.on_click(), self._clicked)
         watches = self._driver != client.client_id
         note = client.gui.add_html(readout.says(readout.WATCH, "watch"), order=-2.0, visible=watches)
         take = client.gui.add_button("Take the controls", order=-1.0, visible=watches)
@@ -564,9 +579,9 @@ def _wear(rotor: int, loss: Any) -> dict[str, Any]:
     return {"type": "wear", "rotor": rotor, "loss": float(loss)}
 
 
-def _look(camera: Any, at: Any, away: Any = None) -> None:
+def _look(camera: Any, at: Any) -> None:
     """Turn a camera to a point [m], from as far away as it is."""
-    away = np.asarray(camera.position) - camera.look_at if away is None else away
+    away = np.asarray(camera.position) - camera.look_at
     camera.position = at + away  # which moves where it looks
     camera.look_at = at
 

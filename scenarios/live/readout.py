@@ -24,7 +24,7 @@ HINTS: Final = {
 
 WATCH: Final = "You watch; another page has the controls."
 STEER: Final = (
-    "Drag the arrows at the goal, type a set-point, or "
+    "Type a set-point, drag its arrows, or "
     '<span class="touch">tap the floor.</span><span class="mouse">shift-click the floor. '
     "Keys W, S, A, D, R, F fly the set-point along x, y and z; X stops it.</span>"
 )
@@ -36,7 +36,7 @@ STYLE: Final = """<style>
 .q .chip.paused{background:#6b7280}.q .chip.busy{background:#a85f00}.q .chip.ended{background:#dc2f38}
 .q table{width:100%;border-collapse:collapse;table-layout:fixed}.q tr{height:1.6em}
 .q td,.q th{padding:0 4px 0 0;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}
-.q th{text-align:left;font-weight:400;opacity:.65}.q .n{text-align:right}
+.q th{text-align:left;font-weight:400;opacity:.65}.q .n{text-align:right;padding-right:8px}
 .q .track{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}
 .q .track i{position:absolute;top:0;bottom:0}
 .q .bad{color:#dc2f38;font-weight:600}.q .near{font-weight:600}.q .off{opacity:.55}

@@ -24,6 +24,8 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from scenarios.cli import main
+from scenarios.flight import Flight
+from scenarios.live import serving
 from scenarios.live.page import Page
 from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
@@ -79,11 +81,11 @@ class Served:
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     target = tmp_path_factory.mktemp("live") / "saved"
 
-    def save(session: Session) -> str:
-        session.flight().save(target, video=False, recording=False, figures=False)
+    def save(flight: Flight) -> str:
+        flight.save(target, video=False, recording=False, figures=False)
         return str(target)
 
-    session, pace = Session(load_scenario("hover", ["controller.horizon=10"])), Pace()
+    session, pace = Session(load_scenario("hover", ["controller.horizon=10"])), Pace(waiting=True)
     page = Page(session, pace, save=save, others={"PID": load_scenario("hover", ["controller=pid"]).controller})
     thread = threading.Thread(target=pace.drive, args=(session, page))
     thread.start()
@@ -94,6 +96,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     session.close()
 
 
+@pytest.mark.usefixtures("tab")
 def test_ten_clients_are_served_and_foreign_ones_are_not(served: Served) -> None:
     address = urlsplit(served.page.address)
     url, own = f"ws://{address.netloc}/", f"http://{address.netloc}"
@@ -146,6 +149,7 @@ def test_an_interrupt_keeps_what_was_flown(
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(Page, "show", interrupted)
+    monkeypatch.setattr(serving, "Pace", lambda waiting: Pace())  # there is no page to wait for
     saved = tmp_path / "saved"
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
@@ -180,6 +184,8 @@ def browser() -> Iterator[Any]:
 def tab(browser: Any, served: Served) -> Iterator[Any]:
     tab = browser.new_page(viewport={"width": 760, "height": 360})
     tab.set_default_timeout(1e3 * PATIENCE)
+    clock.sleep(0.3)
+    assert served.session.k == 0  # nobody looks
     tab.goto(served.page.address)
     tab.get_by_text("of real time").wait_for()
     yield tab
@@ -250,11 +256,11 @@ def test_a_controller_is_changed_in_flight_and_one_that_cannot_be_is_refused(tab
     field.fill("12")
     field.press("Enter")
     served.wait(lambda: served.session.flights[0].loop.controller.horizon == 12)
-    lower = tab.locator("label", has_text="speed lower").locator("xpath=ancestor::div[.//input][1]").locator("input")
-    lower.fill("260")  # above the upper one
-    lower.press("Enter")
-    tab.get_by_text("the controller before flies on").wait_for()
-    served.wait(lambda: lower.input_value() != "260")  # what flies on
+    roll = tab.locator("label", has_text="roll [deg]").locator("xpath=ancestor::div[.//input][1]").locator("input")
+    roll.last.fill("-1")  # [-5, -1]
+    roll.last.press("Enter")
+    tab.get_by_text("a range that contains 0, as in hover").wait_for()
+    served.wait(lambda: roll.last.input_value() == "5")  # what flies on
     assert served.session.flights[0].loop.controller.horizon == 12
     assert served.session.reason is None
 
@@ -272,7 +278,7 @@ def test_pause_stands_still_and_save_keeps_what_flies_again_to_the_bit(tab: Any,
     again = Rollout(flight.scenario).fly()
     assert np.array_equal(again.command, flight.command)
     assert np.array_equal(again.log.plant.state, flight.log.plant.state)
-    tab.get_by_role("button", name="Pause", exact=True).click()
+    tab.get_by_role("button", name="Resume", exact=True).click()
     served.wait(lambda: served.session.k > k + 3)
 
 
@@ -282,7 +288,7 @@ def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
     served.wait(lambda: served.session.k < k)
     field = tab.locator("label", has_text="horizon").locator("xpath=ancestor::div[.//input][1]").locator("input")
     served.wait(lambda: field.input_value() == "10")
-    tab.get_by_role("tab", name="Push").click()
+    tab.get_by_role("tab", name="Disturb").click()
     row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
     served.wait(lambda: row.get_by_role("slider").get_attribute("aria-valuenow") == "1")
     assert served.session.flights[0].loop.controller.horizon == 10
@@ -301,7 +307,7 @@ def phone(browser: Any, served: Served) -> Iterator[Any]:
 def test_a_second_page_watches(served: Served, tab: Any, phone: Any) -> None:
     before = served.pace.paused
     phone.get_by_role("button", name="Pause", exact=True).click()
-    phone.get_by_text("You watch").first.wait_for()
+    phone.get_by_text("Another page has the controls").first.wait_for()
     assert served.pace.paused == before
     for page in (phone, tab):  # from one to the other, and back
         page.get_by_role("button", name="Take the controls").click()
