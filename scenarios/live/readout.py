@@ -32,8 +32,8 @@ STEER: Final = (
 STYLE: Final = """<style>
 .q{font:12px/1.5 system-ui,sans-serif;padding:0 .8em}.q b,.q .n{font-variant-numeric:tabular-nums}
 .q .line{height:1.5em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}
-.q .chip{display:inline-block;padding:0 .6em;border-radius:1em;color:#fff;background:#2f7d4f;font-weight:600}
-.q .chip.paused{background:#6b7280}.q .chip.busy{background:#a85f00}.q .chip.ended{background:#dc2f38}
+.chip{display:inline-block;padding:0 .6em;border-radius:1em;color:#fff;background:#2f7d4f;font-weight:600}
+.chip.paused{background:#6b7280}.chip.busy{background:#a85f00}.chip.ended{background:#dc2f38}
 .q table{width:100%;border-collapse:collapse;table-layout:fixed}.q tr{height:1.6em}
 .q td,.q th{padding:0 4px 0 0;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}
 .q th{text-align:left;font-weight:400;opacity:.65}.q .n{text-align:right;padding-right:8px}
@@ -42,7 +42,8 @@ STYLE: Final = """<style>
 .q .bad{color:#dc2f38;font-weight:600}.q .near{font-weight:600}.q .off{opacity:.55}
 .q .watch{background:#a85f00;color:#fff;padding:.4em .7em;border-radius:4px;margin:.4em 0;white-space:normal}
 .q .why{opacity:.75;padding-bottom:.5em}
-.hints{position:fixed;left:16px;bottom:16px;z-index:5;pointer-events:none;font:14px/1.4 system-ui,sans-serif}
+.hints,.over{position:fixed;left:16px;z-index:5;pointer-events:none;font:14px/1.4 system-ui,sans-serif}
+.hints{bottom:16px}.over{top:16px}
 .hints div{margin-top:6px;padding:4px 12px;border-radius:1em;background:#1f2937d9;color:#fff;width:max-content}
 .touch{display:none}
 @media (pointer:coarse){.touch{display:inline}.mouse{display:none}}
@@ -73,7 +74,9 @@ def headline(state: str, kind: str, frame: Frame | None, factor: float) -> str:
     """Return what the flight does now, its time and its speed."""
     time = "" if frame is None else f" <b>{frame.time:.2f} s</b>"
     speed = f", {factor:.2f} of real time" if frame is not None and kind == "flying" else ""
-    return block(f'<span class="chip {kind}">{escape(state)}</span>{time}{speed}', "line")
+    chip = f'<span class="chip {kind}">{escape(state)}</span>'
+    over = "" if kind == "flying" else f'<div class="over">{chip}</div>'  # seen also where the panel is scrolled
+    return block(f"{chip}{time}{speed}", "line") + over
 
 
 def numbers(
@@ -86,15 +89,16 @@ def numbers(
 ) -> str:
     """Return the answer of the controller and the state of the first vehicle, and why the other one was lost."""
     if frame is None or sample is None:
-        return block("&nbsp;", "line") * 2
+        return block("&nbsp;", "line") * 3
     command = sample.command
     answer = f"{escape(command.status)} ({escape(command.answered_by)})"
     if command.status not in OPTIMAL or command.fallback:
         answer = f'<span class="bad">{answer}, fallback {command.fallback}</span>'
     late = ' <span class="bad">late</span>' if sample.missed else ""
     rows = [
-        f"MPC {answer}, {command.active} bounds active, <b>{1e3 * sample.step_s:.1f}</b> ms{late}",
-        f"tilt <b>{tilt:.1f}</b> deg, error <b>{error:.2f}</b> m, your pull <b>{math.hypot(*frame.pull):.1f}</b> N",
+        f"MPC: {answer}, {command.active} bounds active",
+        f"step <b>{1e3 * sample.step_s:.1f}</b> ms{late}, your pull <b>{math.hypot(*frame.pull):.1f}</b> N",
+        f"tilt <b>{tilt:.1f}</b> deg, position error <b>{error:.2f}</b> m",
         *(f'<span class="bad">{escape(text)}</span>' for text in lost),
     ]
     return "".join(block(row, "line") for row in rows)
