@@ -657,11 +657,9 @@ def view(run: File, /, *, web: Flag = False) -> None:
     open_viewer(recording, web=web)
 
 
-@app.command(
-    help_epilogue=_examples("quadsim live paper-constrained", "quadsim live robust --against paper-unconstrained")
-)
+@app.command(help_epilogue=_examples("quadsim live", "quadsim live robust --against paper-constrained"))
 def live(
-    scenario: ScenarioName,
+    scenario: ScenarioName = "playground",
     /,
     *,
     against: ScenarioName | None = None,
@@ -678,7 +676,8 @@ def live(
     """Fly interactively in the browser: push, change every setting, save the flight as a scenario.
 
     Args:
-        scenario: library name, or path to a TOML file; or directory of a run to continue.
+        scenario: library name, or path to a TOML file; or directory of a run to continue (default: playground, which
+            is made for sessions).
         against: scenario whose controller flies a second vehicle beside the first.
         out: run directory (default: runs/SCENARIO-live, or the next free name).
         overwrite: replace an earlier output, if its summary.json lists every file in the directory.

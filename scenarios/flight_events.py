@@ -26,6 +26,7 @@ from quadsim.sim.loop import ClosedLoop
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing import SensorName
+from quadsim.state import REFERENCE_NAMES
 from scenarios.schema.controllers import AnyController, changed
 from scenarios.schema.events import (
     MOST_EVENTS,
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 
 _DEPENDENT: Final = (ControllerEvent, PayloadDrop, PayloadPickup, SensorFaultEvent)
 """The events that depend on other parts of the scenario."""
+TRACKING_ERRORS: Final = frozenset(f"{name}_error" for name in REFERENCE_NAMES)  # signals relative to the course
 _MOST: Final = 3  # longest run of events of one kind that is reported singly; longer runs become one entry
 _LONGEST: Final = 200
 
@@ -136,6 +138,17 @@ class FlightEvents:
     def successor(self, fields: Mapping[str, Any]) -> Successor:
         """See `scenarios.rollout.Rollout.successor`."""
         return self._built(changed(self._spec, fields))
+
+    def leave_course(self) -> None:
+        """End the constraints on the tracking error, and drop those that would begin later."""
+        scenario, now = self.scenario, round(self._loop.k * self.scenario.control_period, 9)
+        kept = []
+        for limit in scenario.constraints:
+            if limit.signal not in TRACKING_ERRORS:
+                kept.append(limit)
+            elif limit.start < now:
+                kept.append(replace(limit, stop=min(limit.stop, now)))
+        self.assembly = self.assembly.of(scenario.altered(constraints=kept))
 
     def flown(self) -> Scenario:
         """Return the scenario up to now, unless the flight has ended otherwise, or nothing has been flown."""

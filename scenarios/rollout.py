@@ -253,6 +253,11 @@ class Rollout:
         """
         return self._events.successor(fields)
 
+    def leave_course(self) -> None:
+        """End the constraints on the tracking error: from now on somebody steers, and no course is flown."""
+        self._events.leave_course()
+        self.limits = self._events.assembly.limits
+
     def margins(self, sample: FlownPeriod | None = None) -> dict[str, float]:
         """Return the smallest signed margin of each constraint within one period; negative = beyond the bound.
 

@@ -4,13 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from scenarios.schema.base import fields_of, is_table
 from scenarios.schema.controllers import AnyController
 from scenarios.schema.problems import Kind, kinds_of
 
 Value = float | int | bool | str | tuple[float, ...]
+
+TURNED: Final = {
+    "Tracking weights": {
+        "output_weights.x": "x [1/m²]",
+        "output_weights.y": "y [1/m²]",
+        "output_weights.z": "z [1/m²]",
+        "output_weights.yaw": "yaw [1/rad²]",
+        "weights.position": "position [1/m²]",
+        "weights.attitude": "attitude [1/rad²]",
+        "weights.velocity": "velocity [s²/m²]",
+    },
+    "Effort weights": {
+        "input_weights.speed": "speeds [s²/rad²]",
+        "move_weight": "moves [s²/rad²]",
+        "weights.input": "input",
+        "weights.move": "moves",
+    },
+    "Bounds": {
+        "output_bounds.roll": "roll [deg]",
+        "output_bounds.pitch": "pitch [deg]",
+        "input_bounds.slew": "slew [rad/s]",
+        "tilt": "tilt [deg]",
+        "velocity": "velocity [m/s]",
+    },
+    "Robustness": {"soft.linear": "penalty", "rotor_lag": "rotor lag [s]"},
+    "Solver": {"horizon": "horizon N", "iterations": "iterations"},
+}
+"""The fields that people turn, with their labels, by group; the rest are in "All fields"."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +73,8 @@ def _walk(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterator[
             yield from _walk_numbers(path, tuple(map(float, value)), entries, about)
     elif isinstance(value, str):
         choices = tuple(str(choice) for kind in kinds for choice in kind.choices)
-        yield Knob(path=path, value=value, about=about, choices=choices or (value,))
+        if len(choices) > 1:  # else there is nothing to choose
+            yield Knob(path=path, value=value, about=about, choices=choices)
     elif value is not None:
         yield from _walk_numbers(path, value, kinds, about)
 

@@ -25,10 +25,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import parse_qs, urlsplit
 
+from quadsim.controller import law_name
 from quadsim.errors import MissingPackageError, ParameterError, QuadsimError
 from scenarios import console
 from scenarios.app import run_directory
 from scenarios.catalogue import scenario_names
+from scenarios.flight import Flight
 from scenarios.live.session import Frame, Session, read_script
 from scenarios.loading import load_scenario
 from scenarios.progress import reporting
@@ -51,11 +53,12 @@ class Pace:
     Attributes:
         speed: simulated over real time that is aimed at.
         paused: whether only single periods are flown.
+        waiting: whether it is paused until somebody looks.
     """
 
-    def __init__(self, now: Callable[[], float] = clock.monotonic) -> None:
+    def __init__(self, now: Callable[[], float] = clock.monotonic, *, waiting: bool = False) -> None:
         self._now, self._stop, self._single = now, threading.Event(), threading.Semaphore(0)
-        self.speed, self.paused = 1.0, False
+        self.speed, self.paused, self.waiting = 1.0, waiting, waiting
         self._orders: deque[Callable[[Session], None]] = deque()
 
     def single(self) -> None:
@@ -194,13 +197,13 @@ def fly_live(
         run_directory(f"{scenario.name}-live", out, overwrite=overwrite) as directory,
         closing(Session(scenario, against)) as session,
     ):
-        replaced, refused = overwrite, list[str]()
+        replaced, refused, one = overwrite, list[str](), threading.Lock()
 
-        def save(session: Session) -> str:
+        def save(flight: Flight) -> str:
             nonlocal replaced
-            with reporting(True) as report:
-                session.flight().save(directory, overwrite=replaced, video=video, progress=report)
-            replaced = True  # the next time it is this session's own
+            with one, reporting(True) as report:  # one at a time
+                flight.save(directory, overwrite=replaced, video=video, progress=report)
+                replaced = True  # the next time it is this session's own
             return console.short_path(directory)
 
         try:
@@ -218,8 +221,9 @@ def fly_live(
             print(file=sys.stderr)
         text, seconds = "", session.k * session.period
         if session.k:
-            save(session)
-            flight = replace(session.flight(), directory=directory)
+            flight = session.flight()
+            save(flight)
+            flight = replace(flight, directory=directory)
             text = "".join(f"{line}\n" for line in (next(iter(flight.shown())), *flight.outputs()))
         status = EXIT_DONE if session.reason is None and not refused else EXIT_FAILED
         facts = {"directory": str(directory), "duration": seconds, "reason": session.reason, "refused": refused}
@@ -241,7 +245,7 @@ def _require_server(host: str, port: int) -> None:
         raise ParameterError("", "--host", host, "an address of this machine") from error
 
 
-def _serve(session: Session, save: Callable[[Session], str], *, host: str, port: int, browser: bool) -> None:
+def _serve(session: Session, save: Callable[[Flight], str], *, host: str, port: int, browser: bool) -> None:
     """Show the page and fly until Ctrl-C; controllers of the library for the same vehicle and period may take over."""
     from scenarios.live.page import Page
 
@@ -255,8 +259,8 @@ def _serve(session: Session, save: Callable[[Session], str], *, host: str, port:
         other = load_scenario(name)
         same = (other.vehicle, other.control_period) == (scenario.vehicle, scenario.control_period)
         if same and other.controller not in [*others.values(), scenario.controller]:
-            others[f"{other.controller.type} of {name}"] = other.controller
-    pace = Pace()
+            others[f"{name} ({law_name(other.controller.type)})"] = other.controller
+    pace = Pace(waiting=True)
     with closing(Page(session, pace, save=save, host=host, port=port, others=others)) as page:
         print(f"Open {page.address}  (Ctrl-C ends the session and saves it)", flush=True)
         if browser:

@@ -7,7 +7,7 @@ scenario and on the periods at which they act alone.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -25,7 +25,7 @@ from quadsim.state import POSITION, REFERENCE_NAMES, Array
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
 from scenarios.flight_events import Successor
-from scenarios.limits import with_bounds_stated
+from scenarios.limits import COMMANDED, with_bounds_stated
 from scenarios.progress import Progress, silent
 from scenarios.rollout import Rollout
 from scenarios.schema.controllers import AnyController
@@ -133,7 +133,7 @@ class Session:
         if self._against is not None:
             scenarios.append(with_bounds_stated(Assembly(self.scenario)).altered(controller=self._against))
         self.flights = tuple(Rollout(scenarios_flown, live=True) for scenarios_flown in scenarios)
-        self._held = _Hand()
+        self._held, self._steered = _Hand(), False
         self.reason: str | None = None
 
     def close(self) -> None:
@@ -208,6 +208,35 @@ class Session:
             refused=tuple(refused),
         )
 
+    def successor(self, fields: Mapping[str, Any]) -> Successor:
+        """Build a controller for the first flight with some fields changed; callable from any thread.
+
+        Raises:
+            InputError: it cannot be built, or its bounds exclude hover.
+        """
+        flight = self.flights[0]
+        result = flight.successor(fields)
+        for signal, (lower, upper) in result.spec.audited(flight.vehicle).items():
+            hover = flight.vehicle.hover_speed if signal == "speed" else 0.0
+            if signal not in REFERENCE_NAMES and not lower <= hover <= upper:
+                table = "input_bounds" if signal in COMMANDED else "output_bounds"
+                rule = f"a range that contains {hover:.4g}, as in hover"
+                raise ParameterError(f"controller.{table}", signal, [lower, upper], rule)
+        return result
+
+    def refusals(self, tables: Iterable[Mapping[str, Any]]) -> list[str]:
+        """Return for each event why this scenario cannot have it, empty if it can; they are tried on another flight."""
+        result = []
+        with Rollout(self.scenario, live=True) as trial:
+            for table in tables:
+                try:
+                    trial.apply(table)
+                except InputError as error:
+                    result.append(str(error))
+                else:
+                    result.append("")
+        return result
+
     def play(self, script: Script, progress: Progress = silent) -> list[str]:
         """Fly by a script, as fast as possible; return which inputs were refused, when, and why.
 
@@ -258,6 +287,9 @@ class Session:
         for flight in self.flights:
             if flight.loop.reason is None:
                 flight.apply(event)
+                if event.get("type") == "setpoint" and not self._steered:
+                    flight.leave_course()
+        self._steered |= event.get("type") == "setpoint"
 
     def _hold(self, refused: list[str]) -> Array:
         """Apply the inputs in force for one more period; return the force of the pull (3,) [N]."""

@@ -24,7 +24,7 @@ _EVERY: Final = 2  # periods from one to the next; every point is sent anew with
 _WIDE: Final = 20.0  # [m] of ground, lines a metre apart
 _COURSE: Final = 600  # points of the reference that are drawn
 _SHADES: Final = ("#282c34", "#8c96a5")  # of the first vehicle and of the other one
-_FLAT: Final = {"cast_shadow": False, "receive_shadow": False}
+FLAT: Final = {"cast_shadow": False, "receive_shadow": False}
 
 
 class Stage:
@@ -47,7 +47,7 @@ class Stage:
         self._ground = self._line("/ground", _grid(), "#c8ccd2", 1.0)
         self._ahead = self._line("/reference", _course(session), REFERENCE, 1.5)
         self._hand = self._line("/hand", np.zeros((1, 2, 3)), BOUND, 4.0)
-        self._goal = scene.add_icosphere("/goal", 0.25 * self.unit, rgb(REFERENCE), subdivisions=1, **_FLAT)
+        self._goal = scene.add_icosphere("/goal", 0.25 * self.unit, rgb(REFERENCE), subdivisions=1, **FLAT)
         self.frames, self._arrows, self._horizons, self._paths = [], [], [], []
         for i, flight in enumerate(session.flights):
             name, length = f"/vehicle{i}", flight.loop.controller.horizon
@@ -56,7 +56,7 @@ class Stage:
             self._arrows.append(self._line(f"{name}/thrust", np.zeros((len(self._rotors), 2, 3)), LINES[1]))
             self._horizons.append(self._line(f"/horizon{i}", np.zeros((length, 2, 3)), LINES[4 if i else 2]))
             self._paths.append(self._line(f"/path{i}", np.zeros((TRAIL, 2, 3)), LINES[4 if i else 0]))
-        self.grab = scene.add_icosphere("/vehicle0/grab", 1.6 * self.unit, subdivisions=1, opacity=0.001, **_FLAT)
+        self.grab = scene.add_icosphere("/vehicle0/grab", 1.6 * self.unit, subdivisions=1, opacity=0.001, **FLAT)
         self._trails = [deque[Array](maxlen=TRAIL + 1) for _ in session.flights]
         self._events = 0  # that have been seen
         self._moving: list[tuple[Obstacle, Any]] = []
@@ -159,12 +159,12 @@ def _add_solid(scene: Any, name: str, kind: str, size: Any, **look: Any) -> None
     """MuJoCo's shape of that name and size; a capsule without its caps."""
     a, b, c = map(float, size)
     if kind == "box":
-        scene.add_box(name, dimensions=(2.0 * a, 2.0 * b, 2.0 * c), **look, **_FLAT)
+        scene.add_box(name, dimensions=(2.0 * a, 2.0 * b, 2.0 * c), **look, **FLAT)
     elif kind in ("cylinder", "capsule"):
-        scene.add_cylinder(name, radius=a, height=2.0 * b, radial_segments=24, **look, **_FLAT)
+        scene.add_cylinder(name, radius=a, height=2.0 * b, radial_segments=24, **look, **FLAT)
     else:
         scale = (a, b, c) if kind == "ellipsoid" else (a, a, a)
-        scene.add_icosphere(name, subdivisions=2 if kind == "sphere" else 1, scale=scale, **look, **_FLAT)
+        scene.add_icosphere(name, subdivisions=2 if kind == "sphere" else 1, scale=scale, **look, **FLAT)
 
 
 def _segments(points: Array, count: int) -> Array:

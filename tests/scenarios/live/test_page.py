@@ -12,6 +12,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -24,6 +25,8 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from scenarios.cli import main
+from scenarios.flight import Flight
+from scenarios.live import serving
 from scenarios.live.page import Page
 from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
@@ -67,6 +70,14 @@ class Served:
     session: Session
     pace: Pace
     page: Page
+    saves: threading.Event
+    """Whether saving may end."""
+
+    def events(self, kind: str) -> list[Any]:
+        return [event for event in self.session.flights[0].scenario.events if event.type == kind]
+
+    def is_pushed(self) -> bool:
+        return any(any(event.force) for event in self.events("push"))
 
     def wait(self, until: Callable[[], bool]) -> None:
         limit = clock.monotonic() + PATIENCE
@@ -77,23 +88,25 @@ class Served:
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    target = tmp_path_factory.mktemp("live") / "saved"
+    target, saves = tmp_path_factory.mktemp("live") / "saved", threading.Event()
 
-    def save(session: Session) -> str:
-        session.flight().save(target, video=False, recording=False, figures=False)
+    def save(flight: Flight) -> str:
+        saves.wait(PATIENCE)
+        flight.save(target, video=False, recording=False, figures=False)
         return str(target)
 
-    session, pace = Session(load_scenario("hover", ["controller.horizon=10"])), Pace()
+    session, pace = Session(load_scenario("hover", ["controller.horizon=10"])), Pace(waiting=True)
     page = Page(session, pace, save=save, others={"PID": load_scenario("hover", ["controller=pid"]).controller})
     thread = threading.Thread(target=pace.drive, args=(session, page))
     thread.start()
-    yield Served(session, pace, page)
+    yield Served(session, pace, page, saves)
     pace.stop()
     thread.join()
     page.close()
     session.close()
 
 
+@pytest.mark.usefixtures("tab")
 def test_ten_clients_are_served_and_foreign_ones_are_not(served: Served) -> None:
     address = urlsplit(served.page.address)
     url, own = f"ws://{address.netloc}/", f"http://{address.netloc}"
@@ -146,6 +159,7 @@ def test_an_interrupt_keeps_what_was_flown(
             signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(Page, "show", interrupted)
+    monkeypatch.setattr(serving, "Pace", lambda waiting: Pace())  # there is no page to wait for
     saved = tmp_path / "saved"
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
@@ -180,6 +194,8 @@ def browser() -> Iterator[Any]:
 def tab(browser: Any, served: Served) -> Iterator[Any]:
     tab = browser.new_page(viewport={"width": 760, "height": 360})
     tab.set_default_timeout(1e3 * PATIENCE)
+    clock.sleep(0.3)
+    assert served.session.k == 0  # nobody looks
     tab.goto(served.page.address)
     tab.get_by_text("of real time").wait_for()
     yield tab
@@ -198,11 +214,9 @@ def test_a_push_by_the_mouse_acts_and_ends(tab: Any, served: Served) -> None:
     box = tab.locator("canvas").first.bounding_box()
     x, y = box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
 
-    def is_pushed() -> bool:
-        return any(event.type == "push" and any(event.force) for event in served.session.flights[0].scenario.events)
-
+    tab.get_by_text("Drag the drone").wait_for()
     limit = clock.monotonic() + PATIENCE
-    while not is_pushed():  # the page has to see the mouse above the vehicle before its button goes down
+    while not served.is_pushed():  # the page has to see the mouse above the vehicle before its button goes down
         assert clock.monotonic() < limit
         tab.mouse.up()
         for i in range(4):
@@ -214,12 +228,17 @@ def test_a_push_by_the_mouse_acts_and_ends(tab: Any, served: Served) -> None:
             tab.wait_for_timeout(30)
     tab.mouse.up()
     served.wait(lambda: served.session._held.pull is None)
+    tab.get_by_text("Drag the drone").wait_for(state="detached")  # a hint that was followed
+
+
+def test_inputs_that_cannot_act_are_disabled_with_the_reason(tab: Any) -> None:
+    assert tab.get_by_role("button", name="Gust for 1 s").is_disabled()
+    assert tab.get_by_text("the vehicle 'lopes2011' states no drag").is_visible()
+    assert tab.get_by_role("button", name="Take payload").is_enabled()
 
 
 def test_keys_and_clicks_give_set_points(tab: Any, served: Served) -> None:
-    def set_points() -> list[Any]:
-        return [event for event in served.session.flights[0].scenario.events if event.type == "setpoint"]
-
+    set_points = partial(served.events, "setpoint")
     tab.keyboard.press("w")
     served.wait(lambda: len(set_points()) > 3)
     assert set_points()[-1].x > set_points()[0].x
@@ -237,11 +256,7 @@ def test_a_slider_turns(tab: Any, served: Served) -> None:
     row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
     row.get_by_role("slider").focus()
     tab.keyboard.press("ArrowRight")
-    served.wait(
-        lambda: any(
-            event.type == "mass" and event.factor == 1.01 for event in served.session.flights[0].scenario.events
-        )
-    )
+    served.wait(lambda: any(event.factor == 1.01 for event in served.events("mass")))
 
 
 def test_a_controller_is_changed_in_flight_and_one_that_cannot_be_is_refused(tab: Any, served: Served) -> None:
@@ -250,11 +265,11 @@ def test_a_controller_is_changed_in_flight_and_one_that_cannot_be_is_refused(tab
     field.fill("12")
     field.press("Enter")
     served.wait(lambda: served.session.flights[0].loop.controller.horizon == 12)
-    lower = tab.locator("label", has_text="speed lower").locator("xpath=ancestor::div[.//input][1]").locator("input")
-    lower.fill("260")  # above the upper one
-    lower.press("Enter")
-    tab.get_by_text("the controller before flies on").wait_for()
-    served.wait(lambda: lower.input_value() != "260")  # what flies on
+    roll = tab.locator("label", has_text="roll [deg]").locator("xpath=ancestor::div[.//input][1]").locator("input")
+    roll.last.fill("-1")  # [-5, -1]
+    roll.last.press("Enter")
+    tab.get_by_text("a range that contains 0, as in hover").wait_for()
+    served.wait(lambda: roll.last.input_value() == "5")  # what flies on
     assert served.session.flights[0].loop.controller.horizon == 12
     assert served.session.reason is None
 
@@ -267,12 +282,18 @@ def test_pause_stands_still_and_save_keeps_what_flies_again_to_the_bit(tab: Any,
     tab.get_by_role("button", name="Step", exact=True).click()
     served.wait(lambda: served.session.k == k + 1)
     tab.get_by_role("button", name="Save", exact=True).click()
+    tab.get_by_text("saving", exact=True).wait_for()
+    k = served.session.k
+    tab.get_by_role("button", name="Step", exact=True).click()
+    served.wait(lambda: served.session.k == k + 1)  # the flight does not wait
+    served.saves.set()
     tab.get_by_text("saved:").first.wait_for()
+    tab.get_by_text("paused", exact=True).wait_for()
     flight = served.session.flight()
     again = Rollout(flight.scenario).fly()
     assert np.array_equal(again.command, flight.command)
     assert np.array_equal(again.log.plant.state, flight.log.plant.state)
-    tab.get_by_role("button", name="Pause", exact=True).click()
+    tab.get_by_role("button", name="Resume", exact=True).click()
     served.wait(lambda: served.session.k > k + 3)
 
 
@@ -282,7 +303,7 @@ def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
     served.wait(lambda: served.session.k < k)
     field = tab.locator("label", has_text="horizon").locator("xpath=ancestor::div[.//input][1]").locator("input")
     served.wait(lambda: field.input_value() == "10")
-    tab.get_by_role("tab", name="Push").click()
+    tab.get_by_role("tab", name="Disturb").click()
     row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
     served.wait(lambda: row.get_by_role("slider").get_attribute("aria-valuenow") == "1")
     assert served.session.flights[0].loop.controller.horizon == 10
@@ -290,28 +311,60 @@ def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
 
 @pytest.fixture(scope="module")
 def phone(browser: Any, served: Served) -> Iterator[Any]:
-    phone = browser.new_page(viewport={"width": 390, "height": 500})
+    context = browser.new_context(viewport={"width": 390, "height": 600}, has_touch=True, is_mobile=True)
+    phone = context.new_page()
     phone.set_default_timeout(1e3 * PATIENCE)
     phone.goto(served.page.address)
     phone.get_by_text("of real time").wait_for()
     yield phone
-    phone.close()
+    context.close()
 
 
 def test_a_second_page_watches(served: Served, tab: Any, phone: Any) -> None:
+    phone.get_by_text("You watch").wait_for()
     before = served.pace.paused
     phone.get_by_role("button", name="Pause", exact=True).click()
-    phone.get_by_text("You watch").first.wait_for()
+    phone.get_by_text("Another page has the controls:").first.wait_for()
     assert served.pace.paused == before
-    for page in (phone, tab):  # from one to the other, and back
+    for page in (phone, tab, phone):
         page.get_by_role("button", name="Take the controls").click()
         page.get_by_role("button", name="Take the controls").wait_for(state="hidden")
-    assert phone.evaluate("document.documentElement.scrollWidth") <= 390  # nothing is beyond the edge
-    scene = phone.locator("canvas").first.bounding_box()
-    assert scene["width"] == 390
-    bars = phone.get_by_text("roll", exact=True).bounding_box()
-    assert bars["x"] >= 0.0
-    assert bars["x"] + bars["width"] <= 390
+
+
+def test_nothing_is_cut_on_a_phone(phone: Any) -> None:
+    assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+    assert phone.locator("canvas").first.bounding_box()["width"] == 390
+    for cell in ("roll", "bound used"):
+        box = phone.get_by_text(cell, exact=True).bounding_box()
+        assert 0.0 <= box["x"] <= box["x"] + box["width"] <= 390
+    assert phone.get_by_role("tabpanel").bounding_box()["width"] > 360
+    assert phone.get_by_text("Shift-click the floor").is_hidden()
+
+
+def test_a_finger_pulls_and_taps_waypoints(served: Served, phone: Any) -> None:
+    phone.get_by_role("button", name="Reset", exact=True).click()
+    served.wait(lambda: served.session.k > 5 and not served.is_pushed())
+    fingers = phone.context.new_cdp_session(phone)
+
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        at = [{"x": x, "y": y} for x, y in points]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
+
+    while (notices := phone.locator(".mantine-Notification-closeButton")).count():
+        notices.first.click()  # they lie over the scene
+        phone.wait_for_timeout(300)
+    limit = clock.monotonic() + PATIENCE
+    while not served.is_pushed():
+        assert clock.monotonic() < limit
+        touch("touchStart", (195, 140))
+        for i in range(8):
+            touch("touchMove", (195 + 8 * i, 140 - 4 * i))
+            phone.wait_for_timeout(50)
+        touch("touchEnd")
+    served.wait(lambda: served.session._held.pull is None)
+    count = len(served.events("setpoint"))
+    phone.touchscreen.tap(30, 225)
+    served.wait(lambda: len(served.events("setpoint")) > count)
 
 
 def test_a_closed_page_ends_its_push(served: Served, phone: Any) -> None:

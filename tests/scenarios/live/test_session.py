@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 import scenarios.flight_events
 from quadsim.errors import InputError
+from scenarios.app import live
 from scenarios.cli import main
 from scenarios.live.knobs import knobs
 from scenarios.live.serving import LATE, Pace
@@ -36,6 +38,16 @@ INPUTS = st.one_of(
     kind("steer", velocity=vector(1.0)),
     kind("controller", fields=st.sampled_from(FIELDS)),
 )
+EVERY: list[dict[str, Any]] = [
+    {"type": "gust", "velocity": [6.0, 0.0, 0.0], "duration": 1.0},
+    {"type": "wind", "velocity": [3.0, 0.0, 0.0]},
+    {"type": "mass", "factor": 1.1},
+    {"type": "payload_pickup", "mass": 0.05},
+    {"type": "rotor_lag", "rise": 0.02},
+    {"type": "rotor_loss", "rotor": 1, "loss": 0.1},
+    {"type": "stall", "duration": 0.2},
+    {"type": "sensor_fault", "sensor": "position", "fault": "nan", "duration": 1.0},
+]
 
 
 @pytest.fixture(scope="module")
@@ -292,3 +304,57 @@ def test_a_finished_run_is_flown_on_unless_check_refuses_it_and_none_of_its_code
     assert main([*command, "--out", str(tmp_path / "refused")]) == EXIT_WRONG_INPUT
     assert "imported" not in capsys.readouterr().err
     assert not (tmp_path / "refused").exists()
+
+
+def test_constraints_on_the_course_end_once_a_person_steers() -> None:
+    session = Session(load_scenario("robust", ["controller.horizon=10"]))
+    flown(session, 3)
+    assert {"arrival_x", "roll"} <= {limit.name for limit in session.limits}
+    session.submit({"type": "setpoint", "z": 2.0})
+    flown(session, 3)
+    names = {limit.name for limit in session.limits}
+    assert "roll" in names
+    assert not any(name.startswith("arrival") for name in names)
+    assert {finding.limit.name for finding in session.flight().findings} == names
+    assert same_bits(session)
+    assert {limit.name for limit in Rollout(session.flight().scenario).limits} == names
+    session.close()
+
+
+def test_a_running_constraint_on_the_course_ends_where_a_person_steers(session: Session) -> None:
+    flown(session, 4)
+    session.submit({"type": "setpoint", "z": 1.5})
+    flown(session, 10)
+    hold = next(finding for finding in session.flight().findings if finding.limit.name == "hold_z")
+    assert hold.limit.stop == pytest.approx(4 * session.period)
+    assert hold.satisfied
+
+
+def test_the_scenario_made_for_sessions_can_have_every_input_and_withstands_a_broken_rotor() -> None:
+    assert inspect.signature(live).parameters["scenario"].default == "playground"
+    session = Session(load_scenario("playground"))
+    assert not any(session.refusals(EVERY))
+    session.submit({"type": "wear", "rotor": 1, "loss": 0.4})
+    flown(session, 160)
+    assert session.reason is None
+    assert (
+        abs(session.flights[0].loop.last.observation.reference[2] - session.flights[0].loop.last.segment.physics[-1, 3])
+        < 0.05
+    )
+    session.close()
+
+
+def test_what_a_scenario_cannot_have_is_refused_with_the_reason_before_the_flight(session: Session) -> None:
+    reasons = dict(zip([table["type"] for table in EVERY], session.refusals(EVERY), strict=True))
+    assert "states no drag" in reasons["gust"]
+    assert not any(reason for kind, reason in reasons.items() if kind not in ("gust", "wind"))
+    assert session.k == 0
+
+
+@pytest.mark.parametrize(
+    ("bounds", "given"), [({"output_bounds.roll": [-5.0, -1.0]}, "[-5"), ({"input_bounds.speed": [0.0, 100.0]}, "[0")]
+)
+def test_bounds_that_exclude_hover_are_refused(session: Session, bounds: dict[str, Any], given: str) -> None:
+    with pytest.raises(InputError, match=r"a range that contains .*, as in hover; got " + re.escape(given)):
+        session.successor(bounds)
+    assert session.successor({"output_bounds.roll": [-1.0, 5.0]})

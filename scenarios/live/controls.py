@@ -1,0 +1,310 @@
+"""The tabs of a session's page by which a person acts: disturbances, steering, the controller's fields.
+
+Handles are viser's; nothing here imports it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import inspect
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from functools import partial
+from typing import Any, Final, get_args
+
+import numpy as np
+
+from quadsim.errors import InputError
+from quadsim.vehicle import N_ROTORS
+from scenarios.live import readout
+from scenarios.live.knobs import TURNED, Knob, Value, knobs
+from scenarios.live.session import Session
+from scenarios.live.stage import Stage
+from scenarios.schema.controllers import AnyController
+from scenarios.schema.events import SensorText
+from scenarios.schema.writing import plain
+
+_STEER: Final = {"W": (1, 0, 0), "S": (-1, 0, 0), "A": (0, 1, 0), "D": (0, -1, 0), "R": (0, 0, 1), "F": (0, 0, -1)}
+"""Keys, and the direction of the set-point's velocity that each adds to."""
+_STEER_STEP: Final = 0.5  # [m/s] by which a key changes it
+_STEER_MOST: Final = 5.0
+_BROKEN: Final = 0.4  # share of its thrust that a rotor loses by the button
+_SENSORS: Final = get_args(SensorText)
+_WIND: Final = {"type": "gust", "velocity": [1.0, 0.0, 0.0], "duration": 1.0}
+_LOAD: Final = {"type": "mass", "factor": 1.1}
+_LAG: Final = {"type": "rotor_lag", "rise": 0.01}
+
+
+class Widgets:
+    """Widgets that only the driving client may use.
+
+    Args:
+        gui: viser's.
+        drives: whether a client, by its number, has the controls.
+    """
+
+    def __init__(self, gui: Any, session: Session, drives: Callable[[int], bool]) -> None:
+        self.gui, self.session, self._drives = gui, session, drives
+        self._starts: list[tuple[Any, Any]] = []  # widgets, and what they are at the start of a flight
+
+    def on(self, register: Callable[[Any], Any], act: Callable[[Any], Any]) -> None:
+        """Call a function for changes by the driving client, not for changes by Python, which have no client."""
+
+        async def called(event: Any) -> None:  # a plain function would run in one of many threads
+            if event.client is None:
+                return
+            if not self._drives(event.client.client_id):
+                text = "Another page has the controls: Take the controls changes that."
+                event.client.add_notification("You watch", text)
+            elif inspect.isawaitable(result := act(event)):
+                await result
+
+        register(called)
+
+    def starts(self, widget: Any) -> None:
+        """Remember a widget's value for a new flight."""
+        self._starts.append((widget, widget.value))
+
+    def reset(self) -> None:
+        """Show what a new flight starts with."""
+        for widget, value in self._starts:
+            widget.value = value
+
+    def button(self, label: str, act: Callable[[Any], Any], **look: Any) -> None:
+        """A button."""
+        self.on(self.gui.add_button(label, **look).on_click, act)
+
+    def event(self, label: str, table: Callable[[], Mapping[str, Any]], refused: str = "") -> None:
+        """A button that submits an event, if this scenario can have it."""
+        self.button(label, lambda event: self.session.submit(table()), disabled=bool(refused))
+
+    def group(self, label: str, acts: Mapping[str, Callable[[Any], Any]], shown: tuple[str, ...] = ()) -> Any:
+        """Buttons in a row."""
+        buttons = self.gui.add_button_group(label, shown or tuple(acts))
+        self.on(buttons.on_click, lambda event: acts[event.target.value](event))
+        return buttons
+
+    def submits(self, widget: Any, table: Callable[[Any], Mapping[str, Any]]) -> None:
+        """Submit an input made of a widget's value whenever the driving client changes that."""
+        self.starts(widget)
+        self.on(widget.on_update, lambda event: self.session.submit(table(event.target.value), subject=widget.label))
+
+
+def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
+    """Fill the tab with every event that this scenario can have; the others are disabled, with the reason.
+
+    `use` takes a hint away.
+    """
+    gui, session, mass = widgets.gui, widgets.session, widgets.session.flights[0].actual.mass
+    sensors = [{"type": "sensor_fault", "sensor": name, "fault": "nan", "duration": 1.0} for name in _SENSORS]
+    no_wind, no_load, no_lag, *blind = session.refusals([_WIND, _LOAD, _LAG, *sensors])
+
+    def pulled(event: Any) -> None:
+        to = None if event.phase == "end" else [float(number) for number in event.end_position]
+        session.submit({"type": "pull", "to": to}, subject="pull")
+        use("pull")
+
+    def broken(event: Any) -> None:
+        use("break")
+        wear[0].value = _BROKEN
+        session.submit(_wear(1, _BROKEN), subject=wear[0].label)
+
+    widgets.on(stage.grab.on_drag("left"), pulled)
+    widgets.button("Break a rotor", broken, hint=f"rotor 1 loses {100 * _BROKEN:.0f} % of its thrust")
+    wear = [gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0) for rotor in range(1, N_ROTORS + 1)]
+    for rotor, slider in enumerate(wear, 1):
+        widgets.submits(slider, partial(_wear, rotor))
+    box = {"min": (-15.0, -15.0), "max": (15.0, 15.0), "step": 0.5, "disabled": bool(no_wind)}
+    gust = gui.add_vector2("Gust x, y [m/s]", (6.0, 0.0), **box)
+    widgets.event("Gust for 1 s", lambda: _WIND | {"velocity": [*map(float, gust.value), 0.0]}, no_wind)
+    wind = gui.add_vector2("Wind x, y [m/s]", (0.0, 0.0), **box)
+    widgets.submits(wind, lambda value: {"type": "wind", "velocity": [*map(float, value), 0.0]})
+    gui.add_html(readout.says(no_wind, "why"))
+    off = bool(no_load)
+    factor = gui.add_slider("Mass factor", 0.7, 1.5, 0.01, 1.0, disabled=off)
+    widgets.submits(factor, lambda value: {"type": "mass", "factor": float(value)})
+    step = round(0.01 * mass, 5)
+    load = gui.add_number("Payload [kg]", round(0.1 * mass, 4), min=0.0, max=mass, step=step, disabled=off)
+    widgets.event("Take payload", lambda: {"type": "payload_pickup", "mass": float(load.value)}, no_load)
+    widgets.event("Drop payload", lambda: {"type": "payload_drop"}, no_load)
+    gui.add_html(readout.says(no_load, "why"))
+    lag = gui.add_slider("Rotor lag [ms]", 0, 100, 5, 0, disabled=bool(no_lag))
+    widgets.submits(lag, lambda value: {"type": "rotor_lag", "rise": float(value) / 1e3})
+    gui.add_html(readout.says(no_lag, "why"))
+    seen = [name for name, reason in zip(_SENSORS, blind, strict=True) if not reason]
+    sensor = gui.add_dropdown("Sensor", seen or _SENSORS, disabled=not seen)
+    fault = gui.add_dropdown("Fault", ("dropout", "freeze", "nan"), disabled=not seen)
+    no_fault = "" if seen else blind[0]
+    widgets.event("Fail sensor for 1 s", lambda: sensors[0] | {"sensor": sensor.value, "fault": fault.value}, no_fault)
+    late = gui.add_number("Late commands [ms]", 200, min=10, max=5000, step=10)
+    widgets.event("Stall the computer", lambda: {"type": "stall", "duration": float(late.value) / 1e3})
+
+
+class Steering:
+    """The set-point, by every way that there is to give one."""
+
+    def __init__(self, widgets: Widgets, scene: Any, unit: float, use: Callable[[str], None]) -> None:
+        """Fill the tab; `unit` is the vehicle's size [m], `use` takes a hint away."""
+        self._session, self._use, gui = widgets.session, use, widgets.gui
+        self._velocity = np.zeros(3)
+        gui.add_html(readout.block(readout.STEER, "why"))
+        here = np.asarray(self._session.flights[0].loop.course.row(0)[:3])
+        self._handle = scene.add_transform_controls(
+            "/target",
+            scale=3.0 * unit,
+            position=here,
+            disable_rotations=True,
+            disable_sliders=True,
+            visible=False,  # it would lie over the vehicle, and take its pulls
+        )
+        arrows = gui.add_checkbox("Arrows to drag", False)
+        widgets.on(arrows.on_update, lambda event: setattr(self._handle, "visible", event.target.value))
+        self._place = gui.add_vector3("Set-point [m]", tuple(map(float, here)), step=0.1)
+        widgets.starts(self._place)
+        widgets.on(self._handle.on_update, lambda event: self._set_point(event.target.position))
+        widgets.on(self._place.on_update, lambda event: self._set_point(event.target.value))
+        widgets.on(scene.on_click(modifier="shift"), self.clicked)
+        yaw = gui.add_slider("Yaw [deg]", -180, 180, 5, 0)
+        widgets.submits(yaw, lambda value: {"type": "setpoint", "yaw": float(value)})
+        self._steered = gui.add_text("Set-point velocity [m/s]", "0, 0, 0", disabled=True)
+        for key, direction in _STEER.items():
+            command = gui.add_command(f"Fly {'-+'[sum(direction) > 0]}{'xyz'[np.abs(direction).argmax()]}", hotkey=key)
+            widgets.on(command.on_trigger, partial(self._fly_on, _STEER_STEP * np.array(direction)))
+        widgets.on(gui.add_command("Stop the set-point", hotkey="X").on_trigger, lambda event: self.stop())
+        widgets.button("Stop set-point", lambda event: self.stop())
+
+    def clicked(self, event: Any) -> None:
+        """Fly to the point of the ground that was clicked, at the set-point's height."""
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        if origin[2] * direction[2] < 0.0:  # it meets the ground
+            meets = origin - origin[2] / direction[2] * direction
+            last = self._session.flights[0].loop.last
+            height = self._place.value[2] if last is None else last.observation.reference[2]
+            self._set_point((*meets[:2], height))
+            self._use("waypoint")
+
+    def _set_point(self, at: Any) -> None:
+        self.stop()
+        x, y, z = (round(float(number), 2) for number in at)
+        self._handle.position, self._place.value = np.array([x, y, z]), (x, y, z)
+        self._session.submit({"type": "setpoint", "x": x, "y": y, "z": z}, subject="setpoint")
+
+    def stop(self) -> None:
+        """Let the set-point stand."""
+        self._fly(np.zeros(3))
+
+    def reset(self) -> None:
+        """Show what a new flight starts with, after the widgets have been reset."""
+        self._handle.position = np.array(self._place.value)
+        self._show(np.zeros(3))
+
+    def _fly_on(self, change: Any, event: Any) -> None:
+        self._fly(self._velocity + change)
+
+    def _fly(self, velocity: Any) -> None:
+        self._show(np.clip(velocity, -_STEER_MOST, _STEER_MOST))
+        self._session.submit({"type": "steer", "velocity": self._velocity.tolist()}, subject="steer")
+
+    def _show(self, velocity: Any) -> None:
+        self._velocity = velocity
+        self._steered.value = ", ".join(f"{speed:g}" for speed in velocity)
+
+
+class ControllerTab:
+    """The controller's fields, and other controllers that may take over.
+
+    Args:
+        others: these, by name.
+        doing: shows an activity while it lasts.
+    """
+
+    def __init__(
+        self,
+        widgets: Widgets,
+        others: Mapping[str, AnyController],
+        doing: Callable[[str], AbstractContextManager[None]],
+    ) -> None:
+        self._widgets, self._session, self._doing = widgets, widgets.session, doing
+        self._laws = {"as started": self._session.scenario.controller, **others}
+        self._fields: dict[str, tuple[Knob, Any]] = {}
+        self._groups: list[Any] = []  # folders of fields
+        chosen = widgets.gui.add_dropdown("Controller", tuple(self._laws))
+        widgets.button("Take this controller", lambda event: self._take(chosen.value))
+        self._answer = widgets.gui.add_html("")
+        self._folder = widgets.gui.add_folder(None)
+        self._show(self._session.scenario.controller)
+
+    def reset(self) -> None:
+        """Show what a new flight starts with."""
+        self._answer.content = ""
+        self._show(self._session.scenario.controller)
+
+    def _show(self, spec: AnyController) -> None:
+        while self._groups:
+            self._groups.pop().remove()
+        self._fields.clear()
+        fields = {knob.path: knob for knob in knobs(spec)}
+        with self._folder:
+            groups = {
+                title: [(fields.pop(path), label) for path, label in turned.items() if path in fields]
+                for title, turned in TURNED.items()
+            }
+            for title, group in {**groups, "All fields": [(knob, knob.path) for knob in fields.values()]}.items():
+                if not group:
+                    continue
+                self._groups.append(self._widgets.gui.add_folder(title, expand_by_default=title != "All fields"))
+                with self._groups[-1]:
+                    for knob, label in group:
+                        handle = self._input(knob, label)
+                        self._fields[knob.path] = knob, handle
+                        self._widgets.on(handle.on_update, partial(self._turn, knob.path))
+
+    def _input(self, knob: Knob, label: str) -> Any:
+        """The widget of a field."""
+        gui, value, look = self._widgets.gui, knob.value, {"hint": knob.about}
+        if isinstance(value, bool):
+            return gui.add_checkbox(label, value, **look)
+        if isinstance(value, str):
+            return gui.add_dropdown(label, knob.choices, initial_value=value, **look)
+        if isinstance(value, tuple):
+            ends = {
+                name: None if end is None else (end, end)
+                for name, end in (("min", knob.minimum), ("max", knob.maximum))
+            }
+            return gui.add_vector2(label, value, step=0.1, **ends, **look)
+        step = 1 if isinstance(value, int) else None
+        return gui.add_number(label, value, step=step, min=knob.minimum, max=knob.maximum, **look)
+
+    async def _turn(self, path: str, event: Any) -> None:
+        if path not in self._fields:  # of a controller that was replaced meanwhile
+            return
+        knob, handle = self._fields[path]
+        if handle.value == knob.value:
+            return
+        value: Value = handle.value
+        if await self._replace({path: value}, f"{path} = {value}"):
+            self._fields[path] = dataclasses.replace(knob, value=value), handle
+        else:
+            handle.value = knob.value
+
+    async def _take(self, name: str) -> None:
+        spec = self._laws[name]
+        if await self._replace(plain(spec), name):
+            self._show(spec)
+
+    async def _replace(self, fields: Mapping[str, Any], what: str) -> bool:
+        """Build a controller in the background and let it take over; if that fails, report why."""
+        with self._doing("building the controller"):
+            try:
+                successor = await asyncio.to_thread(self._session.successor, fields)
+            except InputError as error:
+                self._answer.content = readout.says(f"Refused, the controller before flies on: {error}", "bad")
+                return False
+        self._session.submit({"type": "controller", "fields": dict(fields)}, successor=successor)
+        self._answer.content = readout.says(f"Flies from the next period on: {what}")
+        return True
+
+
+def _wear(rotor: int, loss: Any) -> dict[str, Any]:
+    return {"type": "wear", "rotor": rotor, "loss": float(loss)}
