@@ -285,7 +285,7 @@ def write_report(
     files = {name: name for name in _FILES if (directory / name).is_file() or (campaign / name).is_file()}
     mark = Mark.NONE if not summary["flights"] else Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
     verdict = Cell(text=sentence, mark=mark)
-    page = render_page("campaign", spec.name, sections, description=spec.description, verdict=verdict, files=files)
+    page = render_page("campaign", spec.name, sections, notes=(spec.description,), verdict=verdict, files=files)
     (directory / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
 
