@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import shlex
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -50,8 +49,8 @@ def write_comparison(runs: Sequence[Run], directory: Path, *, overwrite: bool = 
     """Write a comparison of runs, which appears complete or not at all; returns the page, `directory/index.html`.
 
     The directory holds the page, the overlay `comparison.png`, the table `comparison.md`, and of each run its video
-    `NAME.mp4` with its poster `NAME.jpg`, and a folder `NAME` of its other files; it can be moved or zipped as it is.  Runs that were aborted, and
-    runs without video, recording or constraints are welcome.
+    `NAME.mp4` with its poster `NAME.jpg`, and a folder `NAME` of its other files; it can be moved or zipped as it is.
+    Runs that were aborted, and runs without video, recording or constraints are welcome.
 
     Raises:
         ParameterError: no run is given.
@@ -127,7 +126,6 @@ def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) 
         facts=(", modelled with ".join([vehicle, *mismatch(summary)]), _made_with(run)),
         video=video,
         poster=poster,
-        video_command=f"quadsim video {shlex.quote(str(run.directory))}",
         files=files,
     )
 

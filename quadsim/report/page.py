@@ -40,7 +40,6 @@ class RunView:
     facts: tuple[str, ...]  # vehicle, versions and machine
     video: str | None  # URL; None without one
     poster: str | None  # URL of the video's picture before it plays; None if the video cannot be read
-    video_command: str  # makes the video
     files: Mapping[str, str]  # URL of each, by its label
 
 
