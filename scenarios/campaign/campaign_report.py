@@ -75,7 +75,7 @@ def _brief(grid: Grid) -> Grid:
 
 
 def verdict_sentence(summary: Summary) -> str:
-    """Return the failures with their confidence interval: `3 of 100 flights failed: 3.0 % (95 % interval: 0.6 to 8.5 %)`."""
+    """Return the failures with their confidence interval: `3 of 40 flights failed: 7.5 % (95 % interval: ...)`."""
     failure = summary["events"]["failure"]
     text = f"{failure['count']} of {count_of(failure['flights'], 'flight')} failed"
     if failure["flights"]:
