@@ -15,8 +15,8 @@ ADVICE = ("GL Driver Message", "willReadFrequently")
 """Chromium's advice on the speed of plotly.js without a graphics card; a page cannot mend it."""
 PATIENCE = 120e3  # [ms]
 CLASHES = """plot => {
-  const titles = [...plot.querySelectorAll(".annotation-text, .g-xtitle, .g-ytitle")];
-  const boxes = titles.map((title) => title.getBoundingClientRect());
+  const titles = [...plot.querySelectorAll(".annotation-text, .infolayer text[class$='title']")];
+  const boxes = titles.map((title) => title.getBoundingClientRect()).filter((box) => box.width);
   const meet = (a, b) => a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
   const beyond = boxes.filter((box) => box.left < 0 || box.right > innerWidth);
   return beyond.length + boxes.flatMap((a, i) => boxes.slice(i + 1).filter((b) => meet(a, b))).length;
