@@ -145,7 +145,7 @@ def constraint_table(summary: Summary) -> Grid:
     head = ("constraint", "not held", "share", sure, "worst margin", "in flight")
     note = (
         "Margins are at the physics rate, without the tolerance; negative is beyond the bound. Shares are of the "
-        "flights that reached the constraint or were lost before it; these did not hold it, and have no margin."
+        "flights that reached the constraint or were lost before it; the latter did not hold it and have no margin."
     )
     return _grid("constraints", head, lines, note)
 
