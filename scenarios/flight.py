@@ -18,7 +18,7 @@ import numpy as np
 from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import MissingPackageError, OutputError, QuadsimError, UnknownNameError, printable
 from quadsim.flight import metrics, rundir
-from quadsim.flight.audit import SIGNALS, VERDICT_TEXT, Finding, margins_at, margins_sampled
+from quadsim.flight.audit import SIGNALS, VERDICT_TEXT, Finding, margins_at, margins_sampled, worst_finding
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
@@ -430,15 +430,10 @@ def to_pandas(table: pa.Table) -> Any:
 
 
 def worst_margin(findings: Iterable[Finding]) -> str:
-    """The smallest margin of the required constraints that were reached, as the second line of a repr.
-
-    Those of the commands count once they are violated: a command at its own bound is no near miss.
-    """
-    required = [finding for finding in findings if finding.verdict != "incomplete" and finding.limit.required]
-    reached = [each for each in required if each.verdict == "violated" or each.limit.signal not in ("speed", "slew")]
-    if not reached:
+    """The worst margin of the required constraints, see `worst_finding`, as the second line of a repr."""
+    worst = worst_finding(finding for finding in findings if finding.limit.required)
+    if worst is None:
         return ""
-    worst = min(reached, key=lambda finding: sum(finding.deciding) / finding.limit.half_band)
     margin, tolerance = worst.deciding
     return f"\n worst margin: {worst.limit.name} {margin:.4g} {worst.limit.unit}, tolerance {tolerance:g}"
 

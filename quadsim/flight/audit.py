@@ -9,7 +9,7 @@ A margin is the signed distance to the nearer bound: positive inside, negative b
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Final, Literal
 
@@ -275,6 +275,17 @@ class Finding:
     def deciding_margin(self) -> float:
         """The first entry of `deciding`."""
         return self.deciding[0]
+
+
+def worst_finding(findings: Iterable[Finding]) -> Finding | None:
+    """Return the finding whose margin, tolerance included, is the smallest share of half its band.
+
+    Limits that were not reached do not count, and limits of the commands count once they are violated: a command at its
+    own bound is no near miss.  None if no finding counts.
+    """
+    reached = [finding for finding in findings if finding.verdict != "incomplete"]
+    counted = [each for each in reached if each.verdict == "violated" or each.limit.signal not in ("speed", "slew")]
+    return min(counted, key=lambda finding: sum(finding.deciding) / finding.limit.half_band, default=None)
 
 
 def margins_sampled(limit: Limit, log: FlightLog) -> Array:

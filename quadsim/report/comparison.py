@@ -8,21 +8,26 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from quadsim.controller import Phase, law_name
 from quadsim.errors import printable
-from quadsim.flight.audit import VERDICT_TEXT
-from quadsim.flight.rundir import constraint_verdict, deciding_margin
+from quadsim.flight.audit import VERDICT_TEXT, worst_finding
+from quadsim.flight.rundir import constraint_verdict, deciding_margin, finding_from_json
 from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
 from quadsim.space import SHAPES, Obstacle
+from quadsim.state import VELOCITY
 
 if TYPE_CHECKING:
     from quadsim.flight.rundir import Run
 
 Summary = Mapping[str, Any]
+GLANCE: Final = "At a glance"
+_EXCEEDED: Final = "exceeded, not required"
+_ROUNDING: Final = 1e-3  # share of its tolerance below which a margin is shown as 0
 _MOST_EVENTS: Final = 12  # most events of a flight that are named
 _Line = tuple[str, str, Callable[[Summary], Cell]]  # a row's label, its unit, and the cell of a summary
 
@@ -62,6 +67,10 @@ def comparison_rows(runs: Sequence[Run]) -> list[Row]:
                 yield Row(group=group, label=label, unit=unit, cells=tuple(map(cell, summaries)))
 
     return [
+        *rows(GLANCE, _GLANCE),
+        _best_smallest(GLANCE, "RMS error, position", "m", summaries, list(map(_position_error, summaries))),
+        Row(group=GLANCE, label="highest speed", unit="m/s", cells=tuple(map(_highest_speed, runs))),
+        *rows(GLANCE, [("step time", "ms", _step_time)]),
         *rows("Flight", _FLIGHT),
         *rows("Course", _COURSE, "course"),
         *_tracking_rows(summaries),
@@ -77,10 +86,46 @@ def comparison_rows(runs: Sequence[Run]) -> list[Row]:
 
 
 def outcome(summary: Summary) -> Cell:
-    """Return completed, or aborted with its reason."""
-    if summary["status"] == "completed":
-        return Cell(text="completed", mark=Mark.GOOD)
-    return Cell(text=f"aborted: {summary.get('reason')}", mark=Mark.BAD)
+    """Return the verdict with its reason, and the bounds that were exceeded but are not required."""
+    cell = verdict_cell(summary)
+    if summary["status"] != "completed":
+        cell = replace(cell, text=f"{cell.text}: {summary.get('reason')}")
+    elif verdict(summary) == "incomplete":
+        cell = replace(cell, text=f"{cell.text}; {required(summary).text}")
+    free = [entry for entry in summary["constraints"] if not entry["required"]]
+    if exceeded := [entry["name"] for entry in free if constraint_verdict(entry) == "violated"]:
+        mark = Mark.WARN if cell.mark is Mark.GOOD else cell.mark
+        cell = Cell(text=f"{cell.text}; {_EXCEEDED}: {', '.join(exceeded)}", mark=mark)
+    return cell
+
+
+def _worst_constraint(summary: Summary) -> Cell:
+    """Return the constraint that came closest to its bound, or went furthest beyond it, with its verdict."""
+    worst = worst_finding(map(finding_from_json, summary["constraints"]))
+    if worst is None:
+        return Cell()
+    cell = _verdict(next(entry for entry in summary["constraints"] if entry["name"] == worst.limit.name))
+    return replace(cell, text=f"{worst.limit.name} {cell.text}")
+
+
+def _position_error(summary: Summary) -> float | None:
+    errors = [nested(summary, "tracking", "rmse", axis) for axis in "xyz"]
+    return None if None in errors else math.hypot(*errors)
+
+
+def _highest_speed(run: Run) -> Cell:
+    speeds = np.linalg.norm(run.log.plant.state[:, VELOCITY], axis=1)
+    speeds = speeds[np.isfinite(speeds)]
+    return Cell(text=format_number(float(speeds.max()))) if speeds.size else Cell()
+
+
+def _step_time(summary: Summary) -> Cell:
+    median, longest = (nested(summary, "controller", "step_ms", measure) for measure in ("p50", "max"))
+    deadline = nested(summary, "controller", "deadline_ms")
+    if median is None:
+        return Cell()
+    text = f"median {format_number(median)}, maximum {format_number(longest)}, deadline {format_number(deadline)}"
+    return Cell(text=text, mark=Mark.WARN if nested(summary, "controller", "deadline_misses") else Mark.NONE)
 
 
 def verdict(summary: Summary) -> str:
@@ -241,11 +286,12 @@ def _verdict(entry: Summary) -> Cell:
     verdict = constraint_verdict(entry)
     text = VERDICT_TEXT[verdict]
     if verdict == "violated" and not entry["required"]:
-        text = "exceeded, not required"
+        text = _EXCEEDED
     if verdict != "incomplete":
         margin, tolerance = deciding_margin(entry)
         at_samples = " at the samples" if margin != entry["worst_margin"] else ""
-        text += f" (margin {format_number(margin)} {entry['unit']}{at_samples}, tolerance {tolerance:g})"
+        shown = 0.0 if margin is not None and abs(margin) < _ROUNDING * tolerance else margin
+        text += f" (margin {format_number(shown)} {entry['unit']}{at_samples}, tolerance {tolerance:g})"
     return Cell(text=text, mark=_verdict_mark(entry))
 
 
@@ -341,9 +387,8 @@ def _refused(summary: Summary) -> Cell:
     return Cell(text=", ".join(parts) or ABSENT)
 
 
+_GLANCE: Final[tuple[_Line, ...]] = (("outcome", "", outcome), ("worst constraint", "", _worst_constraint))
 _FLIGHT: Final[tuple[_Line, ...]] = (
-    ("outcome", "", outcome),
-    ("verdict", "", verdict_cell),
     ("required constraints", "", required),
     ("audit", "", lambda summary: Cell(text="; ".join(summary.get("audit_notes", ())) or "as the controller bounds")),
     ("why no optimum", "", _text(lambda summary: "; ".join(failure_sentences(summary)) or ABSENT)),

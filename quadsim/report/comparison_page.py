@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import shlex
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,15 +22,7 @@ from quadsim.flight.rundir import (
     require_inside,
 )
 from quadsim.outputs import writing
-from quadsim.report.comparison import (
-    comparison_rows,
-    distinct_courses,
-    mismatch,
-    outcome,
-    required,
-    run_names,
-    verdict_cell,
-)
+from quadsim.report.comparison import comparison_rows, distinct_courses, mismatch, run_names
 from quadsim.report.figure import Scene, line_colour
 from quadsim.report.flight_figures import overview, page_figures
 from quadsim.report.page import PAGE_FILE, RunView, Section, render_page
@@ -58,8 +49,8 @@ def write_comparison(runs: Sequence[Run], directory: Path, *, overwrite: bool = 
     """Write a comparison of runs, which appears complete or not at all; returns the page, `directory/index.html`.
 
     The directory holds the page, the overlay `comparison.png`, the table `comparison.md`, and of each run its video
-    `NAME.mp4` and a folder `NAME` of its other files; it can be moved or zipped as it is.  Runs that were aborted, and
-    runs without video, recording or constraints are welcome.
+    `NAME.mp4` with its poster `NAME.jpg`, and a folder `NAME` of its other files; it can be moved or zipped as it is.
+    Runs that were aborted, and runs without video, recording or constraints are welcome.
 
     Raises:
         ParameterError: no run is given.
@@ -87,10 +78,11 @@ def write_comparison(runs: Sequence[Run], directory: Path, *, overwrite: bool = 
             scene_to_plot(figure) if isinstance(figure, Scene) else to_plot(figure, labelled=len(runs) == 1)
             for figure in page_figures(runs)
         ]
-        plots = Section(title="Plots", plots=tuple(figures), text=(warning,) if courses > 1 else ())
+        plots = Section(title="Plots", plots=tuple(figures))
         title = " and ".join(names) if len(names) < 3 else f"{len(names)} runs: {', '.join(names)}"
         files = {"overlay of all runs (PNG)": OVERVIEW_FILE, "table (Markdown)": TABLE_FILE}
-        page = render_page("comparison", title, [plots], runs=views, rows=rows, files=files)
+        notes = (warning,) if courses > 1 else ()
+        page = render_page("comparison", title, [plots], notes=notes, runs=views, rows=rows, files=files)
         (partial / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
 
@@ -118,19 +110,22 @@ def _place(run: Run, name: str, folder: str, colour: str, page_directory: Path) 
         shutil.copytree(run.directory / FIGURES_DIR, place / FIGURES_DIR)
         for path in sorted((place / FIGURES_DIR).glob("*.png")):
             files[f"figure: {path.stem}"] = quote(path.relative_to(page_directory).as_posix())
-    has_video = (run.directory / VIDEO_FILE).is_file()
-    if has_video:
-        shutil.copyfile(run.directory / VIDEO_FILE, page_directory / f"{folder}.mp4")
+    video = poster = None
+    if (run.directory / VIDEO_FILE).is_file():
+        from quadsim.report.film.video import write_poster
+
+        video = f"{folder}.mp4"
+        shutil.copyfile(run.directory / VIDEO_FILE, page_directory / video)
+        poster = f"{folder}.jpg" if write_poster(page_directory / video, page_directory / f"{folder}.jpg") else None
     summary = run.summary
-    vehicle = f"Vehicle: {run.vehicle.description or run.vehicle.name}, {run.vehicle.mass:g} kg"
+    vehicle = f"Vehicle: {run.vehicle.description or run.vehicle.name}"
     return RunView(
         name=name,
         colour=colour,
         description=summary.get("description", ""),
-        cells={"flight": outcome(summary), "required constraints": required(summary), "verdict": verdict_cell(summary)},
         facts=(", modelled with ".join([vehicle, *mismatch(summary)]), _made_with(run)),
-        video=quote(f"{folder}.mp4") if has_video else None,
-        video_command=f"quadsim video {shlex.quote(str(run.directory))}",
+        video=video,
+        poster=poster,
         files=files,
     )
 

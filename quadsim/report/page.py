@@ -37,10 +37,9 @@ class RunView:
     name: str
     colour: str
     description: str
-    cells: Mapping[str, Cell]  # outcome and verdicts, by what they are
     facts: tuple[str, ...]  # vehicle, versions and machine
     video: str | None  # URL; None without one
-    video_command: str  # makes the video
+    poster: str | None  # URL of the video's picture before it plays; None if the video cannot be read
     files: Mapping[str, str]  # URL of each, by its label
 
 
@@ -49,21 +48,22 @@ def render_page(
     title: str,
     sections: Sequence[Section],
     *,
-    description: str = "",
     verdict: Cell | None = None,
+    notes: Sequence[str] = (),
     runs: Sequence[RunView] = (),
     rows: Sequence[Row] = (),
     files: Mapping[str, str] | None = None,
 ) -> str:
     """A page of a kind, e.g. `campaign`.
 
-    `verdict` is the answer in one line, `rows` the table of `runs`, whose plots toggle the group `run0` and so on;
-    `files` has the URL of each file beside the page, by its label.
+    `verdict` is the answer in one line, `notes` a paragraph each beneath it, `rows` the table of `runs`, of which the
+    first group stands before the sections and the others after them; plots toggle the group `run0` and so on; `files`
+    has the URL of each file beside the page, by its label.
     """
     groups = [(group, list(of_group)) for group, of_group in itertools.groupby(rows, lambda row: row.group)]
     shown = [part for part in map(_without_empty, sections) if part.text or part.plots or part.tables or part.folded]
     return _environment().get_template("page.html.j2").render(
-        kind=kind, title=title, sections=shown, description=description, verdict=verdict, runs=runs, groups=groups,
+        kind=kind, title=title, sections=shown, verdict=verdict, notes=notes, runs=runs, groups=groups,
         files=files or {}, plotly=plotly_script() if any(section.plots for section in shown) else "",
     )  # fmt: skip
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _ROW, _TOP, _BOTTOM = 210, 34, 46  # of a row of panels, and above and below them all [px]
 _GAP, _LABELLED_GAP = 56, 76  # between rows of panels, and where each has a label [px]
 _SCENE: Final = 560  # [px]
+_LEAST_SHARE: Final = 0.4  # of the longest axis of a scene: how long the others are at least
 _MOST_POINTS: Final = 3000
 _POINTS_OF_ALL_RUNS: Final = 12_000
 """Points that one quantity may have over all runs: keeps a page of two runs near 6 MB, and of ten below 8 MB."""
@@ -112,9 +113,19 @@ def scene_to_plot(scene: Scene) -> Plot:
         x, y, z = path[:: max(1, len(path) // _MOST_POINTS)].T.astype(np.float32)
         line = {"color": colour, "width": 3 if dashed else 5, "dash": "dash" if dashed else "solid"}
         canvas.add_trace(Scatter3d(x=x, y=y, z=z, mode="lines", line=line, name=html.escape(label), legendgroup=group))
-    axes = {f"{name}axis": {"title": {"text": f"{name} [m]"}} for name in "xyz"}
+    drawn = np.concatenate([points for points, *_ in (*scene.solids, *scene.paths)])
+    drawn = drawn[np.isfinite(drawn).all(axis=1)]
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    middle, half = 0.5 * (low + high), 0.55 * (high - low)
+    half = np.maximum(half, max(_LEAST_SHARE * half.max(), 1e-3))  # equal scales, and room beside a straight path
+    axes = {
+        f"{name}axis": {"title": {"text": f"{name} [m]"}, "range": [middle[i] - half[i], middle[i] + half[i]]}
+        for i, name in enumerate("xyz")
+    }
+    ratio = dict(zip("xyz", half / half.max(), strict=True))
     camera = {"eye": {"x": 1.2, "y": -1.7, "z": 0.8}, "center": {"x": 0.0, "y": 0.0, "z": -0.12}}
-    canvas.update_layout(scene={"aspectmode": "data", "camera": camera, **axes}, margin=dict.fromkeys("lrtb", 0))
+    space = {"aspectmode": "manual", "aspectratio": ratio, "camera": camera, **axes}
+    canvas.update_layout(scene=space, margin=dict.fromkeys("lrtb", 0))
     return embed(canvas, scene.key, scene.title, _SCENE)
 
 

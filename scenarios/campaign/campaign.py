@@ -136,6 +136,8 @@ def fly_campaign(
             records.require_same(plan, directory)
         progress = _Progress(plan, files, until_width=until_width, watch=watch)
         manifest = records.start(plan, files, session, flying=bool(progress.missing))
+        if progress.missing:
+            put_report(files, REPORT_FILES, None)  # an earlier report lacks the flights to come
         try:
             progress.fly(workers, cluster)
         except BaseException:
@@ -148,17 +150,17 @@ def fly_campaign(
 
         table = progress.store.close(progress.wanted)
         spec, directory = plan.spec, files.path
-        summary = {"campaign": spec.name, "scenario": plan.scenario.name, **estimate(table)}
-
-        def write(place: Path) -> None:
-            write_report(place, table, summary, spec, campaign=directory)
-
-        put_report(files, REPORT_FILES, write if report else None)
+        summary = {"campaign": spec.name, "scenario": plan.scenario.name, "failure": [*spec.failure], **estimate(table)}
         # flights by the processor that flew them; those that raised, or that no process came back from, have none
         processors = read_table(directory / TIMES_FILE)["machine"].drop_null().to_pylist()
         manifest["machines"] = dict(sorted(Counter(processors).items()))
         manifest["status"] = "complete" if progress.wanted == spec.flights else "stopped"
         records.write(manifest, files)
+
+        def write(place: Path) -> None:
+            write_report(place, table, summary, spec, campaign=directory)
+
+        put_report(files, REPORT_FILES, write if report else None)
         files.finish(summary)
     return CampaignResult(directory=directory, manifest=manifest, table=table, summary=summary)
 

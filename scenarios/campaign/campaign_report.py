@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 
+from quadsim.outputs import SUMMARY_FILE
 from quadsim.report.figure import Bound, Figure, Panel, Series
 from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
@@ -18,9 +19,10 @@ from quadsim.report.to_matplotlib import write_pngs
 from quadsim.report.to_plotly import Plot, to_plot
 from quadsim.state import Array
 from scenarios.campaign.campaign_file import CampaignFile
-from scenarios.campaign.events import HARMLESS, INCOMPLETE, VERDICTS
+from scenarios.campaign.events import HARMLESS, INCOMPLETE, VERDICTS, parse_event
 from scenarios.campaign.rows import (
     DRAW,
+    MARGIN,
     Summary,
     draw_names,
     is_number,
@@ -52,6 +54,7 @@ def campaign_lines(summary: Summary, judgements: Sequence[Judgement], directory:
 
     where = console.short_path(directory)
     yield console.styled((summary["campaign"], "bold"), f": {verdict_sentence(summary)}")
+    yield definition_sentence(summary, summary["failure"])
     if summary["parameters"]:
         yield driver_sentence(summary)
     tables = [event_table(summary), constraint_table(summary), worst_table(summary, where)]
@@ -74,14 +77,27 @@ def _brief(grid: Grid) -> Grid:
 
 
 def verdict_sentence(summary: Summary) -> str:
-    """Return the failures with their confidence interval: `37 of 1000 flights failed: 3.7 % (95 %: 2.6 to 5.1 %)`."""
+    """Return the failures with their confidence interval: `3 of 40 flights failed: 7.5 % (95 % interval: ...)`."""
     failure = summary["events"]["failure"]
     text = f"{failure['count']} of {count_of(failure['flights'], 'flight')} failed"
     if failure["flights"]:
         share, ends = _shares(failure)
-        text += f": {share} ({100.0 * summary['confidence']:g} %: {ends})"
+        text += f": {share} ({100.0 * summary['confidence']:g} % interval: {ends})"
     left_out = summary["flights"] - failure["flights"]
     return text + (f"; {count_of(left_out, 'incomplete flight')} not counted" if left_out else "")
+
+
+def definition_sentence(summary: Summary, failure: Sequence[str]) -> str:
+    """Return what counts as failure, and how many flights violated a constraint where that alone does not count."""
+    units = {name: metric["unit"] for name, metric in summary["metrics"].items()}
+    units |= {MARGIN + name: constraint["unit"] for name, constraint in summary["constraints"].items()}
+    events, violation = [parse_event(text) for text in failure], summary["events"]["violation"]
+    listed = [text.rstrip(" -") for text in (f"{event.text} {units.get(event.column_name, '')}" for event in events)]
+    sentence = f"Counted as failure: {', '.join(listed)}."
+    if violation["count"] and "violation" not in (event.text for event in events):
+        flights = count_of(violation["flights"], "flight")
+        sentence += f" A violation alone does not count: {violation['count']} of {flights} had one."
+    return sentence
 
 
 def driver_sentence(summary: Summary) -> str:
@@ -101,9 +117,9 @@ def _grid(key: str, head: Sequence[str], lines: Iterable[tuple[Cell, ...]], note
     return Grid(key=key, title=_TITLES[key], head=tuple(head), lines=tuple(lines), note=note)
 
 
-def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
-    """Return the frequency of each event that happened; `failure` names the events that count as failure."""
-    sure, counted = f"{100.0 * summary['confidence']:g} %", f" ({', '.join(failure)})" if failure else ""
+def event_table(summary: Summary) -> Grid:
+    """Return the frequency of each event that happened."""
+    sure = f"{100.0 * summary['confidence']:g} %"
     head = ("event", "flights", "share", f"{sure} interval", f"at least, with {sure}", f"at most, with {sure}")
     lines = (
         line(name, str(share["count"]), *_shares(share), *(percent(share[f"{end}_one_sided"]) for end in _ENDS))
@@ -111,9 +127,9 @@ def event_table(summary: Summary, failure: Sequence[str] = ()) -> Grid:
         if share["count"] or name in _ALWAYS
     )
     note = (
-        f"Failure: what the campaign counts as such{counted}. Violation: a required constraint did not hold, or "
-        "the flight was lost, raised an error or met a limit. Shares of both leave out incomplete flights, which ended "
-        "before a required constraint was reached. Intervals are Clopper-Pearson's, of independent draws; the last two "
+        "Violation: a required constraint did not hold, or the flight was lost, raised an error or met a limit. Shares "
+        "of failure and violation leave out incomplete flights, which ended before a required constraint was reached. "
+        "Intervals are Clopper-Pearson's, of independent draws; the last two "
         "columns are one-sided. Spread draws are more precise than that."
     )
     return _grid("events", head, lines, note)
@@ -128,10 +144,10 @@ def constraint_table(summary: Summary) -> Grid:
             worst = f"{format_number(constraint['worst_margin'])} {constraint['unit']}", str(constraint["worst_flight"])
         count = Cell(text=str(failed["count"]), mark=Mark.BAD if failed["count"] else Mark.NONE)
         lines.append(line(name, count, *_shares(failed), *worst))
-    head = ("constraint", "flights that did not hold it", "share", sure, "worst margin", "in flight")
+    head = ("constraint", "not held", "share", sure, "worst margin", "in flight")
     note = (
         "Margins are at the physics rate, without the tolerance; negative is beyond the bound. Shares are of the "
-        "flights that reached the constraint or were lost before it."
+        "flights that reached the constraint or were lost before it; the latter did not hold it and have no margin."
     )
     return _grid("constraints", head, lines, note)
 
@@ -154,17 +170,24 @@ def worst_table(summary: Summary, directory: str) -> Grid:
         line(
             str(flight["flight"]),
             Cell(text=flight["verdict"], mark=_MARKS.get(flight["verdict"], Mark.BAD)),
-            *(format_number(flight["worst_margin"]), flight["worst_constraint"] or ABSENT),
+            *_worst_margin(summary, flight),
             format_number(flight["duration"]),
             Cell(text=flight["reason"] or ABSENT, mark=Mark.TEXT),
         )
         for flight in worst
     )
     note = "Lost flights first, then errors, limits, violations and the rest; among these, failed ones first, then "
-    note += "the smaller worst margin."
+    note += "the smaller worst margin, tolerance included, as a share of half the band."
     if worst:
         note += f" To fly one of them again: {replay_command(directory, worst[0]['flight'])}"
     return _grid("worst", ("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason"), lines, note)
+
+
+def _worst_margin(summary: Summary, flight: Mapping[str, Any]) -> tuple[str, str]:
+    name = flight["worst_constraint"]
+    if name is None:
+        return ABSENT, ABSENT
+    return f"{format_number(flight['margin'])} {summary['constraints'][name]['unit']}", name
 
 
 def worst_draws_table(summary: Summary) -> Grid:
@@ -218,7 +241,7 @@ def group_table(summary: Summary) -> Grid:
     lines = (line(name, *cells, *[ABSENT] * (size - len(cells))) for name, cells in listed.items())
     note = "Share of failed flights among those with such values; groups are of about equal size, or by value where "
     note += f"there are few. Over all flights it is {percent(failure['share'])}."
-    return _grid("groups", ("varied parameter", *(f"{k + 1}." for k in range(size))), lines, note)
+    return _grid("groups", ("varied parameter", *(f"group {k + 1}" for k in range(size))), lines, note)
 
 
 def _association(related: Mapping[str, Any] | None) -> tuple[Cell, ...]:
@@ -235,14 +258,14 @@ def _group(group: Mapping[str, Any]) -> str:
 
 
 _FILES: Final = (
-    *("campaign.toml", "scenario.toml", "flights.parquet", "timing.parquet", "summary.json", "manifest.json"),
+    *("campaign.toml", "scenario.toml", "flights.parquet", "timing.parquet", SUMMARY_FILE, "manifest.json"),
     "campaign.png",
 )
 """Files that the page links to, if they exist."""
 _MARGINS: Final = (
     "The worst margin is that of a flight's required constraints, tolerance included, as a share of half the "
     "constraint's band: 1 in the middle, 0 (dashed) at the end of what is allowed, negative beyond. What is measured "
-    "of a lost flight ends where it was aborted."
+    "of a lost flight ends where it was aborted. Flights beyond an axis are in its end bars."
 )
 _POINTS: Final = "Triangles at the edges are flights beyond the axes; at the foot also those without a margin."
 
@@ -253,6 +276,7 @@ MAIN_METRICS: Final = (
     *("peak_tilt", "total_variation", "fallback_periods"),
 )
 """Metrics shown first."""
+_MARGIN_LABEL: Final = "worst margin [half bands]"
 _BINS: Final = 40
 _MOST_SCATTERS: Final = 3  # in the overview
 _MOST_POINTS: Final = 9000  # of one verdict in all scatters of a page, which has a few MB then
@@ -274,20 +298,32 @@ def write_report(
     sentence = verdict_sentence(summary)
     figure = overview(table, summary, f"{spec.name}: {sentence}")
     write_pngs([figure] if figure.panels else [], directory)
-    often = (event_table(summary, spec.failure), constraint_table(summary))
+    often = (event_table(summary), constraint_table(summary))
     shapes = _plots("metrics", "Flights by verdict", histograms(table), _MARGINS)
     clouds = _plots("scatter", "Worst margin over each parameter", scatters(table), _POINTS)
     worst = (worst_table(summary, str(campaign)), worst_draws_table(summary))
     sections = [
         Section(title="How often", tables=often),
         Section(title="Distributions", plots=shapes, folded=(metric_table(summary),)),
-        Section(title="What drives failure", plots=clouds, tables=(driver_table(summary), group_table(summary))),
+        Section(
+            title="What drives failure",
+            text=(driver_sentence(summary),) if summary["parameters"] else (),
+            plots=clouds,
+            tables=(driver_table(summary), group_table(summary)),
+        ),
         Section(title="Worst flights", tables=worst),
     ]
-    files = {name: name for name in _FILES if (directory / name).is_file() or (campaign / name).is_file()}
+    files = {
+        name: name
+        for name in _FILES
+        if name == SUMMARY_FILE or any((d / name).is_file() for d in (directory, campaign))
+    }
     mark = Mark.NONE if not summary["flights"] else Mark.BAD if summary["events"]["failure"]["count"] else Mark.GOOD
     verdict = Cell(text=sentence, mark=mark)
-    page = render_page("campaign", spec.name, sections, description=spec.description, verdict=verdict, files=files)
+    ended = "complete" if summary["flights"] == spec.flights else "stopped"
+    status = f"Status: {ended}, {summary['flights']} of {count_of(spec.flights, 'flight')} flown."
+    notes = [definition_sentence(summary, spec.failure), spec.description, status]
+    page = render_page("campaign", spec.name, sections, notes=[*filter(None, notes)], verdict=verdict, files=files)
     (directory / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE
 
@@ -328,7 +364,8 @@ def histograms(table: pa.Table) -> list[Panel]:
             below = below + counts
         beyond = int(np.count_nonzero((finite < edges[0]) | (finite > edges[-1])))
         zero = (Bound(value=0.0, vertical=True),) if name == "worst_margin" and edges[0] <= 0.0 <= edges[-1] else ()
-        x_label = label(name, unit_of(table, name)) + (f"; {beyond} beyond, in the end bars" if beyond else "")
+        x_label = _MARGIN_LABEL if name == "worst_margin" else label(name, unit_of(table, name))
+        x_label += f"; {beyond} beyond" if beyond else ""
         panels.append(Panel(title="", x_label=x_label, y_label="flights", series=tuple(bars), bounds=zero, whole=True))
     return panels
 

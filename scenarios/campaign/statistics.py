@@ -325,7 +325,11 @@ def _constraint(table: pa.Table, name: str) -> dict[str, Any]:
 def _flight(table: pa.Table, row: int) -> dict[str, Any]:
     shown = ("flight", "verdict", "failed", "worst_margin", "worst_constraint", "duration", "reason")
     values = table.slice(row, 1).to_pylist()[0]
-    return {name: values[name] for name in shown} | {"draws": {name: values[DRAW + name] for name in draw_names(table)}}
+    draws = {name: values[DRAW + name] for name in draw_names(table)}
+    return {name: values[name] for name in shown} | {
+        "margin": values.get(f"{MARGIN}{values['worst_constraint']}"),
+        "draws": draws,
+    }
 
 
 def parameters(table: pa.Table) -> dict[str, Any]:

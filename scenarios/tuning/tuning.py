@@ -305,8 +305,8 @@ def write_page(directory: Path, *, study: Study, summary: Summary) -> None:
             Section(title="Fresh draws", text=sentences(summary), tables=tables(summary)),
             Section(title="The search", plots=tuple(plots)),
         ],
-        description=summary["description"],
         verdict=Cell(text=verdict(summary), mark=Mark.GOOD if holds else Mark.BAD),
+        notes=(summary["description"],),
         files={**{name: name for name in _FILES}, **{folder: f"{folder}/index.html" for folder in pages}},
     )
     (directory / PAGE_FILE).write_text(page, encoding="utf-8")

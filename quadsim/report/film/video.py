@@ -150,6 +150,12 @@ def render_portrait(
         _work([command], rendering_backend(), new.parent)
 
 
+def write_poster(film: Path, poster: Path) -> bool:
+    """Write a film's frame at 2 s, or its last, as a JPEG; return whether the film can be read."""
+    frame = ("-t", "2", "-vf", "scale=640:-2", "-q:v", "4", "-update", "1", str(poster))
+    return subprocess.run([*_ffmpeg(), "-i", str(film), *frame], capture_output=True).returncode == 0
+
+
 def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None) -> str:
     """Film a shot in pieces and join them; the back end that did it."""
     pieces = worker_count(shot.count, workers)

@@ -31,6 +31,28 @@ function pageColours(layout) {
   return patch;
 }
 
+// Where there is no room for two columns, each panel is below the one before it.
+function stackPanels(layout) {
+  const names = Object.keys(layout).filter((key) => /^yaxis\d*$/.test(key));
+  const panels = names.sort((a, b) => a.slice(5) - b.slice(5)).map((name) => [layout[`x${name.slice(1)}`], layout[name]]);
+  if (panels.length < 2) return;
+  const { t, b } = layout.margin;
+  const heights = panels.map(([, y]) => (y.domain[1] - y.domain[0]) * (layout.height - t - b));
+  const gap = 72;
+  const total = heights.reduce((sum, height) => sum + gap + height);
+  const isAbove = (title, x, y) => Math.abs(title.y - y.domain[1]) < 1e-6 && title.x > x.domain[0] && title.x < x.domain[1];
+  const titles = panels.map(([x, y]) => layout.annotations?.find((title) => isAbove(title, x, y)));
+  let top = total;
+  panels.forEach(([x, y], i) => {
+    x.domain = [0, 1];
+    y.domain = [(top - heights[i]) / total, top / total];
+    if (titles[i]) Object.assign(titles[i], { x: 0.5, y: top / total });
+    top -= heights[i] + gap;
+    if (x.title?.text === "time [s]" && x !== panels.at(-1)[0]) delete x.title;
+  });
+  layout.height = total + t + b;
+}
+
 let linking = false;
 
 async function followTime(source, event) {
@@ -62,6 +84,9 @@ async function drawPlots() {
       plots.splice(plots.indexOf(plot), 1);
       continue;
     }
+    if (narrow) stackPanels(figure.layout);
+    if (narrow && figure.layout.scene) figure.layout.height = plot.clientWidth; // the camera sees a square
+    plot.style.height = `${figure.layout.height}px`;
     await Plotly.newPlot(plot, figure.data, figure.layout, config);
     await Plotly.relayout(plot, pageColours(figure.layout));
   }

@@ -5,10 +5,12 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from quadsim.flight.rundir import Run
 from quadsim.report.comparison import (
+    GLANCE,
     comparison_rows,
     distinct_courses,
     failure_sentences,
@@ -18,6 +20,7 @@ from quadsim.report.comparison import (
     violated_by_fallback,
 )
 from quadsim.report.table import Cell, Mark, Row, format_number, to_markdown
+from quadsim.state import VELOCITY
 
 
 def having(run: Run, scenario: str, **entries: Any) -> Run:
@@ -102,6 +105,30 @@ def test_constraints_carry_their_tolerances_and_what_is_required(short_run: Run,
     assert texts(rows, "time violated", "Constraint speed")[1] == "0.75"
     assert marks(rows, "deadline misses")[1] is Mark.BAD
     assert texts(rows, "required constraints")[2] == "none"
+
+
+def test_five_rows_come_first_and_no_bound_is_exceeded_without_a_word(short_run: Run, worse_run: Run) -> None:
+    rows = comparison_rows([short_run, worse_run])
+    assert [row.label for row in rows if row.group == GLANCE] == [
+        *("outcome", "worst constraint", "RMS error, position", "highest speed", "step time")
+    ]
+    for entry in worse_run.summary["constraints"]:
+        entry["required"] = entry["name"].startswith("arrival")
+    worse_run.summary.update(expected="incomplete", as_expected=True)
+    (_, outcome), (_, worst) = (cells(comparison_rows([short_run, worse_run]), row.label) for row in rows[:2])
+    assert outcome.text.startswith("incomplete, as expected; not reached: arrival_x")
+    assert outcome.text.endswith("; exceeded, not required: roll, speed")
+    assert worst == Cell(text="roll exceeded, not required (margin -2.5 deg, tolerance 0.05)", mark=Mark.WARN)
+    for entry in worse_run.summary["constraints"]:
+        if entry["required"]:
+            entry.update(with_margin(entry, 0.01))
+    worse_run.summary.update(expected="satisfied")
+    (_, outcome) = cells(comparison_rows([short_run, worse_run]), "outcome")
+    assert outcome == Cell(text="satisfied, as expected; exceeded, not required: roll, speed", mark=Mark.WARN)
+    speeds = short_run.log.plant.state[:, VELOCITY]
+    assert texts(rows, "highest speed")[0] == format_number(float(np.linalg.norm(speeds, axis=1).max()))
+    errors = [short_run.summary["tracking"]["rmse"][axis] for axis in "xyz"]
+    assert texts(rows, "RMS error, position")[0] == format_number(float(np.linalg.norm(errors)))
 
 
 def test_a_bound_exceeded_in_the_commands_alone_is_marked(short_run: Run) -> None:

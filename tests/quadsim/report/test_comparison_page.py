@@ -6,9 +6,10 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
-from browser import open_page
+from browser import CLASHES, opened
 from support import draw_nothing
 
 from quadsim.errors import OutputError, ParameterError
@@ -20,24 +21,6 @@ from quadsim.report.flight_figures import page_figures
 from quadsim.report.to_plotly import to_plot
 
 HOSTILE = "<script>alert(1)</script> & \"more\" 'quoted'"
-PROBE = """<script>
-(async () => {
-  while (!("drawn" in document.documentElement.dataset)) await new Promise((done) => setTimeout(done, 50));
-  await Plotly.relayout("states", { "xaxis.range": [1, 2] });
-  document.querySelector("[data-run=run0]").click();
-  await new Promise((done) => setTimeout(done, 500));
-  const panels = ["states", "inputs", "solve_times"].map((id) => document.getElementById(id));
-  const seen = panels[0].data.filter((trace) => trace.legendgroup).map((trace) => String(trace.visible ?? true));
-  const report = document.createElement("output");
-  report.textContent = [
-    "ranges " + panels.map((panel) => panel.layout.xaxis.range.join("-")).join(" "),
-    "visible " + seen.join(" "),
-    "svgs " + document.querySelectorAll(".main-svg .trace").length,
-    "buttons " + [...document.querySelectorAll(".modebar-btn")].map((button) => button.dataset.title).join(","),
-  ].join("; ");
-  document.body.append(report);
-})();
-</script>"""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,7 +36,7 @@ def filmed_run(short_run: Run, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The short flight with a video, a recording and a figure beside it; nothing reads them but a browser."""
     directory = tmp_path_factory.mktemp("filmed") / "run"
     shutil.copytree(short_run.directory, directory)
-    (directory / "flight.mp4").write_bytes(b"film")
+    iio.imwrite(directory / "flight.mp4", np.zeros((5, 32, 64, 3), np.uint8), fps=5)
     (directory / "flight.rrd").write_bytes(b"recording")
     (directory / "figures").mkdir()
     (directory / "figures" / "figure4_states.png").write_bytes(b"picture")
@@ -80,10 +63,9 @@ def test_the_page_stands_beside_its_files(page_of_two: Path) -> None:
     assert page.stat().st_size < 8e6
     assert {path.name for path in page.parent.iterdir()} == {
         *("index.html", "comparison.png", "comparison.md", "summary.json"),
-        *("paper-constrained.mp4", "paper-constrained", "lost"),
+        *("paper-constrained.mp4", "paper-constrained.jpg", "paper-constrained", "lost"),
     }
-    assert (page.parent / "paper-constrained.mp4").read_bytes() == b"film"
-    for url in re.findall(r'(?:href|src)="([^"#]+)"', without_scripts(page.read_text())):
+    for url in re.findall(r'(?:href|src|poster)="([^"#]+)"', without_scripts(page.read_text())):
         assert url == "data:," or (page.parent / url).is_file(), url
 
 
@@ -91,10 +73,10 @@ def test_the_text_gives_outcomes_reasons_and_numbers_and_nothing_is_fetched(page
     text = without_scripts(page_of_two.read_text())
     assert not re.search(r"""(?:src|href)=["']?(?:https?:)?//""", text)
     assert "default-src 'none'" in text
-    assert "aborted: at t = 6.000 s: the plant&#39;s state is &lt;not&gt; finite &amp; more" in text
+    assert "lost (expected satisfied): at t = 6.000 s: the plant&#39;s state is &lt;not&gt; finite &amp; more" in text
     assert "holds (margin 5 deg, tolerance 0.05)" in text
     assert text.count("<video") == 1
-    assert "This run has no video" in text
+    assert "Without video: lost." in text
     assert "paper-constrained/flight.rrd" in text
     assert "lost/flight.rrd" not in text
 
@@ -107,7 +89,7 @@ def test_hostile_names_are_text_and_other_courses_and_verdicts_are_pointed_out(s
     page = write_comparison([renamed(short_run, HOSTILE), other], tmp_path / "out")
     text = page.read_text()
     assert "The runs follow 2 different courses" in text
-    assert 'verdict: <span class="bad">satisfied (expected lost)</span>' in text
+    assert '<td class="bad">satisfied (expected lost)</td>' in text
     assert "<script>alert" not in text
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
     assert (page.parent / "script-alert-1-script-more-quoted").is_dir()
@@ -152,15 +134,60 @@ def test_plots_of_many_long_runs_stay_small(short_run: Run) -> None:
 
 def test_a_browser_draws_the_page_and_has_no_complaint(short_run: Run, aborted_run: Run, tmp_path: Path) -> None:
     page = write_comparison([renamed(short_run, HOSTILE), aborted_run], tmp_path / "out")
-    page.write_text(page.read_text().replace("</body>", f"{PROBE}</body>"))
-    dom, console = open_page(page, tmp_path / "profile")
-    assert console == []
-    report = re.findall(r"<output>(.*?)</output>", dom)[-1]
-    assert "ranges 1-2 1-2 1-2" in report
-    assert "visible false true false true" in report
-    assert int(re.findall(r"svgs (\d+)", report)[0]) > 40
-    buttons = re.findall(r"buttons ([^;]*)", report)[0].replace("a png", "a PNG")  # of an older plotly
-    assert set(buttons.split(",")) == {
+    with opened(page) as tab:
+        tab.evaluate("Plotly.relayout('states', {'xaxis.range': [1, 2]})")
+        tab.locator("[data-run=run0]").uncheck()
+        tab.wait_for_function("document.getElementById('states').data.some((trace) => trace.visible === false)")
+        tab.wait_for_function("document.getElementById('solve_times').layout.xaxis.range[0] === 1")
+        panels = "['states', 'inputs', 'solve_times'].map((id) => document.getElementById(id))"
+        assert tab.evaluate(f"{panels}.map((panel) => panel.layout.xaxis.range)") == [[1, 2]] * 3
+        curves = f"{panels}[0].data.filter((trace) => trace.legendgroup).slice(0, 4)"
+        assert tab.evaluate(f"{curves}.map((trace) => trace.visible ?? true)") == [False, True] * 2
+        assert tab.locator(".main-svg .trace").count() > 40
+        titles = tab.evaluate("[...document.querySelectorAll('.modebar-btn')].map((button) => button.dataset.title)")
+    assert {title.replace("a png", "a PNG") for title in titles} == {  # of an older plotly
         *("Download plot as a PNG", "Zoom", "Pan", "Zoom in", "Zoom out", "Autoscale", "Reset axes"),
         *("Orbital rotation", "Turntable rotation", "Reset camera to default", "Reset camera to last save"),
     }, "no button may send data away"
+
+
+INK = """() => {
+  const plot = document.getElementById("states");
+  const { backgroundColor } = getComputedStyle(plot.querySelector(".main-svg"));
+  return { paper: backgroundColor, page: getComputedStyle(document.body).backgroundColor, ink: plot.layout.font.color };
+}"""
+
+
+def test_the_first_screen_has_the_video_and_five_rows_and_a_phone_all_of_it(page_of_two: Path) -> None:
+    with opened(page_of_two) as tab:
+        assert tab.locator("video").count() == 1
+        rows = tab.locator(".numbers").first.locator("tr")
+        labels = ["outcome", "worst constraint", "RMS error, position [m]", "highest speed [m/s]", "step time [ms]"]
+        assert [row.locator("th").inner_text() for row in rows.all()] == labels
+        for shown in (tab.locator("video"), *rows.all()):
+            box = shown.bounding_box()
+            assert box["y"] + box["height"] <= 800, "below the first screen"
+        poster = "src => new Promise((done) => Object.assign(new Image(), { src, onload() { done(this.width); } }))"
+        assert tab.evaluate(poster, tab.locator("video").get_attribute("poster")) == 640
+        light = tab.evaluate(INK)
+    with opened(page_of_two, width=390, dark=True) as tab:
+        assert tab.evaluate("document.documentElement.scrollWidth") == 390
+        for row in tab.locator("tr.row").all()[:12]:
+            label, *values = [cell.bounding_box() for cell in row.locator("th, td").all()]
+            assert all(value["y"] >= label["y"] + label["height"] for value in values), "not under its label"
+            assert all(value["x"] + value["width"] <= 390 for value in values), "out of sight"
+        for key in ("states", "inputs", "solve_times"):
+            assert tab.evaluate(CLASHES, tab.locator(f"#{key}").element_handle()) == 0, key
+        dark = tab.evaluate(INK)
+    assert light["paper"] == dark["paper"] == "rgba(0, 0, 0, 0)", "a plot shows the page beneath it"
+    assert light["page"] != dark["page"]
+    assert light["ink"] != dark["ink"]
+
+
+def test_a_film_that_cannot_be_read_has_no_poster(filmed_run: Run, tmp_path: Path) -> None:
+    damaged = shutil.copytree(filmed_run.directory, tmp_path / "damaged")
+    (damaged / "flight.mp4").write_bytes(b"film")
+    page = write_comparison([dataclasses.replace(filmed_run, directory=damaged)], tmp_path / "out")
+    assert "<video" in page.read_text()
+    assert "poster=" not in without_scripts(page.read_text())
+    assert not list(page.parent.glob("*.jpg"))

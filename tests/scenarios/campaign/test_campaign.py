@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -23,6 +25,7 @@ from scenarios.campaign import store as records
 from scenarios.campaign.campaign import CampaignProgress, compare_replay, recorded_flight
 from scenarios.campaign.campaign import CampaignResult as Result
 from scenarios.campaign.campaign_file import Choice
+from scenarios.campaign.events import parse_event
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.rows import Row, read_table
 from scenarios.campaign.store import read_manifest
@@ -257,6 +260,13 @@ def test_a_manifest_states_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     assert (manifest["name"], manifest["status"], manifest["flights"]) == ("little", "complete", 12)
     listed = json.loads((result.directory / SUMMARY_FILE).read_text())["files"]
     assert {"campaign.toml", "scenario.toml", "flights.parquet", "index.html", "manifest.json"} <= set(listed)
+    page = html.unescape((result.directory / "index.html").read_text(encoding="utf-8"))
+    assert "Status: complete, 12 of 12 flights flown." in page
+    assert '<a href="summary.json">' in page
+    (definition,) = re.findall(r"Counted as failure: (.*?) m\.", page)
+    events = [parse_event(text) for text in definition.split(", ")]
+    failed = sum(any(event.holds(row) for event in events) for row in result.table.to_pylist())
+    assert f">{failed} of 12 flights failed" in page
     assert manifest["versions"]["mujoco"]
     assert manifest["code"].startswith("sha256:")
     assert manifest["machines"] == {processor_name(): 12}
