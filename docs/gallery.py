@@ -1,9 +1,10 @@
-"""The pictures of docs/gallery.md: `films` into docs/films, in `make docs`; `thumbnails` of all scenarios, stored."""
+"""The pictures of docs/gallery.md: `films` into docs/films, in `make docs`; `thumbnails` and posters, stored."""
 
 from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +13,7 @@ import film
 import imageio
 import numpy as np
 from drawings import FORWARD, INK, SOFT, svg
+from PIL import Image
 
 from quadsim.errors import RenderingUnavailableError
 from quadsim.report.film.frames import Shot, thin
@@ -23,6 +25,7 @@ WIDTH, HEIGHT, MARGIN = 160, 90, 8  # of a thumbnail [pixels]
 FINEST: Final = 0.3  # how far a drawn path may be from the real one [pixels]
 LEAST: Final = 0.5  # a thumbnail shows at least so much [m]
 LONGEST, FPS = 12.0, 20  # of a film [s]; longer flights are shown faster
+POSTER: Final = 0.6  # share of the film before the picture that stands for it
 VIEW: Final = np.array([[0.87, -0.87, 0.0], [0.3, 0.3, -1.0]])  # world -> right and down, seen from above at an angle
 
 
@@ -55,21 +58,31 @@ def polyline(points: Array, looks: str) -> str:
     return f'<polyline points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in points[kept])}" fill="none" {looks}/>'
 
 
-def film_flight(name: str) -> None:
-    """The film of a scenario, H.264."""
+def frames(name: str) -> Iterator[Image.Image]:
+    """The pictures of a scenario's film."""
     film.start()
     import quadsim
 
     run = quadsim.fly(name, progress=False).run
     speed = max(1.0, run.end / LONGEST)
     shot = Shot(run="", width=480, height=270, fps=FPS, speed=speed, count=round(run.end * FPS / speed))
-    title = name if speed == 1.0 else f"{name}, {speed:.1f} times as fast"
+    return film.panels(run, name if speed == 1.0 else f"{name}, {speed:.1f} times as fast", shot)
+
+
+def poster(name: str) -> None:
+    """What a film shows before it plays, late in the flight."""
+    pictures = [*frames(name)]
+    pictures[round(POSTER * len(pictures))].save(THUMBNAILS / f"{name}.jpg", quality=80, optimize=True)
+
+
+def film_flight(name: str) -> None:
+    """The film of a scenario, H.264."""
     writer: Any = imageio.get_writer(
         FILMS / f"{name}.mp4", format="FFMPEG", fps=FPS, codec="libx264", pixelformat="yuv420p", quality=None,
         macro_block_size=1, ffmpeg_log_level="error", output_params=["-crf", "26", "-threads", "1"],
     )  # fmt: skip
     with writer:
-        for picture in film.panels(run, title, shot):
+        for picture in frames(name):
             writer.append_data(np.asarray(picture))
 
 
@@ -79,11 +92,14 @@ def main() -> None:
     from scenarios.machine import usable_cores
 
     names = re.findall(r"films/([\w-]+)\.mp4", (DOCS / "gallery.md").read_text(encoding="utf-8"))
-    task, folder = (film_flight, FILMS) if sys.argv[1:] == ["films"] else (thumbnail, THUMBNAILS)
-    folder.mkdir(exist_ok=True)
+    FILMS.mkdir(exist_ok=True)
     try:
         with ProcessPoolExecutor(usable_cores()) as pool:
-            list(pool.map(task, names if task is film_flight else scenario_names()))
+            if sys.argv[1:] == ["films"]:
+                list(pool.map(film_flight, names))
+            else:
+                list(pool.map(thumbnail, scenario_names()))
+                list(pool.map(poster, names))
     except RenderingUnavailableError as error:
         print(f"The gallery is built without films: {error}", file=sys.stderr)
 
