@@ -146,7 +146,7 @@ def scenarios(golden: dict[str, Any]) -> str:
         rows = [
             (
                 f"![{name}](assets/gallery/{name}.svg){{loading=lazy}}",
-                f"[`{name}`](#{name}){{#{name}}} {specs[name].description}",
+                f"{_title(name)} {specs[name].description}",
                 *scenario_cells(golden[name]),
             )
             for name in members
@@ -157,12 +157,17 @@ def scenarios(golden: dict[str, Any]) -> str:
     return "\n".join(parts)
 
 
+def _title(name: str) -> str:
+    """A scenario's name, which opens its file."""
+    return f'<a href="scenarios/{name}.txt"><code>{name}</code></a>'
+
+
 def _film(name: str) -> str:
     """A film that loads once it is played, under a poster."""
     sources = f'src="films/{name}.mp4" poster="assets/gallery/{name}.jpg" preload="none"'
     failed = "document.querySelector('.no-films').hidden = false"
     video = f'<video {sources} controls muted loop playsinline onerror="{failed}"></video>'
-    return f'<figure>{video}<figcaption><a href="#{name}"><code>{name}</code></a> {FILMS[name]}</figcaption></figure>\n'
+    return f"<figure>{video}<figcaption>{_title(name)} {FILMS[name]}</figcaption></figure>\n"
 
 
 def scenario_cells(entry: dict[str, Any]) -> tuple[str, str, str]:
