@@ -32,7 +32,8 @@ def run(source: str, names: dict[str, Any]) -> str:
     with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.redirect_stderr(io.StringIO()):
         exec(compile(tree, "<page>", "exec"), names)
         value = None if last is None else eval(compile(last, "<page>", "eval"), names)
-    parts = [f"<pre><code>{escape(text)}</code></pre>"] if (text := printed.getvalue().rstrip()) else []
+    text = "\n".join(line.rstrip() for line in printed.getvalue().splitlines()).rstrip()
+    parts = [f"<pre><code>{escape(text)}</code></pre>"] if text else []
     for number in plt.get_fignums():
         image = io.BytesIO()
         plt.figure(number).savefig(image, format="png", dpi=90)

@@ -15,9 +15,9 @@ from quadsim.report import flight_figures as figures
 from quadsim.report.figure import Figure
 from quadsim.report.to_matplotlib import STYLE, draw
 
-ASSETS: Final = Path(__file__).resolve().parent / "assets"
+ASSETS: Final = Path(__file__).resolve().parent / "assets" / "figures"
 WIDTH: Final = 6.4  # [in]
-TEXT, GRID = "#7d87ab", "#8a94b840"
+TEXT, GRID = "#3a4152", "#3a415226"
 LOOKS: Final[dict[str, Any]] = {
     **{"axes.edgecolor": TEXT, "axes.labelcolor": TEXT, "text.color": TEXT, "grid.color": GRID},
     **dict.fromkeys(("xtick.color", "xtick.labelcolor", "ytick.color", "ytick.labelcolor"), TEXT),
@@ -34,7 +34,7 @@ def to_svg(figure: Figure) -> str:
         width, height = canvas.get_size_inches()
         canvas.set_size_inches(WIDTH, height * (WIDTH / width) ** 0.5)  # narrow, to be read on a phone as well
         canvas.savefig(file, format="svg", metadata={"Date": None}, transparent=True)
-    return re.sub(r"(\d\.\d)\d+", r"\1", file.getvalue())
+    return re.sub(r'="[^"]*"', lambda value: re.sub(r"(\d\.\d)\d+", r"\1", value[0]), file.getvalue())
 
 
 def main() -> None:

@@ -1,10 +1,12 @@
-"""The pictures of docs/gallery.md: `films` into docs/films, in `make docs`; `thumbnails` of all scenarios, stored."""
+"""What docs/gallery.md shows: `films`, and scenario files, in `make docs`; `thumbnails` and posters, stored."""
 
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,15 +16,17 @@ import numpy as np
 from drawings import FORWARD, INK, SOFT, svg
 
 from quadsim.errors import RenderingUnavailableError
-from quadsim.report.film.frames import Shot, thin
+from quadsim.flight.rundir import Run
+from quadsim.report.film.frames import Shot, make_footage, thin
 from quadsim.state import Array
 
 DOCS: Final = Path(__file__).resolve().parent
-THUMBNAILS, FILMS = DOCS / "assets" / "gallery", DOCS / "films"
+THUMBNAILS, FILMS, FILES = DOCS / "assets" / "gallery", DOCS / "films", DOCS / "scenarios"
 WIDTH, HEIGHT, MARGIN = 160, 90, 8  # of a thumbnail [pixels]
 FINEST: Final = 0.3  # how far a drawn path may be from the real one [pixels]
 LEAST: Final = 0.5  # a thumbnail shows at least so much [m]
 LONGEST, FPS = 12.0, 20  # of a film [s]; longer flights are shown faster
+POSTER_FPS: Final = 5  # of the pictures among which a poster is chosen
 VIEW: Final = np.array([[0.87, -0.87, 0.0], [0.3, 0.3, -1.0]])  # world -> right and down, seen from above at an angle
 
 
@@ -55,35 +59,54 @@ def polyline(points: Array, looks: str) -> str:
     return f'<polyline points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in points[kept])}" fill="none" {looks}/>'
 
 
-def film_flight(name: str) -> None:
-    """The film of a scenario, H.264."""
+def take(name: str, fps: int) -> tuple[Run, str, Shot]:
+    """A scenario's flight, the title of its film, and its pictures, so many a second."""
     film.start()
     import quadsim
 
     run = quadsim.fly(name, progress=False).run
     speed = max(1.0, run.end / LONGEST)
-    shot = Shot(run="", width=480, height=270, fps=FPS, speed=speed, count=round(run.end * FPS / speed))
-    title = name if speed == 1.0 else f"{name}, {speed:.1f} times as fast"
+    shot = Shot(run="", width=480, height=270, fps=fps, speed=speed, count=round(run.end * fps / speed))
+    return run, name if speed == 1.0 else f"{name}, {speed:.1f} times as fast", shot
+
+
+def poster(name: str) -> None:
+    """What a film shows before it plays: the instant at which the nearest constraint is nearest."""
+    run, title, shot = take(name, POSTER_FPS)
+    tracks = [track for track in make_footage(run, shot.times).margins if track.limit.signal not in ("speed", "slew")]
+    nearest = min(tracks, key=lambda track: track.rank)
+    picture = next(islice(film.panels(run, title, shot), int(np.nanargmin(nearest.now)), None))
+    picture.save(THUMBNAILS / f"{name}.jpg", quality=80, optimize=True)
+
+
+def film_flight(name: str) -> None:
+    """The film of a scenario, H.264."""
     writer: Any = imageio.get_writer(
         FILMS / f"{name}.mp4", format="FFMPEG", fps=FPS, codec="libx264", pixelformat="yuv420p", quality=None,
         macro_block_size=1, ffmpeg_log_level="error", output_params=["-crf", "26", "-threads", "1"],
     )  # fmt: skip
     with writer:
-        for picture in film.panels(run, title, shot):
+        for picture in film.panels(*take(name, FPS)):
             writer.append_data(np.asarray(picture))
 
 
 def main() -> None:
-    """Make what is named; without off-screen OpenGL the page keeps its drawings and says so."""
+    """Make what is named; without off-screen OpenGL the page keeps its pictures and says so."""
     from scenarios.catalogue import scenario_names
     from scenarios.machine import usable_cores
 
     names = re.findall(r"films/([\w-]+)\.mp4", (DOCS / "gallery.md").read_text(encoding="utf-8"))
-    task, folder = (film_flight, FILMS) if sys.argv[1:] == ["films"] else (thumbnail, THUMBNAILS)
-    folder.mkdir(exist_ok=True)
+    for folder in (FILMS, FILES):
+        folder.mkdir(exist_ok=True)
+    for file in (DOCS.parent / "scenarios" / "library").glob("*.toml"):
+        shutil.copy(file, FILES / f"{file.stem}.txt")  # as text, which a browser shows
     try:
         with ProcessPoolExecutor(usable_cores()) as pool:
-            list(pool.map(task, names if task is film_flight else scenario_names()))
+            if sys.argv[1:] == ["films"]:
+                list(pool.map(film_flight, names))
+            else:
+                list(pool.map(thumbnail, scenario_names()))
+                list(pool.map(poster, names))
     except RenderingUnavailableError as error:
         print(f"The gallery is built without films: {error}", file=sys.stderr)
 

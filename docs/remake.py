@@ -39,16 +39,26 @@ FIGURES: Final = {
 }
 """Pictures of docs/, and the files that they are copies of."""
 COLOURS: Final = 128
-TITLES: Final[dict[Group, str]] = {
-    "paper": "The paper's flights, and where its controller ends",
-    "papers": "Other papers, reproduced",
-    "courses": "Courses and vehicles",
-    "air": "Wind, drag and rotors that lag",
-    "faults": "Faults, loads and slow computers",
-    "ground": "Take-off, landing and the ground",
-    "space": "Obstacles, windows and corridors",
-    "sensors": "Sensors and estimation",
+TOPICS: Final[dict[Group, tuple[str, str]]] = {
+    "paper": ("The paper's flights, and where its controller ends", "[the paper, equation by equation](paper.md)"),
+    "papers": ("Other papers, reproduced", "[Papers, reproduced](papers.md)"),
+    "courses": ("Courses and vehicles", "[Courses](effects.md#courses)"),
+    "air": ("Wind, drag and rotors that lag", "[Effects](effects.md#effects)"),
+    "faults": ("Faults, loads and slow computers", "[Events](effects.md#events)"),
+    "ground": ("Take-off, landing and the ground", "[Effects](effects.md#effects)"),
+    "space": ("Obstacles, windows and corridors", "[Constraints in space](space.md)"),
+    "sensors": ("Sensors and estimation", "[What the controller receives](effects.md#what-the-controller-receives)"),
 }
+"""Of each group of scenarios, its title and its guide."""
+FILMS: Final = {
+    "paper-constrained-lag20": "Rotors lag by 20 ms: the paper's hard QP turns infeasible, and the vehicle is lost.",
+    "robust-lag50": "50 ms of lag, known to the robust MPC: tilt stays within 5 deg.",
+    "power-loop": "Upside down at its top: nonlinear MPC on a Kalman filter's estimate.",
+    "window": "Through a window 8 cm wider than the vehicle.",
+    "thrown-ball": "A ball crosses the course where the vehicle would be.",
+    "take-off-and-landing": "From cold rotors on the ground, up 2 m, and down again.",
+}
+"""The scenarios that the gallery films, and what to see there."""
 Row = Sequence[object]
 
 
@@ -61,7 +71,14 @@ def commands(name: str) -> list[list[str]]:
         case "first-flights":
             return [[python, "tests/first_flights.py"]]
         case "pictures":
-            scripts = (["drawings.py"], ["figures.py"], ["film.py"], ["gallery.py", "thumbnails"])
+            scripts = (
+                ["drawings.py"],
+                ["live_picture.py"],
+                ["figures.py"],
+                ["guide_figures.py"],
+                ["film.py"],
+                ["gallery.py", "thumbnails"],
+            )
             return [[python, f"docs/{script}", *rest] for script, *rest in scripts]
         case "campaigns":
             return [[quadsim, "campaign", each, "--out", f"runs/campaigns/{each}", "--resume"] for each in CAMPAIGNS]
@@ -121,19 +138,39 @@ def _bound(found: dict[str, Any], unit: str) -> str:
 
 
 def scenarios(golden: dict[str, Any]) -> str:
-    """The library's scenarios, a table for each group."""
+    """The library's scenarios: the guide, the films and the table of each group."""
     head = ("", "scenario", "verdict", "nearest", "RMS error [m]")
     specs = {name: load_scenario(name) for name in golden}
     parts = []
     for group in get_args(Group):
+        if not (members := [name for name in golden if specs[name].group == group]):
+            continue
+        title, guide = TOPICS[group]
         rows = [
-            (f"![{name}](assets/gallery/{name}.svg)", f"`{name}` {specs[name].description}", *scenario_cells(entry))
-            for name, entry in golden.items()
-            if specs[name].group == group
+            (
+                f"![{name}](assets/gallery/{name}.svg){{loading=lazy}}",
+                f"{_title(name)} {specs[name].description}",
+                *scenario_cells(golden[name]),
+            )
+            for name in members
         ]
-        if rows:
-            parts.append(f"### {TITLES.get(group, group)}\n\n{markdown(head, rows)}")
+        films = "".join(_film(name) for name in members if name in FILMS)
+        shown = f'<div class="films">\n{films}</div>\n\n' if films else ""
+        parts.append(f"## {title}\n\nGuide: {guide}.\n\n{shown}{markdown(head, rows)}")
     return "\n".join(parts)
+
+
+def _title(name: str) -> str:
+    """A scenario's name, which opens its file."""
+    return f'<a href="scenarios/{name}.txt"><code>{name}</code></a>'
+
+
+def _film(name: str) -> str:
+    """A film that loads once it is played, under a poster."""
+    sources = f'src="films/{name}.mp4" poster="assets/gallery/{name}.jpg" preload="none"'
+    failed = "document.querySelector('.no-films').hidden = false"
+    video = f'<video {sources} controls muted loop playsinline onerror="{failed}"></video>'
+    return f"<figure>{video}<figcaption>{_title(name)} {FILMS[name]}</figcaption></figure>\n"
 
 
 def scenario_cells(entry: dict[str, Any]) -> tuple[str, str, str]:

@@ -107,6 +107,27 @@ def test_python_on_the_pages_runs(document: Path, tmp_path: Path, monkeypatch: p
         exec(compile(block, document, "exec"), module.__dict__)
 
 
+def test_code_on_the_pages_is_not_cut_in_a_window_of_1280_pixels() -> None:
+    """Its widest line has 88 characters there; output, in blocks of `text`, wraps."""
+    for page in PAGES:
+        for language, block in re.findall(
+            r"^```(\w+).*?\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.M
+        ):
+            too_wide = [line for line in block.splitlines() if len(line) > 88]
+            assert language == "text" or not too_wide, f"{page.name}: {too_wide}"
+
+
+def test_every_guide_has_a_figure_and_every_picture_says_what_it_shows() -> None:
+    site = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    guides = re.findall(r"[a-z-]+\.md", site[site.index("- Guides:") : site.index("- The paper:")])
+    drawn = set()
+    for page in PAGES:
+        pictures = re.findall(r"!\[(.*?)\]\((.*?)\)", page.read_text(encoding="utf-8"))
+        assert all(shows for shows, _ in pictures), page.name
+        drawn |= {page.name for _, file in pictures if "figures/" in file}
+    assert {*guides} - drawn == {"commands.md", "live.md"}
+
+
 def test_documents_name_what_exists() -> None:
     """Every dotted name of a package in backticks is a module, or something in one."""
     pages = (path.read_text(encoding="utf-8") for path in [*PAGES, ROOT / "CONTRIBUTING.md"])

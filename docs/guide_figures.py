@@ -1,0 +1,336 @@
+"""The figures of the guides, each from flights of its own: part of `make numbers OPTIONS=pictures`, or some by name."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from runpy import run_path
+from typing import Any, Final
+
+import figures
+import numpy as np
+import pandas as pd
+
+import quadsim
+import quadsim.gym
+from quadsim.flight.audit import SIGNALS
+from quadsim.report.figure import BOUND, LINES, OBSTACLE, REFERENCE, Area, Band, Bound, Figure, Panel, Series, outlines
+from quadsim.state import POSITION
+
+ROOT: Final = Path(__file__).resolve().parent.parent
+FREE: Final[dict[str, Any]] = {"constraints": []}
+BLUE, ORANGE, GREEN, PURPLE = LINES[:4]
+UNTIL: Final = 16.0  # what is shown of the paper's step in x, which is at 10 s
+NEAR: Final = 1.2  # of a pillar, where half-spaces are drawn [m]
+SHOWN = (0.04, 0.08)  # of the errors of a tuning [m]; candidates that crash are beyond
+TUNING: Final = """
+name = "weights"
+trials = 40
+batch = 8
+flights = [4]
+require = "P(violation) < 0.5 @ 95%"
+
+[fresh]
+flights = 4
+seed = 1
+
+[[objectives]]
+name = "error"
+unit = "m"
+expression = "sqrt(rmse.x**2 + rmse.y**2 + rmse.z**2)"
+
+[[search]]
+name = "xy"
+fields = ["controller.output_weights.x", "controller.output_weights.y"]
+distribution = "log_uniform"
+low = 3.0
+high = 300.0
+
+[[search]]
+name = "horizon"
+fields = ["controller.horizon"]
+distribution = "integer"
+low = 10
+high = 50
+
+[campaign]
+scenario = "hummingbird-real-rotors"
+
+[campaign.set.controller]
+solver = "core-or-piqp"
+
+[[campaign.vary]]
+name = "mass"
+fields = ["actual.mass"]
+distribution = "uniform"
+low = 0.98
+high = 1.02
+relative = true
+"""
+
+
+def curves(
+    name: str,
+    flights: Mapping[str, quadsim.Flight],
+    title: str = "",
+    *,
+    bounds: Sequence[float] = (),
+    start: float = 0.0,
+) -> Panel:
+    """A signal of several flights from `start` on, at the physics rate."""
+    signal = SIGNALS[name]
+    assert signal.plant is not None
+    lines = [
+        Series(x=flight.log.plant.t, y=signal.plant(flight.log.plant), colour=LINES[i], label=label)
+        for i, (label, flight) in enumerate(flights.items())
+    ]
+    limits = tuple(Bound(value=value) for value in bounds)
+    axis = f"{name} [{signal.unit}]" if title else ""
+    return Panel(
+        title=title or name,
+        unit="" if title else signal.unit,
+        y_label=axis,
+        series=clipped(lines, start, np.inf),
+        bounds=limits,
+    )
+
+
+def fly(name: str, changes: Mapping[str, Any]) -> quadsim.Flight:
+    """A scenario of the library with changes."""
+    return quadsim.fly(quadsim.load(name, changes), progress=False)
+
+
+def controllers() -> Figure:
+    """The same step of 10 m under four control laws: x, and pitch against the bound of 5 deg."""
+    flights = {}
+    for label in ("constrained", "robust", "lqr", "geometric"):
+        law = {"controller": {"type": label, "tilt": 5.0}} if label in ("lqr", "geometric") else {}
+        flights[label] = fly("robust" if label == "robust" else "paper-constrained", {"duration": 24.0, **FREE, **law})
+    panels = (curves("x", flights, start=7.0), curves("pitch", flights, start=7.0, bounds=(-5.0, 5.0)))
+    return Figure(key="controllers", title="", panels=panels, columns=1)
+
+
+def linear() -> Figure:
+    """The QP of one period: the plan with its bounds, and the optimum without."""
+    import daqp
+
+    start, k = fly("paper-constrained", {"duration": 11.0, **FREE}), 164
+    problem = quadsim.problem("paper-constrained")
+    state = np.array([start.state[name][k] for name in quadsim.STATE_NAMES])
+    course = np.column_stack([*start.reference.values()])[k + 1 :]
+    preview = np.vstack([course, np.repeat(course[-1:], problem.horizon, axis=0)])[: problem.horizon]
+    H, f, G, low, high, u_min, u_max = problem.qp(state, preview, start.command[k - 1])
+    plans = {
+        "optimum without bounds": -np.linalg.solve(H, f),
+        "optimum of the QP": daqp.solve(H, f, G, np.r_[u_max, high], np.r_[u_min, low])[0],
+    }
+    t = start.time[k] + 0.05 * np.arange(problem.horizon + 1)
+    pitch, speed = [], []
+    for colour, (label, plan) in zip((ORANGE, BLUE), plans.items(), strict=True):
+        u, states = plan.reshape(-1, 4), [state]
+        for command in u:
+            states.append(problem.model.A @ states[-1] + problem.model.B @ (command - problem.model.u_bar))
+        angles = np.degrees(np.array(states)[:, quadsim.STATE_NAMES.index("pitch")])
+        pitch.append(Series(x=t, y=angles, colour=colour, label=label))
+        speed.append(Series(x=t, y=np.append(u[:, 0], u[-1, 0]), colour=colour, label=label, style="steps"))
+    panels = (
+        Panel(
+            title="predicted pitch [deg]",
+            y_label="pitch",
+            series=tuple(pitch),
+            bounds=(Bound(value=-5.0), Bound(value=5.0)),
+        ),
+        Panel(title="planned speed of rotor 1 [rad/s]", y_label="speed", series=tuple(speed)),
+    )
+    return Figure(key="linear", title="", panels=panels)
+
+
+def robust() -> Figure:
+    """A wrong mass and an unmodelled lag, under the paper's controller and under the robust one."""
+    pairs = []
+    for changes in ({"actual.mass": 4.8}, {"effects.rotors": {"rise": 0.02, "fall": 0.02}}):
+        names = {"constrained": "paper-constrained", "robust": "robust"}
+        pairs.append({label: fly(name, {"duration": UNTIL, **FREE, **changes}) for label, name in names.items()})
+    heavy, lagging = pairs
+    course = Series(x=np.array([3.0, UNTIL]), y=np.full(2, 10.0), colour=REFERENCE, label="reference", dashed=True)
+    height = curves("z", heavy, "20 % more mass than modelled", start=3.0)
+    pitch = curves("pitch", lagging, "20 ms of unmodelled lag", bounds=(-5.0, 5.0), start=3.0)
+    panels = (
+        replace(height, series=(course, *height.series), y_range=(8.5, 10.5)),
+        replace(pitch, y_range=(-15.0, 15.0)),
+    )
+    return Figure(key="robust", title="", panels=panels)
+
+
+def nonlinear() -> Figure:
+    """Released upside down: the rigid body's model, and the gain of the hover model."""
+    weights = {"output_weights": {"x": 10.0, "y": 10.0, "z": 100.0, "yaw": 100.0}, "input_weights": {"speed": 9e-4}}
+    hover_model = {"controller": {"type": "unconstrained", "horizon": 40, **weights}}
+    flights = {label: fly("inverted-start", {"duration": 3.0, **FREE, **law})
+               for label, law in (("nonlinear", {}), ("unconstrained, hover model", hover_model))}  # fmt: skip
+    panels = (curves("tilt", flights), replace(curves("z", flights), y_range=(5.0, 10.2)))
+    return Figure(key="nonlinear", title="", panels=panels, end=3.0)
+
+
+def effects() -> Figure:
+    """What lag does to a command, and a gust to a hover."""
+    climb = {"type": "setpoint", "at": 1.0, "z": 1.5}
+    rotors = {"effects.rotors": {"rise": 0.05, "fall": 0.1}, "reference.response_time": None}
+    lag = fly("hover", {"duration": 2.0, "controller": "lqr", "events": [climb], **rotors, **FREE}).log
+    gust = fly("gust", FREE).log.plant
+    assert gust.wind is not None
+    rotor = (
+        Series(x=lag.control.t, y=lag.control.speeds[:, 0], colour=REFERENCE, label="commanded", style="steps"),
+        Series(x=lag.plant.t, y=lag.plant.speeds[:, 0], colour=BLUE, label="actual"),
+    )
+    pushed = (
+        Series(x=gust.t, y=gust.wind[:, 0] / 10.0, colour=GREEN, label="wind [10 m/s]"),
+        Series(x=gust.t, y=gust.state[:, POSITION][:, 0], colour=ORANGE, label="position [m]"),
+    )
+    panels = (
+        Panel(title="rotor 1 with lag", y_label="speed [rad/s]", series=clipped(rotor, 0.9, 1.6), x_label="time [s]"),
+        Panel(title="a hover in a gust", y_label="along x", series=pushed, x_label="time [s]"),
+    )
+    return Figure(key="effects", title="", panels=panels)
+
+
+def clipped(lines: Sequence[Series], start: float, stop: float) -> tuple[Series, ...]:
+    """The part of curves from `start` to `stop`."""
+    shown = [(line, (line.x >= start) & (line.x <= stop)) for line in lines]
+    return tuple(replace(line, x=line.x[part], y=line.y[part]) for line, part in shown)
+
+
+def space() -> Figure:
+    """The half-spaces of one plan around a pillar, from above."""
+    flight = fly("pillar", {})
+    log, k = flight.log, int(np.searchsorted(flight.state["x"], 3.0))
+    assert log.predicted is not None
+    pillar = flight.scenario.obstacles[0]
+    plan, centre = log.predicted[k][:, :2], np.array(pillar.position[:2])
+    reach = pillar.radius + flight.vehicle.enclosing_radius + flight.scenario.controller.avoidance.margin
+    planes = []
+    for p in plan[np.linalg.norm(plan - centre, axis=1) < NEAR][::5]:
+        n = (p - centre) / np.linalg.norm(p - centre)
+        ends = centre + reach * n + np.array([[-0.6], [0.6]]) * np.array([-n[1], n[0]])
+        planes.append(Series(x=ends[:, 0], y=ends[:, 1], colour=BOUND, label="half-space", dashed=True, width=0.9))
+    path, course = log.plant.state[:, POSITION], log.control.reference
+    lines = (
+        Series(x=course[:, 0], y=course[:, 1], colour=REFERENCE, label="reference", dashed=True),
+        Series(x=path[:, 0], y=path[:, 1], colour=BLUE, label="flight"),
+        Series(x=plan[:, 0], y=plan[:, 1], colour=GREEN, label="plan", style="points", width=3.0),
+    )
+    panel = Panel(title="from above", x_label="x [m]", y_label="y [m]", equal=True, height=1.6,
+                  areas=(Area(outline=outlines(pillar, 0.0)[0], colour=OBSTACLE, label="pillar"),),
+                  series=(*planes, *clipped(lines, 2.0, 6.0)))  # fmt: skip
+    return Figure(key="space", title="", panels=(panel,), columns=1)
+
+
+def campaigns() -> Figure:
+    """Errors of random flights, and the interval of their share of failures as it narrows."""
+    from scipy.stats import binomtest
+
+    mass = {"name": "mass", "fields": ["actual.mass"], "distribution": "uniform", "low": 3.8, "high": 4.2}
+    hover = quadsim.load("hover").replace({"duration": 2.0, **FREE})
+    with tempfile.TemporaryDirectory() as folder:
+        answer = quadsim.campaign(
+            hover, vary=[mass], flights=100, fields={"failure": ["rmse.z > 0.05"]}, out=f"{folder}/masses"
+        )
+        table = answer.to_pandas()
+    failed = (table["rmse.z"] > 0.05).to_numpy()
+    points = tuple(
+        Series(x=table["draw.mass"][which].to_numpy(), y=table["rmse.z"][which].to_numpy(), colour=colour, label=label,
+               style="points", width=3.0)
+        for which, colour, label in ((~failed, BLUE, "flight"), (failed, ORANGE, "failed"))
+    )  # fmt: skip
+    counts = np.arange(4, len(failed) + 1)
+    shares = np.cumsum(failed)[counts - 1] / counts
+    ends = [binomtest(int(np.cumsum(failed)[n - 1]), int(n)).proportion_ci() for n in counts]
+    band = Band(x=1.0 * counts, low=np.array([end.low for end in ends]), high=np.array([end.high for end in ends]),
+                colour=BLUE, label="95 % interval")  # fmt: skip
+    panels = (
+        Panel(title="each flight", y_label="RMS error of z [m]", x_label="mass [kg]", series=points,
+              bounds=(Bound(value=0.05),)),
+        Panel(title="share that failed", y_label="share", x_label="flights", bands=(band,), y_range=(0.0, 1.0),
+              series=(Series(x=1.0 * counts, y=shares, colour=BLUE, label="share"),)),
+    )  # fmt: skip
+    return Figure(key="campaigns", title="", panels=panels)
+
+
+def export() -> Figure:
+    """How the work of the core varies over the paper's flight."""
+    flight = fly("paper-constrained", {"controller.solver": "core", **FREE})
+    t, iterations = flight.log.control.t, flight.log.control.iterations.astype(float)
+    work = Series(x=t, y=iterations, colour=ORANGE, style="steps")
+    panels = (curves("x", {"": flight}), Panel(title="iterations of the core", whole=True, series=(work,)))
+    return Figure(key="export", title="", panels=panels, columns=1, end=60.0)
+
+
+def tuning() -> Figure:
+    """The error of every candidate of a search beside the best so far and the start, and over its horizon."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "search.toml"
+        file.write_text(TUNING, encoding="utf-8")
+        table = pd.read_parquet(quadsim.tune(file, out=f"{folder}/tuned", report=False).directory / "flights.parquet")
+    error = np.sqrt(table["rmse.x"] ** 2 + table["rmse.y"] ** 2 + table["rmse.z"] ** 2)
+    means, horizons = (
+        column.groupby(table["candidate"]).mean().to_numpy() for column in (error, table["search.horizon"])
+    )
+    numbers, best = 1.0 * np.arange(len(means)), np.minimum.accumulate(means)
+    each: dict[str, Any] = {"y": means, "colour": BLUE, "style": "points", "width": 3.5, "label": "candidate"}
+    start = Series(x=numbers[:1], y=means[:1], colour=ORANGE, style="points", width=6.0, label="start")
+    lowest = Series(x=numbers, y=best, colour=GREEN, style="steps", label="best so far")
+    panels = (
+        Panel(title="candidates", y_label="RMS error [m]", x_label="number", y_range=SHOWN,
+              series=(Series(x=numbers, **each), lowest, start)),
+        Panel(title="over one searched field", y_label="RMS error [m]", x_label="horizon", y_range=SHOWN,
+              series=(Series(x=horizons, **each), replace(start, x=horizons[:1]))),
+    )  # fmt: skip
+    return Figure(key="tuning", title="", panels=panels)
+
+
+def learning() -> Figure:
+    """A random agent in turbulence, alone and behind the safety filter."""
+    example = run_path(str(ROOT / "examples" / "safety_filter.py"))
+    scenario = example["filtered_air"]("turbulence").replace({"duration": 5.0})
+    flights = {}
+    for label in ("random agent", "behind the filter"):
+        env: Any = quadsim.gym.make_env(scenario)
+        if flights:
+            env = quadsim.gym.MPCSafetyFilter(env)
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        ended = False
+        while not ended:
+            _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            ended = terminated or truncated
+        flights[label] = env.unwrapped.flight()
+    panel = replace(curves("tilt", flights, bounds=(example["LARGEST"],)), y_range=(0.0, 20.0))
+    return Figure(key="learning", title="", panels=(panel,), columns=1, end=5.0)
+
+
+def scenarios() -> Figure:
+    """The pitch of three flights of one course, satisfied, violated and lost."""
+    names = {"satisfied": "paper-constrained", "violated": "paper-unconstrained", "lost": "paper-constrained-lag20"}
+    flights = {verdict: fly(name, {"duration": UNTIL, **FREE}) for verdict, name in names.items()}
+    panel = replace(curves("pitch", flights, bounds=(-5.0, 5.0), start=7.0), y_range=(-15.0, 15.0))
+    return Figure(key="scenarios", title="", panels=(panel,), columns=1)
+
+
+FIGURES: Final[dict[str, Callable[[], Figure]]] = {
+    made.__name__: made
+    for made in (controllers, linear, robust, nonlinear, effects, space, campaigns, export, tuning, learning, scenarios)
+}
+
+
+def main(names: Sequence[str]) -> None:
+    """Write the figures named, or all."""
+    figures.STYLE.update(figures.LOOKS)
+    for name in names or FIGURES:
+        (figures.ASSETS / f"{name}.svg").write_text(figures.to_svg(FIGURES[name]()), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
