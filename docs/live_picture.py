@@ -44,7 +44,7 @@ def picture(browser: Browser, address: str, scheme: Literal["light", "dark"]) ->
 def main() -> None:
     """Start a session, as a user does, and look at its page."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
-    command = [str(Path(sys.executable).with_name("quadsim")), "live", "robust", "--no-browser", "--port", "0"]
+    command = [str(Path(sys.executable).with_name("quadsim")), "live", "--no-browser", "--port", "0"]
     with (
         sync_playwright() as playwright,
         playwright.chromium.launch(executable_path=chromium, args=[*OPTIONS]) as browser,
