@@ -29,9 +29,10 @@ from quadsim.report.figure import BOUND, LINES
 from quadsim.rotation import quaternion_to_euler
 from quadsim.vehicle import N_ROTORS
 from scenarios.live.knobs import Knob, Value, knobs
+from scenarios.live.look import dressed
 from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
-from scenarios.live.stage import Stage
+from scenarios.live.stage import FIELD, VIEW, Stage
 from scenarios.schema.controllers import AnyController
 from scenarios.schema.writing import plain
 
@@ -98,7 +99,8 @@ class Page:
         self._session, self._pace, self._save, self._others = session, pace, save, others
         guard = Guard(host)
         silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
-        with silent, guard.installed():
+        self._title = f"quadsim live: {session.scenario.name}"
+        with silent, guard.installed(partial(dressed, title=self._title)):
             self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
         listening = self._server.get_port()
         if port not in (0, listening):
@@ -114,7 +116,8 @@ class Page:
         self._history: deque[tuple[float, ...]] = deque(maxlen=round(SECONDS / session.period))
         self._frame: Frame | None = None
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        self._server.gui.set_panel_label(f"quadsim live: {session.scenario.name}")
+        self._server.gui.set_panel_label(self._title)
+        self._server.initial_camera.fov = FIELD
         self.stage = Stage(self._server.scene, session)
         self._fields: dict[str, tuple[Knob, list[Any]]] = {}
         self._rest: list[tuple[Any, Any]] = []  # widgets, and what they are at the start of a flight
@@ -255,8 +258,9 @@ class Page:
 
         def clicked(event: Any) -> None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-            if origin[2] * direction[2] < 0.0:  # it meets the ground
-                meets = origin - origin[2] / direction[2] * direction
+            above = origin[2] - self.stage.floor.position[2]
+            if above * direction[2] < 0.0:  # it meets the ground
+                meets = origin - above / direction[2] * direction
                 sample = None if self._frame is None else self._frame.samples[0]
                 height = self._place.value[2] if sample is None else sample.observation.reference[2]
                 self._set_point((*meets[:2], height))
@@ -353,8 +357,9 @@ class Page:
         self._pace.paused = True
         self._pace.single()
 
-    def _scene(self, event: Any) -> None:
-        _send(event.client, f"{self._session.scenario.name}.html", self._server.scene.as_html())
+    async def _scene(self, event: Any) -> None:
+        page = await asyncio.to_thread(self.stage.recorded, self._session.scenario.name)
+        _send(event.client, f"{self._session.scenario.name}.html", page)
 
     def _between(self, act: Callable[[Session, Any], None]) -> Callable[[Any], None]:
         """Return a function that runs `act(session, client)` between two periods, in the flying thread."""
@@ -381,7 +386,7 @@ class Page:
     async def _connected(self, client: Any) -> None:
         if self._driver is None:
             self._driver = client.client_id
-        away = self.stage.unit * np.array([-4.0, -6.0, 3.0])
+        away = self.stage.unit * VIEW
         upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
         aim = self._aims[client.client_id] = np.array([0.0, 0.0, -0.5 * np.linalg.norm(away)]) * upright
         _look(client.camera, np.asarray(self.stage.frames[0].position) + aim, away)
