@@ -17,10 +17,11 @@ from PIL import Image
 
 from quadsim.sim.airframe import BODY
 from quadsim.space import Obstacle
+from quadsim.state import Array
 
 _SQUARES: Final = (144, 154, 162), (155, 165, 173)
 _SEAM: Final = (172, 180, 188)
-_REACH: Final = 100.0  # squares from the middle of the floor to where it has faded
+_REACH: Final = 100.0  # squares from the middle of the floor to where it has faded, and down to its origin
 _ICON: Final = """<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32' fill='none' stroke-width='3'>
 <path d='M8 8 24 24M8 24 24 8' stroke='#7a7f87'/><path d='M2 24a6 6 0 1 0 12 0a6 6 0 1 0-12 0m16 0a6 6 0 1 0 12 0a6 6 0
 1 0-12 0' stroke='#1b7fc4'/><path d='M2 8a6 6 0 1 0 12 0a6 6 0 1 0-12 0m16 0a6 6 0 1 0 12 0a6 6 0 1 0-12 0'
@@ -67,7 +68,10 @@ def obstacle(shape: Obstacle) -> trimesh.Trimesh:
 
 
 def floor(square: float) -> bytes:
-    """Return a checkered floor that fades with distance, as a GLB; unlit, which a machine without a GPU feels."""
+    """Return a checkered floor that fades with distance, as a GLB; unlit, which a machine without a GPU feels.
+
+    Its origin is far below: what is transparent is drawn in the order of origins, and the floor has to be the first.
+    """
     picture = np.empty((128, 128, 3), np.uint8)  # of two by two squares
     picture[:], picture[:64, :64], picture[64:, 64:] = _SQUARES[1], _SQUARES[0], _SQUARES[0]
     picture[[0, -1]] = picture[:, [0, -1]] = _SEAM
@@ -84,7 +88,7 @@ def floor(square: float) -> bytes:
 
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture), alphaMode="BLEND")
     mesh = trimesh.Trimesh(
-        square * points,
+        square * np.add(points, (0.0, 0.0, _REACH)),
         [(0, i, i + 1) for i in range(1, len(points) - 1)],
         visual=trimesh.visual.TextureVisuals(uv=points[:, :2] / 2.0, material=material),
         vertex_attributes={"color": fading},
@@ -92,6 +96,11 @@ def floor(square: float) -> bytes:
     )
     data: bytes = mesh.export(file_type="glb", tree_postprocessor=finish)
     return data
+
+
+def floor_origin(square: float, at: Array, ground: float) -> Array:
+    """Return where the origin of the floor is while the middle of what is seen is at (3,), above the ground [m]."""
+    return np.array([*(2.0 * square * np.round(at[:2] / (2.0 * square))), ground - _REACH * square])
 
 
 def square_side(arm: float) -> float:

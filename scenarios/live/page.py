@@ -258,7 +258,7 @@ class Page:
 
         def clicked(event: Any) -> None:
             origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-            above = origin[2] - self.stage.floor.position[2]
+            above = origin[2] - self.stage.ground
             if above * direction[2] < 0.0:  # it meets the ground
                 meets = origin - above / direction[2] * direction
                 sample = None if self._frame is None else self._frame.samples[0]

@@ -28,6 +28,7 @@ from scenarios.live import look
 from scenarios.live.session import Frame, Session
 
 VIEW: Final = np.array([-4.0, -6.0, 3.0])  # from the first vehicle to a camera at the start, in arm lengths
+FLAT: Final = {"cast_shadow": False, "receive_shadow": False}
 FIELD: Final = math.radians(45.0)  # of view, as in films
 TRAIL: Final = 200  # points of the flown path that stay
 _EVERY: Final = 2  # periods from one to the next; every point is sent anew with each
@@ -47,7 +48,7 @@ class Stage:
         unit: the vehicle's arm length [m].
         frames: viser's frame of each vehicle.
         grab: what the mouse takes hold of.
-        floor: viser's handle of the floor, which follows the first vehicle.
+        ground: height of the floor, below the whole flight [m].
     """
 
     def __init__(self, scene: Any, session: Session) -> None:
@@ -64,7 +65,7 @@ class Stage:
         model, alone = compile_model(vehicle, visuals=True), len(session.flights) == 1
         self._drop = float(model.geom(FLOOR).pos[2])  # from a vehicle to the floor that it stands on [m]
         self._square = look.square_side(self.unit)
-        self.floor = scene.add_glb(f"{_ROOT}/floor", look.floor(self._square))
+        self._floor = scene.add_glb(f"{_ROOT}/floor", look.floor(self._square))
         target = ink.AMBER if alone else ink.WHITE
         self._ahead = self._line("reference", _course(session), target, 2.0)
         self._goal = self._line("goal", _octahedron(0.5 * self.unit), target, 2.5)
@@ -81,19 +82,21 @@ class Stage:
             self._arrows.append(scene.add_arrows(f"{_ROOT}/{name}/thrust", arrows, ink.BLUE, **shape))
             self._horizons.append(self._line(f"horizon{i}", np.zeros((length, 2, 3)), ink.GREEN if alone else colour))
             self._paths.append(self._line(f"path{i}", np.zeros((TRAIL, 2, 3)), colour))
+            shadow = self._add(f"shadow{i}", look.disc(0.9 * self.unit), _SHADOW)
             plumb = self._line(f"shadow{i}/plumb", np.array([[(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)]]), _SHADOW, 1.0)
-            self._shadows.append((self._add(f"shadow{i}", look.disc(0.9 * self.unit), _SHADOW), plumb))
+            self._shadows.append((shadow, plumb))
             if not alone:
                 side, anchor = ((1.0, "bottom-center"), (-1.0, "top-center"))[i]
                 title, place = law_name(flight.loop.controller.name), (0.0, 0.0, 0.8 * side * self.unit)
                 scene.add_label(f"{_ROOT}/{name}/label", title, position=place, anchor=anchor)
-        reach = look.ball(1.6 * self.unit)  # drawn by its far side, which hides nothing within
-        self.grab = self._add("vehicle0/grab", reach, ink.WHITE, opacity=0.001, side="back")
+        reach = look.ball(1.6 * self.unit)  # drawn after the discs within, which it would hide
+        self.grab = self._add("vehicle0/grab", reach, ink.WHITE, opacity=0.001)
         self._trails = [deque[Array](maxlen=TRAIL + 1) for _ in session.flights]
         self._shown = deque[Frame](maxlen=round(_SECONDS / session.period))
         self._moving: list[tuple[Obstacle, Any]] = []
         self._regions: list[tuple[SpaceLimit, Any]] = []
         self._add_space()
+        self.ground, self._events = 0.0, 0
         self.reset()
 
     def show(self, frame: Frame) -> None:
@@ -121,8 +124,8 @@ class Stage:
         if first is not None:
             at = first.segment.physics[-1, 1:4]
             self._goal.position = first.observation.reference[:3]
-            self._ground = min(self._ground, at[2] + self._drop)
-            self.floor.position = (*(2.0 * self._square * np.round(at[:2] / (2.0 * self._square))), self._ground)
+            self.ground = min(self.ground, at[2] + self._drop)
+            self._floor.position = look.floor_origin(self._square, at, self.ground)
             self._hand.points = np.array([[at, at + 30.0 * self.unit / self._weight * frame.pull]], np.float32)
         self._hand.visible = bool(frame.pull.any())
         for obstacle, handle in self._moving:
@@ -137,15 +140,15 @@ class Stage:
                 physics = sample.segment.physics
                 row = physics[min(len(physics) - 1, int(share * len(physics)))]
                 handle.position, handle.wxyz = row[1:4], row[4:8]
-                foot = self._ground + 0.01 * self.unit
+                foot = self.ground + 0.01 * self.unit
                 shadow.position, plumb.scale = (*row[1:3], foot), (1.0, 1.0, float(row[3] - foot))
         return np.asarray(self.frames[0].position)
 
     def reset(self) -> None:
         """Clear the scene for a new flight."""
         course = self._ahead.points = _course(self._session)
-        self._ground: float = min(0.0, float(course[..., 2].min())) + self._drop  # below the whole flight [m]
-        self._events: int = 0  # that have been seen
+        self.ground = min(0.0, float(course[..., 2].min())) + self._drop
+        self._events = 0  # that have been seen
         self._shown.clear()
         for trail, path in zip(self._trails, self._paths, strict=True):
             trail.clear()
@@ -177,7 +180,7 @@ class Stage:
         return self._scene.add_line_segments(f"{_ROOT}/{name}", points.astype(np.float32), colour, **style)
 
     def _add(self, name: str, mesh: Any, colour: tuple[float, ...], **style: Any) -> Any:
-        style = {"color": colour, "flat_shading": True, "cast_shadow": False, "receive_shadow": False, **style}
+        style = {"color": colour, "flat_shading": True, **FLAT, **style}
         return self._scene.add_mesh_simple(f"{_ROOT}/{name}", mesh.vertices, mesh.faces, **style)
 
     def _add_space(self) -> None:
