@@ -17,11 +17,10 @@ from PIL import Image
 
 from quadsim.sim.airframe import BODY
 from quadsim.space import Obstacle
-from quadsim.state import Array
 
 _SQUARES: Final = (144, 154, 162), (155, 165, 173)
 _SEAM: Final = (172, 180, 188)
-_REACH: Final = 100.0  # squares from the middle of the floor to where it has faded, and down to its origin
+_REACH: Final = 100.0  # squares from the middle of the floor to where it has faded
 _ICON: Final = """<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32' fill='none' stroke-width='3'>
 <path d='M8 8 24 24M8 24 24 8' stroke='#7a7f87'/><path d='M2 24a6 6 0 1 0 12 0a6 6 0 1 0-12 0m16 0a6 6 0 1 0 12 0a6 6 0
 1 0-12 0' stroke='#1b7fc4'/><path d='M2 8a6 6 0 1 0 12 0a6 6 0 1 0-12 0m16 0a6 6 0 1 0 12 0a6 6 0 1 0-12 0'
@@ -70,13 +69,15 @@ def obstacle(shape: Obstacle) -> trimesh.Trimesh:
 def floor(square: float) -> bytes:
     """Return a checkered floor that fades with distance, as a GLB; unlit, which a machine without a GPU feels.
 
-    Its origin is far below: what is transparent is drawn in the order of origins, and the floor has to be the first.
+    What is transparent is drawn in the order of its bounding box's middle, from far to near: a vertex without a face,
+    far below, lets the floor be the first.
     """
     picture = np.empty((128, 128, 3), np.uint8)  # of two by two squares
     picture[:], picture[:64, :64], picture[64:, 64:] = _SQUARES[1], _SQUARES[0], _SQUARES[0]
     picture[[0, -1]] = picture[:, [0, -1]] = _SEAM
     around = np.linspace(0.0, 2.0 * np.pi, 33)
     points = _REACH * np.pad(np.stack([np.cos(around), np.sin(around)], axis=1), ((1, 0), (0, 1)))
+    points = np.concatenate([points, [(0.0, 0.0, -_REACH)]])
     fading = np.ones((len(points), 4), np.float32)
     fading[1:, 3] = 0.0
 
@@ -88,8 +89,8 @@ def floor(square: float) -> bytes:
 
     material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture), alphaMode="BLEND")
     mesh = trimesh.Trimesh(
-        square * np.add(points, (0.0, 0.0, _REACH)),
-        [(0, i, i + 1) for i in range(1, len(points) - 1)],
+        square * points,
+        [(0, i, i + 1) for i in range(1, len(points) - 2)],
         visual=trimesh.visual.TextureVisuals(uv=points[:, :2] / 2.0, material=material),
         vertex_attributes={"color": fading},
         process=False,
@@ -98,20 +99,16 @@ def floor(square: float) -> bytes:
     return data
 
 
-def floor_origin(square: float, at: Array, ground: float) -> Array:
-    """Return where the origin of the floor is while the middle of what is seen is at (3,), above the ground [m]."""
-    return np.array([*(2.0 * square * np.round(at[:2] / (2.0 * square))), ground - _REACH * square])
-
-
 def square_side(arm: float) -> float:
     """Return the side of the floor's squares [m]: 1, 2 or 5 times a power of ten, up to four arms."""
     power = 10.0 ** math.floor(math.log10(4.0 * arm))
     return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= 4.0 * arm)
 
 
-def ball(radius: float) -> trimesh.Trimesh:
-    """Return a sphere."""
-    return trimesh.creation.icosphere(2, radius)
+def grip(radius: float) -> trimesh.Trimesh:
+    """Return a sphere that is drawn last, by a vertex far above (see `floor`): it would hide the discs within."""
+    ball = trimesh.creation.icosphere(2, radius)
+    return trimesh.Trimesh(np.concatenate([ball.vertices, [(0.0, 0.0, 50.0 * radius)]]), ball.faces, process=False)
 
 
 def disc(radius: float) -> trimesh.Trimesh:
@@ -130,7 +127,7 @@ def _solid(kind: str, size: Any, centre: Any, turn: Any) -> trimesh.Trimesh:
         case "capsule":
             mesh = trimesh.creation.capsule(2.0 * b, a, count=(8, 8))
         case _:
-            mesh = ball(1.0).apply_scale((a, b, c) if kind == "ellipsoid" else a)
+            mesh = trimesh.creation.icosphere(2).apply_scale((a, b, c) if kind == "ellipsoid" else a)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = turn, centre
     return mesh.apply_transform(pose)

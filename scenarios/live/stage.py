@@ -89,8 +89,7 @@ class Stage:
                 side, anchor = ((1.0, "bottom-center"), (-1.0, "top-center"))[i]
                 title, place = law_name(flight.loop.controller.name), (0.0, 0.0, 0.8 * side * self.unit)
                 scene.add_label(f"{_ROOT}/{name}/label", title, position=place, anchor=anchor)
-        reach = look.ball(1.6 * self.unit)  # drawn after the discs within, which it would hide
-        self.grab = self._add("vehicle0/grab", reach, ink.WHITE, opacity=0.001)
+        self.grab = self._add("vehicle0/grab", look.grip(1.6 * self.unit), ink.WHITE, opacity=0.001)
         self._trails = [deque[Array](maxlen=TRAIL + 1) for _ in session.flights]
         self._shown = deque[Frame](maxlen=round(_SECONDS / session.period))
         self._moving: list[tuple[Obstacle, Any]] = []
@@ -125,7 +124,7 @@ class Stage:
             at = first.segment.physics[-1, 1:4]
             self._goal.position = first.observation.reference[:3]
             self.ground = min(self.ground, at[2] + self._drop)
-            self._floor.position = look.floor_origin(self._square, at, self.ground)
+            self._floor.position = (*(2.0 * self._square * np.round(at[:2] / (2.0 * self._square))), self.ground)
             self._hand.points = np.array([[at, at + 30.0 * self.unit / self._weight * frame.pull]], np.float32)
         self._hand.visible = bool(frame.pull.any())
         for obstacle, handle in self._moving:

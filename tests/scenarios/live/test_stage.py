@@ -72,11 +72,11 @@ def test_two_vehicles_differ_in_colour_and_have_names(flown: tuple[Page, list[Fr
     assert line_colour(0) != line_colour(1)
 
 
-def test_the_floor_stays_below_the_vehicle_and_keeps_its_pattern() -> None:
-    for at in (np.array([1e3, -7.7, 2.0]), np.array([0.4, 0.4, 5.0])):
-        x, y, _ = look.floor_origin(0.5, at, ground=-0.1)
-        assert max(abs(x - at[0]), abs(y - at[1])) <= 0.5
-        assert (x % 1.0, y % 1.0) == (0.0, 0.0)
+def test_the_floor_stays_below_the_vehicle_and_keeps_its_pattern(flown: tuple[Page, list[Frame]]) -> None:
+    x, y, z = flown[0]._server.scene.get_handle_by_name("/flight/floor").position
+    assert max(abs(x - 40.5), abs(y + 30.0)) <= 1.0 + 0.5
+    assert (x % 2.0, y % 2.0) == (0.0, 0.0)
+    assert z == pytest.approx(flown[0].stage.ground)
 
 
 @pytest.mark.parametrize(("arm", "side"), [(0.3, 1.0), (0.17, 0.5), (0.046, 0.1), (0.25, 1.0), (5.0, 20.0)])
