@@ -83,6 +83,10 @@ def floor(square: float) -> bytes:
 
     def finish(tree: dict[str, Any]) -> None:
         tree["extensionsUsed"] = ["KHR_materials_unlit"]
+        tree["samplers"], tree["textures"][0]["sampler"] = (
+            [{"minFilter": 9985, "magFilter": 9729}],
+            0,
+        )  # not trilinear: twice the frames
         tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
         attributes = tree["meshes"][0]["primitives"][0]["attributes"]
         attributes["COLOR_0"] = attributes.pop("_color")
