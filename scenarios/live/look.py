@@ -83,10 +83,8 @@ def floor(square: float) -> bytes:
 
     def finish(tree: dict[str, Any]) -> None:
         tree["extensionsUsed"] = ["KHR_materials_unlit"]
-        tree["samplers"], tree["textures"][0]["sampler"] = (
-            [{"minFilter": 9985, "magFilter": 9729}],
-            0,
-        )  # not trilinear: twice the frames
+        tree["samplers"] = [{"minFilter": 9985, "magFilter": 9729}]  # not trilinear: twice the frames without a GPU
+        tree["textures"][0]["sampler"] = 0
         tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
         attributes = tree["meshes"][0]["primitives"][0]["attributes"]
         attributes["COLOR_0"] = attributes.pop("_color")
