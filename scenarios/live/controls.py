@@ -144,15 +144,15 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
 class Steering:
     """The set-point, by every way that there is to give one."""
 
-    def __init__(self, widgets: Widgets, scene: Any, unit: float, use: Callable[[str], None]) -> None:
-        """Fill the tab; `unit` is the vehicle's size [m], `use` takes a hint away."""
-        self._session, self._use, gui = widgets.session, use, widgets.gui
+    def __init__(self, widgets: Widgets, scene: Any, stage: Stage, use: Callable[[str], None]) -> None:
+        """Fill the tab; `use` takes a hint away."""
+        self._session, self._stage, self._use, gui = widgets.session, stage, use, widgets.gui
         self._velocity = np.zeros(3)
         gui.add_html(readout.block(readout.STEER, "why"))
         here = np.asarray(self._session.flights[0].loop.course.row(0)[:3])
         self._handle = scene.add_transform_controls(
             "/target",
-            scale=3.0 * unit,
+            scale=3.0 * stage.unit,
             position=here,
             disable_rotations=True,
             disable_sliders=True,
@@ -177,8 +177,9 @@ class Steering:
     def clicked(self, event: Any) -> None:
         """Fly to the point of the ground that was clicked, at the set-point's height."""
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-        if origin[2] * direction[2] < 0.0:  # it meets the ground
-            meets = origin - origin[2] / direction[2] * direction
+        above = origin[2] - self._stage.ground
+        if above * direction[2] < 0.0:  # it meets the ground
+            meets = origin - above / direction[2] * direction
             last = self._session.flights[0].loop.last
             height = self._place.value[2] if last is None else last.observation.reference[2]
             self._set_point((*meets[:2], height))

@@ -15,6 +15,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
+from functools import partial
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -25,9 +26,10 @@ from quadsim.rotation import quaternion_to_euler
 from scenarios.flight import Flight
 from scenarios.live import readout
 from scenarios.live.controls import ControllerTab, Steering, Widgets, disturb
+from scenarios.live.look import dressed
 from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
-from scenarios.live.stage import FLAT, Stage
+from scenarios.live.stage import FIELD, FLAT, VIEW, Stage
 from scenarios.schema.controllers import AnyController
 
 SECONDS: Final = 20.0  # of the plots
@@ -80,7 +82,8 @@ class Page:
         self._session, self._pace, self._save = session, pace, save
         guard = Guard(host)
         silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
-        with silent, guard.installed():
+        title = f"quadsim live: {session.scenario.name}"
+        with silent, guard.installed(partial(dressed, title=title)):
             self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
         listening = self._server.get_port()
         if port not in (0, listening):
@@ -99,12 +102,12 @@ class Page:
         self._used: set[str] = set()  # hints
         self._limits = session.limits  # of the flight's start, so that no row goes
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        self._server.gui.set_panel_label(f"quadsim live: {session.scenario.name}")
+        self._server.gui.set_panel_label(title)
         self._server.gui.main_panel.dock_right()
         self.stage = Stage(self._server.scene, session)
-        self._away = self.stage.unit * np.array([-4.0, -6.0, 3.0])
-        start = np.asarray(session.flights[0].loop.course.row(0)[:3])
-        self._server.initial_camera.position, self._server.initial_camera.look_at = start + self._away, start
+        self._away = self.stage.unit * VIEW
+        start, camera = np.asarray(session.flights[0].loop.course.row(0)[:3]), self._server.initial_camera
+        camera.position, camera.look_at, camera.fov = start + self._away, start, FIELD
         self._widgets = Widgets(self._server.gui, session, lambda client: client == self._driver)
         self._build(others)
         self._server.on_client_connect(self._connected)
@@ -182,7 +185,7 @@ class Page:
         with tabs.add_tab("Disturb"):
             disturb(self._widgets, self.stage, self._use)
         with tabs.add_tab("Steer"):
-            self._steering = Steering(self._widgets, self._server.scene, self.stage.unit, self._use)
+            self._steering = Steering(self._widgets, self._server.scene, self.stage, self._use)
         with tabs.add_tab("Controller"):
             self._controller = ControllerTab(self._widgets, others, self._doing)
         with tabs.add_tab("Plots"):
@@ -271,8 +274,10 @@ class Page:
             text = await self._ask(lambda session: session.flight().scenario.to_toml())
             _send(event.client, f"{self._session.scenario.name}.toml", text)
 
-    def _scene(self, event: Any) -> None:
-        _send(event.client, f"{self._session.scenario.name}.html", self._server.scene.as_html())
+    async def _scene(self, event: Any) -> None:
+        with self._doing("recording the scene"):
+            page = await asyncio.to_thread(self.stage.recorded, self._session.scenario.name)
+        _send(event.client, f"{self._session.scenario.name}.html", page)
 
     # Who drives
 
@@ -291,7 +296,8 @@ class Page:
 
         client.camera.on_update(moved)
         if upright:  # it has no Shift key, and viser's clicks of the scene ignore touches
-            floor = client.scene.add_box("/tapped", dimensions=(200.0, 200.0, 1e-3), opacity=0.001, **FLAT)
+            below = (0.0, 0.0, self.stage.ground - self.stage.unit)  # it would hide what is behind it
+            floor = client.scene.add_box("/tapped", dimensions=(200.0, 200.0, 1e-3), position=below, **FLAT)
             self._widgets.on(floor.on_click(), self._steering.clicked)
         watches = self._driver != client.client_id
         note = client.gui.add_html(readout.says(readout.WATCH, "watch"), order=-2.0, visible=watches)

@@ -9,13 +9,12 @@ from typing import Final
 
 from quadsim.controller import OPTIMAL
 from quadsim.flight.audit import Limit
-from quadsim.report.figure import BOUND, LINES
+from quadsim.report.figure import BOUND, line_colour
 from quadsim.sim.physics import FlownPeriod
 from scenarios.live.session import Frame
 
 NEAR: Final = 0.1  # share of a bound's half band within which the row says so
 _SHOWN: Final = 1.2  # bounds to the right end of a bar: what is beyond the bound shows too
-COLOURS: Final = (LINES[0], LINES[1])  # of the two vehicles
 HINTS: Final = {
     "pull": "<b>Drag the drone</b> to pull it",
     "waypoint": '<b><span class="mouse">Shift-click</span><span class="touch">Tap</span> the floor</b> to fly there',
@@ -106,7 +105,7 @@ def numbers(
 
 def legend(names: Iterable[str]) -> str:
     """Return which colour is whose, with two vehicles."""
-    marks = [f'<b style="color:{colour}">●</b> {escape(name)}' for colour, name in zip(COLOURS, names, strict=False)]
+    marks = [f'<b style="color:{line_colour(i)}">●</b> {escape(name)}' for i, name in enumerate(names)]
     return block(" &nbsp; ".join(marks), "line") if len(marks) > 1 else ""
 
 
@@ -152,7 +151,7 @@ def is_violated(limit: Limit, margin: float) -> bool:
 def _mark(limit: Limit, margin: float, vehicle: int) -> str:
     """Return a vehicle's mark: the first one's bar grows towards the bound, the other's is a stroke at its end."""
     share = min(max(1.0 - margin / limit.half_band, 0.0), _SHOWN) / _SHOWN
-    colour = BOUND if is_violated(limit, margin) else COLOURS[vehicle]
+    colour = BOUND if is_violated(limit, margin) else line_colour(vehicle)
     if vehicle == 0:
         return f'<i style="left:0;width:{100.0 * share:.1f}%;background:{colour}"></i>'
     return f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{colour}"></i>'

@@ -134,8 +134,8 @@ class Guard:
         return None
 
     @contextlib.contextmanager
-    def installed(self) -> Iterator[None]:
-        """Make a server that viser starts in this block check its requests."""
+    def installed(self, dress: Callable[[str], str] = str) -> Iterator[None]:
+        """Make a server that viser starts in this block check its requests, and change its page."""
         from viser.infra import _infra
 
         library = _infra.websockets.asyncio.server
@@ -147,7 +147,12 @@ class Guard:
                 refused = self.refusal(request.headers, request.path, port)
                 if refused is not None:
                     return connection.respond(HTTPStatus.FORBIDDEN, f"quadsim: {refused}\n")
+                request.headers.pop("Accept-Encoding", None)  # the page is packed as it is
                 response = None if process_request is None else process_request(connection, request)
+                if response is not None and response.headers.get("Content-Type", "").startswith("text/html"):
+                    response.body = dress(response.body.decode()).encode()
+                    del response.headers["Content-Length"]
+                    response.headers["Content-Length"] = str(len(response.body))
                 if response is not None and "token" in parse_qs(request.path.partition("?")[2]):
                     cookie = f"quadsim-{port}={self.token}"  # its name has the port, which cookies ignore
                     response.headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict; Path=/"

@@ -1,30 +1,44 @@
-"""The 3-D scene of a live session: vehicles, thrusts, horizons, reference, path, obstacles, regions and ground.
+"""The 3-D scene of a live session, as films show it, and its recording.
 
-Handles are viser's; nothing here imports it.  Everything has few triangles: machines without a graphics card draw too.
+Everything has few triangles: machines without a graphics card draw too.  Handles are viser's.
 """
 
 from __future__ import annotations
 
+import math
+import threading
+import time as clock
 from collections import deque
+from itertools import combinations
+from types import SimpleNamespace
 from typing import Any, Final
 
-import mujoco
 import numpy as np
+import viser
+from viser.infra._infra import WebsockMessageHandler
 
+from quadsim.controller import law_name
 from quadsim.flight.audit import SpaceLimit
-from quadsim.report.figure import BOUND, LINES, OBSTACLE, REFERENCE
-from quadsim.sim.airframe import BODY, compile_model
+from quadsim.report.figure import BOUND, OBSTACLE, line_colour
+from quadsim.report.film import painter as ink
+from quadsim.sim.airframe import FLOOR, compile_model
 from quadsim.space import Obstacle, Region
 from quadsim.state import Array
-from quadsim.vehicle import Vehicle
+from scenarios.live import look
 from scenarios.live.session import Frame, Session
 
+VIEW: Final = np.array([-4.0, -6.0, 3.0])  # from the first vehicle to a camera at the start, in arm lengths
+FLAT: Final = {"cast_shadow": False, "receive_shadow": False}
+FIELD: Final = math.radians(45.0)  # of view, as in films
 TRAIL: Final = 200  # points of the flown path that stay
 _EVERY: Final = 2  # periods from one to the next; every point is sent anew with each
-_WIDE: Final = 20.0  # [m] of ground, lines a metre apart
 _COURSE: Final = 600  # points of the reference that are drawn
-_SHADES: Final = ("#282c34", "#8c96a5")  # of the first vehicle and of the other one
-FLAT: Final = {"cast_shadow": False, "receive_shadow": False}
+_SECONDS: Final = 180.0  # of the flight that a recording has at most
+_REST: Final = 5e-4  # [s] after each period that is recorded, for the thread that flies
+_ROOT: Final = "/flight"  # what moves as one in a recording
+_SHADOW: Final = (84, 92, 101)
+_REGION: Final = (242, 242, 140)
+_TINTED: Final = ("front", "disc", "disc_front")  # materials in a vehicle's colour where there are two
 
 
 class Stage:
@@ -34,41 +48,63 @@ class Stage:
         unit: the vehicle's arm length [m].
         frames: viser's frame of each vehicle.
         grab: what the mouse takes hold of.
+        ground: height of the floor, below the whole flight [m].
     """
 
     def __init__(self, scene: Any, session: Session) -> None:
         self._scene, self._session = scene, session
         scene.set_up_direction("+z")
-        scene.configure_default_lights(cast_shadow=False)
         scene.configure_environment_map(hdri=None)
+        scene.configure_default_lights(enabled=False)
+        scene.add_light_hemisphere("/light", intensity=2.5)
+        scene.add_light_directional("/light/sun", intensity=2.0, position=(0.35, -0.25, 0.9))
+        self.root = scene.add_frame(_ROOT, show_axes=False)
         vehicle = session.flights[0].actual
         self.unit, self._weight = vehicle.arm_length, vehicle.mass * vehicle.gravity
         self._rotors, self._coefficient = np.array(vehicle.rotor_positions), vehicle.thrust_coefficient
-        self._ground = self._line("/ground", _grid(), "#c8ccd2", 1.0)
-        self._ahead = self._line("/reference", _course(session), REFERENCE, 1.5)
-        self._hand = self._line("/hand", np.zeros((1, 2, 3)), BOUND, 4.0)
-        self._goal = scene.add_icosphere("/goal", 0.25 * self.unit, rgb(REFERENCE), subdivisions=1, **FLAT)
-        self.frames, self._arrows, self._horizons, self._paths = [], [], [], []
+        model, alone = compile_model(vehicle, visuals=True), len(session.flights) == 1
+        self._drop = float(model.geom(FLOOR).pos[2])  # from a vehicle to the floor that it stands on [m]
+        self._square = look.square_side(self.unit)
+        self._floor = scene.add_glb(f"{_ROOT}/floor", look.floor(self._square))
+        target = ink.AMBER if alone else ink.WHITE
+        self._ahead = self._line("reference", _course(session), target, 2.0)
+        self._goal = self._line("goal", _octahedron(0.5 * self.unit), target, 2.5)
+        self._hand = self._line("hand", np.zeros((1, 2, 3)), _rgb(BOUND), 5.0)
+        self.frames, self._arrows, self._horizons, self._paths, self._shadows = [], [], [], [], []
         for i, flight in enumerate(session.flights):
-            name, length = f"/vehicle{i}", flight.loop.controller.horizon
-            self.frames.append(scene.add_frame(name, show_axes=False))
-            _add_airframe(scene, name, vehicle, _SHADES[i])
-            self._arrows.append(self._line(f"{name}/thrust", np.zeros((len(self._rotors), 2, 3)), LINES[1]))
-            self._horizons.append(self._line(f"/horizon{i}", np.zeros((length, 2, 3)), LINES[4 if i else 2]))
-            self._paths.append(self._line(f"/path{i}", np.zeros((TRAIL, 2, 3)), LINES[4 if i else 0]))
-        self.grab = scene.add_icosphere("/vehicle0/grab", 1.6 * self.unit, subdivisions=1, opacity=0.001, **FLAT)
+            name, length, colour = f"vehicle{i}", flight.loop.controller.horizon, _rgb(line_colour(i))
+            self.frames.append(scene.add_frame(f"{_ROOT}/{name}", show_axes=False))
+            for material, (*rgb, alpha), mesh in look.airframe(model):
+                tint = tuple(rgb) if alone or material not in _TINTED else colour
+                self._add(f"{name}/{material}", mesh, tint, opacity=None if alpha == 1.0 else alpha)
+            arrows, sizes = np.zeros((len(self._rotors), 2, 3)), (0.04 * self.unit, 0.09 * self.unit, 0.2 * self.unit)
+            shape = dict(zip(("shaft_radius", "head_radius", "head_length"), sizes, strict=True))
+            self._arrows.append(scene.add_arrows(f"{_ROOT}/{name}/thrust", arrows, ink.BLUE, **shape))
+            self._horizons.append(self._line(f"horizon{i}", np.zeros((length, 2, 3)), ink.GREEN if alone else colour))
+            self._paths.append(self._line(f"path{i}", np.zeros((TRAIL, 2, 3)), colour))
+            shadow = self._add(f"shadow{i}", look.disc(0.9 * self.unit), _SHADOW)
+            plumb = self._line(f"shadow{i}/plumb", np.array([[(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)]]), _SHADOW, 1.0)
+            self._shadows.append((shadow, plumb))
+            if not alone:
+                side, anchor = ((1.0, "bottom-center"), (-1.0, "top-center"))[i]
+                title, place = law_name(flight.loop.controller.name), (0.0, 0.0, 0.8 * side * self.unit)
+                scene.add_label(f"{_ROOT}/{name}/label", title, position=place, anchor=anchor)
+        self.grab = self._add("vehicle0/grab", look.grip(1.6 * self.unit), ink.WHITE, opacity=0.001)
         self._trails = [deque[Array](maxlen=TRAIL + 1) for _ in session.flights]
-        self._events = 0  # that have been seen
+        self._shown = deque[Frame](maxlen=round(_SECONDS / session.period))
         self._moving: list[tuple[Obstacle, Any]] = []
         self._regions: list[tuple[SpaceLimit, Any]] = []
         self._add_space()
+        self.ground, self._events = 0.0, 0
+        self.reset()
 
     def show(self, frame: Frame) -> None:
         """Update the objects that change once per period."""
+        self._shown.append(frame)
         for i, (sample, horizon) in enumerate(zip(frame.samples, frame.horizons, strict=True)):
             if sample is None:
                 continue
-            lengths = 1.2 * self.unit * len(self._rotors) / self._weight * self._coefficient * np.square(sample.rotors)
+            lengths = self.unit * len(self._rotors) / self._weight * self._coefficient * np.square(sample.rotors)
             tips = self._rotors + np.outer(lengths, [0.0, 0.0, 1.0])
             self._arrows[i].points = np.stack([self._rotors, tips], axis=1).astype(np.float32)
             if frame.k % _EVERY == 0:
@@ -87,7 +123,8 @@ class Stage:
         if first is not None:
             at = first.segment.physics[-1, 1:4]
             self._goal.position = first.observation.reference[:3]
-            self._ground.position = (*np.round(at[:2]), 0.0)
+            self.ground = min(self.ground, at[2] + self._drop)
+            self._floor.position = (*(2.0 * self._square * np.round(at[:2] / (2.0 * self._square))), self.ground)
             self._hand.points = np.array([[at, at + 30.0 * self.unit / self._weight * frame.pull]], np.float32)
         self._hand.visible = bool(frame.pull.any())
         for obstacle, handle in self._moving:
@@ -97,23 +134,53 @@ class Stage:
 
     def pose(self, frame: Frame, share: float) -> Array:
         """Draw the vehicles at a fraction of the period; return the position of the first (3,) [m]."""
-        for sample, handle in zip(frame.samples, self.frames, strict=True):
+        for sample, handle, (shadow, plumb) in zip(frame.samples, self.frames, self._shadows, strict=True):
             if sample is not None:
                 physics = sample.segment.physics
                 row = physics[min(len(physics) - 1, int(share * len(physics)))]
                 handle.position, handle.wxyz = row[1:4], row[4:8]
+                foot = self.ground + 0.01 * self.unit
+                shadow.position, plumb.scale = (*row[1:3], foot), (1.0, 1.0, float(row[3] - foot))
         return np.asarray(self.frames[0].position)
 
     def reset(self) -> None:
         """Clear the scene for a new flight."""
-        self._events, self._ahead.points = 0, _course(self._session)
+        course = self._ahead.points = _course(self._session)
+        self.ground = min(0.0, float(course[..., 2].min())) + self._drop
+        self._events = 0  # that have been seen
+        self._shown.clear()
         for trail, path in zip(self._trails, self._paths, strict=True):
             trail.clear()
             path.points = np.zeros((TRAIL, 2, 3), np.float32)
 
-    def _line(self, name: str, points: Array, colour: str, thickness: float = 3.0) -> Any:
-        points = points.astype(np.float32)
-        return self._scene.add_line_segments(name, points, rgb(colour), thickness=thickness, thickness_units="screen")
+    def recorded(self, title: str) -> str:
+        """The flight so far as one page that plays it without a network; callable from any thread.
+
+        The scene moves instead of the camera: the first vehicle stays in the middle, and a viewer may turn it.
+        """
+        tape: Any = WebsockMessageHandler()  # takes the place of a server
+        tape.get_message_buffer = lambda: SimpleNamespace(push=lambda message: None)
+        record = tape.get_message_serializer(lambda message: message.include_in_scene_serialization)
+        camera = viser.InitialCameraConfig(tape.queue_message)
+        camera.position, camera.look_at, camera.fov = self.unit * VIEW, np.zeros(3), FIELD
+        lock = SimpleNamespace(_scene_lifecycle_lock=threading.RLock())
+        owner: Any = SimpleNamespace(_websock_connection=tape, client_id="", _viser_server=lock)
+        frames, idle = list(self._shown), SimpleNamespace()
+        stage = Stage(viser.SceneApi(owner, idle, idle), self._session)
+        for frame in frames:
+            stage.show(frame)
+            stage.root.position = -stage.pose(frame, 1.0)
+            record.insert_sleep(self._session.period)
+            clock.sleep(_REST)
+        return look.dressed(record.as_html(), title)
+
+    def _line(self, name: str, points: Array, colour: ink.Colour, thickness: float = 3.0) -> Any:
+        style = {"thickness": thickness, "thickness_units": "screen"}
+        return self._scene.add_line_segments(f"{_ROOT}/{name}", points.astype(np.float32), colour, **style)
+
+    def _add(self, name: str, mesh: Any, colour: tuple[float, ...], **style: Any) -> Any:
+        style = {"color": colour, "flat_shading": True, **FLAT, **style}
+        return self._scene.add_mesh_simple(f"{_ROOT}/{name}", mesh.vertices, mesh.faces, **style)
 
     def _add_space(self) -> None:
         course = _course(self._session).reshape(-1, 3)
@@ -121,50 +188,24 @@ class Stage:
         for limit in self._session.limits:
             shape = limit.shape if isinstance(limit, SpaceLimit) else None
             if isinstance(limit, SpaceLimit) and isinstance(shape, Region):
-                line = self._line(f"/regions/{limit.name}", shape.edges(low, high), LINES[5], 1.5)
+                line = self._line(f"regions/{limit.name}", shape.edges(low, high), _REGION, 1.5)
                 self._regions.append((limit, line))
             elif isinstance(shape, Obstacle):
-                name = f"/obstacles/{shape.name}"
-                handle = self._scene.add_frame(name, show_axes=False, position=shape.position)
-                for i, solid in enumerate(shape.solids):
-                    pose = {"position": solid.centre, "wxyz": solid.quaternion}
-                    _add_solid(self._scene, f"{name}/{i}", solid.kind, solid.size, color=rgb(OBSTACLE), **pose)
+                pose = {"position": shape.position}
+                handle = self._add(f"obstacles/{shape.name}", look.obstacle(shape), _rgb(OBSTACLE), **pose)
                 if shape.moves:
                     self._moving.append((shape, handle))
 
 
-def rgb(colour: str) -> tuple[int, int, int]:
-    """Return a colour of the palette in viser's format."""
+def _rgb(colour: str) -> ink.Colour:
     red, green, blue = bytes.fromhex(colour[1:])
     return red, green, blue
 
 
-def _add_airframe(scene: Any, name: str, vehicle: Vehicle, shade: str) -> None:
-    """The airframe as films show it, rotor discs transparent."""
-    model = compile_model(vehicle, visuals=True)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)  # at the origin, level
-    body = model.body(BODY).id
-    for geom in range(model.ngeom):
-        if model.body_rootid[model.geom_bodyid[geom]] == body and model.geom_group[geom] <= 2:
-            kind, turn = mujoco.mjtGeom(model.geom_type[geom]).name, np.empty(4)
-            mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
-            look = {"color": rgb(shade), "opacity": 0.35 if "disc" in model.geom(geom).name else None}
-            pose = {"position": data.geom_xpos[geom] - data.xpos[body], "wxyz": turn}
-            kind = kind.removeprefix("mjGEOM_").lower()
-            _add_solid(scene, f"{name}/part{geom}", kind, model.geom_size[geom], **look, **pose)
-
-
-def _add_solid(scene: Any, name: str, kind: str, size: Any, **look: Any) -> None:
-    """MuJoCo's shape of that name and size; a capsule without its caps."""
-    a, b, c = map(float, size)
-    if kind == "box":
-        scene.add_box(name, dimensions=(2.0 * a, 2.0 * b, 2.0 * c), **look, **FLAT)
-    elif kind in ("cylinder", "capsule"):
-        scene.add_cylinder(name, radius=a, height=2.0 * b, radial_segments=24, **look, **FLAT)
-    else:
-        scale = (a, b, c) if kind == "ellipsoid" else (a, a, a)
-        scene.add_icosphere(name, subdivisions=2 if kind == "sphere" else 1, scale=scale, **look, **FLAT)
+def _octahedron(radius: float) -> Array:
+    """(12, 2, 3) its edges, which hide no vehicle within."""
+    corners = radius * np.concatenate([np.eye(3), -np.eye(3)])
+    return np.array([pair for pair in combinations(corners, 2) if pair[0] @ pair[1] == 0.0])
 
 
 def _segments(points: Array, count: int) -> Array:
@@ -181,10 +222,3 @@ def _course(session: Session) -> Array:
     every = max(1, scenario.periods // _COURSE)
     rows = session.flights[0].loop.course.preview(0, scenario.periods)[::every, :3]
     return _segments(np.asarray(rows), _COURSE + 1)
-
-
-def _grid() -> Array:
-    lines = np.arange(-_WIDE / 2.0, _WIDE / 2.0 + 0.5)
-    along = [[(x, -_WIDE / 2.0, 0.0), (x, _WIDE / 2.0, 0.0)] for x in lines]
-    across = [[(-_WIDE / 2.0, y, 0.0), (_WIDE / 2.0, y, 0.0)] for y in lines]
-    return np.array([*along, *across])

@@ -1,0 +1,135 @@
+"""The look of films for viser's page: meshes of vehicles and obstacles, floor and sky, title and icon."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from html import escape
+from typing import Any, Final
+from urllib.parse import quote
+
+import mujoco
+import numpy as np
+import trimesh
+from PIL import Image
+
+from quadsim.sim.airframe import BODY
+from quadsim.space import Obstacle
+
+_SQUARES: Final = (144, 154, 162), (155, 165, 173)
+_SEAM: Final = (172, 180, 188)
+_REACH: Final = 100.0  # squares from the middle of the floor to where it has faded
+_ICON: Final = """<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32' fill='none' stroke-width='3'>
+<path d='M8 8 24 24M8 24 24 8' stroke='#7a7f87'/><path d='M2 24a6 6 0 1 0 12 0a6 6 0 1 0-12 0m16 0a6 6 0 1 0 12 0a6 6 0
+1 0-12 0' stroke='#1b7fc4'/><path d='M2 8a6 6 0 1 0 12 0a6 6 0 1 0-12 0m16 0a6 6 0 1 0 12 0a6 6 0 1 0-12 0'
+stroke='#f56b14'/></svg>"""
+_HEAD: Final = """<style>
+canvas[data-engine]{background:linear-gradient(#839dc0,#cad8e6 40%)}
+@media(prefers-color-scheme:dark){canvas[data-engine]{background:linear-gradient(#0e1621,#31435a 40%)}}
+</style><script>
+const dark = matchMedia("(prefers-color-scheme: dark)")
+window.__VISER_EMBED_CONFIG__ = {darkMode: dark.matches}
+dark.addEventListener("change", () => location.reload())
+</script></head>"""
+
+
+def dressed(page: str, title: str) -> str:
+    """Return viser's page with our title, icon and sky, in the theme of the system."""
+    icon = "data:image/svg+xml," + quote(_ICON)
+    for pattern, ours in (
+        ('data:image/svg[^"]*', icon),
+        ("<title>.*?</title>", f"<title>{escape(title)}</title>"),
+        ("</head>", _HEAD),
+    ):
+        page = re.sub(pattern, ours.replace("\\", r"\\"), page, count=1)
+    return page
+
+
+def airframe(model: mujoco.MjModel) -> Iterator[tuple[str, tuple[float, ...], trimesh.Trimesh]]:
+    """Yield the airframe level at the origin: each material, its colour (4,) and all parts made of it."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    body, parts = model.body(BODY).id, defaultdict[int, list[trimesh.Trimesh]](list)
+    for geom in range(model.ngeom):
+        if model.body_rootid[model.geom_bodyid[geom]] == body and model.geom_group[geom] <= 2:
+            kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+            place, turn = data.geom_xpos[geom] - data.xpos[body], data.geom_xmat[geom].reshape(3, 3)
+            parts[model.geom_matid[geom]].append(_solid(kind, model.geom_size[geom], place, turn))
+    for material, meshes in parts.items():
+        yield model.material(material).name, tuple(model.mat_rgba[material].tolist()), trimesh.util.concatenate(meshes)
+
+
+def obstacle(shape: Obstacle) -> trimesh.Trimesh:
+    """Return an obstacle, relative to its position."""
+    return trimesh.util.concatenate([_solid(s.kind, s.size, s.centre, s.turn) for s in shape.solids])
+
+
+def floor(square: float) -> bytes:
+    """Return a checkered floor that fades with distance, as a GLB; unlit, which a machine without a GPU feels.
+
+    What is transparent is drawn in the order of its bounding box's middle, from far to near: a vertex without a face,
+    far below, lets the floor be the first.
+    """
+    picture = np.empty((128, 128, 3), np.uint8)  # of two by two squares
+    picture[:], picture[:64, :64], picture[64:, 64:] = _SQUARES[1], _SQUARES[0], _SQUARES[0]
+    picture[[0, -1]] = picture[:, [0, -1]] = _SEAM
+    around = np.linspace(0.0, 2.0 * np.pi, 33)
+    points = _REACH * np.pad(np.stack([np.cos(around), np.sin(around)], axis=1), ((1, 0), (0, 1)))
+    points = np.concatenate([points, [(0.0, 0.0, -_REACH)]])
+    fading = np.ones((len(points), 4), np.float32)
+    fading[1:, 3] = 0.0
+
+    def finish(tree: dict[str, Any]) -> None:
+        tree["extensionsUsed"] = ["KHR_materials_unlit"]
+        tree["samplers"] = [{"minFilter": 9985, "magFilter": 9729}]  # not trilinear: twice the frames without a GPU
+        tree["textures"][0]["sampler"] = 0
+        tree["materials"][0]["extensions"] = {"KHR_materials_unlit": {}}
+        attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+        attributes["COLOR_0"] = attributes.pop("_color")
+
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.fromarray(picture), alphaMode="BLEND")
+    mesh = trimesh.Trimesh(
+        square * points,
+        [(0, i, i + 1) for i in range(1, len(points) - 2)],
+        visual=trimesh.visual.TextureVisuals(uv=points[:, :2] / 2.0, material=material),
+        vertex_attributes={"color": fading},
+        process=False,
+    )
+    data: bytes = mesh.export(file_type="glb", tree_postprocessor=finish)
+    return data
+
+
+def square_side(arm: float) -> float:
+    """Return the side of the floor's squares [m]: 1, 2 or 5 times a power of ten, up to four arms."""
+    power = 10.0 ** math.floor(math.log10(4.0 * arm))
+    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= 4.0 * arm)
+
+
+def grip(radius: float) -> trimesh.Trimesh:
+    """Return a sphere that is drawn last, by a vertex far above (see `floor`): it would hide the discs within."""
+    ball = trimesh.creation.icosphere(2, radius)
+    return trimesh.Trimesh(np.concatenate([ball.vertices, [(0.0, 0.0, 50.0 * radius)]]), ball.faces, process=False)
+
+
+def disc(radius: float) -> trimesh.Trimesh:
+    """Return a thin cylinder."""
+    return trimesh.creation.cylinder(radius, 0.01 * radius, sections=32)
+
+
+def _solid(kind: str, size: Any, centre: Any, turn: Any) -> trimesh.Trimesh:
+    """MuJoCo's shape of that kind and size [m]."""
+    a, b, c = map(float, size)
+    match kind:
+        case "box":
+            mesh = trimesh.creation.box(extents=(2.0 * a, 2.0 * b, 2.0 * c))
+        case "cylinder":
+            mesh = trimesh.creation.cylinder(a, 2.0 * b, sections=24)
+        case "capsule":
+            mesh = trimesh.creation.capsule(2.0 * b, a, count=(8, 8))
+        case _:
+            mesh = trimesh.creation.icosphere(2).apply_scale((a, b, c) if kind == "ellipsoid" else a)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, centre
+    return mesh.apply_transform(pose)
