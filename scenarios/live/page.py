@@ -11,6 +11,7 @@ import contextlib
 import io
 import math
 import socket
+import time as clock
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -29,13 +30,14 @@ from scenarios.live.controls import ControllerTab, Steering, Widgets, disturb
 from scenarios.live.look import dressed
 from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
-from scenarios.live.stage import FIELD, FLAT, VIEW, Stage
+from scenarios.live.stage import FIELD, VIEW, Stage
 from scenarios.schema.controllers import AnyController
 
 SECONDS: Final = 20.0  # of the plots
 _EVERY: Final = 4
 """Periods from one update of the panel to the next, a fifth of a second at 20 Hz; plots take two of these."""
 _SPEEDS: Final = ("0.1", "0.25", "0.5", "1", "2", "4")
+_STRANGE: Final = 5.0  # [s] after which a page's camera is where a person has turned it
 _PLOTS: Final = {
     "Position error [m]": ("x", "y", "z"),
     "Tilt and yaw error [deg]": ("tilt", "yaw"),
@@ -288,16 +290,19 @@ class Page:
             self._pace.waiting = self._pace.paused = False
             self._announce()
         upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
-        aim = np.array([0.0, 0.0, -0.36 * np.linalg.norm(self._away)]) * upright
+        aim = np.array([0.0, 0.0, -0.2 * np.linalg.norm(self._away)]) * upright
 
-        async def moved(camera: Any) -> None:
-            if not np.allclose(camera.position, 3.0):  # viser's own place, until the page hears of ours
+        connected = clock.monotonic()
+
+        async def moved(camera: Any) -> None:  # a page reports viser's own place before it hears of ours
+            away = camera.position - camera.look_at
+            if np.allclose(away, self._away, atol=0.1 * self.stage.unit) or clock.monotonic() > connected + _STRANGE:
                 self._aims.setdefault(client.client_id, aim)
 
         client.camera.on_update(moved)
         if upright:  # it has no Shift key, and viser's clicks of the scene ignore touches
             below = (0.0, 0.0, self.stage.ground - self.stage.unit)  # it would hide what is behind it
-            floor = client.scene.add_box("/tapped", dimensions=(200.0, 200.0, 1e-3), position=below, **FLAT)
+            floor = client.scene.add_box("/tapped", dimensions=(200.0, 200.0, 1e-3), position=below, opacity=1e-3)
             self._widgets.on(floor.on_click(), self._steering.clicked)
         watches = self._driver != client.client_id
         note = client.gui.add_html(readout.says(readout.WATCH, "watch"), order=-2.0, visible=watches)

@@ -47,7 +47,7 @@ STYLE: Final = """<style>
 .touch{display:none}
 @media (pointer:coarse){.touch{display:inline}.mouse{display:none}}
 @media (max-width:36em){
- .hints{top:12px;bottom:auto}
+ .hints{top:8px;bottom:auto;font-size:12px}.hints div{margin-top:4px;padding:2px 10px}
  .mantine-Paper-root[style*="20em"],.mantine-Paper-root [style*="20em"]{width:100%!important}
 }
 </style>"""
@@ -126,8 +126,8 @@ def _row(limit: Limit, audited: bool, frame: Frame) -> str:
     marks = "".join(_mark(limit, margin, i) for i, margin in enumerate(margins) if not math.isnan(margin))
     first, word, kind = margins[0], "", ""
     if math.isnan(first):
-        number, kind = "", "off"
-        word = f"from {limit.start:g} s" if audited and frame.time < limit.start else "ended"
+        kind = "off"
+        number = f"from {limit.start:g} s" if audited and frame.time < limit.start else "ended"
     else:
         decimals = max(0, 2 - math.floor(math.log10(limit.half_band)))
         number = f"{round(first, decimals) + 0.0:+.{decimals}f} {limit.unit}"

@@ -27,7 +27,7 @@ from quadsim.state import Array
 from scenarios.live import look
 from scenarios.live.session import Frame, Session
 
-VIEW: Final = np.array([-4.0, -6.0, 3.0])  # from the first vehicle to a camera at the start, in arm lengths
+VIEW: Final = np.array([-5.5, -8.0, 4.5])  # from the first vehicle to a camera at the start, in arm lengths
 FLAT: Final = {"cast_shadow": False, "receive_shadow": False}
 FIELD: Final = math.radians(45.0)  # of view, as in films
 TRAIL: Final = 200  # points of the flown path that stay
