@@ -79,9 +79,11 @@ class Widgets:
         """A button that submits an event, if this scenario can have it."""
         self.button(label, lambda event: self.session.submit(table()), disabled=bool(refused))
 
-    def group(self, label: str, acts: Mapping[str, Callable[[Any], Any]], shown: tuple[str, ...] = ()) -> Any:
+    def group(
+        self, label: str, acts: Mapping[str, Callable[[Any], Any]], shown: tuple[str, ...] = (), **look: Any
+    ) -> Any:
         """Buttons in a row."""
-        buttons = self.gui.add_button_group(label, shown or tuple(acts))
+        buttons = self.gui.add_button_group(label, shown or tuple(acts), **look)
         self.on(buttons.on_click, lambda event: acts[event.target.value](event))
         return buttons
 
@@ -107,8 +109,9 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
 
     def broken(event: Any) -> None:
         use("break")
-        wear[0].value = _BROKEN
-        session.submit(_wear(1, _BROKEN), subject=wear[0].label)
+        loss = 0.0 if wear[0].value else _BROKEN
+        wear[0].value, event.target.label = loss, "Repair the rotor" if loss else "Break a rotor"
+        session.submit(_wear(1, loss), subject=wear[0].label)
 
     widgets.on(stage.grab.on_drag("left"), pulled)
     widgets.button("Break a rotor", broken, hint=f"rotor 1 loses {100 * _BROKEN:.0f} % of its thrust")
@@ -120,7 +123,7 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     widgets.event("Gust for 1 s", lambda: _WIND | {"velocity": [*map(float, gust.value), 0.0]}, no_wind)
     wind = gui.add_vector2("Wind x, y [m/s]", (0.0, 0.0), **box)
     widgets.submits(wind, lambda value: {"type": "wind", "velocity": [*map(float, value), 0.0]})
-    gui.add_html(readout.says(no_wind, "why"))
+    gui.add_html(readout.says(f"No wind: {no_wind}" if no_wind else "", "why"))
     off = bool(no_load)
     factor = gui.add_slider("Mass factor", 0.7, 1.5, 0.01, 1.0, disabled=off)
     widgets.submits(factor, lambda value: {"type": "mass", "factor": float(value)})
@@ -189,6 +192,7 @@ class Steering:
         self.stop()
         x, y, z = (round(float(number), 2) for number in at)
         self._handle.position, self._place.value = np.array([x, y, z]), (x, y, z)
+        self._stage.mark.position, self._stage.mark.visible = (x, y, self._stage.ground), True
         self._session.submit({"type": "setpoint", "x": x, "y": y, "z": z}, subject="setpoint")
 
     def stop(self) -> None:
@@ -227,11 +231,11 @@ class ControllerTab:
         doing: Callable[[str], AbstractContextManager[None]],
     ) -> None:
         self._widgets, self._session, self._doing = widgets, widgets.session, doing
-        self._laws = {"as started": self._session.scenario.controller, **others}
+        self._laws = {"initial": self._session.scenario.controller, **others}
         self._fields: dict[str, tuple[Knob, Any]] = {}
         self._groups: list[Any] = []  # folders of fields
         chosen = widgets.gui.add_dropdown("Controller", tuple(self._laws))
-        widgets.button("Take this controller", lambda event: self._take(chosen.value))
+        widgets.button("Use this controller", lambda event: self._take(event, chosen.value))
         self._answer = widgets.gui.add_html("")
         self._folder = widgets.gui.add_folder(None)
         self._show(self._session.scenario.controller)
@@ -284,26 +288,27 @@ class ControllerTab:
         if handle.value == knob.value:
             return
         value: Value = handle.value
-        if await self._replace({path: value}, f"{path} = {value}"):
+        if await self._replace(event, {path: value}, f"{path} = {value}, was {knob.value}"):
             self._fields[path] = dataclasses.replace(knob, value=value), handle
         else:
             handle.value = knob.value
 
-    async def _take(self, name: str) -> None:
+    async def _take(self, event: Any, name: str) -> None:
         spec = self._laws[name]
-        if await self._replace(plain(spec), name):
+        if await self._replace(event, plain(spec), name):
             self._show(spec)
 
-    async def _replace(self, fields: Mapping[str, Any], what: str) -> bool:
+    async def _replace(self, event: Any, fields: Mapping[str, Any], what: str) -> bool:
         """Build a controller in the background and let it take over; if that fails, report why."""
         with self._doing("building the controller"):
             try:
                 successor = await asyncio.to_thread(self._session.successor, fields)
             except InputError as error:
-                self._answer.content = readout.says(f"Refused, the controller before flies on: {error}", "bad")
+                self._answer.content = readout.says(f"Refused, the previous controller stays active: {error}", "bad")
+                event.client.add_notification("Refused", str(error), color="red")  # where the panel is scrolled
                 return False
         self._session.submit({"type": "controller", "fields": dict(fields)}, successor=successor)
-        self._answer.content = readout.says(f"Flies from the next period on: {what}")
+        self._answer.content = readout.says(f"Active from the next period on: {what}")
         return True
 
 

@@ -22,21 +22,21 @@ TURNED: Final = {
         "weights.attitude": "attitude [1/rad²]",
         "weights.velocity": "velocity [s²/m²]",
     },
-    "Effort weights": {
-        "input_weights.speed": "speeds [s²/rad²]",
-        "move_weight": "moves [s²/rad²]",
+    "Effort weights [1/(rad/s)²]": {
+        "input_weights.speed": "speeds u",
+        "move_weight": "steps Δu",
         "weights.input": "input",
         "weights.move": "moves",
     },
     "Bounds": {
         "output_bounds.roll": "roll [deg]",
         "output_bounds.pitch": "pitch [deg]",
-        "input_bounds.slew": "slew [rad/s]",
+        "input_bounds.slew": "step Δu [rad/s]",
         "tilt": "tilt [deg]",
         "velocity": "velocity [m/s]",
     },
-    "Robustness": {"soft.linear": "penalty", "rotor_lag": "rotor lag [s]"},
-    "Solver": {"horizon": "horizon N", "iterations": "iterations"},
+    "Robustness": {"soft.linear": "slack weight", "rotor_lag": "rotor lag [s]"},
+    "Solver": {"horizon": "N [periods]", "iterations": "iterations"},
 }
 """The fields that people turn, with their labels, by group; the rest are in "All fields"."""
 

@@ -21,9 +21,11 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
+from quadsim.controller import law_name
 from quadsim.errors import InputError, OutputError, ParameterError
 from quadsim.report.figure import LINES
 from quadsim.rotation import quaternion_to_euler
+from quadsim.sim.physics import FlownPeriod
 from scenarios.flight import Flight
 from scenarios.live import readout
 from scenarios.live.controls import ControllerTab, Steering, Widgets, disturb
@@ -102,7 +104,8 @@ class Page:
         self._factor = 1.0
         self._activity = ""  # what is done beside the flight
         self._used: set[str] = set()  # hints
-        self._limits = session.limits  # of the flight's start, so that no row goes
+        self._constraints = readout.Constraints(session.limits)
+        self._names = [law_name(flight.loop.controller.name) for flight in session.flights]
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         self._server.gui.set_panel_label(title)
         self._server.gui.main_panel.dock_right()
@@ -126,6 +129,7 @@ class Page:
         """Show a flown period."""
         self._frame, self._factor = frame, factor
         self._remember(frame)
+        self._constraints.add(frame)
         with _unless_gone():
             for reason in frame.refused:
                 for client in self._server.get_clients().values():
@@ -136,9 +140,9 @@ class Page:
                 self._announce()
                 self._show_numbers(frame)
                 audited = {limit.name for limit in self._session.limits}
-                self._margins.content = readout.constraint_rows(self._limits, audited, frame)
+                self._margins.content = self._constraints.rows(frame, audited)
             if (frame.k % (2 * _EVERY) == 0 or self._pace.paused) and len(self._history) > 1:
-                table = np.array(self._history)[::2].T  # plots are the most of what is sent
+                table = np.array(self._history).round(3)[::2].T  # plots are the most of what is sent
                 first = 1
                 for plot, names in zip(self._plots, _PLOTS.values(), strict=True):
                     plot.data = (table[0], *table[first : first + len(names)])
@@ -160,6 +164,7 @@ class Page:
             self._numbers.content = readout.says(f"{reason}. Reset begins anew; Save keeps this flight.", "bad")
             return
         self._history.clear()
+        self._constraints.reset()
         self._frame = None
         self.stage.reset()
         for part in (self._widgets, self._steering, self._controller):
@@ -171,15 +176,15 @@ class Page:
     def _build(self, others: Mapping[str, AnyController]) -> None:
         gui = self._server.gui
         gui.add_html(readout.STYLE)
-        self._overlay = gui.add_html(readout.hints(self._used))
+        self._overlay = gui.add_html(readout.hints(self._used, self._names))
         self._headline = gui.add_html("")
         self._numbers = gui.add_html(readout.numbers(None))
-        gui.add_html(readout.legend(flight.loop.controller.name for flight in self._session.flights))
         self._margins = gui.add_html("")
         with gui.add_folder("Run"):
             flight = {"Pause": self._toggle, "Step": self._step, "Reset": self._reset}
             self._flight = self._widgets.group("Flight", flight | {"Resume": self._toggle}, tuple(flight))
-            self._widgets.group("Keep", {"Save": self._keep, "Scenario": self._download, "Scene": self._scene})
+            outputs = {"Save": self._keep, "Scenario file": self._download, "3-D replay": self._scene}
+            self._widgets.group("Output", outputs, hint=readout.OUTPUT)
             speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1", hint="simulated over real time")
             self._widgets.on(speed.on_update, lambda event: setattr(self._pace, "speed", float(event.target.value)))
             self._follow = gui.add_checkbox("Camera follows", True)
@@ -233,7 +238,7 @@ class Page:
         """Take a hint away that a person has followed."""
         if hint not in self._used:
             self._used.add(hint)
-            self._overlay.content = readout.hints(self._used)
+            self._overlay.content = readout.hints(self._used, self._names)
 
     async def _ask(self, question: Callable[[Session], T]) -> T:
         """Return a function of the session, called between two periods in the flying thread."""
@@ -265,7 +270,7 @@ class Page:
         with self._doing("saving"):
             try:
                 flight = await self._ask(lambda session: session.flight())
-                result = f"saved: {await asyncio.to_thread(self._save, flight)}"
+                result = f"saved: {await asyncio.to_thread(self._save, flight)}, on the machine that flies"
             except (InputError, OutputError) as error:
                 result = f"not saved: {error}"
         with _unless_gone():
@@ -305,7 +310,7 @@ class Page:
             floor = client.scene.add_box("/tapped", dimensions=(200.0, 200.0, 1e-3), position=below, opacity=1e-3)
             self._widgets.on(floor.on_click(), self._steering.clicked)
         watches = self._driver != client.client_id
-        note = client.gui.add_html(readout.says(readout.WATCH, "watch"), order=-2.0, visible=watches)
+        note = client.gui.add_html(readout.WATCH, order=-2.0, visible=watches)
         take = client.gui.add_button("Take the controls", order=-1.0, visible=watches)
         self._takes[client.client_id] = [note, take]
 
@@ -338,18 +343,25 @@ class Page:
         observed, physics = sample.observation, sample.segment.physics[-1]
         error = observed.truth[[0, 2, 4]] - observed.reference[:3]
         yaw = quaternion_to_euler(physics[None, 4:8])[0, 2] - observed.reference[3]
-        up = 1.0 - 2.0 * (physics[5] ** 2 + physics[6] ** 2)
-        tilt = math.degrees(math.acos(min(1.0, max(-1.0, up))))
+        tilt, _ = _state(sample)
         yaw = math.degrees(math.remainder(yaw, 2.0 * math.pi))
         self._history.append((frame.time, *error, tilt, yaw, *sample.speeds, 1e3 * sample.step_s))
 
     def _show_numbers(self, frame: Frame) -> None:
-        sample, others = frame.samples[0], [flight.loop for flight in self._session.flights[1:]]
-        if sample is not None and self._history:
-            lost = [f"{other.controller.name} was lost: {other.reason}" for other in others if other.reason is not None]
-            now = self._history[-1]
-            error = float(np.linalg.norm(now[1:4]))
-            self._numbers.content = readout.numbers(frame, sample, tilt=now[4], error=error, lost=lost)
+        others = [flight.loop for flight in self._session.flights[1:]]
+        lost = [
+            f"{law_name(other.controller.name)} lost: {other.reason}" for other in others if other.reason is not None
+        ]
+        states = [_state(sample) for sample in frame.samples if sample is not None]
+        self._numbers.content = readout.numbers(frame, states, lost)
+
+
+def _state(sample: FlownPeriod) -> tuple[float, float]:
+    """Return a vehicle's largest tilt within the period [deg], and its position error at its start [m]."""
+    observed, physics = sample.observation, sample.segment.physics
+    up = 1.0 - 2.0 * (physics[:, 5] ** 2 + physics[:, 6] ** 2)
+    tilt = math.degrees(math.acos(np.clip(up.min(), -1.0, 1.0)))
+    return tilt, float(np.linalg.norm(observed.truth[[0, 2, 4]] - observed.reference[:3]))
 
 
 @contextlib.contextmanager

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Sequence
 from html import escape
 from typing import Final
 
 from quadsim.controller import OPTIMAL
 from quadsim.flight.audit import Limit
 from quadsim.report.figure import BOUND, line_colour
-from quadsim.sim.physics import FlownPeriod
 from scenarios.live.session import Frame
 
-NEAR: Final = 0.1  # share of a bound's half band within which the row says so
+NEAR: Final = 0.1  # share of a bound's half band within which the row is marked
 _SHOWN: Final = 1.2  # bounds to the right end of a bar: what is beyond the bound shows too
 HINTS: Final = {
     "pull": "<b>Drag the drone</b> to pull it",
@@ -21,35 +20,44 @@ HINTS: Final = {
     "break": "<b>Break a rotor</b> with the button in the panel",
 }
 
-WATCH: Final = "You watch; another page has the controls."
+WATCH: Final = (
+    "<style>[role=tabpanel],.mantine-Button-root[data-variant=outline]{opacity:.45}</style>"
+    '<div class="q"><div class="watch">You watch; another page has the controls.</div></div>'
+)
+OUTPUT: Final = (
+    "Save: the run directory, with tables, figures and a recording. Scenario file: flies this session again, bit for "
+    "bit. 3-D replay: an HTML page that plays."
+)
 STEER: Final = (
     "Type a set-point, drag its arrows, or "
     '<span class="touch">tap the floor.</span><span class="mouse">shift-click the floor. '
     "Keys W, S, A, D, R, F fly the set-point along x, y and z; X stops it.</span>"
 )
 
-STYLE: Final = """<style>
-.q{font:12px/1.5 system-ui,sans-serif;padding:0 .8em}.q b,.q .n{font-variant-numeric:tabular-nums}
-.q .line{height:1.5em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}
-.chip{display:inline-block;padding:0 .6em;border-radius:1em;color:#fff;background:#2f7d4f;font-weight:600}
-.chip.paused{background:#6b7280}.chip.busy{background:#a85f00}.chip.ended{background:#dc2f38}
-.q table{width:100%;border-collapse:collapse;table-layout:fixed}.q tr{height:1.6em}
-.q td,.q th{padding:0 4px 0 0;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}
-.q th{text-align:left;font-weight:400;opacity:.65}.q .n{text-align:right;padding-right:8px}
-.q .track{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}
-.q .track i{position:absolute;top:0;bottom:0}
-.q .bad{color:#dc2f38;font-weight:600}.q .near{font-weight:600}.q .off{opacity:.55}
-.q .watch{background:#a85f00;color:#fff;padding:.4em .7em;border-radius:4px;margin:.4em 0;white-space:normal}
-.q .why{opacity:.75;padding-bottom:.5em}
-.hints,.over{position:fixed;left:16px;z-index:5;pointer-events:none;font:14px/1.4 system-ui,sans-serif}
-.hints{bottom:16px}.over{top:16px}
-.hints div{margin-top:6px;padding:4px 12px;border-radius:1em;background:#1f2937d9;color:#fff;width:max-content}
-.touch{display:none}
-@media (pointer:coarse){.touch{display:inline}.mouse{display:none}}
-@media (max-width:36em){
- .hints{top:8px;bottom:auto;font-size:12px}.hints div{margin-top:4px;padding:2px 10px}
- .mantine-Paper-root[style*="20em"],.mantine-Paper-root [style*="20em"]{width:100%!important}
-}
+STYLE: Final = f"""<style>
+.q{{font:12px/1.5 system-ui,sans-serif;padding:0 .8em}}.q b,.q .n{{font-variant-numeric:tabular-nums}}
+.q .line{{height:1.5em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}}
+.chip{{display:inline-block;padding:0 .6em;border-radius:1em;color:#fff;background:#2f7d4f;font-weight:600}}
+.chip.paused{{background:#6b7280}}.chip.busy{{background:#a85f00}}.chip.ended{{background:{BOUND}}}
+.q table{{width:100%;border-collapse:collapse;table-layout:fixed}}.q tr{{height:1.6em}}
+.q td,.q th{{padding:0 4px 0 0;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}}
+.q th{{text-align:left;font-weight:400;opacity:.7}}.q .n{{text-align:right}}
+.q .track{{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}}
+.q .track i{{position:absolute;top:0;bottom:0}}
+.q .bad{{color:{BOUND};font-weight:600}}.q .near{{font-weight:600}}.q .off{{opacity:.55}}
+.q .watch{{background:#a85f00;color:#fff;padding:.4em .7em;border-radius:4px;margin:.4em 0}}
+.q .why{{opacity:.75;padding-bottom:.5em}}
+.hints,.over{{position:fixed;left:16px;z-index:5;pointer-events:none;font:14px/1.4 system-ui,sans-serif}}
+.hints{{bottom:16px}}.over{{top:16px}}
+.hints div{{margin-top:6px;padding:4px 12px;border-radius:1em;background:#1f2937d9;color:#fff;width:max-content}}
+.hints .key{{font-size:12px}}.touch{{display:none}}
+@media (pointer:coarse){{
+ .touch{{display:inline}}.mouse{{display:none}}.mantine-Button-root{{min-height:36px}}
+}}
+@media (max-width:36em){{
+ .hints{{top:8px;bottom:auto;font-size:12px}}.hints div{{margin-top:4px;padding:2px 10px}}.hints .key{{display:none}}
+ .mantine-Paper-root[style*="20em"],.mantine-Paper-root [style*="20em"]{{width:100%!important}}
+}}
 </style>"""
 
 
@@ -63,84 +71,111 @@ def says(text: str, mark: str = "") -> str:
     return block(escape(text), mark) if text else ""
 
 
-def hints(used: Collection[str]) -> str:
-    """Return the hints over the scene that have not been used."""
+def hints(used: Collection[str], names: Sequence[str]) -> str:
+    """Return the hints over the scene that have not been used, and the key to its colours."""
     left = "".join(f"<div>{text}</div>" for name, text in HINTS.items() if name not in used)
-    return f'<div class="hints">{left}</div>'
+    if len(names) == 1:
+        key = "octahedron: set-point; blue: flown; green: predicted; arrows: thrusts; orange arm: front"
+    else:
+        key = f"octahedron: set-point; blue: {escape(names[0])}; orange: {escape(names[1])}; inputs act on both"
+    return f'<div class="hints">{left}<div class="key">{key}</div></div>'
 
 
 def headline(state: str, kind: str, frame: Frame | None, factor: float) -> str:
     """Return what the flight does now, its time and its speed."""
     time = "" if frame is None else f" <b>{frame.time:.2f} s</b>"
-    speed = f", {factor:.2f} of real time" if frame is not None and kind == "flying" else ""
+    speed = f", real-time factor {factor:.2f}" if frame is not None and kind == "flying" else ""
     chip = f'<span class="chip {kind}">{escape(state)}</span>'
     over = "" if kind == "flying" else f'<div class="over">{chip}</div>'  # seen also where the panel is scrolled
     return block(f"{chip}{time}{speed}", "line") + over
 
 
-def numbers(
-    frame: Frame | None,
-    sample: FlownPeriod | None = None,
-    *,
-    tilt: float = 0.0,
-    error: float = 0.0,
-    lost: Collection[str] = (),
-) -> str:
-    """Return the answer of the controller and the state of the first vehicle, and why the other one was lost."""
+def numbers(frame: Frame | None, states: Sequence[tuple[float, float]] = (), lost: Collection[str] = ()) -> str:
+    """Return the answer of the first vehicle's controller, the `states` of the vehicles, and why the other was lost.
+
+    A state is tilt [deg] and position error [m].
+    """
+    sample = None if frame is None else frame.samples[0]
     if frame is None or sample is None:
-        return block("&nbsp;", "line") * 3
-    command = sample.command
-    answer = f"{escape(command.status)} ({escape(command.answered_by)})"
+        return block("&nbsp;", "line") * 4
+    command, late = sample.command, ' <span class="bad">late</span>' if sample.missed else ""
+    solved = f"QP {escape(command.status)} by {escape(command.answered_by)}"
     if command.status not in OPTIMAL or command.fallback:
-        answer = f'<span class="bad">{answer}, fallback {command.fallback}</span>'
-    late = ' <span class="bad">late</span>' if sample.missed else ""
+        solved = f'<span class="bad">QP {escape(command.status)}, fallback {command.fallback}</span>'
+    elif not command.active:
+        solved = f"no bound active, by {escape(command.answered_by)}"
+    active = f", {command.active} bounds active" if command.active else ""
+    weak = [f"rotor {i}: {100 * (share - 1):.0f} %" for i, share in enumerate(frame.health, 1) if share < 1.0]
     rows = [
-        f"MPC: {answer}, {command.active} bounds active",
-        f"step <b>{1e3 * sample.step_s:.1f}</b> ms{late}, your pull <b>{math.hypot(*frame.pull):.1f}</b> N",
-        f"tilt <b>{tilt:.1f}</b> deg, position error <b>{error:.2f}</b> m",
+        f"MPC: {solved}{active}",
+        f"solved in <b>{1e3 * sample.step_s:.1f}</b> ms{late}; pull <b>{math.hypot(*frame.pull):.1f}</b> N"
+        + "".join(f'; <span class="bad">{text}</span>' for text in weak),
+        _each("tilt", [tilt for tilt, _ in states], "deg", 1),
+        _each("position error", [error for _, error in states], "m", 2),
         *(f'<span class="bad">{escape(text)}</span>' for text in lost),
     ]
     return "".join(block(row, "line") for row in rows)
 
 
-def legend(names: Iterable[str]) -> str:
-    """Return which colour is whose, with two vehicles."""
-    marks = [f'<b style="color:{line_colour(i)}">●</b> {escape(name)}' for i, name in enumerate(names)]
-    return block(" &nbsp; ".join(marks), "line") if len(marks) > 1 else ""
+def _each(name: str, values: Sequence[float], unit: str, decimals: int) -> str:
+    dots = [_dot(i) if len(values) > 1 else "" for i in range(len(values))]
+    return f"{name} " + " ".join(f"{dots[i]}<b>{value:.{decimals}f}</b>" for i, value in enumerate(values)) + f" {unit}"
 
 
-def constraint_rows(limits: tuple[Limit, ...], audited: Collection[str], frame: Frame) -> str:
-    """Return a row per limit: the share of its bound that each vehicle uses, and the margin of the first one.
-
-    `limits` are those of the flight's start, `audited` names those that still apply.
-    """
-    head = (
-        '<tr><th style="width:27%">constraint<th>bound used<th class="n" style="width:27%">margin<th style="width:17%">'
-    )
-    rows = [_row(limit, limit.name in audited, frame) for limit in limits]
-    return block(f"<table>{head}{''.join(rows)}</table>") if rows else ""
+def _dot(vehicle: int) -> str:
+    return f'<span style="color:{line_colour(vehicle)}">●</span> '
 
 
-def _row(limit: Limit, audited: bool, frame: Frame) -> str:
-    margins = [margins.get(limit.name, math.nan) for margins in frame.margins]
-    marks = "".join(_mark(limit, margin, i) for i, margin in enumerate(margins) if not math.isnan(margin))
-    first, word, kind = margins[0], "", ""
-    if math.isnan(first):
-        kind = "off"
-        number = f"from {limit.start:g} s" if audited and frame.time < limit.start else "ended"
-    else:
-        decimals = max(0, 2 - math.floor(math.log10(limit.half_band)))
-        number = f"{round(first, decimals) + 0.0:+.{decimals}f} {limit.unit}"
-        if is_violated(limit, first):
-            word = kind = "bad"
-            word = "violated"
-        elif first <= NEAR * limit.half_band:
-            word = kind = "near"
-    bound = f'<i style="left:{100.0 / _SHOWN:.1f}%;width:2px;background:{BOUND}"></i>'
-    return (
-        f'<tr class="{kind}"><td title="{escape(limit.name)}">{escape(limit.name)}</td>'
-        f'<td><div class="track">{marks}{bound}</div></td><td class="n">{escape(number)}</td><td>{word}</td></tr>'
-    )
+class Constraints:
+    """A row per limit of the flight's start: the share of its bound that each vehicle uses, and margins."""
+
+    def __init__(self, limits: tuple[Limit, ...]) -> None:
+        self._limits = limits
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the worst margins."""
+        self._worst: dict[tuple[str, int], float] = {}
+
+    def add(self, frame: Frame) -> None:
+        """Take a period's margins into account."""
+        for i, margins in enumerate(frame.margins):
+            for name, margin in margins.items():
+                if not math.isnan(margin):
+                    self._worst[name, i] = min(margin, self._worst.get((name, i), math.inf))
+
+    def rows(self, frame: Frame, audited: Collection[str]) -> str:
+        """Return the table; `audited` names the limits that still apply."""
+        both = len(frame.margins) > 1
+        titles = [f"{_dot(0)}worst", f"{_dot(1)}worst"] if both else ["margin", "worst"]
+        heads = "".join(f'<th class="n" style="width:22%">{title}' for title in titles)
+        head = f'<tr><th style="width:30%">constraint<th>utilisation{heads}'
+        rows = [self._row(limit, limit.name in audited, frame) for limit in self._limits]
+        return block(f"<table>{head}{''.join(rows)}</table>") if rows else ""
+
+    def _row(self, limit: Limit, audited: bool, frame: Frame) -> str:
+        margins = [margins.get(limit.name, math.nan) for margins in frame.margins]
+        marks = "".join(_mark(limit, margin, i) for i, margin in enumerate(margins) if not math.isnan(margin))
+        worst = [self._worst.get((limit.name, i), math.nan) for i in range(len(margins))]
+        kind = "near" if margins[0] <= NEAR * limit.half_band else ""
+        cells = [_number(limit, margin) for margin in (worst if len(margins) > 1 else [margins[0], *worst])]
+        if math.isnan(margins[0]):
+            kind = "off"
+            cells[0] = f"from {limit.start:g} s" if audited and frame.time < limit.start else "ended"
+        bound = f'<i style="left:{100.0 / _SHOWN:.1f}%;width:2px;background:{BOUND}"></i>'
+        numbers = "".join(f'<td class="n">{cell}</td>' for cell in cells)
+        name = f"{escape(limit.name)} [{escape(limit.unit)}]"
+        track = f'<div class="track">{marks}{bound}</div>'
+        return f'<tr class="{kind}"><td title="{name}">{name}</td><td>{track}</td>{numbers}</tr>'
+
+
+def _number(limit: Limit, margin: float) -> str:
+    """Return a margin, red where it is a violation."""
+    if math.isnan(margin):
+        return ""
+    decimals = max(0, 2 - math.floor(math.log10(limit.half_band)))
+    text = f"{round(margin, decimals) + 0.0:+.{decimals}f}"
+    return f'<span class="bad" title="violated">{text}</span>' if is_violated(limit, margin) else text
 
 
 def is_violated(limit: Limit, margin: float) -> bool:
@@ -151,7 +186,9 @@ def is_violated(limit: Limit, margin: float) -> bool:
 def _mark(limit: Limit, margin: float, vehicle: int) -> str:
     """Return a vehicle's mark: the first one's bar grows towards the bound, the other's is a stroke at its end."""
     share = min(max(1.0 - margin / limit.half_band, 0.0), _SHOWN) / _SHOWN
-    colour = BOUND if is_violated(limit, margin) else line_colour(vehicle)
     if vehicle == 0:
+        colour = BOUND if is_violated(limit, margin) else line_colour(0)
         return f'<i style="left:0;width:{100.0 * share:.1f}%;background:{colour}"></i>'
-    return f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{colour}"></i>'
+    return (
+        f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{line_colour(vehicle)};z-index:1"></i>'
+    )

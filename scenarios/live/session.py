@@ -6,6 +6,7 @@ scenario and on the periods at which they act alone.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -20,8 +21,10 @@ from quadsim.assets import read_toml
 from quadsim.errors import FlightError, InputError, ParameterError
 from quadsim.fields import Fraction, Vector
 from quadsim.flight.audit import Limit
+from quadsim.sim.effects.rotors import RotorLoss
 from quadsim.sim.physics import FlownPeriod
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
+from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
 from scenarios.flight_events import Successor
@@ -96,8 +99,9 @@ class Frame:
     time: float  # when it began [s]
     samples: tuple[FlownPeriod | None, ...]
     margins: tuple[Mapping[str, float], ...]  # see `Rollout.margins`
-    horizons: tuple[Array | None, ...]  # (N + 1, 3) predicted positions [m], from the present one on
+    horizons: tuple[Array | None, ...]  # (N, 3) predicted positions [m], from the period's end on
     pull: Array  # (3,) the force of the person's hand [N]; zero without one
+    health: Array  # (4,) share of its thrust that each rotor of the first vehicle has left
     refused: tuple[str, ...]  # why inputs were refused
 
 
@@ -205,8 +209,19 @@ class Session:
             margins=all_margins,
             horizons=horizons,
             pull=pull,
+            health=self._health(),
             refused=tuple(refused),
         )
+
+    def _health(self) -> Array:
+        """(4,) share of its thrust that each rotor has, by the scenario's events and by wear."""
+        result, now = np.ones(N_ROTORS), self.flights[0].loop.time
+        for event in self.scenario.events:
+            if isinstance(event, RotorLoss) and event.at <= now < event.at + (event.duration or math.inf):
+                result[event.rotor - 1] *= 1.0 - event.loss
+        for rotor, loss in self._held.wear.items():
+            result[rotor - 1] *= 1.0 - loss
+        return result
 
     def successor(self, fields: Mapping[str, Any]) -> Successor:
         """Build a controller for the first flight with some fields changed; callable from any thread.
@@ -340,4 +355,4 @@ def _horizon(flight: Rollout, sample: FlownPeriod) -> Array | None:
         return None
     state = sample.observation.state
     path: Array = predict(state[None], sample.command.plan[None])[0][:, list(POSITION)]
-    return np.concatenate([state[None, list(POSITION)], path])
+    return np.concatenate([sample.segment.physics[-1:, 1:4], path[1:]])  # the period that is shown is over

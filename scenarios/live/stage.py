@@ -48,6 +48,7 @@ class Stage:
         unit: the vehicle's arm length [m].
         frames: viser's frame of each vehicle.
         grab: what the mouse takes hold of.
+        mark: a spot on the floor.
         ground: height of the floor, below the whole flight [m].
     """
 
@@ -70,6 +71,7 @@ class Stage:
         self._ahead = self._line("reference", _course(session), target, 2.0)
         self._goal = self._line("goal", _octahedron(0.5 * self.unit), target, 2.5)
         self._hand = self._line("hand", np.zeros((1, 2, 3)), _rgb(BOUND), 5.0)
+        self._thrusts: list[ink.Colour] = []  # colours
         self.frames, self._arrows, self._horizons, self._paths, self._shadows = [], [], [], [], []
         for i, flight in enumerate(session.flights):
             name, length, colour = f"vehicle{i}", flight.loop.controller.horizon, _rgb(line_colour(i))
@@ -79,16 +81,18 @@ class Stage:
                 self._add(f"{name}/{material}", mesh, tint, opacity=None if alpha == 1.0 else alpha)
             arrows, sizes = np.zeros((len(self._rotors), 2, 3)), (0.04 * self.unit, 0.09 * self.unit, 0.2 * self.unit)
             shape = dict(zip(("shaft_radius", "head_radius", "head_length"), sizes, strict=True))
-            self._arrows.append(scene.add_arrows(f"{_ROOT}/{name}/thrust", arrows, ink.BLUE, **shape))
+            self._thrusts.append(ink.BLUE if alone else colour)
+            self._arrows.append(scene.add_arrows(f"{_ROOT}/{name}/thrust", arrows, self._thrusts[i], **shape))
             self._horizons.append(self._line(f"horizon{i}", np.zeros((length, 2, 3)), ink.GREEN if alone else colour))
             self._paths.append(self._line(f"path{i}", np.zeros((TRAIL, 2, 3)), colour))
             shadow = self._add(f"shadow{i}", look.disc(0.9 * self.unit), _SHADOW)
             plumb = self._line(f"shadow{i}/plumb", np.array([[(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)]]), _SHADOW, 1.0)
             self._shadows.append((shadow, plumb))
             if not alone:
-                side, anchor = ((1.0, "bottom-center"), (-1.0, "top-center"))[i]
-                title, place = law_name(flight.loop.controller.name), (0.0, 0.0, 0.8 * side * self.unit)
-                scene.add_label(f"{_ROOT}/{name}/label", title, position=place, anchor=anchor)
+                title, top = law_name(flight.loop.controller.name), (0.0, 0.0, (2.2 + 0.6 * i) * self.unit)
+                scene.add_label(f"{_ROOT}/{name}/label", title, position=top, anchor="bottom-center")
+                self._line(f"{name}/pole", np.array([[(0.0, 0.0, 0.0), top]]), colour, 1.5)
+        self.mark = self._add("mark", look.disc(0.5 * self.unit), target, visible=False)
         self.grab = self._add("vehicle0/grab", look.grip(1.6 * self.unit), ink.WHITE, opacity=0.001)
         self._trails = [deque[Array](maxlen=TRAIL + 1) for _ in session.flights]
         self._shown = deque[Frame](maxlen=round(_SECONDS / session.period))
@@ -104,7 +108,10 @@ class Stage:
         for i, (sample, horizon) in enumerate(zip(frame.samples, frame.horizons, strict=True)):
             if sample is None:
                 continue
-            lengths = self.unit * len(self._rotors) / self._weight * self._coefficient * np.square(sample.rotors)
+            thrusts = self._coefficient * frame.health * np.square(sample.rotors)
+            lengths = self.unit * len(self._rotors) / self._weight * thrusts
+            sound = np.where(frame.health[:, None] == 1.0, self._thrusts[i], _rgb(BOUND))
+            self._arrows[i].colors = sound.astype(np.uint8)
             tips = self._rotors + np.outer(lengths, [0.0, 0.0, 1.0])
             self._arrows[i].points = np.stack([self._rotors, tips], axis=1).astype(np.float32)
             if frame.k % _EVERY == 0:
@@ -147,7 +154,7 @@ class Stage:
         """Clear the scene for a new flight."""
         course = self._ahead.points = _course(self._session)
         self.ground = min(0.0, float(course[..., 2].min())) + self._drop
-        self._events = 0  # that have been seen
+        self._events, self.mark.visible = 0, False  # those that have been seen
         self._shown.clear()
         for trail, path in zip(self._trails, self._paths, strict=True):
             trail.clear()

@@ -197,7 +197,7 @@ def tab(browser: Any, served: Served) -> Iterator[Any]:
     clock.sleep(0.3)
     assert served.session.k == 0  # nobody looks
     tab.goto(served.page.address)
-    tab.get_by_text("of real time").wait_for()
+    tab.get_by_text("real-time factor").wait_for()
     yield tab
     tab.close()
 
@@ -261,14 +261,14 @@ def test_a_slider_turns(tab: Any, served: Served) -> None:
 
 def test_a_controller_is_changed_in_flight_and_one_that_cannot_be_is_refused(tab: Any, served: Served) -> None:
     tab.get_by_role("tab", name="Controller").click()
-    field = tab.locator("label", has_text="horizon").locator("xpath=ancestor::div[.//input][1]").locator("input")
+    field = tab.locator("label", has_text="N [periods]").locator("xpath=ancestor::div[.//input][1]").locator("input")
     field.fill("12")
     field.press("Enter")
     served.wait(lambda: served.session.flights[0].loop.controller.horizon == 12)
     roll = tab.locator("label", has_text="roll [deg]").locator("xpath=ancestor::div[.//input][1]").locator("input")
     roll.last.fill("-1")  # [-5, -1]
     roll.last.press("Enter")
-    tab.get_by_text("a range that contains 0, as in hover").wait_for()
+    tab.get_by_text("a range that contains 0, as in hover").first.wait_for()
     served.wait(lambda: roll.last.input_value() == "5")  # what flies on
     assert served.session.flights[0].loop.controller.horizon == 12
     assert served.session.reason is None
@@ -282,13 +282,13 @@ def test_pause_stands_still_and_save_keeps_what_flies_again_to_the_bit(tab: Any,
     tab.get_by_role("button", name="Step", exact=True).click()
     served.wait(lambda: served.session.k == k + 1)
     tab.get_by_role("button", name="Save", exact=True).click()
-    tab.get_by_text("saving", exact=True).wait_for()
+    tab.get_by_text("saving", exact=True).first.wait_for()
     k = served.session.k
     tab.get_by_role("button", name="Step", exact=True).click()
     served.wait(lambda: served.session.k == k + 1)  # the flight does not wait
     served.saves.set()
     tab.get_by_text("saved:").first.wait_for()
-    tab.get_by_text("paused", exact=True).wait_for()
+    tab.get_by_text("paused", exact=True).first.wait_for()
     flight = served.session.flight()
     again = Rollout(flight.scenario).fly()
     assert np.array_equal(again.command, flight.command)
@@ -301,7 +301,7 @@ def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
     k = served.session.k
     tab.get_by_role("button", name="Reset", exact=True).click()
     served.wait(lambda: served.session.k < k)
-    field = tab.locator("label", has_text="horizon").locator("xpath=ancestor::div[.//input][1]").locator("input")
+    field = tab.locator("label", has_text="N [periods]").locator("xpath=ancestor::div[.//input][1]").locator("input")
     served.wait(lambda: field.input_value() == "10")
     tab.get_by_role("tab", name="Disturb").click()
     row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
@@ -315,7 +315,7 @@ def phone(browser: Any, served: Served) -> Iterator[Any]:
     phone = context.new_page()
     phone.set_default_timeout(1e3 * PATIENCE)
     phone.goto(served.page.address)
-    phone.get_by_text("of real time").wait_for()
+    phone.get_by_text("real-time factor").wait_for()
     yield phone
     context.close()
 
@@ -334,8 +334,8 @@ def test_a_second_page_watches(served: Served, tab: Any, phone: Any) -> None:
 def test_nothing_is_cut_on_a_phone(phone: Any) -> None:
     assert phone.evaluate("document.documentElement.scrollWidth") <= 390
     assert phone.locator("canvas").first.bounding_box()["width"] == 390
-    for cell in ("roll", "bound used"):
-        box = phone.get_by_text(cell, exact=True).bounding_box()
+    for cell in ("roll [deg]", "utilisation", "worst"):
+        box = phone.get_by_text(cell, exact=True).first.bounding_box()
         assert 0.0 <= box["x"] <= box["x"] + box["width"] <= 390
     assert phone.get_by_role("tabpanel").bounding_box()["width"] > 360
     assert phone.get_by_text("Shift-click the floor").is_hidden()

@@ -8,40 +8,58 @@ import numpy as np
 import pytest
 
 from quadsim.flight.audit import Limit
-from scenarios.live.readout import constraint_rows, hints, is_violated
-from scenarios.live.session import Frame
+from scenarios.live.readout import Constraints, hints, is_violated, numbers
+from scenarios.live.session import Frame, Session
+from scenarios.loading import load_scenario
 
 ROLL = Limit(name="roll", signal="roll", lower=-5.0, upper=5.0, tolerance=0.05)
 LATE = Limit(name="arrival_x", signal="x_error", lower=-0.1, upper=0.1, start=29.0)
 
 
-def frame(*margins: float, name: str = "roll") -> Frame:
-    """A period in which each vehicle has this margin."""
-    samples = (None,) * len(margins)
+def frame(*margins: float, health: tuple[float, ...] = (1.0,) * 4) -> Frame:
+    """A period in which each vehicle has this margin in roll."""
+    nothing = (None,) * len(margins)
     return Frame(
         k=0,
         time=1.0,
-        samples=samples,
-        margins=tuple({name: margin} for margin in margins),
-        horizons=samples,
+        samples=nothing,
+        margins=tuple({"roll": margin} for margin in margins),
+        horizons=nothing,
         pull=np.zeros(3),
+        health=np.array(health),
         refused=(),
     )
 
 
+def rows(*frames: Frame, limits: tuple[Limit, ...] = (ROLL,), audited: frozenset[str] = frozenset({"roll"})) -> str:
+    """The table after these periods."""
+    table = Constraints(limits)
+    for each in frames:
+        table.add(each)
+    return table.rows(frames[-1], audited)
+
+
+def numbers_of(table: str) -> list[str]:
+    """Its numbers, in order; a violation as `violated: NUMBER`."""
+    cells = re.findall('<td class="n">(.*?)</td>', table)
+    return [re.sub('<span class="bad" title="violated">(.*?)</span>', r"violated: \1", cell) for cell in cells]
+
+
 @pytest.mark.parametrize(
-    ("margin", "says"),
+    ("margin", "number"),
     [
-        (4.0, "+4.00 deg</td><td></td>"),
-        (0.3, "+0.30 deg</td><td>near</td>"),
-        (-0.04, "-0.04 deg</td><td>near</td>"),
-        (-0.06, "-0.06 deg</td><td>violated</td>"),
-        (-1.3e-10, "+0.00 deg</td><td>near</td>"),
+        (4.0, "+4.00"),
+        (-0.04, "-0.04"),
+        (-0.06, "violated: -0.06"),
+        (-1.3e-10, "+0.00"),
     ],
 )
-def test_a_row_says_of_a_margin_what_the_audit_would(margin: float, says: str) -> None:
-    row = constraint_rows((ROLL,), {"roll"}, frame(margin))
-    assert says in row
+def test_a_row_says_of_a_margin_what_the_audit_would(margin: float, number: str) -> None:
+    assert numbers_of(rows(frame(margin))) == [number, number]
+
+
+def test_the_worst_margin_stays() -> None:
+    assert numbers_of(rows(frame(4.0), frame(-0.5), frame(3.0))) == ["+3.00", "violated: -0.50"]
 
 
 def test_rounding_is_no_violation_and_more_is() -> None:
@@ -51,20 +69,32 @@ def test_rounding_is_no_violation_and_more_is() -> None:
 
 
 def test_two_vehicles_share_a_row_and_a_constraint_keeps_its_row_when_it_ends() -> None:
-    both = constraint_rows((ROLL, LATE), {"roll"}, frame(4.0, 1.0))
+    both = rows(frame(4.0, 1.0), limits=(ROLL, LATE))
     assert both.count("<tr") == 3  # with the head
     assert both.count("<i style") == 4  # a mark per vehicle, and the two bounds
-    assert "ended" in both
-    assert "from 29 s" in constraint_rows((ROLL, LATE), {"roll", "arrival_x"}, frame(4.0))
+    assert numbers_of(both) == ["+4.00", "+1.00", "ended", ""]
+    assert "from 29 s" in rows(frame(4.0), limits=(ROLL, LATE), audited=frozenset({"roll", "arrival_x"}))
 
 
 def test_bars_grow_towards_the_bound() -> None:
-    rows = [constraint_rows((ROLL,), {"roll"}, frame(margin)) for margin in (5.0, 3.0, 0.0, -2.0)]
-    widths = [float(re.findall(r"left:0;width:([\d.]+)%", row)[0]) for row in rows]
+    tables = [rows(frame(margin)) for margin in (5.0, 3.0, 0.0, -2.0)]
+    widths = [float(re.findall(r"left:0;width:([\d.]+)%", table)[0]) for table in tables]
     assert widths == sorted(widths)
     assert widths[0] == 0.0
 
 
 def test_hints_that_were_followed_go() -> None:
-    assert hints(()).count("<div>") == 3
-    assert "Drag the drone" not in hints({"pull"})
+    assert hints((), ["robust MPC"]).count("<b>") == 3
+    assert "Drag the drone" not in hints({"pull"}, ["robust MPC"])
+    assert "blue: A; orange: B" in hints((), ["A", "B"])
+
+
+def test_numbers_keep_their_height_and_name_a_broken_rotor() -> None:
+    session = Session(load_scenario("hover", ["controller.horizon=5"]))
+    sound = session.advance()
+    session.submit({"type": "wear", "rotor": 2, "loss": 0.4})
+    broken = session.advance()
+    session.close()
+    assert numbers(None).count('class="line"') == numbers(sound, [(0.0, 0.0)]).count('class="line"')
+    assert "rotor 2: -40 %" in numbers(broken, [(0.0, 0.0)])
+    assert "rotor" not in numbers(sound, [(0.0, 0.0)])
