@@ -23,7 +23,7 @@ import numpy as np
 
 from quadsim.controller import law_name
 from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.report.figure import LINES
+from quadsim.report.figure import LINES, least_range
 from quadsim.rotation import quaternion_to_euler
 from quadsim.sim.physics import FlownPeriod
 from scenarios.flight import Flight
@@ -46,6 +46,7 @@ _PLOTS: Final = {
     "Rotor speeds [rad/s]": ("1", "2", "3", "4"),
     "Step [ms]": ("step",),
 }
+_TIME: Final = {"x": {"time": False}}  # not a date
 T = TypeVar("T")
 
 
@@ -142,10 +143,15 @@ class Page:
                 audited = {limit.name for limit in self._session.limits}
                 self._margins.content = self._constraints.rows(frame, audited)
             if (frame.k % (2 * _EVERY) == 0 or self._pace.paused) and len(self._history) > 1:
-                table = np.array(self._history).round(3)[::2].T  # plots are the most of what is sent
+                table = np.array(self._history)[::2].T  # plots are the most of what is sent
                 first = 1
-                for plot, names in zip(self._plots, _PLOTS.values(), strict=True):
-                    plot.data = (table[0], *table[first : first + len(names)])
+                for plot, (title, names) in zip(self._plots, _PLOTS.items(), strict=True):
+                    curves = table[first : first + len(names)]
+                    least = least_range(list(curves), title[title.index("[") + 1 : -1])
+                    scales = _TIME if least is None else {**_TIME, "y": {"range": least}}
+                    if scales != plot.scales:  # which draws the plot anew
+                        plot.scales = scales
+                    plot.data = (table[0], *curves)
                     first += len(names)
 
     def pose(self, frame: Frame, share: float) -> None:
@@ -183,7 +189,7 @@ class Page:
         with gui.add_folder("Run"):
             flight = {"Pause": self._toggle, "Step": self._step, "Reset": self._reset}
             self._flight = self._widgets.group("Flight", flight | {"Resume": self._toggle}, tuple(flight))
-            outputs = {"Save": self._keep, "Scenario file": self._download, "3-D replay": self._scene}
+            outputs = {"Save": self._keep, "Scenario": self._download, "Replay": self._scene}
             self._widgets.group("Output", outputs, hint=readout.OUTPUT)
             speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1", hint="simulated over real time")
             self._widgets.on(speed.on_update, lambda event: setattr(self._pace, "speed", float(event.target.value)))
@@ -200,7 +206,7 @@ class Page:
                 gui.add_uplot(
                     (np.array([0.0, 1.0]), *([np.zeros(2)] * len(names))),
                     ({"label": "t [s]"}, *({"label": n, "stroke": c} for n, c in zip(names, LINES, strict=False))),
-                    scales={"x": {"time": False}},
+                    scales=_TIME,
                     aspect=1.9,
                     title=title,
                 )

@@ -25,8 +25,8 @@ WATCH: Final = (
     '<div class="q"><div class="watch">You watch; another page has the controls.</div></div>'
 )
 OUTPUT: Final = (
-    "Save: the run directory, with tables, figures and a recording. Scenario file: flies this session again, bit for "
-    "bit. 3-D replay: an HTML page that plays."
+    "Save: the run directory, with tables, figures and a recording. Scenario: a file that flies this session again, "
+    "bit for bit. Replay: an HTML page that plays the scene."
 )
 STEER: Final = (
     "Type a set-point, drag its arrows, or "

@@ -89,7 +89,7 @@ class Stage:
             plumb = self._line(f"shadow{i}/plumb", np.array([[(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)]]), _SHADOW, 1.0)
             self._shadows.append((shadow, plumb))
             if not alone:
-                title, top = law_name(flight.loop.controller.name), (0.0, 0.0, (2.2 + 0.6 * i) * self.unit)
+                title, top = law_name(flight.loop.controller.name), (0.0, 0.0, (1.4 + 0.5 * i) * self.unit)
                 scene.add_label(f"{_ROOT}/{name}/label", title, position=top, anchor="bottom-center")
                 self._line(f"{name}/pole", np.array([[(0.0, 0.0, 0.0), top]]), colour, 1.5)
         self.mark = self._add("mark", look.disc(0.5 * self.unit), target, visible=False)
