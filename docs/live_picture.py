@@ -17,7 +17,6 @@ from playwright.sync_api import Browser, sync_playwright
 ASSETS: Final = Path(__file__).resolve().parent / "assets"
 WIDTH, HEIGHT = 1280, 720  # of the browser's window [pixels]
 FLOWN: Final = 12.0  # s of the flight before the picture
-COLOURS: Final = 96
 OPTIONS: Final = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 
 
@@ -38,7 +37,7 @@ def picture(browser: Browser, address: str, scheme: Literal["light", "dark"]) ->
     shown = Image.open(io.BytesIO(page.screenshot()))
     page.mouse.up()
     page.close()
-    return shown.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    return shown.convert("RGB")
 
 
 def main() -> None:
@@ -49,14 +48,14 @@ def main() -> None:
         sync_playwright() as playwright,
         playwright.chromium.launch(executable_path=chromium, args=[*OPTIONS]) as browser,
     ):
-        for scheme, name in (("light", "live.png"), ("dark", "live-dark.png")):
+        for scheme, name in (("light", "live.jpg"), ("dark", "live-dark.jpg")):
             with (
                 tempfile.TemporaryDirectory() as folder,
                 subprocess.Popen([*command, "--out", f"{folder}/live"], stdout=subprocess.PIPE, text=True) as session,
             ):
                 assert session.stdout is not None
                 address = next(filter(None, (re.search(r"http\S+token=\S+", line) for line in session.stdout)))[0]
-                picture(browser, address, scheme).save(ASSETS / name, optimize=True)
+                picture(browser, address, scheme).save(ASSETS / name, quality=80, optimize=True)
                 session.terminate()
 
 

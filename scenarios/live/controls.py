@@ -305,7 +305,7 @@ class ControllerTab:
                 successor = await asyncio.to_thread(self._session.successor, fields)
             except InputError as error:
                 self._answer.content = readout.says(f"Refused, the previous controller stays active: {error}", "bad")
-                event.client.add_notification("Refused", str(error), color="red")  # where the panel is scrolled
+                event.client.add_notification("Refused", str(error), color="red", auto_close_seconds=8.0)
                 return False
         self._session.submit({"type": "controller", "fields": dict(fields)}, successor=successor)
         self._answer.content = readout.says(f"Active from the next period on: {what}")

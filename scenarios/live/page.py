@@ -134,7 +134,7 @@ class Page:
         with _unless_gone():
             for reason in frame.refused:
                 for client in self._server.get_clients().values():
-                    client.add_notification("quadsim", f"refused: {reason}")
+                    client.add_notification("Refused", reason, color="red", auto_close_seconds=8.0)
         with self._server.atomic():
             self.stage.show(frame)
             if frame.k % _EVERY == 0 or self._pace.paused:
@@ -280,7 +280,7 @@ class Page:
             except (InputError, OutputError) as error:
                 result = f"not saved: {error}"
         with _unless_gone():
-            event.client.add_notification("Save", result)
+            event.client.add_notification("Save", result, auto_close_seconds=20.0)
 
     async def _download(self, event: Any) -> None:
         if self._session.k:
@@ -301,7 +301,7 @@ class Page:
             self._pace.waiting = self._pace.paused = False
             self._announce()
         upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
-        aim = np.array([0.0, 0.0, -0.2 * np.linalg.norm(self._away)]) * upright
+        aim = np.array([0.0, 0.0, -0.3 * np.linalg.norm(self._away)]) * upright
 
         connected = clock.monotonic()
 
@@ -311,10 +311,11 @@ class Page:
                 self._aims.setdefault(client.client_id, aim)
 
         client.camera.on_update(moved)
-        if upright:  # it has no Shift key, and viser's clicks of the scene ignore touches
+        if upright:  # more of the floor to tap; it has no Shift key, and viser's clicks of the scene ignore touches
             below = (0.0, 0.0, self.stage.ground - self.stage.unit)  # it would hide what is behind it
             floor = client.scene.add_box("/tapped", dimensions=(200.0, 200.0, 1e-3), position=below, opacity=1e-3)
             self._widgets.on(floor.on_click(), self._steering.clicked)
+            client.camera.fov = 1.4 * FIELD
         watches = self._driver != client.client_id
         note = client.gui.add_html(readout.WATCH, order=-2.0, visible=watches)
         take = client.gui.add_button("Take the controls", order=-1.0, visible=watches)

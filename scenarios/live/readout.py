@@ -50,12 +50,13 @@ STYLE: Final = f"""<style>
 .hints,.over{{position:fixed;left:16px;z-index:5;pointer-events:none;font:14px/1.4 system-ui,sans-serif}}
 .hints{{bottom:16px}}.over{{top:16px}}
 .hints div{{margin-top:6px;padding:4px 12px;border-radius:1em;background:#1f2937d9;color:#fff;width:max-content}}
-.hints .key{{font-size:12px}}.touch{{display:none}}
+.hints .key{{font-size:12px}}.hints div{{max-width:calc(100vw - 400px)}}.touch{{display:none}}
 @media (pointer:coarse){{
  .touch{{display:inline}}.mouse{{display:none}}.mantine-Button-root{{min-height:36px}}
 }}
 @media (max-width:36em){{
- .hints{{top:8px;bottom:auto;font-size:12px}}.hints div{{margin-top:4px;padding:2px 10px}}.hints .key{{display:none}}
+ .hints{{top:8px;bottom:auto;font-size:12px}}
+ .hints div{{max-width:none}}.hints div{{margin-top:4px;padding:2px 10px}}.hints .key{{display:none}}
  .mantine-Paper-root[style*="20em"],.mantine-Paper-root [style*="20em"]{{width:100%!important}}
 }}
 </style>"""

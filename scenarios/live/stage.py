@@ -93,7 +93,7 @@ class Stage:
                 scene.add_label(f"{_ROOT}/{name}/label", title, position=top, anchor="bottom-center")
                 self._line(f"{name}/pole", np.array([[(0.0, 0.0, 0.0), top]]), colour, 1.5)
         self.mark = self._add("mark", look.disc(0.5 * self.unit), target, visible=False)
-        self.grab = self._add("vehicle0/grab", look.grip(1.6 * self.unit), ink.WHITE, opacity=0.001)
+        self.grab = self._add("vehicle0/grab", look.grip(1.3 * self.unit), ink.WHITE, opacity=0.001)
         self._trails = [deque[Array](maxlen=TRAIL + 1) for _ in session.flights]
         self._shown = deque[Frame](maxlen=round(_SECONDS / session.period))
         self._moving: list[tuple[Obstacle, Any]] = []

@@ -322,6 +322,8 @@ def phone(browser: Any, served: Served) -> Iterator[Any]:
 
 def test_a_second_page_watches(served: Served, tab: Any, phone: Any) -> None:
     phone.get_by_text("You watch").wait_for()
+    dimmed = phone.get_by_role("tabpanel").first
+    assert dimmed.evaluate("panel => getComputedStyle(panel).opacity") == "0.45"
     before = served.pace.paused
     phone.get_by_role("button", name="Pause", exact=True).click()
     phone.get_by_text("Another page has the controls:").first.wait_for()
