@@ -318,7 +318,7 @@ class Page:
             client.camera.fov = 1.4 * FIELD
         watches = self._driver != client.client_id
         note = client.gui.add_html(readout.WATCH, order=-2.0, visible=watches)
-        take = client.gui.add_button("Take the controls", order=-1.0, visible=watches)
+        take = client.gui.add_button("Take the controls", order=-1.0, visible=watches, color="orange")
         self._takes[client.client_id] = [note, take]
 
         async def taken(event: Any) -> None:

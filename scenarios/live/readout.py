@@ -21,7 +21,7 @@ HINTS: Final = {
 }
 
 WATCH: Final = (
-    "<style>[role=tabpanel],.mantine-Button-root[data-variant=outline]{opacity:.45}</style>"
+    "<style>.mantine-Button-root:not([style*=orange]),.mantine-Slider-root,.mantine-Input-wrapper{opacity:.45}</style>"
     '<div class="q"><div class="watch">You watch; another page has the controls.</div></div>'
 )
 OUTPUT: Final = (
