@@ -44,7 +44,6 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) run paper-unconstrained --out $(RUNS)/paper-unconstrained --overwrite $(OPTIONS)
 	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained --overwrite $(OPTIONS)
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite
-	@echo "Done. Open $(RUNS)/comparison/index.html in a browser."
 
 test peers firmware numbers reproduce: export OMP_NUM_THREADS := 1
 test peers firmware numbers reproduce: export OPENBLAS_NUM_THREADS := 1
