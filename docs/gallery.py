@@ -94,6 +94,7 @@ def main() -> None:
     """Make what is named; without off-screen OpenGL the page keeps its pictures and says so."""
     from scenarios.catalogue import scenario_names
     from scenarios.machine import usable_cores
+    from scenarios.progress import reporting
 
     names = re.findall(r"films/([\w-]+)\.mp4", (DOCS / "gallery.md").read_text(encoding="utf-8"))
     for folder in (FILMS, FILES):
@@ -101,12 +102,12 @@ def main() -> None:
     for file in (DOCS.parent / "scenarios" / "library").glob("*.toml"):
         shutil.copy(file, FILES / f"{file.stem}.txt")  # as text, which a browser shows
     try:
-        with ProcessPoolExecutor(usable_cores()) as pool:
-            if sys.argv[1:] == ["films"]:
-                list(pool.map(film_flight, names))
-            else:
-                list(pool.map(thumbnail, scenario_names()))
-                list(pool.map(poster, names))
+        with ProcessPoolExecutor(usable_cores()) as pool, reporting(True) as report:
+            films = sys.argv[1:] == ["films"]
+            stages = {film_flight: names} if films else {thumbnail: scenario_names(), poster: names}
+            for make, of in stages.items():
+                for i, _ in enumerate(pool.map(make, of), 1):
+                    report(make.__name__.replace("_", " "), i, len(of))
     except RenderingUnavailableError as error:
         print(f"The gallery is built without films: {error}", file=sys.stderr)
 
