@@ -79,10 +79,10 @@ class Stage:
             for material, (*rgb, alpha), mesh in look.airframe(model):
                 tint = tuple(rgb) if alone or material not in _TINTED else colour
                 self._add(f"{name}/{material}", mesh, tint, opacity=None if alpha == 1.0 else alpha)
-            arrows, sizes = np.zeros((len(self._rotors), 2, 3)), (0.04 * self.unit, 0.09 * self.unit, 0.2 * self.unit)
-            shape = dict(zip(("shaft_radius", "head_radius", "head_length"), sizes, strict=True))
-            self._thrusts.append(ink.BLUE if alone else colour)
-            self._arrows.append(scene.add_arrows(f"{_ROOT}/{name}/thrust", arrows, self._thrusts[i], **shape))
+            thrust, arrows = ink.BLUE if alone else colour, np.zeros((len(self._rotors), 2, 3))
+            widths = {"shaft_radius": 0.04 * self.unit, "head_radius": 0.09 * self.unit, "head_length": 0.2 * self.unit}
+            self._thrusts.append(thrust)
+            self._arrows.append(scene.add_arrows(f"{_ROOT}/{name}/thrust", arrows, thrust, **widths))
             self._horizons.append(self._line(f"horizon{i}", np.zeros((length, 2, 3)), ink.GREEN if alone else colour))
             self._paths.append(self._line(f"path{i}", np.zeros((TRAIL, 2, 3)), colour))
             shadow = self._add(f"shadow{i}", look.disc(0.9 * self.unit), _SHADOW)
@@ -98,7 +98,18 @@ class Stage:
         self._shown = deque[Frame](maxlen=round(_SECONDS / session.period))
         self._moving: list[tuple[Obstacle, Any]] = []
         self._regions: list[tuple[SpaceLimit, Any]] = []
-        self._add_space()
+        course = _course(session).reshape(-1, 3)
+        low, high = course.min(axis=0) - 1.5, course.max(axis=0) + 1.5
+        for limit in session.limits:
+            match limit:
+                case SpaceLimit(shape=Region() as region):
+                    line = self._line(f"regions/{limit.name}", region.edges(low, high), _REGION, 1.5)
+                    self._regions.append((limit, line))
+                case SpaceLimit(shape=Obstacle() as body):
+                    handle = self._add(f"obstacles/{body.name}", look.obstacle(body), _rgb(OBSTACLE))
+                    handle.position = body.position
+                    if body.moves:
+                        self._moving.append((body, handle))
         self.ground, self._events = 0.0, 0
         self.reset()
 
@@ -189,20 +200,6 @@ class Stage:
         style = {"color": colour, "flat_shading": True, **FLAT, **style}
         return self._scene.add_mesh_simple(f"{_ROOT}/{name}", mesh.vertices, mesh.faces, **style)
 
-    def _add_space(self) -> None:
-        course = _course(self._session).reshape(-1, 3)
-        low, high = course.min(axis=0) - 1.5, course.max(axis=0) + 1.5
-        for limit in self._session.limits:
-            shape = limit.shape if isinstance(limit, SpaceLimit) else None
-            if isinstance(limit, SpaceLimit) and isinstance(shape, Region):
-                line = self._line(f"regions/{limit.name}", shape.edges(low, high), _REGION, 1.5)
-                self._regions.append((limit, line))
-            elif isinstance(shape, Obstacle):
-                pose = {"position": shape.position}
-                handle = self._add(f"obstacles/{shape.name}", look.obstacle(shape), _rgb(OBSTACLE), **pose)
-                if shape.moves:
-                    self._moving.append((shape, handle))
-
 
 def _rgb(colour: str) -> ink.Colour:
     red, green, blue = bytes.fromhex(colour[1:])
@@ -225,7 +222,6 @@ def _segments(points: Array, count: int) -> Array:
 
 def _course(session: Session) -> Array:
     """The reference over the scenario's whole time, thinned."""
-    scenario = session.scenario
-    every = max(1, scenario.periods // _COURSE)
-    rows = session.flights[0].loop.course.preview(0, scenario.periods)[::every, :3]
+    periods = session.scenario.periods
+    rows = session.flights[0].loop.course.preview(0, periods)[:: max(1, periods // _COURSE), :3]
     return _segments(np.asarray(rows), _COURSE + 1)
