@@ -23,8 +23,8 @@ from scenarios.schema.controllers import AnyController
 from scenarios.schema.events import SensorText
 from scenarios.schema.writing import plain
 
-_STEER: Final = {"W": "+x", "S": "-x", "A": "+y", "D": "-y", "R": "+z", "F": "-z"}  # keys, and where each steers
-_STEER_STEP: Final = 0.5  # [m/s] by which a key changes the set-point's velocity
+_STEER: Final = {"W": ("+", "x"), "S": ("-", "x"), "A": ("+", "y"), "D": ("-", "y"), "R": ("+", "z"), "F": ("-", "z")}
+_STEER_STEP: Final = 0.5  # [m/s] by which each of these keys changes the set-point's velocity
 _STEER_MOST: Final = 5.0
 _BROKEN: Final = 0.4  # share of its thrust that a rotor loses by the button
 _SENSORS: Final = get_args(SensorText)
@@ -164,7 +164,7 @@ class Steering:
         for key, (sign, axis) in _STEER.items():
             change = float(f"{sign}{_STEER_STEP}") * np.eye(3)["xyz".index(axis)]
             command = gui.add_command(f"Fly {sign}{axis}", hotkey=key)
-            widgets.on(command.on_trigger, lambda event, change=change: self._fly(self._velocity + change))
+            widgets.on(command.on_trigger, partial(self._fly_on, change))
         widgets.on(gui.add_command("Stop the set-point", hotkey="X").on_trigger, lambda event: self.stop())
         widgets.button("Stop set-point", lambda event: self.stop())
 
@@ -194,6 +194,9 @@ class Steering:
         """Show what a new flight starts with, after the widgets have been reset."""
         self._handle.position = np.array(self._place.value)
         self._show(np.zeros(3))
+
+    def _fly_on(self, change: Any, event: Any) -> None:
+        self._fly(self._velocity + change)
 
     def _fly(self, velocity: Any) -> None:
         self._show(np.clip(velocity, -_STEER_MOST, _STEER_MOST))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from html import escape
 from typing import Final
 
@@ -97,10 +97,6 @@ def numbers(frame: Frame | None, states: Sequence[tuple[float, float]] = (), los
     sample = None if frame is None else frame.samples[0]
     if frame is None or sample is None:
         return block("&nbsp;", "line") * 4
-
-    def dotted(texts: Iterable[str]) -> str:
-        return " ".join(f"{_dot(i) if len(states) > 1 else ''}<b>{text}</b>" for i, text in enumerate(texts))
-
     command, late = sample.command, ' <span class="bad">late</span>' if sample.missed else ""
     solved = f"QP {escape(command.status)} by {escape(command.answered_by)}"
     if command.status not in OPTIMAL or command.fallback:
@@ -113,11 +109,15 @@ def numbers(frame: Frame | None, states: Sequence[tuple[float, float]] = (), los
         f"MPC: {solved}{active}",
         f"solved in <b>{1e3 * sample.step_s:.1f}</b> ms{late}; pull <b>{math.hypot(*frame.pull):.1f}</b> N"
         + "".join(f'; <span class="bad">{text}</span>' for text in weak),
-        f"tilt {dotted(f'{tilt:.1f}' for tilt, _ in states)} deg",
-        f"position error {dotted(f'{error:.2f}' for _, error in states)} m",
+        f"tilt {_dotted([f'{tilt:.1f}' for tilt, _ in states])} deg",
+        f"position error {_dotted([f'{error:.2f}' for _, error in states])} m",
         *(f'<span class="bad">{escape(text)}</span>' for text in lost),
     ]
     return "".join(block(row, "line") for row in rows)
+
+
+def _dotted(texts: Sequence[str]) -> str:
+    return " ".join(f"{_dot(i) if len(texts) > 1 else ''}<b>{text}</b>" for i, text in enumerate(texts))
 
 
 def _dot(vehicle: int) -> str:
