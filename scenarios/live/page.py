@@ -319,19 +319,15 @@ class Page:
         note = client.gui.add_html(readout.WATCH, order=-2.0, visible=watches)
         take = client.gui.add_button("Take the controls", order=-1.0, visible=watches, color="orange")
         self._takes[client.client_id] = [note, take]
-
-        async def taken(event: Any) -> None:
-            self._hand_over(client.client_id)
-
-        take.on_click(taken)
+        take.on_click(partial(self._hand_over, client.client_id))
 
     async def _left(self, client: Any) -> None:
         self._aims.pop(client.client_id, None)
         self._takes.pop(client.client_id, None)
         if self._driver == client.client_id:
-            self._hand_over(min(self._takes, default=None))
+            await self._hand_over(min(self._takes, default=None))
 
-    def _hand_over(self, driver: int | None) -> None:
+    async def _hand_over(self, driver: int | None, event: Any = None) -> None:
         """Give a client the controls; the pull and the manual set-point end."""
         self._session.submit({"type": "pull"}, subject="pull")
         self._steering.stop()

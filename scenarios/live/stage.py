@@ -46,7 +46,6 @@ class Stage:
 
     Attributes:
         unit: the vehicle's arm length [m].
-        frames: viser's frame of each vehicle.
         grab: what the mouse takes hold of.
         mark: a spot on the floor.
         ground: height of the floor, below the whole flight [m].
@@ -59,7 +58,7 @@ class Stage:
         scene.configure_default_lights(enabled=False)
         scene.add_light_hemisphere("/light", intensity=2.5)
         scene.add_light_directional("/light/sun", intensity=2.0, position=(0.35, -0.25, 0.9))
-        self.root = scene.add_frame(_ROOT, show_axes=False)
+        self._root = scene.add_frame(_ROOT, show_axes=False)
         vehicle = session.flights[0].actual
         self.unit, self._weight = vehicle.arm_length, vehicle.mass * vehicle.gravity
         self._rotors, self._coefficient = np.array(vehicle.rotor_positions), vehicle.thrust_coefficient
@@ -72,10 +71,10 @@ class Stage:
         self._goal = self._line("goal", _octahedron(0.5 * self.unit), target, 2.5)
         self._hand = self._line("hand", np.zeros((1, 2, 3)), _rgb(BOUND), 5.0)
         self._thrusts: list[ink.Colour] = []  # colours
-        self.frames, self._arrows, self._horizons, self._paths, self._shadows = [], [], [], [], []
+        self._frames, self._arrows, self._horizons, self._paths, self._shadows = [], [], [], [], []
         for i, flight in enumerate(session.flights):
             name, length, colour = f"vehicle{i}", flight.loop.controller.horizon, _rgb(line_colour(i))
-            self.frames.append(scene.add_frame(f"{_ROOT}/{name}", show_axes=False))
+            self._frames.append(scene.add_frame(f"{_ROOT}/{name}", show_axes=False))
             for material, (*rgb, alpha), mesh in look.airframe(model):
                 tint = tuple(rgb) if alone or material not in _TINTED else colour
                 self._add(f"{name}/{material}", mesh, tint, opacity=None if alpha == 1.0 else alpha)
@@ -152,14 +151,14 @@ class Stage:
 
     def pose(self, frame: Frame, share: float) -> Array:
         """Draw the vehicles at a fraction of the period; return the position of the first (3,) [m]."""
-        for sample, handle, (shadow, plumb) in zip(frame.samples, self.frames, self._shadows, strict=True):
+        for sample, handle, (shadow, plumb) in zip(frame.samples, self._frames, self._shadows, strict=True):
             if sample is not None:
                 physics = sample.segment.physics
                 row = physics[min(len(physics) - 1, int(share * len(physics)))]
                 handle.position, handle.wxyz = row[1:4], row[4:8]
                 foot = self.ground + 0.01 * self.unit
                 shadow.position, plumb.scale = (*row[1:3], foot), (1.0, 1.0, float(row[3] - foot))
-        return np.asarray(self.frames[0].position)
+        return np.asarray(self._frames[0].position)
 
     def reset(self) -> None:
         """Clear the scene for a new flight."""
@@ -187,7 +186,7 @@ class Stage:
         stage = Stage(viser.SceneApi(owner, idle, idle), self._session)
         for frame in frames:
             stage.show(frame)
-            stage.root.position = -stage.pose(frame, 1.0)
+            stage._root.position = -stage.pose(frame, 1.0)
             record.insert_sleep(self._session.period)
             clock.sleep(_REST)
         return look.dressed(record.as_html(), title)
