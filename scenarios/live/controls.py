@@ -6,10 +6,8 @@ Handles are viser's; nothing here imports it.
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import inspect
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any, Final, get_args
 
@@ -25,15 +23,11 @@ from scenarios.schema.controllers import AnyController
 from scenarios.schema.events import SensorText
 from scenarios.schema.writing import plain
 
-_STEER: Final = {"W": (1, 0, 0), "S": (-1, 0, 0), "A": (0, 1, 0), "D": (0, -1, 0), "R": (0, 0, 1), "F": (0, 0, -1)}
-"""Keys, and the direction of the set-point's velocity that each adds to."""
-_STEER_STEP: Final = 0.5  # [m/s] by which a key changes it
+_STEER: Final = {"W": ("+", "x"), "S": ("-", "x"), "A": ("+", "y"), "D": ("-", "y"), "R": ("+", "z"), "F": ("-", "z")}
+_STEER_STEP: Final = 0.5  # [m/s] by which each of these keys changes the set-point's velocity
 _STEER_MOST: Final = 5.0
 _BROKEN: Final = 0.4  # share of its thrust that a rotor loses by the button
 _SENSORS: Final = get_args(SensorText)
-_WIND: Final = {"type": "gust", "velocity": [1.0, 0.0, 0.0], "duration": 1.0}
-_LOAD: Final = {"type": "mass", "factor": 1.1}
-_LAG: Final = {"type": "rotor_lag", "rise": 0.01}
 
 
 class Widgets:
@@ -62,10 +56,6 @@ class Widgets:
 
         register(called)
 
-    def starts(self, widget: Any) -> None:
-        """Remember a widget's value for a new flight."""
-        self._starts.append((widget, widget.value))
-
     def reset(self) -> None:
         """Show what a new flight starts with."""
         for widget, value in self._starts:
@@ -79,18 +69,21 @@ class Widgets:
         """A button that submits an event, if this scenario can have it."""
         self.button(label, lambda event: self.session.submit(table()), disabled=bool(refused))
 
-    def group(
-        self, label: str, acts: Mapping[str, Callable[[Any], Any]], shown: tuple[str, ...] = (), **look: Any
-    ) -> Any:
+    def group(self, label: str, acts: Mapping[str, Callable[[Any], Any]], **look: Any) -> Any:
         """Buttons in a row."""
-        buttons = self.gui.add_button_group(label, shown or tuple(acts), **look)
+        buttons = self.gui.add_button_group(label, tuple(acts), **look)
         self.on(buttons.on_click, lambda event: acts[event.target.value](event))
         return buttons
 
-    def submits(self, widget: Any, table: Callable[[Any], Mapping[str, Any]]) -> None:
-        """Submit an input made of a widget's value whenever the driving client changes that."""
-        self.starts(widget)
-        self.on(widget.on_update, lambda event: self.session.submit(table(event.target.value), subject=widget.label))
+    def value(self, widget: Any, act: Callable[[Any], Any]) -> Any:
+        """Call a function of each value that the driving client gives; a new flight starts with the present one."""
+        self._starts.append((widget, widget.value))
+        self.on(widget.on_update, lambda event: act(event.target.value))
+        return widget
+
+    def submits(self, widget: Any, table: Callable[[Any], Mapping[str, Any]]) -> Any:
+        """Submit an input made of a widget's value, likewise."""
+        return self.value(widget, lambda value: self.session.submit(table(value), subject=widget.label))
 
 
 def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
@@ -99,8 +92,10 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     `use` takes a hint away.
     """
     gui, session, mass = widgets.gui, widgets.session, widgets.session.flights[0].actual.mass
+    gust = {"type": "gust", "velocity": [1.0, 0.0, 0.0], "duration": 1.0}
+    load, lag = {"type": "mass", "factor": 1.1}, {"type": "rotor_lag", "rise": 0.01}
     sensors = [{"type": "sensor_fault", "sensor": name, "fault": "nan", "duration": 1.0} for name in _SENSORS]
-    no_wind, no_load, no_lag, *blind = session.refusals([_WIND, _LOAD, _LAG, *sensors])
+    no_wind, no_load, no_lag, *blind = session.refusals([gust, load, lag, *sensors])
 
     def pulled(event: Any) -> None:
         to = None if event.phase == "end" else [float(number) for number in event.end_position]
@@ -115,25 +110,26 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
 
     widgets.on(stage.grab.on_drag("left"), pulled)
     widgets.button("Break a rotor", broken, hint=f"rotor 1 loses {100 * _BROKEN:.0f} % of its thrust")
-    wear = [gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0) for rotor in range(1, N_ROTORS + 1)]
-    for rotor, slider in enumerate(wear, 1):
-        widgets.submits(slider, partial(_wear, rotor))
+    wear = [
+        widgets.submits(gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0), partial(_wear, rotor))
+        for rotor in range(1, N_ROTORS + 1)
+    ]
     box = {"min": (-15.0, -15.0), "max": (15.0, 15.0), "step": 0.5, "disabled": bool(no_wind)}
-    gust = gui.add_vector2("Gust x, y [m/s]", (6.0, 0.0), **box)
-    widgets.event("Gust for 1 s", lambda: _WIND | {"velocity": [*map(float, gust.value), 0.0]}, no_wind)
+    blow = gui.add_vector2("Gust x, y [m/s]", (6.0, 0.0), **box)
+    widgets.event("Gust for 1 s", lambda: gust | {"velocity": [*blow.value, 0.0]}, no_wind)
     wind = gui.add_vector2("Wind x, y [m/s]", (0.0, 0.0), **box)
-    widgets.submits(wind, lambda value: {"type": "wind", "velocity": [*map(float, value), 0.0]})
+    widgets.submits(wind, lambda value: {"type": "wind", "velocity": [*value, 0.0]})
     gui.add_html(readout.says(f"No wind: {no_wind}" if no_wind else "", "why"))
-    off = bool(no_load)
-    factor = gui.add_slider("Mass factor", 0.7, 1.5, 0.01, 1.0, disabled=off)
+    off = {"disabled": bool(no_load)}
+    factor = gui.add_slider("Mass factor", 0.7, 1.5, 0.01, 1.0, **off)
     widgets.submits(factor, lambda value: {"type": "mass", "factor": float(value)})
     step = round(0.01 * mass, 5)
-    load = gui.add_number("Payload [kg]", round(0.1 * mass, 4), min=0.0, max=mass, step=step, disabled=off)
-    widgets.event("Take payload", lambda: {"type": "payload_pickup", "mass": float(load.value)}, no_load)
+    payload = gui.add_number("Payload [kg]", round(0.1 * mass, 4), min=0.0, max=mass, step=step, **off)
+    widgets.event("Take payload", lambda: {"type": "payload_pickup", "mass": float(payload.value)}, no_load)
     widgets.event("Drop payload", lambda: {"type": "payload_drop"}, no_load)
     gui.add_html(readout.says(no_load, "why"))
-    lag = gui.add_slider("Rotor lag [ms]", 0, 100, 5, 0, disabled=bool(no_lag))
-    widgets.submits(lag, lambda value: {"type": "rotor_lag", "rise": float(value) / 1e3})
+    rise = gui.add_slider("Rotor lag [ms]", 0, 100, 5, 0, disabled=bool(no_lag))
+    widgets.submits(rise, lambda value: {"type": "rotor_lag", "rise": value / 1e3})
     gui.add_html(readout.says(no_lag, "why"))
     seen = [name for name, reason in zip(_SENSORS, blind, strict=True) if not reason]
     sensor = gui.add_dropdown("Sensor", seen or _SENSORS, disabled=not seen)
@@ -141,7 +137,7 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     no_fault = "" if seen else blind[0]
     widgets.event("Fail sensor for 1 s", lambda: sensors[0] | {"sensor": sensor.value, "fault": fault.value}, no_fault)
     late = gui.add_number("Late commands [ms]", 200, min=10, max=5000, step=10)
-    widgets.event("Stall the computer", lambda: {"type": "stall", "duration": float(late.value) / 1e3})
+    widgets.event("Stall the computer", lambda: {"type": "stall", "duration": late.value / 1e3})
 
 
 class Steering:
@@ -153,27 +149,22 @@ class Steering:
         self._velocity = np.zeros(3)
         gui.add_html(readout.block(readout.STEER, "why"))
         here = np.asarray(self._session.flights[0].loop.course.row(0)[:3])
-        self._handle = scene.add_transform_controls(
-            "/target",
-            scale=3.0 * stage.unit,
-            position=here,
-            disable_rotations=True,
-            disable_sliders=True,
-            visible=False,  # it would lie over the vehicle, and take its pulls
-        )
+        plain_arrows = {"disable_rotations": True, "disable_sliders": True}
+        self._handle = scene.add_transform_controls("/target", scale=3.0 * stage.unit, position=here, **plain_arrows)
+        self._handle.visible = False  # it would lie over the vehicle, and take its pulls
         arrows = gui.add_checkbox("Arrows to drag", False)
         widgets.on(arrows.on_update, lambda event: setattr(self._handle, "visible", event.target.value))
-        self._place = gui.add_vector3("Set-point [m]", tuple(map(float, here)), step=0.1)
-        widgets.starts(self._place)
         widgets.on(self._handle.on_update, lambda event: self._set_point(event.target.position))
-        widgets.on(self._place.on_update, lambda event: self._set_point(event.target.value))
+        place = gui.add_vector3("Set-point [m]", tuple(map(float, here)), step=0.1)
+        self._place = widgets.value(place, self._set_point)
         widgets.on(scene.on_click(modifier="shift"), self.clicked)
         yaw = gui.add_slider("Yaw [deg]", -180, 180, 5, 0)
         widgets.submits(yaw, lambda value: {"type": "setpoint", "yaw": float(value)})
         self._steered = gui.add_text("Set-point velocity [m/s]", "0, 0, 0", disabled=True)
-        for key, direction in _STEER.items():
-            command = gui.add_command(f"Fly {'-+'[sum(direction) > 0]}{'xyz'[np.abs(direction).argmax()]}", hotkey=key)
-            widgets.on(command.on_trigger, partial(self._fly_on, _STEER_STEP * np.array(direction)))
+        for key, (sign, axis) in _STEER.items():
+            change = float(f"{sign}{_STEER_STEP}") * np.eye(3)["xyz".index(axis)]
+            command = gui.add_command(f"Fly {sign}{axis}", hotkey=key)
+            widgets.on(command.on_trigger, partial(self._fly_on, change))
         widgets.on(gui.add_command("Stop the set-point", hotkey="X").on_trigger, lambda event: self.stop())
         widgets.button("Stop set-point", lambda event: self.stop())
 
@@ -221,18 +212,13 @@ class ControllerTab:
 
     Args:
         others: these, by name.
-        doing: shows an activity while it lasts.
+        doing: returns a context in which an activity is shown.
     """
 
-    def __init__(
-        self,
-        widgets: Widgets,
-        others: Mapping[str, AnyController],
-        doing: Callable[[str], AbstractContextManager[None]],
-    ) -> None:
+    def __init__(self, widgets: Widgets, others: Mapping[str, AnyController], doing: Callable[[str], Any]) -> None:
         self._widgets, self._session, self._doing = widgets, widgets.session, doing
         self._laws = {"initial": self._session.scenario.controller, **others}
-        self._fields: dict[str, tuple[Knob, Any]] = {}
+        self._values: dict[str, Value] = {}  # by path, as they fly
         self._groups: list[Any] = []  # folders of fields
         chosen = widgets.gui.add_dropdown("Controller", tuple(self._laws))
         widgets.button("Use this controller", lambda event: self._take(event, chosen.value))
@@ -248,50 +234,44 @@ class ControllerTab:
     def _show(self, spec: AnyController) -> None:
         while self._groups:
             self._groups.pop().remove()
-        self._fields.clear()
         fields = {knob.path: knob for knob in knobs(spec)}
-        with self._folder:
-            groups = {
-                title: [(fields.pop(path), label) for path, label in turned.items() if path in fields]
-                for title, turned in TURNED.items()
-            }
-            for title, group in {**groups, "All fields": [(knob, knob.path) for knob in fields.values()]}.items():
-                if not group:
-                    continue
-                self._groups.append(self._widgets.gui.add_folder(title, expand_by_default=title != "All fields"))
+        self._values = {path: knob.value for path, knob in fields.items()}
+        groups = {
+            title: [(fields.pop(path), label) for path, label in turned.items() if path in fields]
+            for title, turned in TURNED.items()
+        }
+        groups["All fields"] = [(knob, knob.path) for knob in fields.values()]
+        for title, group in groups.items():
+            if group:
+                with self._folder:
+                    self._groups.append(self._widgets.gui.add_folder(title, expand_by_default=title != "All fields"))
                 with self._groups[-1]:
                     for knob, label in group:
-                        handle = self._input(knob, label)
-                        self._fields[knob.path] = knob, handle
-                        self._widgets.on(handle.on_update, partial(self._turn, knob.path))
+                        self._widgets.on(self._input(knob, label).on_update, partial(self._turn, knob.path))
 
     def _input(self, knob: Knob, label: str) -> Any:
         """The widget of a field."""
-        gui, value, look = self._widgets.gui, knob.value, {"hint": knob.about}
-        if isinstance(value, bool):
-            return gui.add_checkbox(label, value, **look)
-        if isinstance(value, str):
-            return gui.add_dropdown(label, knob.choices, initial_value=value, **look)
-        if isinstance(value, tuple):
-            ends = {
-                name: None if end is None else (end, end)
-                for name, end in (("min", knob.minimum), ("max", knob.maximum))
-            }
-            return gui.add_vector2(label, value, step=0.1, **ends, **look)
-        step = 1 if isinstance(value, int) else None
-        return gui.add_number(label, value, step=step, min=knob.minimum, max=knob.maximum, **look)
+        gui, look, low, high = self._widgets.gui, {"hint": knob.about}, knob.minimum, knob.maximum
+        match knob.value:
+            case bool(value):
+                return gui.add_checkbox(label, value, **look)
+            case str(value):
+                return gui.add_dropdown(label, knob.choices, initial_value=value, **look)
+            case tuple(value):
+                least, most = (None if end is None else (end, end) for end in (low, high))
+                return gui.add_vector2(label, value, step=0.1, min=least, max=most, **look)
+            case value:
+                step = 1 if isinstance(value, int) else None
+                return gui.add_number(label, value, step=step, min=low, max=high, **look)
 
     async def _turn(self, path: str, event: Any) -> None:
-        if path not in self._fields:  # of a controller that was replaced meanwhile
+        handle, value, before = event.target, event.target.value, self._values.get(path)
+        if before is None or value == before:  # of a controller that was replaced meanwhile, or put back
             return
-        knob, handle = self._fields[path]
-        if handle.value == knob.value:
-            return
-        value: Value = handle.value
-        if await self._replace(event, {path: value}, f"{path} = {value}, was {knob.value}"):
-            self._fields[path] = dataclasses.replace(knob, value=value), handle
+        if await self._replace(event, {path: value}, f"{path} = {value}, was {before}"):
+            self._values[path] = value
         else:
-            handle.value = knob.value
+            handle.value = before
 
     async def _take(self, event: Any, name: str) -> None:
         spec = self._laws[name]

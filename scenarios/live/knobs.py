@@ -59,28 +59,23 @@ def knobs(spec: AnyController) -> tuple[Knob, ...]:
 
 
 def _walk(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterator[Knob]:
-    below = f"{path}." if path else ""
+    below, entries = f"{path}." if path else "", [entry for kind in kinds for entry in kind.entries]
+    pair = isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(n, int | float) for n in value)
     if is_table(type(value)):
         for name, field in fields_of(type(value)).items():
             inner = kinds_of(field.annotation, tuple(field.metadata))
             yield from _walk(f"{below}{name}", getattr(value, name), inner, field.description or about)
     elif isinstance(value, Mapping):
         for name, entry in value.items():
-            yield from _walk(f"{below}{name}", entry, [kind for table in kinds for kind in table.entries], about)
-    elif isinstance(value, list | tuple):
-        if len(value) == 2 and all(isinstance(number, int | float) for number in value):
-            entries = [entry for kind in kinds for entry in kind.entries]
-            yield from _walk_numbers(path, tuple(map(float, value)), entries, about)
+            yield from _walk(f"{below}{name}", entry, entries, about)
     elif isinstance(value, str):
         choices = tuple(str(choice) for kind in kinds for choice in kind.choices)
         if len(choices) > 1:  # else there is nothing to choose
             yield Knob(path=path, value=value, about=about, choices=choices)
-    elif value is not None:
-        yield from _walk_numbers(path, value, kinds, about)
-
-
-def _walk_numbers(path: str, value: Any, kinds: Sequence[Kind], about: str) -> Iterator[Knob]:
-    limits = next((kind.limits for kind in kinds if kind.type in (float, int, bool)), None)
-    if limits is not None:  # else it is what a user's controller reads
-        low, high = (limits.get(inside, limits.get(beyond)) for inside, beyond in (("ge", "gt"), ("le", "lt")))
-        yield Knob(path=path, value=value, about=about, minimum=low, maximum=high)
+    elif pair or isinstance(value, int | float):
+        numbers = entries if pair else kinds
+        limits = next((kind.limits for kind in numbers if kind.type in (float, int, bool)), None)
+        if limits is not None:  # else it is what a user's controller reads
+            low, high = (limits.get(inside, limits.get(beyond)) for inside, beyond in (("ge", "gt"), ("le", "lt")))
+            turned = tuple(map(float, value)) if pair else value
+            yield Knob(path=path, value=turned, about=about, minimum=low, maximum=high)

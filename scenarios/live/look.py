@@ -37,14 +37,9 @@ dark.addEventListener("change", () => location.reload())
 
 def dressed(page: str, title: str) -> str:
     """Return viser's page with our title, icon and sky, in the theme of the system."""
-    icon = "data:image/svg+xml," + quote(_ICON)
-    for pattern, ours in (
-        ('data:image/svg[^"]*', icon),
-        ("<title>.*?</title>", f"<title>{escape(title)}</title>"),
-        ("</head>", _HEAD),
-    ):
-        page = re.sub(pattern, ours.replace("\\", r"\\"), page, count=1)
-    return page
+    page = re.sub('data:image/svg[^"]*', "data:image/svg+xml," + quote(_ICON), page, count=1)
+    page = re.sub("<title>.*?</title>", lambda found: f"<title>{escape(title)}</title>", page, count=1)
+    return page.replace("</head>", _HEAD, 1)
 
 
 def airframe(model: mujoco.MjModel) -> Iterator[tuple[str, tuple[float, ...], trimesh.Trimesh]]:

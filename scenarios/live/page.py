@@ -1,4 +1,4 @@
-"""The page of a live session, drawn by viser, which only this module imports.
+"""The page of a live session, drawn by viser.
 
 All clients see the same page; one drives, the others watch.  Callbacks run in viser's thread and do no more than submit
 inputs, give orders to the pace and change what is shown.
@@ -17,9 +17,12 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from functools import partial
+from itertools import islice
 from typing import Any, Final, TypeVar
 
 import numpy as np
+import viser
+from viser import _messages
 
 from quadsim.controller import law_name
 from quadsim.errors import InputError, OutputError, ParameterError
@@ -81,9 +84,6 @@ class Page:
         port: int = 0,
         others: Mapping[str, AnyController],
     ) -> None:
-        import viser
-        from viser import _messages
-
         self._session, self._pace, self._save = session, pace, save
         guard = Guard(host)
         silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
@@ -129,7 +129,9 @@ class Page:
     def show(self, frame: Frame, factor: float) -> None:
         """Show a flown period."""
         self._frame, self._factor = frame, factor
-        self._remember(frame)
+        values = [None if sample is None else _values(sample) for sample in frame.samples]
+        if values[0] is not None:
+            self._history.append((frame.time, *values[0]))
         self._constraints.add(frame)
         with _unless_gone():
             for reason in frame.refused:
@@ -139,43 +141,37 @@ class Page:
             self.stage.show(frame)
             if frame.k % _EVERY == 0 or self._pace.paused:
                 self._announce()
-                self._show_numbers(frame)
+                loops = [flight.loop for flight in self._session.flights[1:]]
+                lost = [f"{law_name(loop.controller.name)} lost: {loop.reason}" for loop in loops if loop.reason]
+                states = [(value[3], math.hypot(*value[:3])) for value in values if value is not None]
+                self._numbers.content = readout.numbers(frame, states, lost)
                 audited = {limit.name for limit in self._session.limits}
                 self._margins.content = self._constraints.rows(frame, audited)
             if (frame.k % (2 * _EVERY) == 0 or self._pace.paused) and len(self._history) > 1:
-                table = np.array(self._history)[::2].T  # plots are the most of what is sent
-                first = 1
+                time, *rows = np.array(self._history)[::2].T  # plots are the most of what is sent
+                left = iter(rows)
                 for plot, (title, names) in zip(self._plots, _PLOTS.items(), strict=True):
-                    curves = table[first : first + len(names)]
-                    least = least_range(list(curves), title[title.index("[") + 1 : -1])
+                    curves = list(islice(left, len(names)))
+                    least = least_range(curves, title[title.index("[") + 1 : -1])
                     scales = _TIME if least is None else {**_TIME, "y": {"range": least}}
                     if scales != plot.scales:  # which draws the plot anew
                         plot.scales = scales
-                    plot.data = (table[0], *curves)
-                    first += len(names)
+                    plot.data = (time, *curves)
 
     def pose(self, frame: Frame, share: float) -> None:
         """Draw the vehicles, and let cameras follow."""
         with _unless_gone(), self._server.atomic():
             at = self.stage.pose(frame, share)
-            for client in self._server.get_clients().values() if self._follow.value else ():
-                if client.client_id in self._aims:
-                    _look(client.camera, at + self._aims[client.client_id])
+            for number, client in self._server.get_clients().items() if self._follow.value else ():
+                if number in self._aims:  # where it looks moves with it
+                    camera = client.camera
+                    camera.position = camera.position + (at + self._aims[number] - camera.look_at)
         self._server.flush()
 
-    def ended(self, reason: str | None) -> None:
-        """Show why the flight ended, or that it restarted (None)."""
-        if reason is not None:
-            self._announce()
-            self._numbers.content = readout.says(f"{reason}. Reset begins anew; Save keeps this flight.", "bad")
-            return
-        self._history.clear()
-        self._constraints.reset()
-        self._frame = None
-        self.stage.reset()
-        for part in (self._widgets, self._steering, self._controller):
-            part.reset()
+    def ended(self, reason: str) -> None:
+        """Show why the flight ended."""
         self._announce()
+        self._numbers.content = readout.says(f"{reason}. Reset begins anew; Save keeps this flight.", "bad")
 
     # What is on the page
 
@@ -187,8 +183,8 @@ class Page:
         self._numbers = gui.add_html(readout.numbers(None))
         self._margins = gui.add_html("")
         with gui.add_folder("Run"):
-            flight = {"Pause": self._toggle, "Step": self._step, "Reset": self._reset}
-            self._flight = self._widgets.group("Flight", flight | {"Resume": self._toggle}, tuple(flight))
+            toggles = {"Pause": self._toggle, "Resume": self._toggle}  # one at a time
+            self._flight = self._widgets.group("Flight", {**toggles, "Step": self._step, "Reset": self._reset})
             outputs = {"Save": self._keep, "Scenario": self._download, "Replay": self._scene}
             self._widgets.group("Output", outputs, hint=readout.OUTPUT)
             speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1", hint="simulated over real time")
@@ -230,14 +226,14 @@ class Page:
     def _announce(self) -> None:
         """Show what the session does now."""
         if self._activity:
-            state, kind = self._activity, "busy"
+            state = self._activity
         elif self._session.reason is not None:
-            state, kind = "ended", "ended"
+            state = "ended"
         elif self._pace.paused:
-            state, kind = "paused" if self._frame is not None else "ready", "paused"
+            state = "ready" if self._frame is None else "paused"
         else:
-            state, kind = "flying", "flying"
-        self._headline.content = readout.headline(state, kind, self._frame, self._factor)
+            state = "flying"
+        self._headline.content = readout.headline(state, self._frame, self._factor)
         self._flight.options = ("Resume" if self._pace.paused else "Pause", "Step", "Reset")
 
     def _use(self, hint: str) -> None:
@@ -269,7 +265,11 @@ class Page:
 
     async def _reset(self, event: Any) -> None:
         await self._ask(lambda session: session.reset())
-        self.ended(None)
+        self._frame = None
+        self._history.clear()
+        for part in (self._constraints, self.stage, self._widgets, self._steering, self._controller):
+            part.reset()
+        self._announce()
 
     async def _keep(self, event: Any) -> None:
         """Save what has been flown, beside the flight."""
@@ -302,7 +302,6 @@ class Page:
             self._announce()
         upright = client.camera.aspect < 1.0  # a phone, whose lower half is the panel
         aim = np.array([0.0, 0.0, -0.3 * np.linalg.norm(self._away)]) * upright
-
         connected = clock.monotonic()
 
         async def moved(camera: Any) -> None:  # a page reports viser's own place before it hears of ours
@@ -320,19 +319,15 @@ class Page:
         note = client.gui.add_html(readout.WATCH, order=-2.0, visible=watches)
         take = client.gui.add_button("Take the controls", order=-1.0, visible=watches, color="orange")
         self._takes[client.client_id] = [note, take]
-
-        async def taken(event: Any) -> None:
-            self._hand_over(client.client_id)
-
-        take.on_click(taken)
+        take.on_click(partial(self._hand_over, client.client_id))
 
     async def _left(self, client: Any) -> None:
         self._aims.pop(client.client_id, None)
         self._takes.pop(client.client_id, None)
         if self._driver == client.client_id:
-            self._hand_over(min(self._takes, default=None))
+            await self._hand_over(min(self._takes, default=None))
 
-    def _hand_over(self, driver: int | None) -> None:
+    async def _hand_over(self, driver: int | None, event: Any = None) -> None:
         """Give a client the controls; the pull and the manual set-point end."""
         self._session.submit({"type": "pull"}, subject="pull")
         self._steering.stop()
@@ -341,34 +336,16 @@ class Page:
             for widget in widgets:
                 widget.visible = client != driver
 
-    # Numbers
 
-    def _remember(self, frame: Frame) -> None:
-        sample = frame.samples[0]
-        if sample is None:
-            return
-        observed, physics = sample.observation, sample.segment.physics[-1]
-        error = observed.truth[[0, 2, 4]] - observed.reference[:3]
-        yaw = quaternion_to_euler(physics[None, 4:8])[0, 2] - observed.reference[3]
-        tilt, _ = _state(sample)
-        yaw = math.degrees(math.remainder(yaw, 2.0 * math.pi))
-        self._history.append((frame.time, *error, tilt, yaw, *sample.speeds, 1e3 * sample.step_s))
-
-    def _show_numbers(self, frame: Frame) -> None:
-        others = [flight.loop for flight in self._session.flights[1:]]
-        lost = [
-            f"{law_name(other.controller.name)} lost: {other.reason}" for other in others if other.reason is not None
-        ]
-        states = [_state(sample) for sample in frame.samples if sample is not None]
-        self._numbers.content = readout.numbers(frame, states, lost)
-
-
-def _state(sample: FlownPeriod) -> tuple[float, float]:
-    """Return a vehicle's largest tilt within the period [deg], and its position error at its start [m]."""
+def _values(sample: FlownPeriod) -> tuple[float, ...]:
+    """Return what is plotted of a period, in the order of `_PLOTS`."""
     observed, physics = sample.observation, sample.segment.physics
     up = 1.0 - 2.0 * (physics[:, 5] ** 2 + physics[:, 6] ** 2)
     tilt = math.degrees(math.acos(np.clip(up.min(), -1.0, 1.0)))
-    return tilt, float(np.linalg.norm(observed.truth[[0, 2, 4]] - observed.reference[:3]))
+    yaw = quaternion_to_euler(physics[-1:, 4:8])[0, 2] - observed.reference[3]
+    error = observed.truth[[0, 2, 4]] - observed.reference[:3]
+    turned = math.degrees(math.remainder(yaw, 2.0 * math.pi))
+    return (*error, tilt, turned, *sample.speeds, 1e3 * sample.step_s)
 
 
 @contextlib.contextmanager
@@ -377,13 +354,6 @@ def _unless_gone() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r"Queued a \w+ on a closed connection")
         yield
-
-
-def _look(camera: Any, at: Any) -> None:
-    """Turn a camera to a point [m], from as far away as it is."""
-    away = np.asarray(camera.position) - camera.look_at
-    camera.position = at + away  # which moves where it looks
-    camera.look_at = at
 
 
 def _send(client: Any, name: str, text: str) -> None:

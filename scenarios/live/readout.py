@@ -37,8 +37,8 @@ STEER: Final = (
 STYLE: Final = f"""<style>
 .q{{font:12px/1.5 system-ui,sans-serif;padding:0 .8em}}.q b,.q .n{{font-variant-numeric:tabular-nums}}
 .q .line{{height:1.5em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}}
-.chip{{display:inline-block;padding:0 .6em;border-radius:1em;color:#fff;background:#2f7d4f;font-weight:600}}
-.chip.paused{{background:#6b7280}}.chip.busy{{background:#a85f00}}.chip.ended{{background:{BOUND}}}
+.chip{{display:inline-block;padding:0 .6em;border-radius:1em;color:#fff;background:#a85f00;font-weight:600}}
+.chip.flying{{background:#2f7d4f}}.chip.paused,.chip.ready{{background:#6b7280}}.chip.ended{{background:{BOUND}}}
 .q table{{width:100%;border-collapse:collapse;table-layout:fixed}}.q tr{{height:1.6em}}
 .q td,.q th{{padding:0 4px 0 0;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}}
 .q th{{text-align:left;font-weight:400;opacity:.7}}.q .n{{text-align:right}}
@@ -48,15 +48,14 @@ STYLE: Final = f"""<style>
 .q .watch{{background:#a85f00;color:#fff;padding:.4em .7em;border-radius:4px;margin:.4em 0}}
 .q .why{{opacity:.75;padding-bottom:.5em}}
 .hints,.over{{position:fixed;left:16px;z-index:5;pointer-events:none;font:14px/1.4 system-ui,sans-serif}}
-.hints{{bottom:16px}}.over{{top:16px}}
-.hints div{{margin-top:6px;padding:4px 12px;border-radius:1em;background:#1f2937d9;color:#fff;width:max-content}}
-.hints .key{{font-size:12px}}.hints div{{max-width:calc(100vw - 400px)}}.touch{{display:none}}
-@media (pointer:coarse){{
- .touch{{display:inline}}.mouse{{display:none}}.mantine-Button-root{{min-height:36px}}
-}}
+.hints{{bottom:16px}}.over{{top:16px}}.hints .key{{font-size:12px}}
+.hints div{{margin-top:6px;padding:4px 12px;border-radius:1em;background:#1f2937d9;color:#fff;width:max-content;
+ max-width:calc(100vw - 400px)}}
+.touch{{display:none}}
+@media (pointer:coarse){{.touch{{display:inline}}.mouse{{display:none}}.mantine-Button-root{{min-height:36px}}}}
 @media (max-width:36em){{
  .hints{{top:8px;bottom:auto;font-size:12px}}
- .hints div{{max-width:none}}.hints div{{margin-top:4px;padding:2px 10px}}.hints .key{{display:none}}
+ .hints div{{max-width:none;margin-top:4px;padding:2px 10px}}.hints .key{{display:none}}
  .mantine-Paper-root[style*="20em"],.mantine-Paper-root [style*="20em"]{{width:100%!important}}
 }}
 </style>"""
@@ -75,19 +74,18 @@ def says(text: str, mark: str = "") -> str:
 def hints(used: Collection[str], names: Sequence[str]) -> str:
     """Return the hints over the scene that have not been used, and the key to its colours."""
     left = "".join(f"<div>{text}</div>" for name, text in HINTS.items() if name not in used)
-    if len(names) == 1:
-        key = "octahedron: set-point; blue: flown; green: predicted; arrows: thrusts; orange arm: front"
-    else:
-        key = f"octahedron: set-point; blue: {escape(names[0])}; orange: {escape(names[1])}; inputs act on both"
-    return f'<div class="hints">{left}<div class="key">{key}</div></div>'
+    key = "blue: flown; green: predicted; arrows: thrusts; orange arm: front"
+    if len(names) > 1:
+        key = f"blue: {escape(names[0])}; orange: {escape(names[1])}; inputs act on both"
+    return f'<div class="hints">{left}<div class="key">octahedron: set-point; {key}</div></div>'
 
 
-def headline(state: str, kind: str, frame: Frame | None, factor: float) -> str:
+def headline(state: str, frame: Frame | None, factor: float) -> str:
     """Return what the flight does now, its time and its speed."""
     time = "" if frame is None else f" <b>{frame.time:.2f} s</b>"
-    speed = f", real-time factor {factor:.2f}" if frame is not None and kind == "flying" else ""
-    chip = f'<span class="chip {kind}">{escape(state)}</span>'
-    over = "" if kind == "flying" else f'<div class="over">{chip}</div>'  # seen also where the panel is scrolled
+    speed = f", real-time factor {factor:.2f}" if frame is not None and state == "flying" else ""
+    chip = f'<span class="chip {state}">{state}</span>'
+    over = "" if state == "flying" else f'<div class="over">{chip}</div>'  # seen also where the panel is scrolled
     return block(f"{chip}{time}{speed}", "line") + over
 
 
@@ -111,16 +109,15 @@ def numbers(frame: Frame | None, states: Sequence[tuple[float, float]] = (), los
         f"MPC: {solved}{active}",
         f"solved in <b>{1e3 * sample.step_s:.1f}</b> ms{late}; pull <b>{math.hypot(*frame.pull):.1f}</b> N"
         + "".join(f'; <span class="bad">{text}</span>' for text in weak),
-        _each("tilt", [tilt for tilt, _ in states], "deg", 1),
-        _each("position error", [error for _, error in states], "m", 2),
+        f"tilt {_dotted([f'{tilt:.1f}' for tilt, _ in states])} deg",
+        f"position error {_dotted([f'{error:.2f}' for _, error in states])} m",
         *(f'<span class="bad">{escape(text)}</span>' for text in lost),
     ]
     return "".join(block(row, "line") for row in rows)
 
 
-def _each(name: str, values: Sequence[float], unit: str, decimals: int) -> str:
-    dots = [_dot(i) if len(values) > 1 else "" for i in range(len(values))]
-    return f"{name} " + " ".join(f"{dots[i]}<b>{value:.{decimals}f}</b>" for i, value in enumerate(values)) + f" {unit}"
+def _dotted(texts: Sequence[str]) -> str:
+    return " ".join(f"{_dot(i) if len(texts) > 1 else ''}<b>{text}</b>" for i, text in enumerate(texts))
 
 
 def _dot(vehicle: int) -> str:
@@ -186,10 +183,8 @@ def is_violated(limit: Limit, margin: float) -> bool:
 
 def _mark(limit: Limit, margin: float, vehicle: int) -> str:
     """Return a vehicle's mark: the first one's bar grows towards the bound, the other's is a stroke at its end."""
-    share = min(max(1.0 - margin / limit.half_band, 0.0), _SHOWN) / _SHOWN
-    if vehicle == 0:
-        colour = BOUND if is_violated(limit, margin) else line_colour(0)
-        return f'<i style="left:0;width:{100.0 * share:.1f}%;background:{colour}"></i>'
-    return (
-        f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{line_colour(vehicle)};z-index:1"></i>'
-    )
+    share, colour = min(max(1.0 - margin / limit.half_band, 0.0), _SHOWN) / _SHOWN, line_colour(vehicle)
+    if vehicle:
+        return f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{colour};z-index:1"></i>'
+    colour = BOUND if is_violated(limit, margin) else colour
+    return f'<i style="left:0;width:{100.0 * share:.1f}%;background:{colour}"></i>'

@@ -22,7 +22,7 @@ from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
 from quadsim.controller import law_name
@@ -38,9 +38,6 @@ from scenarios.results import EXIT_DONE, EXIT_FAILED, Document
 from scenarios.schema.controllers import AnyController
 from scenarios.schema.scenario import Scenario
 
-if TYPE_CHECKING:
-    from scenarios.live.page import Page
-
 LATE: Final = 0.25  # [s] beyond which lost time is given up: no period is dropped, the flight is behind real time
 POSES: Final = 2  # drawn in each period
 _IDLE: Final = 0.02  # [s] between looks for orders while nothing is flown
@@ -54,27 +51,19 @@ class Pace:
         speed: simulated over real time that is aimed at.
         paused: whether only single periods are flown.
         waiting: whether it is paused until somebody looks.
+        single: flies one period while paused.
+        stop: ends the session after this period.
+        order: calls a function of the session between two periods, in the flying thread.
     """
 
     def __init__(self, now: Callable[[], float] = clock.monotonic, *, waiting: bool = False) -> None:
         self._now, self._stop, self._single = now, threading.Event(), threading.Semaphore(0)
-        self.speed, self.paused, self.waiting = 1.0, waiting, waiting
         self._orders: deque[Callable[[Session], None]] = deque()
+        self.speed, self.paused, self.waiting = 1.0, waiting, waiting
+        self.single, self.stop, self.order = self._single.release, self._stop.set, self._orders.append
 
-    def single(self) -> None:
-        """Fly one period while paused."""
-        self._single.release()
-
-    def stop(self) -> None:
-        """End the session after this period."""
-        self._stop.set()
-
-    def order(self, what: Callable[[Session], None]) -> None:
-        """Run a function between two periods, in the flying thread."""
-        self._orders.append(what)
-
-    def drive(self, session: Session, view: Page, until: Callable[[Frame], bool] = lambda frame: False) -> None:
-        """Fly until `stop` or the last frame; a flight that ended waits for a reset."""
+    def drive(self, session: Session, view: Any, until: Callable[[Frame], bool] = lambda frame: False) -> None:
+        """Fly until `stop` or the last frame, shown by a `Page`; a flight that ended waits for a reset."""
         due, recent = self._now(), deque[float](maxlen=round(2.0 / session.period) + 1)  # two seconds
         while not self._stop.is_set():
             while self._orders:
@@ -134,26 +123,27 @@ class Guard:
         return None
 
     @contextlib.contextmanager
-    def installed(self, dress: Callable[[str], str] = str) -> Iterator[None]:
+    def installed(self, dress: Callable[[str], str]) -> Iterator[None]:
         """Make a server that viser starts in this block check its requests, and change its page."""
         from viser.infra import _infra
 
         library = _infra.websockets.asyncio.server
         serve = library.serve
 
-        def guarded(*args: Any, process_request: Any = None, **options: Any) -> Any:
+        def guarded(*args: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
             def check(connection: Any, request: Any) -> Any:
                 port = connection.local_address[1]
-                refused = self.refusal(request.headers, request.path, port)
-                if refused is not None:
+                if refused := self.refusal(request.headers, request.path, port):
                     return connection.respond(HTTPStatus.FORBIDDEN, f"quadsim: {refused}\n")
                 request.headers.pop("Accept-Encoding", None)  # the page is packed as it is
-                response = None if process_request is None else process_request(connection, request)
-                if response is not None and response.headers.get("Content-Type", "").startswith("text/html"):
+                response = process_request(connection, request)
+                if response is None:  # a WebSocket
+                    return None
+                if response.headers.get("Content-Type", "").startswith("text/html"):
                     response.body = dress(response.body.decode()).encode()
                     del response.headers["Content-Length"]
                     response.headers["Content-Length"] = str(len(response.body))
-                if response is not None and "token" in parse_qs(request.path.partition("?")[2]):
+                if "token" in parse_qs(request.path.partition("?")[2]):
                     cookie = f"quadsim-{port}={self.token}"  # its name has the port, which cookies ignore
                     response.headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict; Path=/"
                 return response
@@ -220,8 +210,7 @@ def fly_live(
                 with reporting(True) as report:
                     refused = session.play(inputs, report)
                 for reason in refused:
-                    first, *others = reason.split("\n")
-                    console.show([f"quadsim: refused: {script}: {first}", *others], console.stderr())
+                    console.show(f"quadsim: refused: {script}: {reason}".split("\n"), console.stderr())
         except KeyboardInterrupt:  # what was flown is saved
             print(file=sys.stderr)
         text, seconds = "", session.k * session.period

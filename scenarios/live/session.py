@@ -38,7 +38,6 @@ from scenarios.schema.scenario import Scenario
 
 STIFFNESS: Final = 0.4  # of the spring that a person pulls by, in weights of the vehicle per metre
 STRONGEST: Final = 0.3  # largest pull in weights of the vehicle
-FORCE_STEP: Final = 1e-3  # to which pulls are rounded [N]
 HELD: Final = ("pull", "wear", "steer")  # inputs in force until they are changed; the others are events
 
 
@@ -91,7 +90,7 @@ class Script:
                 raise ParameterError("", f"inputs.{i}.at", at, f"below duration = {self.duration} s, and 0 or more")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Frame:
     """One flown control period, for a view; one entry per flight that has not ended."""
 
@@ -125,7 +124,7 @@ class Session:
 
     def __init__(self, scenario: Scenario, against: AnyController | None = None) -> None:
         self.scenario, self._against = preferring_core(scenario), against
-        self._queue: deque[tuple[Mapping[str, Any], str | None, Successor | None, str]] = deque()
+        self._queue: deque[tuple[Mapping[str, Any], str, Successor | None, str]] = deque()
         self.flights: tuple[Rollout, ...] = ()
         self.reset()
 
@@ -133,10 +132,10 @@ class Session:
         """Restart at t = 0; pending inputs are dropped."""
         self.close()
         self._queue.clear()
-        scenarios = [self.scenario]
+        flown = [self.scenario]
         if self._against is not None:
-            scenarios.append(with_bounds_stated(Assembly(self.scenario)).altered(controller=self._against))
-        self.flights = tuple(Rollout(scenarios_flown, live=True) for scenarios_flown in scenarios)
+            flown.append(with_bounds_stated(Assembly(self.scenario)).altered(controller=self._against))
+        self.flights = tuple(Rollout(scenario, live=True) for scenario in flown)
         self._held, self._steered = _Hand(), False
         self.reason: str | None = None
 
@@ -161,12 +160,7 @@ class Session:
         return tuple(self.flights[0].limits)
 
     def submit(
-        self,
-        table: Mapping[str, Any],
-        *,
-        subject: str | None = None,
-        successor: Successor | None = None,
-        name: str = "",
+        self, table: Mapping[str, Any], *, subject: str = "", successor: Successor | None = None, name: str = ""
     ) -> None:
         """Let a `Pull`, `Wear`, `Steer`, or an event without its time, happen from the next period on; from any thread.
 
@@ -186,42 +180,30 @@ class Session:
         taken = [self._queue.popleft() for _ in range(len(self._queue))]
         last = {subject: i for i, (_, subject, *_) in enumerate(taken)}
         for i, (table, subject, successor, name) in enumerate(taken):
-            if subject is None or last[subject] == i:
+            if not subject or last[subject] == i:
                 try:
                     self._apply(table, successor)
                 except InputError as error:
                     refused.append(f"{name}{error}")
         pull, shown = self._hold(refused), []
         for flight in self.flights:
-            sample, margins, horizon = None, {}, None
+            entry: tuple[FlownPeriod | None, Mapping[str, float], Array | None] = None, {}, None
             if flight.loop.reason is None:
                 try:
                     sample = flight.step()
-                    margins, horizon = flight.margins(sample), _horizon(flight, sample)
+                    entry = sample, flight.margins(sample), _horizon(flight, sample)
                 except FlightError as error:
                     self.reason = str(error) if flight is self.flights[0] else self.reason
-            shown.append((sample, margins, horizon))
-        samples, all_margins, horizons = zip(*shown, strict=True)
-        return Frame(
-            k=self.k - 1,
-            time=round((self.k - 1) * self.period, 9),
-            samples=samples,
-            margins=all_margins,
-            horizons=horizons,
-            pull=pull,
-            health=self._health(),
-            refused=tuple(refused),
-        )
-
-    def _health(self) -> Array:
-        """(4,) share of its thrust that each rotor has, by the scenario's events and by wear."""
-        result, now = np.ones(N_ROTORS), self.flights[0].loop.time
+            shown.append(entry)
+        samples, margins, horizons = zip(*shown, strict=True)
+        health, now = np.ones(N_ROTORS), self.flights[0].loop.time
         for event in self.scenario.events:
             if isinstance(event, RotorLoss) and event.at <= now < event.at + (event.duration or math.inf):
-                result[event.rotor - 1] *= 1.0 - event.loss
+                health[event.rotor - 1] *= 1.0 - event.loss
         for rotor, loss in self._held.wear.items():
-            result[rotor - 1] *= 1.0 - loss
-        return result
+            health[rotor - 1] *= 1.0 - loss
+        time = round((self.k - 1) * self.period, 9)
+        return Frame(self.k - 1, time, samples, margins, horizons, pull, health, tuple(refused))
 
     def successor(self, fields: Mapping[str, Any]) -> Successor:
         """Build a controller for the first flight with some fields changed; callable from any thread.
@@ -246,10 +228,9 @@ class Session:
             for table in tables:
                 try:
                     trial.apply(table)
+                    result.append("")
                 except InputError as error:
                     result.append(str(error))
-                else:
-                    result.append("")
         return result
 
     def play(self, script: Script, progress: Progress = silent) -> list[str]:
@@ -263,40 +244,37 @@ class Session:
             progress("session", self.k, round(script.duration / self.period))
             while waiting and waiting[0][1]["at"] <= time + 1e-9:
                 i, entry = waiting.popleft()
-                self.submit(
-                    {key: value for key, value in entry.items() if key != "at"},
-                    name=f"inputs.{i} at t = {time:.3f} s: ",
-                )
+                table = {key: value for key, value in entry.items() if key != "at"}
+                self.submit(table, name=f"inputs.{i} at t = {time:.3f} s: ")
             refused += self.advance().refused
         return refused
 
-    def flight(self, which: int = 0) -> Flight:
-        """Return the flight so far, audited; its scenario reproduces it bit for bit.
+    def flight(self) -> Flight:
+        """Return the first vehicle's flight so far, audited; its scenario reproduces it bit for bit.
 
         Raises:
             InputError: nothing has been flown.
         """
         if self.k == 0:
             raise InputError("nothing has been flown yet")
-        return self.flights[which].flight()
+        return self.flights[0].flight()
 
     def _apply(self, table: Mapping[str, Any], successor: Successor | None) -> None:
         """Apply an input; a controller event only to the first flight."""
-        if table.get("type") not in HELD:
+        if table.get("type") in HELD:
+            match parse_table(_Held, {"input": table}, "input").input:
+                case Pull(to=to):
+                    self._held.pull = None if to is None else np.array(to)
+                case Wear(rotor=rotor, loss=loss):
+                    self._held.wear[rotor] = loss
+                case Steer(velocity=velocity):
+                    self._held.steer = np.array(velocity)
+        elif table.get("type") == "controller":
+            self.flights[0].apply(table, successor)
+        else:
             if table.get("type") == "setpoint":
                 self._held.setpoint = None
-            if table.get("type") == "controller":
-                self.flights[0].apply(table, successor)
-            else:
-                self._happen(table)
-            return
-        match parse_table(_Held, {"input": table}, "input").input:
-            case Pull(to=to):
-                self._held.pull = None if to is None else np.array(to)
-            case Wear(rotor=rotor, loss=loss):
-                self._held.wear[rotor] = loss
-            case Steer(velocity=velocity):
-                self._held.steer = np.array(velocity)
+            self._happen(table)
 
     def _happen(self, event: Mapping[str, Any]) -> None:
         for flight in self.flights:
@@ -315,18 +293,16 @@ class Session:
         if held.pull is not None:
             weight = self.flights[0].actual.mass * self.flights[0].actual.gravity
             force = STIFFNESS * weight * (held.pull - last.segment.physics[-1, 1:4])
-            size = float(np.linalg.norm(force))
-            force *= min(1.0, STRONGEST * weight / size) if size > 0.0 else 0.0
-            force = np.round(force / FORCE_STEP) * FORCE_STEP
+            force *= min(1.0, STRONGEST * weight / max(float(np.linalg.norm(force)), 1e-9))
+            force = np.round(force, 3)  # [N]
             if force.any():
-                events.append({"type": "push", "duration": self.period, "force": np.round(force, 6).tolist()})
-        for rotor, loss in sorted(held.wear.items()):
-            if loss > 0.0:
-                events.append({"type": "rotor_loss", "rotor": rotor, "loss": loss, "duration": self.period})
+                events.append({"type": "push", "duration": self.period, "force": force.tolist()})
+        worn = {"type": "rotor_loss", "duration": self.period}
+        events += [worn | {"rotor": rotor, "loss": loss} for rotor, loss in sorted(held.wear.items()) if loss > 0.0]
         if held.steer.any():
             at = last.observation.reference[:3] if held.setpoint is None else held.setpoint
             held.setpoint = np.round(at + self.period * held.steer, 6)
-            events.append({"type": "setpoint", **dict(zip(REFERENCE_NAMES, held.setpoint.tolist(), strict=False))})
+            events.append({"type": "setpoint", **dict(zip("xyz", held.setpoint.tolist(), strict=True))})
         try:
             for event in events:
                 self._happen(event)

@@ -46,7 +46,6 @@ class Stage:
 
     Attributes:
         unit: the vehicle's arm length [m].
-        frames: viser's frame of each vehicle.
         grab: what the mouse takes hold of.
         mark: a spot on the floor.
         ground: height of the floor, below the whole flight [m].
@@ -59,7 +58,7 @@ class Stage:
         scene.configure_default_lights(enabled=False)
         scene.add_light_hemisphere("/light", intensity=2.5)
         scene.add_light_directional("/light/sun", intensity=2.0, position=(0.35, -0.25, 0.9))
-        self.root = scene.add_frame(_ROOT, show_axes=False)
+        self._root = scene.add_frame(_ROOT, show_axes=False)
         vehicle = session.flights[0].actual
         self.unit, self._weight = vehicle.arm_length, vehicle.mass * vehicle.gravity
         self._rotors, self._coefficient = np.array(vehicle.rotor_positions), vehicle.thrust_coefficient
@@ -72,17 +71,17 @@ class Stage:
         self._goal = self._line("goal", _octahedron(0.5 * self.unit), target, 2.5)
         self._hand = self._line("hand", np.zeros((1, 2, 3)), _rgb(BOUND), 5.0)
         self._thrusts: list[ink.Colour] = []  # colours
-        self.frames, self._arrows, self._horizons, self._paths, self._shadows = [], [], [], [], []
+        self._frames, self._arrows, self._horizons, self._paths, self._shadows = [], [], [], [], []
         for i, flight in enumerate(session.flights):
             name, length, colour = f"vehicle{i}", flight.loop.controller.horizon, _rgb(line_colour(i))
-            self.frames.append(scene.add_frame(f"{_ROOT}/{name}", show_axes=False))
+            self._frames.append(scene.add_frame(f"{_ROOT}/{name}", show_axes=False))
             for material, (*rgb, alpha), mesh in look.airframe(model):
                 tint = tuple(rgb) if alone or material not in _TINTED else colour
                 self._add(f"{name}/{material}", mesh, tint, opacity=None if alpha == 1.0 else alpha)
-            arrows, sizes = np.zeros((len(self._rotors), 2, 3)), (0.04 * self.unit, 0.09 * self.unit, 0.2 * self.unit)
-            shape = dict(zip(("shaft_radius", "head_radius", "head_length"), sizes, strict=True))
-            self._thrusts.append(ink.BLUE if alone else colour)
-            self._arrows.append(scene.add_arrows(f"{_ROOT}/{name}/thrust", arrows, self._thrusts[i], **shape))
+            thrust, arrows = ink.BLUE if alone else colour, np.zeros((len(self._rotors), 2, 3))
+            widths = {"shaft_radius": 0.04 * self.unit, "head_radius": 0.09 * self.unit, "head_length": 0.2 * self.unit}
+            self._thrusts.append(thrust)
+            self._arrows.append(scene.add_arrows(f"{_ROOT}/{name}/thrust", arrows, thrust, **widths))
             self._horizons.append(self._line(f"horizon{i}", np.zeros((length, 2, 3)), ink.GREEN if alone else colour))
             self._paths.append(self._line(f"path{i}", np.zeros((TRAIL, 2, 3)), colour))
             shadow = self._add(f"shadow{i}", look.disc(0.9 * self.unit), _SHADOW)
@@ -98,7 +97,18 @@ class Stage:
         self._shown = deque[Frame](maxlen=round(_SECONDS / session.period))
         self._moving: list[tuple[Obstacle, Any]] = []
         self._regions: list[tuple[SpaceLimit, Any]] = []
-        self._add_space()
+        course = _course(session).reshape(-1, 3)
+        low, high = course.min(axis=0) - 1.5, course.max(axis=0) + 1.5
+        for limit in session.limits:
+            match limit:
+                case SpaceLimit(shape=Region() as region):
+                    line = self._line(f"regions/{limit.name}", region.edges(low, high), _REGION, 1.5)
+                    self._regions.append((limit, line))
+                case SpaceLimit(shape=Obstacle() as body):
+                    handle = self._add(f"obstacles/{body.name}", look.obstacle(body), _rgb(OBSTACLE))
+                    handle.position = body.position
+                    if body.moves:
+                        self._moving.append((body, handle))
         self.ground, self._events = 0.0, 0
         self.reset()
 
@@ -141,14 +151,14 @@ class Stage:
 
     def pose(self, frame: Frame, share: float) -> Array:
         """Draw the vehicles at a fraction of the period; return the position of the first (3,) [m]."""
-        for sample, handle, (shadow, plumb) in zip(frame.samples, self.frames, self._shadows, strict=True):
+        for sample, handle, (shadow, plumb) in zip(frame.samples, self._frames, self._shadows, strict=True):
             if sample is not None:
                 physics = sample.segment.physics
                 row = physics[min(len(physics) - 1, int(share * len(physics)))]
                 handle.position, handle.wxyz = row[1:4], row[4:8]
                 foot = self.ground + 0.01 * self.unit
                 shadow.position, plumb.scale = (*row[1:3], foot), (1.0, 1.0, float(row[3] - foot))
-        return np.asarray(self.frames[0].position)
+        return np.asarray(self._frames[0].position)
 
     def reset(self) -> None:
         """Clear the scene for a new flight."""
@@ -176,7 +186,7 @@ class Stage:
         stage = Stage(viser.SceneApi(owner, idle, idle), self._session)
         for frame in frames:
             stage.show(frame)
-            stage.root.position = -stage.pose(frame, 1.0)
+            stage._root.position = -stage.pose(frame, 1.0)
             record.insert_sleep(self._session.period)
             clock.sleep(_REST)
         return look.dressed(record.as_html(), title)
@@ -188,20 +198,6 @@ class Stage:
     def _add(self, name: str, mesh: Any, colour: tuple[float, ...], **style: Any) -> Any:
         style = {"color": colour, "flat_shading": True, **FLAT, **style}
         return self._scene.add_mesh_simple(f"{_ROOT}/{name}", mesh.vertices, mesh.faces, **style)
-
-    def _add_space(self) -> None:
-        course = _course(self._session).reshape(-1, 3)
-        low, high = course.min(axis=0) - 1.5, course.max(axis=0) + 1.5
-        for limit in self._session.limits:
-            shape = limit.shape if isinstance(limit, SpaceLimit) else None
-            if isinstance(limit, SpaceLimit) and isinstance(shape, Region):
-                line = self._line(f"regions/{limit.name}", shape.edges(low, high), _REGION, 1.5)
-                self._regions.append((limit, line))
-            elif isinstance(shape, Obstacle):
-                pose = {"position": shape.position}
-                handle = self._add(f"obstacles/{shape.name}", look.obstacle(shape), _rgb(OBSTACLE), **pose)
-                if shape.moves:
-                    self._moving.append((shape, handle))
 
 
 def _rgb(colour: str) -> ink.Colour:
@@ -225,7 +221,6 @@ def _segments(points: Array, count: int) -> Array:
 
 def _course(session: Session) -> Array:
     """The reference over the scenario's whole time, thinned."""
-    scenario = session.scenario
-    every = max(1, scenario.periods // _COURSE)
-    rows = session.flights[0].loop.course.preview(0, scenario.periods)[::every, :3]
+    periods = session.scenario.periods
+    rows = session.flights[0].loop.course.preview(0, periods)[:: max(1, periods // _COURSE), :3]
     return _segments(np.asarray(rows), _COURSE + 1)

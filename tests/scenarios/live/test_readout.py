@@ -19,16 +19,8 @@ LATE = Limit(name="arrival_x", signal="x_error", lower=-0.1, upper=0.1, start=29
 def frame(*margins: float, health: tuple[float, ...] = (1.0,) * 4) -> Frame:
     """A period in which each vehicle has this margin in roll."""
     nothing = (None,) * len(margins)
-    return Frame(
-        k=0,
-        time=1.0,
-        samples=nothing,
-        margins=tuple({"roll": margin} for margin in margins),
-        horizons=nothing,
-        pull=np.zeros(3),
-        health=np.array(health),
-        refused=(),
-    )
+    roll = tuple({"roll": margin} for margin in margins)
+    return Frame(0, 1.0, nothing, roll, nothing, np.zeros(3), np.array(health), ())
 
 
 def rows(*frames: Frame, limits: tuple[Limit, ...] = (ROLL,), audited: frozenset[str] = frozenset({"roll"})) -> str:

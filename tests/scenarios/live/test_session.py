@@ -67,7 +67,7 @@ def flown(session: Session, periods: int) -> list[Frame]:
 
 
 def same_bits(session: Session, which: int = 0) -> bool:
-    flight = session.flight(which)
+    flight = session.flights[which].flight()
     again = Rollout(flight.scenario).fly()
     return np.array_equal(again.log.plant.state, flight.log.plant.state) and np.array_equal(
         again.command, flight.command
@@ -148,7 +148,9 @@ def test_a_second_vehicle_feels_the_same(hover: Scenario) -> None:
     flown(session, 3)
     session.submit({"type": "pull", "to": [3.0, 0.0, 1.0]})
     flown(session, 10)
-    pushes = [[event for event in session.flight(i).scenario.events if event.type == "push"] for i in range(2)]
+    pushes = [
+        [event for event in session.flights[i].flight().scenario.events if event.type == "push"] for i in range(2)
+    ]
     session.close()
     assert len(pushes[0]) > 5
     assert pushes[0] == pushes[1]
