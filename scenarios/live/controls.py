@@ -61,9 +61,11 @@ class Widgets:
         for widget, value in self._starts:
             widget.value = value
 
-    def button(self, label: str, act: Callable[[Any], Any], **look: Any) -> None:
+    def button(self, label: str, act: Callable[[Any], Any], **look: Any) -> Any:
         """A button."""
-        self.on(self.gui.add_button(label, **look).on_click, act)
+        button = self.gui.add_button(label, **look)
+        self.on(button.on_click, act)
+        return button
 
     def event(self, label: str, table: Callable[[], Mapping[str, Any]], refused: str = "") -> None:
         """A button that submits an event, if this scenario can have it."""
@@ -105,15 +107,19 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     def broken(event: Any) -> None:
         use("break")
         loss = 0.0 if wear[0].value else _BROKEN
-        wear[0].value, event.target.label = loss, "Repair the rotor" if loss else "Break a rotor"
+        wear[0].value = loss
         session.submit(_wear(1, loss), subject=wear[0].label)
 
+    async def named(event: Any) -> None:  # also after a reset
+        button.label = "Repair the rotor" if wear[0].value else "Break a rotor"
+
     widgets.on(stage.grab.on_drag("left"), pulled)
-    widgets.button("Break a rotor", broken, hint=f"rotor 1 loses {100 * _BROKEN:.0f} % of its thrust")
+    button = widgets.button("Break a rotor", broken, hint=f"rotor 1 loses {100 * _BROKEN:.0f} % of its thrust")
     wear = [
         widgets.submits(gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0), partial(_wear, rotor))
         for rotor in range(1, N_ROTORS + 1)
     ]
+    wear[0].on_update(named)
     box = {"min": (-15.0, -15.0), "max": (15.0, 15.0), "step": 0.5, "disabled": bool(no_wind)}
     blow = gui.add_vector2("Gust x, y [m/s]", (6.0, 0.0), **box)
     widgets.event("Gust for 1 s", lambda: gust | {"velocity": [*blow.value, 0.0]}, no_wind)

@@ -332,9 +332,10 @@ class Page:
         self._session.submit({"type": "pull"}, subject="pull")
         self._steering.stop()
         self._driver = driver
-        for client, widgets in self._takes.items():
-            for widget in widgets:
-                widget.visible = client != driver
+        with _unless_gone():
+            for client, widgets in self._takes.items():
+                for widget in widgets:
+                    widget.visible = client != driver
 
 
 def _values(sample: FlownPeriod) -> tuple[float, ...]:

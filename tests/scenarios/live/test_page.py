@@ -298,12 +298,18 @@ def test_pause_stands_still_and_save_keeps_what_flies_again_to_the_bit(tab: Any,
 
 
 def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
+    tab.get_by_role("tab", name="Disturb").click()
+    tab.get_by_role("button", name="Break a rotor").click()
+    tab.get_by_role("button", name="Repair the rotor").wait_for()
+    served.wait(lambda: bool(served.events("rotor_loss")))
+    tab.get_by_role("tab", name="Controller").click()
     k = served.session.k
     tab.get_by_role("button", name="Reset", exact=True).click()
     served.wait(lambda: served.session.k < k)
     field = tab.locator("label", has_text="N [periods]").locator("xpath=ancestor::div[.//input][1]").locator("input")
     served.wait(lambda: field.input_value() == "10")
     tab.get_by_role("tab", name="Disturb").click()
+    tab.get_by_role("button", name="Break a rotor").wait_for()
     row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
     served.wait(lambda: row.get_by_role("slider").get_attribute("aria-valuenow") == "1")
     assert served.session.flights[0].loop.controller.horizon == 10
