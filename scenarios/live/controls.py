@@ -142,6 +142,7 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     fault = gui.add_dropdown("Fault", ("dropout", "freeze", "nan"), disabled=not seen)
     no_fault = "" if seen else blind[0]
     widgets.event("Fail sensor for 1 s", lambda: sensors[0] | {"sensor": sensor.value, "fault": fault.value}, no_fault)
+    gui.add_html(readout.says(no_fault, "why"))
     late = gui.add_number("Late commands [ms]", 200, min=10, max=5000, step=10)
     widgets.event("Stall the computer", lambda: {"type": "stall", "duration": late.value / 1e3})
 
