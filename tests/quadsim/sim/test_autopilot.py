@@ -69,7 +69,8 @@ def test_the_mixer_gives_what_fits_and_says_what_it_cut(vehicle: Vehicle, airmod
         elif not cut[0]:  # thrust moves no further than roll and pitch need
             level = np.linalg.inv(vehicle.allocation / vehicle.thrust_coefficient)[:, 1:3] @ torque[:2]
             ends = 4.0 * (lowest - level.min()), 4.0 * (top - level.max())
-            assert given == pytest.approx(np.clip(np.clip(thrust, 4.0 * lowest, 4.0 * top), *ends))
+            wanted = np.clip(thrust, 4.0 * lowest, 4.0 * top)
+            assert abs(given - wanted) <= abs(np.clip(wanted, *ends) - wanted) + 1e-9 * top
 
 
 def test_yaw_is_cut_before_roll_and_pitch(vehicle: Vehicle) -> None:
@@ -105,7 +106,7 @@ def test_a_step_of_a_body_rate_is_reached_with_little_overshoot(vehicle: Vehicle
 def test_a_constant_torque_is_integrated_away(vehicle: Vehicle) -> None:
     torque = 2.0 * vehicle.inertia[0]
     effects = Effects(rotors=RotorDynamics().resolved(vehicle), disturbance=Disturbance(torque=(torque, 0.0, 0.0)))
-    assert abs(fly(vehicle, Autopilot(vehicle), hover(vehicle), 3.0, effects)[-1, 11]) < 1e-3
+    assert abs(fly(vehicle, Autopilot(vehicle), hover(vehicle), 8.0, effects)[-1, 11]) < 1e-3
     without = Autopilot(vehicle, AutopilotSettings(i=NONE))
     gain = without.settings.p[0] if without.settings.p else 0.0
     assert fly(vehicle, without, hover(vehicle), 3.0, effects)[-1, 11] == pytest.approx(2.0 / gain, rel=0.02)
