@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 
 from quadsim.errors import FileError
 from quadsim.flight.log import (
+    BATTERY,
     BODY_RATES,
     COLUMNS,
     CONTROL,
@@ -47,10 +48,11 @@ _PLANT: Final[Fields] = {
     "speeds": {f"w{i}": "rad/s" for i in range(1, N_ROTORS + 1)},
     "wrench": WRENCH,
     "wind": WIND,
+    "battery": BATTERY,
     "attitude": QUATERNION,
     "body_rates": BODY_RATES,
 }
-_OPTIONAL: Final = frozenset({"truth", "attitude", "body_rates", "sqp", "wrench", "wind"})
+_OPTIONAL: Final = frozenset({"truth", "attitude", "body_rates", "sqp", "wrench", "wind", "battery"})
 _GAPS: Final = frozenset({*RESIDUALS, *SQP_RESIDUAL})  # columns that are null in some periods
 
 _Column = tuple[str, str, pa.Array]

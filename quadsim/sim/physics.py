@@ -78,6 +78,7 @@ class Segment:
     """(M, 6) force, world [N], and torque, body frame about its origin [N m], of all effects but contact, over each
     step; None if no effect causes any."""
     wind: Array | None  # (M, 3) velocity of the air in the middle of each step, world [m/s]; None without wind
+    battery: Array | None = None  # (M, 2) voltage [V] over each step, charge [-] at its start; None without a battery
 
     @staticmethod
     def join(parts: Sequence[Segment]) -> Segment:
@@ -208,6 +209,7 @@ def _plant_log(
         speeds=np.concatenate([segment.speeds, samples[-1].rotors[None]]),
         wrench=None if segment.wrench is None else np.concatenate([segment.wrench, segment.wrench[-1:]]),
         wind=None if segment.wind is None else np.concatenate([segment.wind, segment.wind[-1:]]),
+        battery=None if segment.battery is None else np.concatenate([segment.battery, segment.battery[-1:]]),
     )
 
 
