@@ -83,7 +83,9 @@ def test_every_field_arrives() -> None:
 
 
 def test_sizes_left_out_are_the_vehicle_s() -> None:
-    loaded, vehicle = scenario("effects={rotors={}, air={}, ground={effect=true}}", vehicle="hummingbird")
+    loaded, vehicle = scenario(
+        "effects={rotors={}, air={}, ground={effect=true}, battery={cells=3, capacity=2.1}}", vehicle="hummingbird"
+    )
     result = loaded.effects.resolved(vehicle)
     assert result.rotors is not None
     assert result.air is not None
@@ -92,6 +94,9 @@ def test_sizes_left_out_are_the_vehicle_s() -> None:
     assert result.rotors.inertia == vehicle.rotor_inertia
     assert (result.air.rotor_drag, result.air.body_drag) == (vehicle.rotor_drag, vehicle.body_drag)
     assert result.ground.rotor_radius == vehicle.rotor_radius
+    assert result.battery is not None
+    assert result.battery.reference_voltage == pytest.approx(12.6)
+    assert result.battery.hover_current is not None
     assert result.resolved(vehicle) == result
 
 
