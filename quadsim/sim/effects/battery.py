@@ -34,7 +34,8 @@ class Battery:
         i = i_hover (V / V0)^2 sum_i e_i (w_i / w_hover)^3 / 4 + i_idle,  V = E(s) - R i,  ds/dt = -i / (3600 Q),
 
     with e_i the rotor's share of thrust left and w_hover of the vehicle as it took off.  V is the positive root of this
-    quadratic, never below 0; the current is that of n = 2.  Each physics step holds the charge s of its start; an empty battery keeps its E(0).
+    quadratic, never below 0; the current is that of n = 2.  Each physics step holds the charge s of its start, and an
+    empty battery keeps its E(0).
 
     An ESC that regulates speed would lose its largest speed only: not modelled.  Rotor drag, rotor inertia and the
     logged rotor speeds are those of w.
