@@ -28,7 +28,9 @@ class LinearModel:
     B: Array  # (n, nu) input matrix
     u_bar: Array  # (nu,) equilibrium input; for a quadrotor, omega_bar on all rotors [rad/s]
     period: float  # tau_s [s]
-    targets: bool = False  # whether the inputs are an inner loop's targets, collective thrust [N] and body rates [rad/s]
+    targets: bool = (
+        False  # whether the inputs are an inner loop's targets, collective thrust [N] and body rates [rad/s]
+    )
 
     @property
     def n(self) -> int:
@@ -89,7 +91,7 @@ def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
 def target_model(vehicle: Vehicle, period: float, lag: Sequence[float]) -> LinearModel:
     """The discrete model at hover above an inner loop, whose targets are the inputs.
 
-    The rates follow with the time constants `lag` (thrust, p, q, r) [s], of at least `SHORTEST_LAG`; the thrust at once.
+    The rates follow with the time constants `lag` (thrust, p, q, r) [s], at least `SHORTEST_LAG`; the thrust at once.
     """
     A, B = continuous_model(vehicle)
     B = np.zeros_like(B)
