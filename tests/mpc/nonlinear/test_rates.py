@@ -358,6 +358,27 @@ def test_it_refuses_bounds_on_thrust(thrust: tuple[float, float]) -> None:
         TargetBounds(thrust=thrust)
 
 
+@pytest.mark.parametrize("thrust", [(0.0, 1.0), (100.0, 200.0)])
+def test_bounds_on_thrust_hold_the_weight(thrust: tuple[float, float]) -> None:
+    with pytest.raises(ParameterError, match=r"target_bounds.thrust must be below and above the weight"):
+        TargetBounds(thrust=thrust).actuators(VEHICLE)
+
+
+@pytest.mark.parametrize("ratio", [1.1, 1.5, 3.5, 14.0])
+def test_default_bounds_on_thrust_leave_room_around_the_weight(ratio: float) -> None:
+    weight = VEHICLE.mass * VEHICLE.gravity
+    speed = math.sqrt(ratio * weight / (4.0 * VEHICLE.thrust_coefficient))
+    lower, upper = TargetBounds().audited(replace(VEHICLE, speed_max=speed))["thrust"]
+    assert lower <= 0.3 * weight
+    assert weight + 0.5 * (ratio - 1.0) * weight == pytest.approx(min(upper, 0.5 * (1.0 + ratio) * weight))
+    assert upper < ratio * weight
+
+
+def test_a_thrust_scale_excludes_indi() -> None:
+    with pytest.raises(ValueError, match="thrust_scale must be false where indi is given"):
+        Nonlinear(indi=INDISettings(), disturbance=RampSettings(thrust_scale=True))
+
+
 def test_rows_over_rotor_speeds_have_no_meaning_for_targets() -> None:
     row = Constraint(name="total", lower=np.zeros(1), upper=np.ones(1), D=np.ones((1, 4)))
     settings = table().settings(VEHICLE, 2)
