@@ -82,7 +82,7 @@ class Weights:
         Weight,
         doc(
             "[-] weight of the inputs' distance from the reference, as shares of the rotors' largest; of targets, as "
-            f"shares of the largest collective thrust and of {RATE_SCALE:g} rad/s"
+            f"shares of the weight and of {RATE_SCALE:g} rad/s"
         ),
     ] = 0.1
     move: Annotated[NonNegative, doc("[-] weight of the inputs' change from node to node, as shares")] = 0.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -131,7 +132,7 @@ def test_it_moves_by_the_equations_of_the_rigid_body_and_four_lags(others: dict[
 
 # --- the controller ------------------------------------------------------------------------------------------------
 
-WEIGHTS = Weights(position=20.0, attitude=(1.0, 1.0, 2.0), velocity=1.0, body_rates=0.02, input=5.0, move=2.0)
+WEIGHTS = Weights(position=20.0, attitude=(1.0, 1.0, 2.0), velocity=1.0, body_rates=0.02, input=0.1, move=0.04)
 LEVEL = np.array([VEHICLE.mass * VEHICLE.gravity, 0.0, 0.0, 0.0])
 Course = Callable[[float], tuple[float, ...]]
 
@@ -223,12 +224,12 @@ def test_targets_and_body_rates_hold_their_bounds() -> None:
 
 
 def test_bounds_of_targets_follow_the_vehicle() -> None:
-    largest = 4.0 * VEHICLE.thrust_coefficient * VEHICLE.speed_max**2
+    largest, least = 4.0 * VEHICLE.thrust_coefficient * VEHICLE.speed_max**2, 0.5 * VEHICLE.mass * VEHICLE.gravity
     bounds = TargetBounds().actuators(VEHICLE)
-    np.testing.assert_allclose(bounds.u_min, [0.1 * largest, *np.radians([-300.0, -300.0, -90.0])])
+    np.testing.assert_allclose(bounds.u_min, [least, *np.radians([-300.0, -300.0, -90.0])])
     np.testing.assert_allclose(bounds.u_max, [0.9 * largest, *np.radians([300.0, 300.0, 90.0])])
     assert np.isinf(bounds.delta_max).all()
-    np.testing.assert_allclose(bounds.lowest(LEVEL), [0.1 * largest, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(bounds.lowest(LEVEL), [least, 0.0, 0.0, 0.0])
 
 
 def test_grounded_it_turns_nowhere_with_the_least_thrust() -> None:
@@ -422,7 +423,7 @@ def test_default_bounds_on_thrust_leave_room_around_the_weight(ratio: float) -> 
     weight = VEHICLE.mass * VEHICLE.gravity
     speed = math.sqrt(ratio * weight / (4.0 * VEHICLE.thrust_coefficient))
     lower, upper = TargetBounds().audited(replace(VEHICLE, speed_max=speed))["thrust"]
-    assert lower <= 0.3 * weight
+    assert lower == 0.5 * weight
     assert weight + 0.5 * (ratio - 1.0) * weight == pytest.approx(min(upper, 0.5 * (1.0 + ratio) * weight))
     assert upper < ratio * weight
 
