@@ -184,7 +184,7 @@ def test_it_follows_a_previewed_step_quickly_with_small_overshoot(axis: int) -> 
     target[axis] = 1.0
     states, commands = fly(table().build(VEHICLE, 0.02), 0.02, 2.5, step_of(*target))
     way = states[:, axis]
-    assert 5e-3 * np.argmax(way > 0.9) - 0.5 < 0.26
+    assert 5e-3 * np.argmax(way > 0.9) - 0.5 < 0.3
     assert way.max() < 1.06
     np.testing.assert_allclose(states[-1, P], target[:3], atol=5e-3)
     bounds = TargetBounds().actuators(VEHICLE)
@@ -293,7 +293,7 @@ def test_it_predicts_its_own_flight() -> None:
     start = np.zeros((1, N_STATES))
     start[:, ANGLE_RATES] = x[W]
     predicted = controller.predict(start, commands[0].plan[None])[0]
-    np.testing.assert_allclose(predicted[0, POSITIONS], states[-1, P], atol=2e-3)
+    np.testing.assert_allclose(predicted[0, POSITIONS], states[-1, P], atol=5e-3)
     np.testing.assert_allclose(predicted[0, ANGLES], quaternion_to_euler(states[-1, Q]), atol=1e-4)
     np.testing.assert_allclose(predicted[0, ANGLE_RATES], states[-1, W], atol=5e-3)
 
