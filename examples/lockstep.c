@@ -1,0 +1,102 @@
+/* A simulated clock, and turns in place of concurrency, for a program that takes its time from
+   clock_gettime(CLOCK_MONOTONIC) and nanosleep, and receives in threads that wait in select: Betaflight's SITL.
+
+   LOCKSTEP="R,W,ADDRESS" LD_PRELOAD=./lockstep.so PROGRAM
+
+   The clock advances by TICK_NS with each look of the main thread at it, and by the length of each of its sleeps, which
+   take no time.  At a limit the main thread writes `d` (done) to the file descriptor W and waits for the next limit on
+   R (8 bytes, ns).  Other threads run only while it waits there; one that has dealt with a datagram and waits for
+   the next writes `p` (processed).  So whoever sends a datagram and waits for `p`, then sets a limit and waits for
+   `d`, meets the same state every time. */
+#define _GNU_SOURCE
+#include <arpa/inet.h>
+#include <dlfcn.h>
+#include <errno.h>
+#include <pthread.h>
+#include <semaphore.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <sys/select.h>
+#include <time.h>
+#include <unistd.h>
+
+enum { TICK_NS = 500, SECOND_NS = 1000000000 };
+#define NEXT(function) ((__typeof__(&function))dlsym(RTLD_NEXT, #function))
+
+static uint64_t now_ns = SECOND_NS, limit_ns = SECOND_NS;
+static int limits, reports; /* file descriptors */
+static struct in_addr loopback;
+static pthread_mutex_t turn = PTHREAD_MUTEX_INITIALIZER;
+static sem_t begun;
+static _Thread_local enum { BEGINS, HANDLES, WAITS, MAIN } phase = BEGINS;
+
+static void report(char what) {
+    if (write(reports, &what, 1) != 1) _exit(3); /* nobody is there any more */
+}
+
+__attribute__((constructor)) static void start(void) {
+    const char *settings = getenv("LOCKSTEP");
+    char address[16];
+    if (!settings || sscanf(settings, "%d,%d,%15s", &limits, &reports, address) != 3 || !inet_aton(address, &loopback)) {
+        fputs("lockstep: LOCKSTEP must be R,W,ADDRESS\n", stderr);
+        _exit(2);
+    }
+    phase = MAIN;
+    sem_init(&begun, 0, 0);
+    pthread_mutex_lock(&turn);
+}
+
+static void advance(uint64_t ns) {
+    now_ns += ns;
+    while (now_ns >= limit_ns) {
+        pthread_mutex_unlock(&turn);
+        report('d');
+        if (read(limits, &limit_ns, sizeof limit_ns) != sizeof limit_ns) _exit(3);
+        pthread_mutex_lock(&turn);
+    }
+}
+
+int clock_gettime(clockid_t clock, struct timespec *time) {
+    if (clock != CLOCK_MONOTONIC) return NEXT(clock_gettime)(clock, time);
+    if (phase == MAIN) advance(TICK_NS);
+    *time = (struct timespec){.tv_sec = now_ns / SECOND_NS, .tv_nsec = now_ns % SECOND_NS};
+    return 0;
+}
+
+int nanosleep(const struct timespec *length, struct timespec *remaining) {
+    if (phase != MAIN) return NEXT(nanosleep)(length, remaining);
+    advance((uint64_t)length->tv_sec * SECOND_NS + length->tv_nsec);
+    return 0;
+}
+
+int pthread_create(pthread_t *thread, const pthread_attr_t *attributes, void *(*run)(void *), void *argument) {
+    int error = NEXT(pthread_create)(thread, attributes, run, argument);
+    return error ? error : sem_wait(&begun);
+}
+
+int pthread_join(pthread_t thread, void **result) { return (void)thread, (void)result, 0; } /* only before exit */
+
+int select(int count, fd_set *readable, fd_set *writable, fd_set *failed, struct timeval *patience) {
+    if (phase == BEGINS) sem_post(&begun);
+    else pthread_mutex_unlock(&turn);
+    if (phase == HANDLES) report('p');
+    phase = WAITS;
+    int ready = NEXT(select)(count, readable, writable, failed, patience);
+    pthread_mutex_lock(&turn);
+    return ready;
+}
+
+ssize_t recvfrom(int fd, void *data, size_t size, int flags, struct sockaddr *from, socklen_t *length) {
+    ssize_t received = NEXT(recvfrom)(fd, data, size, flags, from, length);
+    if (received > 0) phase = HANDLES;
+    return received;
+}
+
+/* The program's servers listen on all interfaces, its command line among them: keep them on this machine. */
+int bind(int fd, const struct sockaddr *address, socklen_t length) {
+    struct sockaddr_in here = {.sin_family = AF_INET, .sin_addr = loopback};
+    if (address->sa_family != AF_INET || length < sizeof here) return errno = EAFNOSUPPORT, -1;
+    here.sin_port = ((const struct sockaddr_in *)address)->sin_port;
+    return NEXT(bind)(fd, (struct sockaddr *)&here, sizeof here);
+}
