@@ -68,7 +68,7 @@ class TorqueIncrement:
         """Take over the state of another inner loop."""
         self._last, self._filtered, self._slope = other._last, other._filtered, other._slope
 
-    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
+    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
         """Return the rotor speeds (4,) to hold until the next call, from the demanded and the measured ones."""
         M, J = self._allocation.M, self._inertia
         last, self._last = self._last, (time, rates.copy())

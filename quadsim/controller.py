@@ -40,6 +40,10 @@ LAW_NAMES: Final = {
     "geometric": "geometric control",
 }
 """Display names of the built-in controllers, by recorded name; others are shown by their recorded name."""
+ROTORS: Final = "rotors"
+"""Commands of rotor speeds; others are targets of an autopilot: `rates` (4,), `attitude` (8,)."""
+TARGET_SIZES: Final = {ROTORS: 4, "rates": 4, "attitude": 8}
+"""What a controller commands (its attribute or field `commands`), and the numbers in a command."""
 LARGEST_SPEED: Final = 1e5
 """Largest magnitude of a valid rotor speed command [rad/s]; a larger one is a fault."""
 
@@ -111,15 +115,35 @@ class StepInputs:
 
 
 class InnerLoop(Protocol):
-    """A faster loop inside the control period, from commanded rotor speeds to those applied."""
+    """A faster loop inside the control period, from the command in force to the rotor speeds applied.
+
+    One with an attribute `takes_targets` that is true is an autopilot: commands are targets, not rotor speeds; see
+    `quadsim.sim.autopilot`.
+    """
 
     @property
     def rate(self) -> float:
         """Rate of calls [Hz], a whole number of physics steps apart; the first at the start of each period."""
         ...
 
-    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array) -> Array:
-        """Return rotor speeds (4,) to hold until the next call; speeds in rad/s, `rates` (3,) true body rates."""
+    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
+        """Return the rotor speeds (4,) to hold until the next call [rad/s].
+
+        Args:
+            time: [s].
+            commanded: the command in force: rotor speeds (4,) [rad/s], or a target.
+            rates: (3,) body rates [rad/s], of the sensor if there is one.
+            rotors: (4,) rotor speeds [rad/s].
+            attitude: (4,) quaternion wxyz, body to world, of the sensor if there is one.
+        """
+        ...
+
+
+class AutopilotLoop(InnerLoop, Protocol):
+    """An autopilot: an inner loop that takes targets; built in, or a firmware's."""
+
+    def reset(self) -> None:
+        """Start anew, as before a flight."""
         ...
 
 
@@ -138,8 +162,9 @@ class Command:
     """A controller's command for one period, and how it was computed.
 
     Attributes:
-        speeds: (4,) rotor speeds to hold for the period [rad/s].
-        plan: (N, 4) planned speeds, `plan[0]` being this period's [rad/s].
+        speeds: (4,) rotor speeds to hold for the period [rad/s]; where `inner` takes targets, collective thrust [N] and
+            body rates [rad/s], (4,), perhaps followed by an attitude, (8,): see `quadsim.sim.autopilot.Autopilot`.
+        plan: (N, 4) or (N, 8) planned speeds or targets, `plan[0]` being this period's.
         status: `solved`, `unconstrained`, `commanded` or `not_converged` (`ACCEPTED`), `landed` or `crashed` where
             rotors are stopped, or the solver's name for its failure.
         answered_by: source of `speeds`: `gain`, `core`, a QP solver by its name, `law`, `fallback` or `stopped`.
@@ -157,7 +182,7 @@ class Command:
         kkt_dual: largest multiplier with the wrong sign, computed from the QP.
         solve_s: wall time inside the solver [s].
         sqp: residuals of sequential quadratic programming; None for other laws.
-        inner: inner loop that executes commands from now on; None: the rotors hold `speeds`.
+        inner: inner loop that flies commands from now on; None: the rotors hold `speeds`.
 
     Examples:
         >>> import numpy as np

@@ -17,6 +17,7 @@ from quadsim.fields import Number, Vector
 from quadsim.state import Array
 
 N_ROTORS: Final = 4
+AUTOPILOT: Final = "autopilot"  # table of a vehicle file; see `quadsim.sim.autopilot.AutopilotSettings`
 OfRotors = Annotated[tuple[Number, ...], Len(N_ROTORS, N_ROTORS)]
 SMALLEST, LARGEST = 1e-12, 1e6
 """Allowed magnitudes of a vehicle's numbers; MuJoCo refuses smaller inertias, and larger numbers overflow."""
@@ -210,11 +211,26 @@ def vehicle_sources(path: Path) -> dict[str, str]:
     return {key: entry["source"] for key, entry in _read_entries(path)[1].items()}
 
 
+def vehicle_autopilot(path: Path) -> dict[str, Any]:
+    """Return the fields of a vehicle file's `[autopilot]` but its `source`; empty if it has no such table.
+
+    Raises:
+        FileError: as `load_vehicle`.
+        ParameterError: it is not a table, or does not say where its numbers are from.
+    """
+    table = read_toml(path).get(AUTOPILOT, {"source": "none"})
+    if not isinstance(table, dict) or not isinstance(table.get("source"), str) or not table["source"].strip():
+        raise ParameterError("vehicle", AUTOPILOT, table, "a table with a source, a text saying where it is from")
+    return {name: value for name, value in table.items() if name != "source"}
+
+
 def _read_entries(path: Path) -> tuple[dict[str, str], dict[str, dict[str, Any]]]:
     """Return a vehicle file's description and parameters, each with value, unit and source."""
     texts: dict[str, str] = {}
     entries: dict[str, dict[str, Any]] = {}
     for key, entry in read_toml(path).items():
+        if key == AUTOPILOT:
+            continue
         if key in ("name", "description"):
             if not isinstance(entry, str):
                 raise ParameterError("vehicle", key, entry, "a text")

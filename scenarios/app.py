@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from mpc.ocp import Problem
-    from quadsim.controller import Controller
+    from quadsim.controller import AutopilotLoop, Controller
     from quadsim.flight.feasibility import Feasibility
     from quadsim.vehicle import Vehicle
     from scenarios.campaign.campaign import CampaignResult, Replay
@@ -208,6 +208,7 @@ def fly(
     controller: object = None,
     forces: Sequence[object] = (),
     reference: UserReference = None,
+    autopilot: AutopilotLoop | None = None,
     progress: Watched = True,
 ) -> Flight:
     """Fly a scenario and audit it, in memory; `run` and `Flight.save` write its run directory.
@@ -229,6 +230,9 @@ def fly(
             [s] that returns x, y, z [m] and yaw [rad] (unwrapped).  It is called before the flight, for all control
             instants up to the end of the last preview.  A run directory keeps these samples in `reference.csv`; its
             `scenario.toml` reproduces the flight bit for bit.
+        autopilot: flies in place of the built-in autopilot, for a controller that commands thrust and body rates: an
+            inner loop (`quadsim.controller.AutopilotLoop`) that takes targets, such as a firmware's.  The file does not
+            name it.
         progress: True shows a bar on a terminal, or a line every ten seconds elsewhere; False shows nothing; a function
             is called with (activity, done, total).
 
@@ -250,7 +254,8 @@ def fly(
     from scenarios.progress import reporting
 
     with reporting(progress) as report:
-        return start(scenario, controller=controller, forces=forces, reference=reference).fly(report)
+        begun = start(scenario, controller=controller, forces=forces, reference=reference, autopilot=autopilot)
+        return begun.fly(report)
 
 
 @app.command(
@@ -363,6 +368,7 @@ def start(
     controller: object = None,
     forces: Sequence[object] = (),
     reference: UserReference = None,
+    autopilot: AutopilotLoop | None = None,
     live: bool = False,
     recorded: bool = True,
 ) -> Rollout:
@@ -373,6 +379,7 @@ def start(
         controller: as in `fly`.
         forces: as in `fly`.
         reference: as in `fly`; after the scenario's end and its preview it keeps its last sample.
+        autopilot: as in `fly`.
         live: whether events of every kind may be applied; otherwise only the kinds among the scenario's events, and
             set-points, stalls, rotor losses, rotor lags and controller changes.
         recorded: whether every period is recorded, at about 10 kB; required by `Rollout.flight`.
@@ -391,7 +398,7 @@ def start(
     from scenarios import loading, user_code
     from scenarios.rollout import Rollout
 
-    parts = user_code.set_up(loading.assemble(scenario), controller, forces, reference)
+    parts = user_code.set_up(loading.assemble(scenario), controller, forces, reference, autopilot)
     return Rollout(*parts, live=live, recorded=recorded)
 
 

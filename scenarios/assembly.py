@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
@@ -15,13 +15,16 @@ import numpy as np
 
 from mpc.bounded import Bounded, FallbackSettings, Weighted
 from mpc.flatness import motion_along
+from mpc.piloted import Piloted
 from mpc.solvers import CORE_OR_PIQP
 from quadsim.assets import vehicle_path
+from quadsim.controller import ROTORS
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
 from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance
 from quadsim.sim.airframe import outline
+from quadsim.sim.autopilot import Autopilot, AutopilotSettings, identify_lags, own_lags
 from quadsim.sim.computation import Computation, ComputationTime, Stall
 from quadsim.sim.effects import Change, Effects, Force, Push, PushChange
 from quadsim.sim.effects.load import Load, mass_properties
@@ -34,17 +37,27 @@ from quadsim.sim.rigid_body import check_free
 from quadsim.sim.sensing import AXES, FaultKind, Sensor, SensorFault, SensorName
 from quadsim.space import Corridor, Fence, Region
 from quadsim.state import POSITION, REFERENCE_NAMES, Array, make_state
-from quadsim.vehicle import N_ROTORS, OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
+from quadsim.vehicle import (
+    AUTOPILOT,
+    N_ROTORS,
+    OPTIONAL_PARAMETERS,
+    VEHICLE_UNITS,
+    Vehicle,
+    load_vehicle,
+    vehicle_autopilot,
+)
 from scenarios.courses.course import Course
 from scenarios.courses.followed import FollowedCourse
 from scenarios.courses.steps import Steps, switches
 from scenarios.limits import audited, space_limits
 from scenarios.plugin import import_plugin, make_force
 from scenarios.schema.events import Event, SensorFaultEvent, SetpointEvent
+from scenarios.schema.problems import parse_table
+from scenarios.schema.writing import plain
 
 if TYPE_CHECKING:
     from mpc.ocp import Problem
-    from quadsim.controller import Controller
+    from quadsim.controller import AutopilotLoop, Controller
     from quadsim.flight.audit import Limit
     from quadsim.motion import Motion
     from scenarios.schema.controllers import AnyController
@@ -66,8 +79,15 @@ _UNITS: Final = {
     SensorName.RATES: math.radians(1.0),
 }
 """SI units per unit of the scenario file, by sensor."""
-_OF_ALL_EVENTS: Final = ("vehicle", "actual", "effects", "course")
+_OF_ALL_EVENTS: Final = ("vehicle", "autopilot", "own_autopilot", "actual", "effects", "course")
 """Parts that do not depend on events, controller or duration."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Piloted:
+    """A table with an autopilot, so that messages name the field."""
+
+    autopilot: AutopilotSettings
 
 
 class Assembly:
@@ -75,7 +95,10 @@ class Assembly:
 
     Attributes:
         scenario: the file's content.
+        own_autopilot: an inner loop that flies in place of the built-in autopilot, for one flight at a time; or None.
     """
+
+    own_autopilot: AutopilotLoop | None = None
 
     def __init__(self, scenario: Scenario, vehicle: Vehicle | None = None) -> None:
         """Build nothing yet; `vehicle` saves loading it again."""
@@ -103,7 +126,7 @@ class Assembly:
         """The scenario with the numbers of its vehicle file; effects continue to take theirs from the vehicle."""
         numbers = {name: getattr(self.vehicle, name) for name in VEHICLE_UNITS}
         table = replace(self.scenario.vehicle, **numbers)
-        return self.scenario.altered(vehicle=table)
+        return self.scenario.altered(vehicle=table, autopilot=self.autopilot)
 
     # --- vehicle -----------------------------------------------------------------------------------------------------
 
@@ -118,6 +141,24 @@ class Assembly:
                 raise
             return Vehicle(name=Path(file).stem, **overrides)
         return load_vehicle(path, overrides)
+
+    @cached_property
+    def autopilot(self) -> AutopilotSettings | None:
+        """`[autopilot]` of the scenario over that of the vehicle file; None if neither has one.
+
+        Raises:
+            InputError: a field of the vehicle file's is wrong.
+        """
+        stated = self.scenario.autopilot
+        try:
+            path = vehicle_path(self.scenario.vehicle.file)
+        except InputError:  # a resolved scenario needs no file
+            return stated
+        of_file = vehicle_autopilot(path)
+        if not of_file:
+            return stated
+        table = {**of_file, **(plain(stated) if stated is not None else {})}
+        return parse_table(_Piloted, {AUTOPILOT: table}, str(path)).autopilot
 
     @cached_property
     def actual(self) -> Vehicle:
@@ -265,7 +306,28 @@ class Assembly:
             InputError: it cannot be built from these numbers, or its code cannot be found or called.
         """
         spec = self.scenario.controller if spec is None else spec
-        return spec.build(self.vehicle, self.scenario.control_period, (*self.scenario.obstacles, *self.regions))
+        commands: str | None = getattr(spec, "commands", None)
+        if commands not in (None, ROTORS) and spec.inner_lag is None:  # type: ignore[union-attr]
+            spec = replace(spec, inner_lag=self.inner_lag)  # type: ignore[call-arg]
+        shapes = (*self.scenario.obstacles, *self.regions)
+        return self.piloted(spec.build(self.vehicle, self.scenario.control_period, shapes), commands)
+
+    def piloted(self, law: Controller, commands: str | None = None) -> Controller:
+        """Return a law with the autopilot that flies its commands, unless these are rotor speeds.
+
+        `commands` is the law's attribute of that name by default.
+        """
+        if (getattr(law, "commands", ROTORS) if commands is None else commands) == ROTORS:
+            return law
+        return Piloted(law, self.own_autopilot or Autopilot(self.vehicle, self.autopilot), self.vehicle)
+
+    @property
+    def inner_lag(self) -> tuple[float, ...]:
+        """(4,) first-order lags of thrust and body rates [s], by a step on the autopilot."""
+        timestep = self.scenario.plant.timestep
+        if self.own_autopilot is not None:
+            return identify_lags(self.vehicle, self.own_autopilot, timestep=timestep)
+        return own_lags(self.vehicle, self.autopilot or AutopilotSettings(), timestep)
 
     def problem(self) -> Problem:
         """The controller's optimisation.

@@ -27,13 +27,13 @@ from annotated_types import doc
 from mpc.bounded import ControllerTable, Horizon
 from mpc.handover import hand_over
 from mpc.obstacles import Shape
-from quadsim.controller import SQP, Command, Controller, StepInputs
+from quadsim.controller import ROTORS, SQP, TARGET_SIZES, Command, Controller, StepInputs
 from quadsim.errors import CommandError, InputError, ParameterError, UnknownNameError, printable
 from quadsim.fields import is_plain
 from quadsim.flight.log import RESIDUALS
 from quadsim.sim.effects import Force
 from quadsim.state import Array, State
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.vehicle import Vehicle
 
 FORM: Final = "package.module:Class"  # form of a controller's name
 ENTRY_POINTS: Final = "quadsim.controllers"
@@ -139,6 +139,10 @@ class PluginController:
         self._law, self.horizon = law, horizon
         self.name = printable(str(getattr(law, "name", type(law).__name__)))[:200]
         self.solver = printable(str(getattr(law, "solver", "")))[:200]
+        self.commands = getattr(law, "commands", ROTORS)
+        if self.commands not in TARGET_SIZES:
+            raise ParameterError("controller", f"{self.name}.commands", self.commands, f"one of {[*TARGET_SIZES]}")
+        self._size = TARGET_SIZES[self.commands]
         if hasattr(law, "predict"):
             self.predict = lambda states, plans: _numbers(
                 law.predict(states.copy(), plans.copy()), (*plans.shape[:2], states.shape[1]), f"{self.name}.predict"
@@ -171,18 +175,18 @@ class PluginController:
         answer: Any = self._law.step(replace(now, acting=acting), named, reference.copy())
         try:
             if not isinstance(answer, Command):
-                answer = Command(speeds=answer, plan=np.tile(_numbers(answer, (N_ROTORS,), "it"), (self.horizon, 1)))
+                answer = Command(speeds=answer, plan=np.tile(_numbers(answer, (self._size,), "it"), (self.horizon, 1)))
             parts: dict[str, Any] = {name: operator.index(getattr(answer, name)) for name in _WHOLE}
             parts |= {name: float(getattr(answer, name)) for name in _REAL}
             parts |= {name: printable(getattr(answer, name))[:200] for name in ("status", "answered_by")}
             parts["sqp"] = None if answer.sqp is None else SQP(*map(float, answer.sqp))
-            parts["speeds"] = _numbers(answer.speeds, (N_ROTORS,), "its speeds")
-            parts["plan"] = _numbers(answer.plan, (self.horizon, N_ROTORS), "its plan")
+            parts["speeds"] = _numbers(answer.speeds, (self._size,), "its speeds")
+            parts["plan"] = _numbers(answer.plan, (self.horizon, self._size), "its plan")
             if answer.inner is not None and not answer.inner.rate > 0.0:
                 raise ValueError("its inner loop must have a positive rate")
             return replace(answer, **parts)
         except (AttributeError, TypeError, ValueError) as error:
-            problem = f"{self.name} answered {answer!r:.100}, neither {N_ROTORS} speeds nor a Command: {error}"
+            problem = f"{self.name} answered {answer!r:.100}, neither {self._size} numbers nor a Command: {error}"
             raise CommandError(problem, time=now.time) from error
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from quadsim.controller import Controller
+from quadsim.controller import AutopilotLoop, Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.sim.effects import Force
 from quadsim.state import Array
@@ -76,19 +76,24 @@ def _pose(reference: Callable[[float], Any], time: float) -> Array:
 
 
 def set_up(
-    assembly: Assembly, controller: object, forces: Sequence[object], reference: object = None
+    assembly: Assembly,
+    controller: object,
+    forces: Sequence[object],
+    reference: object = None,
+    autopilot: AutopilotLoop | None = None,
 ) -> tuple[Assembly, Controller | None, list[Force] | None]:
-    """Return the assembly with the reference, and the controller and forces for the closed loop.
+    """Return the assembly with the reference and the autopilot, and the controller and forces for the closed loop.
 
     Raises:
         InputError: the controller, a force or the reference cannot be set up.
     """
     assembly = assembly if reference is None else following(assembly, reference)
+    assembly.own_autopilot = autopilot
     scenario, law, acting = assembly.scenario, None, None
     flown = named(scenario, controller, forces)
     if controller is not None and not isinstance(controller, str):
         spec = refer_to(controller, scenario.controller.horizon)
-        law = make_law(controller, spec, assembly.vehicle, scenario.control_period)
+        law = assembly.piloted(make_law(controller, spec, assembly.vehicle, scenario.control_period))
     if forces:
         rng = assembly.generator("forces")
         pairs = [(import_plugin(spec), spec) for spec in scenario.forces]

@@ -84,6 +84,11 @@ def _body_rate(axis: int) -> Signal:
     return Signal(unit="deg/s", sampled=lambda log: rates(log.truth), plant=plant)
 
 
+def _present(values: Array | None, t: Array) -> Array:
+    """The values (K,), or NaN where there are none."""
+    return np.full(t.shape, math.nan) if values is None else values
+
+
 SIGNALS: Final[dict[str, Signal]] = {
     **{name: _state(i) for name, i in INDEX.items()},
     **{f"{name}_error": _error(j) for j, name in enumerate(REFERENCE_NAMES)},
@@ -92,7 +97,12 @@ SIGNALS: Final[dict[str, Signal]] = {
         unit="deg", sampled=lambda log: np.degrees(tilt(log.truth)), plant=lambda log: np.degrees(tilt(log.state))
     ),
     **{f"body_rate_{name}": _body_rate(axis) for axis, name in enumerate("xyz")},
-    # Commanded at the samples, acting in between: the two differ when rotors saturate.
+    # Commanded at the samples, acting in between: the two differ when rotors saturate, or the mixer changes the thrust.
+    "thrust": Signal(
+        unit="N",
+        sampled=lambda log: _present(log.target[:, 0] if log.target is not None else None, log.t),
+        plant=lambda log: _present(log.thrust, log.t),
+    ),
     "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds),
     "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None),
 }
@@ -330,6 +340,8 @@ def _find(log: FlightLog, limit: Limit) -> Finding:
 def _worst(limit: Limit, t: Array, values: Array) -> tuple[float, float, float]:
     """Return value, margin and time of the smallest margin; NaN if the window is empty."""
     inside = limit.holds_at(t)
+    if limit.signal == "thrust":  # which has no target on the ground
+        inside &= np.isfinite(values)
     if not inside.any():
         return math.nan, math.nan, math.nan
     t, columns = t[inside], values[inside].reshape(np.count_nonzero(inside), -1)

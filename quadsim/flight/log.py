@@ -34,6 +34,10 @@ BODY_RATES: Final = {f"body_rate_{axis}": "rad/s" for axis in "xyz"}
 """Columns of the body rates, with units; same condition."""
 SQP_RESIDUAL: Final = {"sqp_defect": "-", "sqp_step": "-"}
 """Columns of `quadsim.controller.SQP`, with units; only for flights with sequential quadratic programming."""
+TARGET: Final = {"target_thrust": "N", **{f"target_body_rate_{axis}": "rad/s" for axis in "xyz"}}
+"""Columns of the target in force, with units; only for flights with an autopilot."""
+TARGET_ATTITUDE: Final = {f"target_q{axis}": "-" for axis in "wxyz"}
+"""Columns of the attitude in it, with units; only where it has one."""
 
 Fields = dict[str, dict[str, str]]
 """The fields of a log, each with its columns and their units."""
@@ -53,6 +57,8 @@ CONTROL: Final[Fields] = {
     "attitude": QUATERNION,
     "body_rates": BODY_RATES,
     "sqp": SQP_RESIDUAL,
+    "target": TARGET,
+    "target_attitude": TARGET_ATTITUDE,
 }
 COLUMNS: Final = frozenset(name for units in CONTROL.values() for name in units)
 """The columns of flight.parquet, but for those that a controller logs."""
@@ -109,6 +115,10 @@ class ControlLog:
     attitude: Array | None = None  # (K, 4) measured quaternion wxyz, sign continuous; None if Euler angles suffice
     body_rates: Array | None = None  # (K, 3) measured body rates [rad/s]; None if Euler angles suffice
     sqp: Array | None = None  # (K, 2) of `quadsim.controller.SQP`, NaN in periods without; None if all are
+    target: Array | None = None
+    """(K, 4) collective thrust [N] and body rates [rad/s] that the autopilot is to fly, NaN in periods without; None
+    without an autopilot."""
+    target_attitude: Array | None = None  # (K, 4) attitude that it is to hold, wxyz; None if it holds none
     logged: Mapping[str, tuple[str, Array]] = field(default_factory=dict)
     """What the controller logged, by name: unit and values (K,), NaN in periods without."""
 
@@ -163,6 +173,7 @@ class PlantLog:
     wind: Array | None = None  # (M, 3) velocity of the air, world [m/s]; None without wind
     attitude: Array | None = None  # (M, 4) true quaternion wxyz; None if Euler angles suffice
     body_rates: Array | None = None  # (M, 3) true body rates [rad/s]; None if Euler angles suffice
+    thrust: Array | None = None  # (M,) collective thrust of the rotors [N]; None without an autopilot
 
     def every(self, stride: int) -> PlantLog:
         """Return every `stride`-th row, starting with the first."""

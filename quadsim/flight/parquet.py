@@ -25,6 +25,8 @@ from quadsim.flight.log import (
     RESIDUALS,
     SQP_RESIDUAL,
     STATE,
+    TARGET,
+    TARGET_ATTITUDE,
     TEXTS,
     WIND,
     WRENCH,
@@ -49,9 +51,14 @@ _PLANT: Final[Fields] = {
     "wind": WIND,
     "attitude": QUATERNION,
     "body_rates": BODY_RATES,
+    "thrust": {"thrust": "N"},
 }
-_OPTIONAL: Final = frozenset({"truth", "attitude", "body_rates", "sqp", "wrench", "wind"})
-_GAPS: Final = frozenset({*RESIDUALS, *SQP_RESIDUAL})  # columns that are null in some periods
+_OPTIONAL: Final = frozenset(
+    {"truth", "attitude", "body_rates", "sqp", "target", "target_attitude", "wrench", "wind", "thrust"}
+)
+_GAPS: Final = frozenset(
+    {*RESIDUALS, *SQP_RESIDUAL, *TARGET, *TARGET_ATTITUDE}
+)  # columns that are null in some periods
 
 _Column = tuple[str, str, pa.Array]
 

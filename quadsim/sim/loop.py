@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from quadsim.flight.phase import PhaseMonitor
     from quadsim.sim.navigation import Navigation
 
-_BODY_RATES: Final = slice(11, 14)  # in the plant's own state; see `quadsim.sim.physics.physics_to_state`
 _log: Final = logging.getLogger("quadsim")
 _HEIGHT: Final = REFERENCE_NAMES.index("z")
 
@@ -138,7 +137,9 @@ class ClosedLoop:
         self._start = plant.physics
         self._initial_speeds = np.array(initial_speeds, float)
         self._lowest = float(initial_state[INDEX["z"]])
-        self._acting = self._initial_speeds
+        self._acting = self._initial_speeds  # the command in force, flown by an inner loop, and the rotor speeds of it
+        self._inner: InnerLoop | None = None
+        self._speeds = self._initial_speeds
         self._plan, self._age = self._acting[None], 0  # the last plan that came in time, and how many periods ago
         self._observed: Observation | None = None
         self._samples: list[FlownPeriod] | None = [] if recorded else None
@@ -169,7 +170,7 @@ class ClosedLoop:
         if self._observed is not None:
             raise InputError("a controller takes over before a period is observed, not after")
         with _ending_flight(self.time):
-            controller.reset(self._acting.copy())
+            controller.reset(self._speeds.copy())
             adopt = getattr(controller, "adopt", None)
             if adopt is not None:
                 adopt(self.controller)
@@ -263,7 +264,7 @@ class ClosedLoop:
         now = StepInputs(
             time=self.time,
             phase=phase,
-            acting=self._acting,
+            acting=self._speeds,
             attitude=attitude,
             body_rates=body_rates,
             motion=None if self.motion is None else self.motion.after(k),
@@ -301,32 +302,56 @@ class ClosedLoop:
         if computation is not None and computation.plan:
             due = min(due, math.ceil(computation.delay / plant.timestep - 1e-6))
         planned = self._plan[min(self._age + 1, len(self._plan) - 1)]  # its last row beyond its end
-        holds = [(self._acting, due), (planned, min(wait, steps) - due)]
+        inner = self._inner
+        holds = [(inner, self._acting, due), (inner, planned, min(wait, steps) - due)]
         if missed:
             self._age += 1
-            acting = holds[1][0] if holds[1][1] else self._acting
+            acting = planned if holds[1][2] else self._acting
         else:
-            acting, self._plan, self._age = command.speeds, command.plan, 0
-            holds.append((acting, steps - wait))
-        before = plant.physics
-        holds = [(speeds, count) for speeds, count in holds if count > 0]
-        flown_parts = [part for speeds, count in holds for part in _hold(plant, command.inner, speeds, count)]
-        if self._navigation is not None:
-            for segment, speeds in flown_parts:
-                held = np.broadcast_to(speeds, (len(segment.physics), N_ROTORS))
-                self._navigation.advance(segment.physics, held, on_ground=now.phase in (Phase.LANDED, Phase.ARMED))
+            acting, self._plan, self._age, self._inner = command.speeds, command.plan, 0, command.inner
+            holds.append((self._inner, acting, steps - wait))
+        before, on_ground = plant.physics, now.phase in (Phase.LANDED, Phase.ARMED)
+        segments = []
+        for loop, row, count in holds:
+            for segment, speeds in self._hold(loop, row, count):
+                if self._navigation is not None:
+                    held = np.broadcast_to(speeds, (len(segment.physics), N_ROTORS))
+                    self._navigation.advance(segment.physics, held, on_ground=on_ground)
+                segments.append(segment)
         self._acting = acting
+        piloted = getattr(self._inner, "takes_targets", False)
+        self._speeds = speeds if piloted else acting
         return FlownPeriod(
             observation=observed,
             command=command,
-            speeds=acting,
+            speeds=self._speeds,
+            target=acting if piloted else None,
             delay=delay,
             missed=missed,
             step_s=step_s,
             before=before,
-            segment=Segment.join([segment for segment, _ in flown_parts]),
+            segment=Segment.join(segments),
             rotors=plant.speeds,
         )
+
+    def _hold(self, inner: InnerLoop | None, row: Array, steps: int) -> Iterator[tuple[Segment, Array]]:
+        """Advance under a command: segments of flight, each with the rotor speeds (4,) commanded during it [rad/s].
+
+        Raises:
+            RaisedError: the inner loop raised, or its period is not a whole number of physics steps.
+        """
+        plant = self._plant
+        if inner is None:
+            if steps > 0:
+                yield plant.advance(row, steps), plant.applied(row)
+            return
+        with _ending_flight(plant.time):
+            stride = inner_steps(inner.rate, plant.timestep)
+        for first in range(0, steps, stride):
+            attitude, rates = plant.attitude if self._navigation is None else self._navigation.sensed()
+            with _ending_flight(plant.time):
+                commanded = inner.speeds(plant.time, row, rates, plant.speeds, attitude)
+            yield plant.advance(commanded, min(stride, steps - first)), plant.applied(commanded)
 
 
 def fly(
@@ -373,23 +398,6 @@ def _ending_flight(time: float) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as error:
         raise RaisedError("the controller", error, time=time) from error
-
-
-def _hold(plant: Plant, inner: InnerLoop | None, speeds: Array, steps: int) -> Iterator[tuple[Segment, Array]]:
-    """Advance under a command: segments of flight, each with the rotor speeds (4,) commanded during it [rad/s].
-
-    Raises:
-        RaisedError: the inner loop raised, or its period is not a whole number of physics steps.
-    """
-    if inner is None:
-        yield plant.advance(speeds, steps), plant.applied(speeds)
-        return
-    with _ending_flight(plant.time):
-        stride = inner_steps(inner.rate, plant.timestep)
-    for first in range(0, steps, stride):
-        with _ending_flight(plant.time):
-            commanded = inner.speeds(plant.time, speeds, plant.physics[_BODY_RATES], plant.speeds)
-        yield plant.advance(commanded, min(stride, steps - first)), plant.applied(commanded)
 
 
 def _joined(parts: list[Array | None]) -> np.ndarray[Any, np.dtype[np.float32]] | None:

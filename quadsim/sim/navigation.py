@@ -10,7 +10,7 @@ import numpy as np
 
 from quadsim.errors import ParameterError
 from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
-from quadsim.sim.error_state import MEAN_QUATERNION, MEAN_RATES, EstimatorSettings
+from quadsim.sim.error_state import MEAN_GYRO_BIAS, MEAN_QUATERNION, MEAN_RATES, EstimatorSettings
 from quadsim.sim.estimator import ErrorStateFilter, Tally
 from quadsim.sim.sensing import Sample, Sampler, Sensor, SensorFault, SensorName, truth
 from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array, YawTurns
@@ -87,6 +87,7 @@ class Navigation:
         self._step, self._yaw, self._physics = 0, YawTurns(yaw), physics.copy()
         self.attitude: tuple[Array, Array] = physics[4:8].copy(), physics[11:14].copy()
         self._held = {name: truth(name, physics[None])[0] for name in SensorName}
+        self._bias, self._sensed = np.zeros(3), self.attitude
         self._in_flight: list[Sample] = []
         for sampler in self._samplers:
             sampler.reset()
@@ -95,7 +96,7 @@ class Navigation:
             self._filter.reset(mean, speeds, copy.deepcopy(self._rng))
         self._receive(physics[None], first=0)
         if self._filter is not None:
-            self._filter.advance(np.empty((0, len(speeds))), self._arrived(), first=0)
+            self._filter.advance(np.empty((0, len(speeds))), self._hear(), first=0)
 
     def advance(self, physics: Array, commands: Array, *, on_ground: bool = False) -> None:
         """Record a segment of flight: (M, 14) true states after each physics step, (M, 4) rotor speeds [rad/s].
@@ -107,12 +108,33 @@ class Navigation:
         first, self._step, self._physics = self._step, self._step + len(physics), physics[-1].copy()
         self._receive(physics, first + 1)
         if self._filter is not None:
-            self._filter.advance(commands, self._arrived(), first, on_ground=on_ground)
+            self._filter.advance(commands, self._hear(), first, on_ground=on_ground)
+
+    def sensed(self) -> tuple[Array, Array]:
+        """What an autopilot measures now: attitude (4,), wxyz, body to world, and body rates (3,) [rad/s].
+
+        The newest finite sample of each sensor, the true value where there is none; with an estimator, rates less their
+        last estimated bias, and the attitude that it estimates where no sensor measures it.
+        """
+        if self._filter is None:
+            self._hear()
+        attitude, rates = self._physics[4:8], self._physics[11:14]
+        if SensorName.RATES not in self._perfect:
+            rates = self._held[SensorName.RATES] - self._bias
+        if SensorName.ATTITUDE not in self._perfect:
+            attitude = euler_to_quaternion(self._held[SensorName.ATTITUDE])
+        elif self._filter is not None:
+            attitude = self._filter.estimate(self._step).mean[MEAN_QUATERNION]
+        pairs = zip((attitude, rates), self._sensed, strict=True)
+        new, rate = (now if np.isfinite(now).all() else before for now, before in pairs)
+        self._sensed = new, rate
+        return self._sensed
 
     def state(self) -> Array:
         """Return (12,) the state that the controller receives now: the paper's order, yaw unwrapped."""
         if self._filter is not None:
             mean = self._filter.estimate(self._step).mean
+            self._bias = mean[MEAN_GYRO_BIAS].copy()
             received = {
                 SensorName.POSITION: mean[0:3],
                 SensorName.VELOCITY: mean[3:6],
@@ -120,8 +142,7 @@ class Navigation:
                 SensorName.RATES: mean[MEAN_RATES],
             }
         else:
-            for sample in self._arrived():
-                self._held[sample.sensor] = sample.value
+            self._hear()
             received = self._held | {name: truth(name, self._physics[None])[0] for name in self._perfect}
         euler = received[SensorName.ATTITUDE].copy()
         quaternion = euler_to_quaternion(euler) if self._filter is None else mean[MEAN_QUATERNION]
@@ -143,6 +164,13 @@ class Navigation:
     def _receive(self, physics: Array, first: int) -> None:
         for sampler in self._samplers:
             self._in_flight += sampler.sample(physics, first)
+
+    def _hear(self) -> list[Sample]:
+        """Hold the newest value of each sensor, and return the samples that have arrived since the last call."""
+        arrived = self._arrived()
+        for sample in arrived:
+            self._held[sample.sensor] = sample.value
+        return arrived
 
     def _arrived(self) -> list[Sample]:
         """Return the samples that have arrived since the last call, oldest first; the others stay in transit."""

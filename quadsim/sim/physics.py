@@ -78,6 +78,7 @@ class Segment:
     """(M, 6) force, world [N], and torque, body frame about its origin [N m], of all effects but contact, over each
     step; None if no effect causes any."""
     wind: Array | None  # (M, 3) velocity of the air in the middle of each step, world [m/s]; None without wind
+    thrust: Array  # (M,) collective thrust in the middle of each step [N]
 
     @staticmethod
     def join(parts: Sequence[Segment]) -> Segment:
@@ -108,7 +109,8 @@ class FlownPeriod:
 
     observation: Observation  # the data at its start
     command: Command  # the controller's answer, or the command passed to `step`
-    speeds: Array  # (4,) the command in force at its end, an earlier one if `command` was missed [rad/s]
+    speeds: Array  # (4,) rotor speeds commanded at its end, of an earlier command if `command` was missed [rad/s]
+    target: Array | None  # (4,) or (8,) the target in force at its end, for an autopilot; None without one
     delay: float  # simulated time from the measurement to the command [s]
     missed: bool  # whether the command came too late
     step_s: float  # wall time of the controller's step [s]; 0 if the command was passed in
@@ -139,6 +141,9 @@ def flight_log(
         control = replace(control, attitude=attitudes, body_rates=rates)
         physics = np.concatenate([start[None], *(sample.segment.physics for sample in samples)])
         plant = replace(plant, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
+    if control.target is not None:
+        thrust = np.concatenate([sample.segment.thrust for sample in samples])
+        plant = replace(plant, thrust=np.append(thrust, thrust[-1]))
     return FlightLog(control=control, timing=_timing_log(samples, control.t), plant=plant)
 
 
@@ -164,6 +169,7 @@ def _control_log(samples: Sequence[FlownPeriod], initial_speeds: Array, period: 
     fallback = column("fallback", np.int64)
     late = np.array([sample.missed for sample in samples], dtype=bool)
     residuals = [sample.command.sqp for sample in samples]
+    target = _targets(samples)
     return ControlLog(
         t=_times(len(samples), period),
         state=np.array([observation.state for observation in observed], float).reshape(-1, N_STATES),
@@ -183,8 +189,21 @@ def _control_log(samples: Sequence[FlownPeriod], initial_speeds: Array, period: 
         **{name: column(name, float) for name in RESIDUALS},
         delay=np.array([sample.delay for sample in samples], float),
         sqp=np.array([residual or (math.nan, math.nan) for residual in residuals]) if any(residuals) else None,
+        target=None if target is None else target[:, :4],
+        target_attitude=None if target is None or np.isnan(target[:, 4:]).all() else target[:, 4:],
         logged=stacked([s for o in observed if isinstance(s := o.moment.signals, LoggedSignals)]),
     )
+
+
+def _targets(samples: Sequence[FlownPeriod]) -> Array | None:
+    """(K, 8) targets in force, four numbers and an attitude, NaN where there is none; None without an autopilot."""
+    if all(sample.target is None for sample in samples):
+        return None
+    rows = np.full((len(samples), 8), math.nan)
+    for row, sample in zip(rows, samples, strict=True):
+        if sample.target is not None:
+            row[: sample.target.size] = sample.target
+    return rows
 
 
 def _timing_log(samples: Sequence[FlownPeriod], t: Array) -> TimingLog:

@@ -289,7 +289,7 @@ class Plant:
         self._check(trajectory)
         self._physics[0] = trajectory[-1]
         self._step += steps
-        return Segment(physics=trajectory, speeds=before, wrench=wrench, wind=wind)
+        return Segment(physics=trajectory, speeds=before, wrench=wrench, wind=wind, thrust=thrusts.sum(axis=1))
 
     def _run(self, thrusts: Array) -> Array:
         """Take all steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""

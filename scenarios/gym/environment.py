@@ -193,7 +193,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
         if self._answered and self._answered[0] == flight.k and np.array_equal(self._answered[1], action):
             command = self._answered[2]
         else:
-            command = self.actions.command(action, seen.moment.body_rates, flight.loop.controller.horizon)
+            command = self.actions.command(action, flight.loop.controller.horizon)
         nothing = np.full(len(self.limits), np.inf)
         try:
             sample = flight.loop.step(command)

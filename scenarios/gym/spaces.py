@@ -11,10 +11,10 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from mpc.answer import ActuatorBounds
-from mpc.body_rates import STATUS, BodyRateLoop
 from mpc.bounded import Bounded
 from quadsim.controller import Command
 from quadsim.errors import ParameterError, UnknownNameError
+from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from quadsim.state import REFERENCE_NAMES, REFERENCE_STATES, STATE_NAMES, STATE_UNITS, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.schema.scenario import Scenario
@@ -26,8 +26,10 @@ PARTS: Final = ("state", "preview", "ahead", "command")
 USUAL: Final = ("state", "preview", "command")
 LARGEST: Final = 1e6  # magnitude that the plant takes for divergence
 LARGEST_RATES: Final = (6.0, 6.0, 2.0)  # body rates at an action of 1 [rad/s]
-BANDWIDTH: Final = 20.0  # of the body rate loop [1/s]
-INNER_PERIOD: Final = 0.002  # longest time between two calls of the body rate loop [s]
+STATUS: Final = "given"
+"""Status of a command that no controller computed."""
+BANDWIDTH: Final = (20.0, 20.0, 20.0)  # of the autopilot's rate loop, proportional alone [1/s]
+INNER_PERIOD: Final = 0.002  # longest time between two calls of the autopilot [s]
 
 
 class Actions:
@@ -36,7 +38,7 @@ class Actions:
     - `speeds`: rotor speeds [rad/s], as they are.
     - `deviations`: in [-1, 1]; 0 is hover, -1 and 1 the lowest and the highest speed, linear on either side.
     - `rates`: in [-1, 1]; collective thrust, 0 the weight and -1 and 1 the least and the most that rotors have, and
-      body rates as shares of `LARGEST_RATES`, flown by an inner loop.
+      body rates as shares of `LARGEST_RATES`, flown by an autopilot.
 
     Raises:
         UnknownNameError: there is no such kind.
@@ -64,21 +66,23 @@ class Actions:
         if kind == "rates":
             timestep = scenario.plant.timestep
             rate = 1.0 / (max(1, round(INNER_PERIOD / timestep)) * timestep)
-            self._loop = BodyRateLoop(vehicle, rate=rate, bandwidth=BANDWIDTH, bounds=bounds)
+            none = (0.0, 0.0, 0.0)
+            settings = AutopilotSettings(rate=rate, p=BANDWIDTH, i=none, d=none, gyro_cutoff=0.0, delay=0.0)
+            self._autopilot = Autopilot(vehicle, settings, speeds=(float(low[0]), float(high[0])))
             self._weight = vehicle.mass * vehicle.gravity
             self._thrusts = [vehicle.thrust_coefficient * float(np.sum(ends**2)) for ends in (low, high)]
 
-    def command(self, action: Action, body_rates: Array | None, horizon: int) -> Command:
-        """The command, a plan of this many rows, for an action at body rates (3,) [rad/s], if these are known."""
+    def command(self, action: Action, horizon: int) -> Command:
+        """The command, a plan of this many rows, for an action."""
+        speeds, inner = np.array(action, np.float64), None
         if self._kind == "rates":
-            thrust, *rates = np.asarray(action, float).tolist()
-            self._loop.thrust = self._weight + abs(thrust) * (self._thrusts[thrust > 0.0] - self._weight)
-            self._loop.rates = np.multiply(rates, LARGEST_RATES)
-            return self._loop.command(np.zeros(3) if body_rates is None else body_rates, horizon)
-        speeds = np.array(action, np.float64)
-        if self._kind == "deviations":
+            inner, thrust = self._autopilot, float(speeds[0])
+            collective = self._weight + abs(thrust) * (self._thrusts[thrust > 0.0] - self._weight)
+            speeds = np.append(collective, speeds[1:] * LARGEST_RATES)
+        elif self._kind == "deviations":
             speeds = self._hover + speeds * np.where(speeds < 0.0, self._down, self._up)
-        return Command(speeds=speeds, plan=np.broadcast_to(speeds, (horizon, N_ROTORS)), status=STATUS)
+        plan = np.broadcast_to(speeds, (horizon, N_ROTORS))
+        return Command(speeds=speeds, plan=plan, status=STATUS, inner=inner)
 
     def of(self, speeds: Array) -> Action:
         """The action that commands rotor speeds (4,) [rad/s]; beyond [-1, 1] where these are beyond their bounds.

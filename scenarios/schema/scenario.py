@@ -17,6 +17,7 @@ from mpc.indi import INDISettings
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Positive, Vector
 from quadsim.flight.audit import Limit
+from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.load import PayloadDrop, PayloadPickup
@@ -153,7 +154,7 @@ MOST_STEPS: Final = 10_000_000
 
 
 Verdict = Literal["satisfied", "violated", "lost", "aborted", "incomplete"]
-BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate_z", "speed", "slew")
+BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate_z", "thrust", "speed", "slew")
 """Signals that controllers can bound."""
 
 
@@ -196,6 +197,10 @@ class Scenario:
     plant: Simulation = Simulation()
     reference: ReferenceTable
     controller: AnyController
+    autopilot: Annotated[
+        AutopilotSettings | None,
+        doc("flies a controller that commands thrust and body rates; absent: the vehicle file's, or by rule"),
+    ] = None
     effects: Effects = field(default_factory=Effects)
     forces: Annotated[
         tuple[PluginForce, ...],
@@ -291,6 +296,11 @@ class Scenario:
                     inner_steps(indi.rate, self.plant.timestep)
                 except ParameterError as error:
                     raise ValueError(f"controller.indi.rate must be {error.rule}; got {indi.rate}") from error
+        if self.autopilot is not None and self.autopilot.rate is not None:
+            try:
+                inner_steps(self.autopilot.rate, self.plant.timestep)
+            except ParameterError as error:
+                raise ValueError(f"autopilot.rate must be {error.rule}; got {self.autopilot.rate}") from error
         for what, count in (
             ("physics steps", self.periods * self.steps_per_period),
             ("planned steps", self.periods * max(spec.horizon for spec in specs)),

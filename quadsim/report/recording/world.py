@@ -27,6 +27,7 @@ PANELS: Final[dict[str, tuple[str, ...]]] = {
     "Position": ("x", "y", "z"),
     "Roll and pitch": ("roll", "pitch"),
     "Rotor speeds": ("speed",),
+    "Collective thrust": ("thrust",),
     "Steps of the rotor speeds, per period": ("slew",),
     "Velocity": ("vx", "vy", "vz"),
     "Position errors": ("x_error", "y_error", "z_error"),

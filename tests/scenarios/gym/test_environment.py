@@ -75,7 +75,7 @@ def test_actions_are_within_the_controllers_bounds_or_the_vehicles() -> None:
     env = quadsim.gym.make_env("paper-constrained", action="speeds")
     assert env.action_space == gymnasium.spaces.Box(0.0, 250.0, (4,), dtype=np.float64)
     actions = quadsim.gym.QuadrotorEnv("hover").actions
-    speeds = actions.command(np.array([-1.0, -0.3, 0.0, 1.0]), None, 1).speeds
+    speeds = actions.command(np.array([-1.0, -0.3, 0.0, 1.0]), 1).speeds
     assert speeds[[0, 3]].tolist() == [0.0, 250.0]
     assert actions.of(speeds) == pytest.approx([-1.0, -0.3, 0.0, 1.0], abs=1e-7)
     free = quadsim.gym.make_env("torrente-loop4-drag", action="speeds").unwrapped

@@ -1,0 +1,285 @@
+"""An autopilot: the fast inner loop that flies a controller's thrust and body rates, or thrust and attitude.
+
+At its own rate, from measured body rates omega, low-pass filtered to y, and attitude q,
+
+    omega_c = omega_ff + k_a 2 vec(q* q_c)                    attitude mode only, with the error's scalar part >= 0
+    alpha   = p (omega_c - y) + I - d dy/dt,     dI/dt = i (omega_c - y),  |I| <= i_max
+    tau     = J alpha + y x J y
+
+and the mixer turns thrust and torque into rotor speeds.  Roll and pitch come first, then as much yaw as fits, then the
+collective thrust, which is shifted until no rotor saturates: airmode.  Without airmode the thrust stays, and torques
+are cut.  An axis that was cut does not integrate.  This is the structure of Betaflight and PX4, in SI units.
+
+Gains that a file does not state follow from the vehicle (`AutopilotSettings.resolved`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Final
+
+import numpy as np
+from annotated_types import Len, doc
+
+from quadsim.controller import AutopilotLoop
+from quadsim.fields import Fraction, NonNegative, Positive, filled
+from quadsim.sim.effects import Effects
+from quadsim.sim.effects.rotors import RotorDynamics
+from quadsim.sim.physics import inner_steps
+from quadsim.sim.plant import Plant
+from quadsim.sim.sensing import whole
+from quadsim.state import N_STATES, Array
+from quadsim.vehicle import N_ROTORS, Vehicle
+
+Gains = Annotated[tuple[NonNegative, ...], Len(3, 3)]
+
+RATE, GYRO_CUTOFF, D_CUTOFF = 1000.0, 100.0, 60.0  # [Hz]
+LARGEST_RATE: Final = (500.0, 500.0, 200.0)  # [deg/s]
+DAMPING: Final = 0.7
+"""Damping of the rate loop that the default gains aim at."""
+FASTEST: Final = 40.0
+"""Largest bandwidth of the default rate loop [rad/s]."""
+LARGEST_D: Final = 2.0
+"""Largest default of d: it multiplies the effect of gyro noise."""
+INTEGRAL_TIME: Final = 1.0  # of the default rate loop, p / i [s]
+AUTHORITY: Final = 0.25  # share of the angular acceleration available at hover that the default I may demand
+
+
+@dataclass(frozen=True, kw_only=True)
+class AutopilotSettings:
+    """An autopilot's loops and mixer; what is absent follows from the vehicle file, or from inertia and rotor lag."""
+
+    rate: Annotated[
+        Positive | None, doc("[Hz] of the loops; the period is a whole number of physics steps; absent: 1000")
+    ] = None
+    p: Annotated[Gains | None, doc("[1/s] gain of the rate error, about body x, y, z; absent: by rule")] = None
+    i: Annotated[Gains | None, doc("[1/s^2] gain of its integral; absent: p per second")] = None
+    d: Annotated[Gains | None, doc("[-] gain of the measured angular acceleration; absent: by rule")] = None
+    i_max: Annotated[
+        Gains | None, doc("[rad/s^2] largest integral part; absent: a quarter of what the rotors give at hover")
+    ] = None
+    gyro_cutoff: Annotated[
+        NonNegative | None, doc("[Hz] of the low-pass filter on body rates, 0 for none; absent: 100")
+    ] = None
+    d_cutoff: Annotated[
+        NonNegative | None, doc("[Hz] of a second one, on their derivative, 0 for none; absent: 60")
+    ] = None
+    delay: Annotated[
+        NonNegative | None, doc("[s] from measured rates to rotor commands, whole periods of the loop; absent: one")
+    ] = None
+    attitude: Annotated[
+        Gains | None, doc("[1/s] gain of the attitude error; absent: a quarter of the rate loop's bandwidth")
+    ] = None
+    largest_rate: Annotated[
+        Gains | None, doc("[deg/s] larger body-rate targets are clipped; absent: 500, 500, 200")
+    ] = None
+    idle: Annotated[
+        Fraction | None, doc("[-] slowest rotor, as a share of speed_max; absent: the vehicle's speed_min")
+    ] = None
+    airmode: Annotated[bool | None, doc("whether thrust yields to roll and pitch; absent: true")] = None
+
+    def resolved(self, vehicle: Vehicle) -> AutopilotSettings:
+        """Fill in what is absent, by rule.
+
+        With T the rotors' rise time plus filter and delay, the loop s^2 T + (1 + d) s + p has the bandwidth
+        w = min(40 rad/s, (1 + 2) / (2 zeta T)), for d <= 2, and the damping zeta = 0.7: p = w^2 T, d = 2 zeta w T - 1;
+        where T is so short that d would be negative, p = w / (2 zeta).  Yaw, whose reaction torque saturates first,
+        has d = 0 and p = 1 / (2 T), at most that of roll.
+        """
+        usual = filled(
+            self, rate=RATE, gyro_cutoff=GYRO_CUTOFF, d_cutoff=D_CUTOFF, largest_rate=LARGEST_RATE, airmode=True
+        )
+        assert usual.rate is not None
+        rate = usual.rate
+        usual = filled(usual, delay=1.0 / rate)
+        filtering = 1.0 / (math.tau * usual.gyro_cutoff) if usual.gyro_cutoff else 0.0
+        lag = (vehicle.rotor_rise or 0.0) + filtering + (usual.delay or 0.0) + 0.5 / rate
+        w = min(FASTEST, (1.0 + LARGEST_D) / (2.0 * DAMPING * lag))
+        p, d = w * max(w * lag, 0.5 / DAMPING), max(2.0 * DAMPING * w * lag - 1.0, 0.0)
+        gains = filled(usual, p=(p, p, min(p, 0.5 / lag)), d=(d, d, 0.0))
+        assert gains.p is not None
+        effect = np.abs(vehicle.allocation[1:]).sum(axis=1) / np.array(vehicle.inertia)
+        room = min(vehicle.hover_speed**2 - vehicle.speed_min**2, vehicle.speed_max**2 - vehicle.hover_speed**2)
+        return filled(
+            gains,
+            i=tuple(gain / INTEGRAL_TIME for gain in gains.p),
+            i_max=tuple((AUTHORITY * effect * room).tolist()),
+            attitude=(0.25 * w, 0.25 * w, 0.25 * min(w, gains.p[2])),
+            idle=vehicle.speed_min / vehicle.speed_max,
+        )
+
+
+class Autopilot:
+    """The autopilot of a vehicle (`quadsim.controller.AutopilotLoop`), for a controller's targets.
+
+    A target is a row: collective thrust [N] and body rates [rad/s], (4,); with an attitude (wxyz, body to world) after
+    them, (8,), the attitude is held, and the rates are fed forward.
+
+    Attributes:
+        settings: resolved.
+        saturated: calls so far in which an axis was cut.
+    """
+
+    takes_targets: Final = True
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        settings: AutopilotSettings | None = None,
+        *,
+        speeds: tuple[float, float] | None = None,
+    ) -> None:
+        """Set up at hover; `speeds` are the slowest and the fastest of a rotor, idle and speed_max by default."""
+        self.settings = settings = (settings or AutopilotSettings()).resolved(vehicle)
+        assert settings.rate is not None
+        assert settings.delay is not None
+        assert settings.largest_rate is not None
+        self.rate, self._step = settings.rate, 1.0 / settings.rate
+        self._p, self._i, self._d, self._i_max, self._attitude = (
+            np.array(gains) for gains in (settings.p, settings.i, settings.d, settings.i_max, settings.attitude)
+        )
+        self._largest = np.radians(settings.largest_rate)
+        rule = f"a whole number of periods of {self._step:g} s"
+        self._delay = whole("autopilot", "delay", settings.delay, settings.delay * settings.rate, rule, smallest=0)
+        self._gyro_share, self._d_share = (
+            1.0 - math.exp(-math.tau * cutoff * self._step) if cutoff else 1.0
+            for cutoff in (settings.gyro_cutoff, settings.d_cutoff)
+        )
+        self._inertia, self._coefficient = np.array(vehicle.inertia), vehicle.thrust_coefficient
+        self._to_thrusts = np.linalg.inv(vehicle.allocation / vehicle.thrust_coefficient)
+        assert settings.idle is not None
+        slowest, fastest = speeds or (settings.idle * vehicle.speed_max, vehicle.speed_max)
+        self._range = self._coefficient * slowest**2, self._coefficient * fastest**2
+        self._hover = np.full(N_ROTORS, vehicle.hover_speed)
+        self.reset()
+
+    def reset(self) -> None:
+        """Start anew: no integral, filters at rest, rotors at hover."""
+        self._filtered, self._slope, self._integral = np.zeros(3), np.zeros(3), np.zeros(3)
+        self._queue: deque[Array] = deque([self._hover] * self._delay)
+        self.saturated = 0
+
+    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
+        """Return the rotor speeds (4,) [rad/s] until the next call, for the target `commanded` (4,) or (8,)."""
+        wanted = commanded[1:4]
+        if commanded.size > N_ROTORS:
+            wanted = wanted + self._attitude * attitude_error(attitude, commanded[4:])
+        before, self._filtered = self._filtered, self._filtered + self._gyro_share * (rates - self._filtered)
+        y = self._filtered
+        self._slope = self._slope + self._d_share * ((y - before) / self._step - self._slope)
+        error = np.minimum(np.maximum(wanted, -self._largest), self._largest) - y
+        momentum = self._inertia * y
+        gyroscopic = np.array(
+            [
+                y[1] * momentum[2] - y[2] * momentum[1],
+                y[2] * momentum[0] - y[0] * momentum[2],
+                y[0] * momentum[1] - y[1] * momentum[0],
+            ]
+        )
+        torque = self._inertia * (self._p * error + self._integral - self._d * self._slope) + gyroscopic
+        thrusts, cut = self.mix(float(commanded[0]), torque)
+        integral = self._integral + self._step * self._i * error
+        self._integral = np.where(cut, self._integral, np.minimum(np.maximum(integral, -self._i_max), self._i_max))
+        self.saturated += bool(cut.any())
+        self._queue.append(np.sqrt(thrusts / self._coefficient))
+        return self._queue.popleft()
+
+    def mix(self, thrust: float, torque: Array) -> tuple[Array, Array]:
+        """Return the rotors' thrusts (4,) [N] for a collective thrust [N] and a torque (3,) [N m], and the axes cut.
+
+        Each thrust is within the rotors' range; `cut` (3,) says which torques are smaller than demanded.
+        """
+        low, high = self._range
+        level, tilting = self._to_thrusts[:, 1:3] @ torque[:2], self._to_thrusts[:, 3] * torque[2]
+        base, share = min(max(0.25 * thrust, low), high), 1.0
+        if self.settings.airmode:
+            room = high - low
+            extent = float(level.max() - level.min())
+        else:
+            room, extent = min(base - low, high - base), float(np.abs(level).max())
+        if extent > room:
+            level, share = level * (room / extent), room / extent
+        yaw = self._yaw_share(level, tilting, base)
+        parts = level + yaw * tilting
+        if self.settings.airmode:
+            base = min(max(base, low - float(parts.min())), high - float(parts.max()))
+        return np.minimum(np.maximum(base + parts, low), high), np.array([share < 1.0, share < 1.0, yaw < 1.0])
+
+    def _yaw_share(self, level: Array, yaw: Array, base: float) -> float:
+        """Return the largest share, up to 1, of the yaw parts that fits: collective thrust does not yield to yaw."""
+        low, high = self._range
+        if self.settings.airmode:
+            base = min(max(base, low - float(level.min())), high - float(level.max()))
+        share = 1.0
+        for part, turn in zip((base + level).tolist(), yaw.tolist(), strict=True):
+            if turn:
+                share = min(share, max((high - part) / turn, (low - part) / turn))
+        return max(share, 0.0)
+
+
+def attitude_error(attitude: Array, target: Array) -> Array:
+    """(3,) 2 vec(q* q_c), the shorter way: the rotation from q to q_c, wxyz, about body axes [rad], to first order."""
+    w, x, y, z = attitude.tolist()
+    a, b, c, d = target.tolist()
+    sign = 2.0 if w * a + x * b + y * c + z * d >= 0.0 else -2.0
+    return sign * np.array(
+        [w * b - x * a - y * d + z * c, w * c + x * d - y * a - z * b, w * d - x * c + y * b - z * a]
+    )
+
+
+STEPS: Final = (0.1, 1.0, 1.0, 0.5)
+"""Steps by which lags are identified: of the weight, and of body rates [rad/s]."""
+WINDOW: Final = 0.3  # time of a step response that is fitted [s]
+
+
+def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float = 1e-3) -> tuple[float, ...]:
+    """Return the first-order lags of thrust, p, q and r [s] that fit the autopilot's step responses best.
+
+    It steps each target from hover, on the plant with the vehicle's rotor lag and without other effects, and fits
+    1 - exp(-t / lag) to the first 0.3 s by least squares.
+    """
+    from scipy.optimize import minimize_scalar  # slow to import
+
+    rise, fall = vehicle.rotor_rise or 0.0, vehicle.rotor_fall or vehicle.rotor_rise or 0.0
+    rotors = RotorDynamics(rise=rise or None, fall=fall or None, inertia=None if rise else 0.0).resolved(vehicle)
+    times = np.arange(1, round(WINDOW / timestep) + 1) * timestep
+    lags = []
+    with Plant(vehicle, timestep=timestep, effects=Effects(rotors=rotors), limit_speeds=True) as plant:
+        for axis in range(4):
+            response = _step_response(plant, autopilot, axis)
+
+            def misfit(lag: float, response: Array = response) -> float:
+                return float(np.square(1.0 - np.exp(-times / lag) - response).sum())
+
+            lags.append(float(minimize_scalar(misfit, bounds=(timestep, 2.0 * WINDOW), method="bounded").x))
+    return tuple(lags)
+
+
+def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
+    """(WINDOW / timestep,) the share of a step of a target, 0 thrust, 1 to 3 body rates, that is reached."""
+    vehicle, stride = plant.vehicle, inner_steps(autopilot.rate, plant.timestep)
+    weight = vehicle.mass * vehicle.gravity
+    target, size = np.array([weight, 0.0, 0.0, 0.0]), STEPS[axis] * (weight if axis == 0 else 1.0)
+    plant.reset(np.zeros(N_STATES))
+    autopilot.reset()
+    reached = []
+    target[axis] += size
+    for _ in range(0, round(WINDOW / plant.timestep), stride):
+        attitude, rates = plant.attitude
+        speeds = autopilot.speeds(plant.time, target, rates, plant.speeds, attitude)
+        segment = plant.advance(speeds, stride)
+        if axis:
+            reached.append(segment.physics[:, 10 + axis] / size)
+        else:
+            ends = np.concatenate([segment.speeds[1:], plant.speeds[None]])
+            reached.append((vehicle.thrust_coefficient * np.square(ends).sum(axis=1) - weight) / size)
+    return np.concatenate(reached)[: round(WINDOW / plant.timestep)]
+
+
+@cache
+def own_lags(vehicle: Vehicle, settings: AutopilotSettings, timestep: float) -> tuple[float, ...]:
+    """`identify_lags` of the built-in autopilot, kept: a campaign asks for the same one in every flight."""
+    return identify_lags(vehicle, Autopilot(vehicle, settings), timestep=timestep)
