@@ -31,12 +31,16 @@ LARGEST_MAP: Final = 2**20
 
 @dataclass(frozen=True, kw_only=True)
 class ActuatorBounds:
-    """Hard bounds on rotor speeds, Eq. (20), and on their steps from one period to the next, Eq. (15)."""
+    """Hard bounds on rotor speeds, Eq. (20), and on their steps from one period to the next, Eq. (15).
+
+    With `targets`, on the targets of an inner loop, collective thrust [N] and body rates [rad/s], instead of speeds.
+    """
 
     u_min: Array  # (4,) speeds [rad/s], finite and not negative: rotors turn one way
     u_max: Array  # same
     delta_min: Array  # (4,) steps u(k) - u(k-1) [rad/s]; infinite for no bound
     delta_max: Array  # same
+    targets: bool = False  # whether commands are targets
 
     def __post_init__(self) -> None:
         for name in ("u_min", "u_max", "delta_min", "delta_max"):
@@ -46,7 +50,7 @@ class ActuatorBounds:
             object.__setattr__(self, name, bound)
         if not (np.isfinite(self.u_min).all() and np.isfinite(self.u_max).all() and np.all(self.u_min < self.u_max)):
             raise ParameterError("controller", "u_min", self.u_min, f"finite and below a finite u_max = {self.u_max}")
-        if self.u_min.min() < 0.0:
+        if self.u_min.min() < 0.0 and not self.targets:
             raise ParameterError("controller", "u_min", self.u_min, "at least 0 rad/s: rotors turn one way")
         if not np.all((self.delta_min <= 0.0) & (self.delta_max >= 0.0)):
             rule = f"<= 0 and delta_max = {self.delta_max} >= 0, so that a speed can be held"
@@ -92,6 +96,11 @@ class ActuatorBounds:
         lower = np.minimum(np.maximum(before + self.delta_min, self.u_min), self.u_max)
         upper = np.minimum(np.maximum(before + self.delta_max, self.u_min), self.u_max)
         return lower, upper
+
+    def lowest(self, before: Array) -> Array:
+        """Return the command (4,) of stopping rotors: the lowest speeds in reach of `before` (4,), or no rates."""
+        lower, _ = self.reach(before)
+        return np.append(lower[0], np.zeros(N_ROTORS - 1)) if self.targets else lower
 
     def clip(self, speeds: Array, before: Array) -> Array:
         """Return the speeds (4,) [rad/s] in reach of `before` that are closest to `speeds`."""

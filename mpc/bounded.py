@@ -15,6 +15,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 
 from mpc.constraints import Bounds, Constraint, Penalty
+from mpc.model import SHORTEST_LAG
 from mpc.obstacles import AvoidanceSettings, Shape, Space
 from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
@@ -39,6 +40,7 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 if TYPE_CHECKING:
     from mpc.answer import ActuatorBounds
     from mpc.core.numbers import Exportable
+    from mpc.model import LinearModel
 
 IN_DEGREES: Final = frozenset(
     name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad")
@@ -46,11 +48,12 @@ IN_DEGREES: Final = frozenset(
 """States that scenario files give in degrees (per second)."""
 TERMS: Final = (*STATE_NAMES, *(f"speed_{i + 1}" for i in range(N_ROTORS)))
 """The quantities that the rows of a polytope may combine."""
-SHORTEST_LAG: Final = 1e-4  # shortest rotor lag [s] for which gains can be computed; far below any period
 LARGEST_HORIZON: Final = 1000
 MOST_ENTRIES: Final = 1000  # most entries in a list of tables
 USUAL_TILT: Final = 10.0
 """Default limit of the fallback's tilt [deg], for a controller without a bound on tilt."""
+USUAL_THRUST: Final = (0.1, 0.9)
+"""Default bounds on a target of collective thrust, as shares of the vehicle's largest."""
 _FALLBACK_SHARE: Final = 0.8
 """Fallback tilt as a share of the tightest bound on it, so that the controller resumes within its bounds."""
 _SMALLEST_TILT: Final = (
@@ -64,6 +67,8 @@ KktEvery = Annotated[
 ]
 Seconds = Annotated[float, Ge(0.0), Le(10.0)]
 Lag = Seconds | Literal["vehicle"]  # a time constant, or the one in the vehicle file
+Rates = Positive | Annotated[tuple[Positive, ...], Len(3, 3)]
+"""One largest magnitude for three body rates, or one per axis."""
 RotorWeights = Weight | Annotated[tuple[Weight, ...], Len(N_ROTORS, N_ROTORS)]
 """One weight for all rotors, or one per rotor."""
 Price = Annotated[float, Ge(0.0), Le(1e12)]
@@ -123,6 +128,43 @@ class RotorBounds:
         from mpc.answer import ActuatorBounds
 
         return ActuatorBounds.alike(**self.audited(vehicle))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TargetBounds:
+    """Hard bounds on an inner loop's targets: collective thrust and body rates."""
+
+    thrust: Annotated[
+        Pair | None,
+        doc(
+            f"[N] collective; absent: {100 * USUAL_THRUST[0]:g} and {100 * USUAL_THRUST[1]:g} % of the vehicle's "
+            "largest, which leaves the rotors a range for torques"
+        ),
+    ] = None
+    body_rate: Annotated[Rates, doc("[deg/s] largest magnitude, one or about body x, y, z")] = (300.0, 300.0, 90.0)
+
+    def __post_init__(self) -> None:
+        if self.thrust is not None:
+            require_ordered("thrust", self.thrust)
+            if self.thrust[0] < 0.0:
+                raise ValueError(f"thrust must have a lower bound >= 0 N; got {[*self.thrust]}")
+
+    def audited(self, vehicle: Vehicle) -> dict[str, Range]:
+        """Return the bounds on collective thrust [N] and on each body rate [deg/s]."""
+        largest = N_ROTORS * vehicle.thrust_coefficient * vehicle.speed_max**2
+        lower, upper = self.thrust or (USUAL_THRUST[0] * largest, USUAL_THRUST[1] * largest)
+        rates = np.broadcast_to(np.asarray(self.body_rate, float), 3).tolist()
+        sides = {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", rates, strict=True)}
+        return {"thrust": (lower, upper), **sides}
+
+    def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
+        """Return the same bounds on targets (4,) [N], [rad/s], with unbounded steps."""
+        from mpc.answer import ActuatorBounds
+
+        thrust, *rates = self.audited(vehicle).values()
+        lower, upper = np.array([thrust, *np.radians(rates)]).T
+        steps = np.full(N_ROTORS, math.inf)
+        return ActuatorBounds(u_min=lower, u_max=upper, delta_min=-steps, delta_max=steps, targets=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,8 +333,12 @@ class FallbackSettings:
         vehicle: Vehicle,
         period: float,
         output_bounds: Mapping[str, Sequence[float]] | None = None,
+        model: LinearModel | None = None,
     ) -> Controller:
-        """Return the law inside the fallback contract, with the tilt of `output_bounds`; the law itself if disabled."""
+        """Return the law inside the fallback contract, with the tilt of `output_bounds`; the law itself if disabled.
+
+        `model` is the hover model whose inputs are the law's commands; None for that of rotor speeds.
+        """
         from mpc.fallback.contract import Guarded
         from mpc.model import hover_model
 
@@ -303,7 +349,7 @@ class FallbackSettings:
             pairs = (output_bounds[name] for name in ("roll", "pitch") if name in output_bounds)
             tightest = min((_FALLBACK_SHARE * min(-lower, upper) for lower, upper in pairs), default=USUAL_TILT)
             settings = replace(self, tilt=min(max(tightest, _SMALLEST_TILT), USUAL_TILT))
-        return Guarded(law, hover_model(vehicle, period), bounds=bounds, settings=settings)
+        return Guarded(law, hover_model(vehicle, period) if model is None else model, bounds=bounds, settings=settings)
 
 
 USUAL_FALLBACK: Final = FallbackSettings()

@@ -18,6 +18,25 @@ With f / m computed from the rotor commands, this is the acceleration feedback o
 inversion (Tal and Karaman, "Accurate tracking of aggressive quadrotor trajectories using incremental nonlinear dynamic
 inversion and differential flatness", 2021), f / m R e_z - g e_z + d = v', with a prediction in place of the lag of a
 low-pass filter.
+
+With `thrust_scale`, rotors give kappa times the modelled thrust T b, per mass, with b = R e_z, and what else is missed
+is a horizontal force,
+
+    d = s T b + (a_x, a_y, 0),    s = kappa - 1 = d_z / (T b_z),    a_xy = (d - s T b)_xy.
+
+T is the thrust commanded, at kappa = 1, and each period splits its own d, so that the filters of a_x, a_y and g s, in
+place of those of d, do not act on each other.  A vertical force and a scale cannot be told apart in hover: estimates of
+both drift, one growing against the other.  Where T b_z is less than `LEAST_THRUST` g, d hardly depends on the scale,
+which holds, as does the fit of drag.  The torque of the commands counts kappa times, with the scale that was foreseen
+for the period, by which a controller divides the wrench that it demands.  (a_x, a_y, 0) differs from d by s T b, which
+has no component along the body's x and y axes; so drag is fitted along these two.  Drag along z counts as a change of
+the thrust.
+
+An autopilot takes collective thrust, which acts with the lag tau_T.  Its mean over a period is then
+
+    T_c + (T - T_c) tau_T / tau_s (1 - exp(-tau_s / tau_T)),
+
+with T, at its start, the thrust that acted and T_c the one commanded.  The autopilot's own integrals balance torques.
 """
 
 from __future__ import annotations
@@ -40,6 +59,10 @@ TORQUE_SHARE: Final = 0.25
 """Default bandwidth of the torque estimate times the control period."""
 FITTED_FROM: Final = 1.0
 """Speed along an axis [m/s] at which the fitted drag explains half of the force."""
+LEAST_THRUST: Final = 0.3
+"""Vertical thrust as a share of the weight below which the thrust scale holds."""
+LARGEST_CHANGE: Final = 0.7
+"""Largest difference of the thrust scale from 1; larger estimates are clipped."""
 _SAME_TIME: Final = 1e-6  # [s]
 
 
@@ -60,6 +83,13 @@ class RampSettings:
         NonNegative | None,
         doc("[s] rotor time constant; absent: that of the controller's prediction, or 0"),
     ] = None
+    thrust_scale: Annotated[
+        bool,
+        doc(
+            "true: a vertical misfit scales the thrust, as a battery's charge does, and only a horizontal one is a "
+            "force; false: a force along three axes"
+        ),
+    ] = False
     largest_force: Annotated[Positive, doc("[m/s^2] larger estimates are clipped")] = 20.0
     largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 100.0
 
@@ -67,7 +97,9 @@ class RampSettings:
 class RampObserver:
     """The six filters, an evolving state: three for the force (world axes) and three for the torque (body axes).
 
-    The model knows `drag` (3,) [1/s] and `quadratic_drag` (3,) [1/m], of the square of each component, in body axes.
+    Commands are rotor speeds, or with `thrust_lag` [s] collective thrusts [N] that act with this lag; no torque is
+    estimated then. The model knows `drag` (3,) [1/s] and `quadratic_drag` (3,) [1/m], of the square of each component,
+    in body axes.
     """
 
     def __init__(
@@ -78,12 +110,18 @@ class RampObserver:
         *,
         drag: ArrayLike = (0.0, 0.0, 0.0),
         quadratic_drag: ArrayLike = (0.0, 0.0, 0.0),
+        thrust_lag: float | None = None,
     ) -> None:
         force = FORCE_SHARE / period if settings.force is None else settings.force
         torque = TORQUE_SHARE / period if settings.torque is None else settings.torque
         pole = np.exp(-period * np.repeat([force, torque], 3))
         self._gain, self._gain_of_change = 1.0 - pole**2, (1.0 - pole) ** 2 / period
         self._largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
+        self._scaled, self._thrust_lag = settings.thrust_scale, thrust_lag
+        if self._scaled:
+            self._largest[2] = LARGEST_CHANGE * vehicle.gravity
+        if thrust_lag is not None:
+            self._gain[3:] = self._gain_of_change[3:] = 0.0
         self._vehicle, self._period, self._lag = vehicle, period, settings.rotor_lag or 0.0
         inertia = (vehicle.rotor_inertia or 0.0) if self._lag else 0.0
         self._momentum = -inertia * np.array(vehicle.rotor_spins, float)
@@ -91,31 +129,39 @@ class RampObserver:
         self._decay = math.exp(-period / settings.drag_memory)
         self._ballast = FITTED_FROM**2 / (1.0 - self._decay)
         self._up = np.array([0.0, 0.0, vehicle.gravity])
-        self.reset(np.full(4, vehicle.hover_speed))
+        self._rotors, self._thrust = np.full(4, vehicle.hover_speed), vehicle.mass * vehicle.gravity
+        self.reset(self._rotors if thrust_lag is None else self._thrust)
 
-    def reset(self, rotors: Array) -> None:
-        """Clear the estimates; the rotors turn at `rotors` (4,) [rad/s]."""
+    def reset(self, acting: Array | float) -> None:
+        """Clear the estimates; the rotors turn at `acting` (4,) [rad/s], or give this thrust [N] with `thrust_lag`."""
         self._value, self._change = np.zeros(6), np.zeros(6)
         self._products, self._squares = np.zeros(3), np.zeros(3)
-        self._rotors = np.array(rotors, float)
+        if self._thrust_lag is None:
+            self._rotors = np.array(acting, float)
+        else:
+            self._thrust = float(acting)
         self._last: tuple[Array, Array, Array, Array] | None = None
         self._time = 0.0
 
     def adopt(self, other: RampObserver) -> None:
-        """Take over the state of another observer."""
-        self._value = np.clip(other._value, -self._largest, self._largest)
-        self._change, self._rotors = other._change, other._rotors
+        """Take over the state of another observer, as far as it estimates the same."""
+        same_commands = (self._thrust_lag is None) == (other._thrust_lag is None)
+        shared = np.array([True, True, self._scaled == other._scaled, *[same_commands] * 3])
+        self._value = np.where(shared, np.clip(other._value, -self._largest, self._largest), 0.0)
+        self._change = np.where(shared, other._change, 0.0)
+        if same_commands:
+            self._rotors, self._thrust = other._rotors, other._thrust
         self._products, self._squares = other._products, other._squares
         self._last, self._time = other._last, other._time
 
-    def update(self, time: float, velocity: Array, attitude: Array, rates: Array, speeds: Array) -> None:
+    def update(self, time: float, velocity: Array, attitude: Array, rates: Array, command: Array | float) -> None:
         """Update the estimates at the end of a period; after a gap, only record the start of the next one.
 
-        Measured values: velocity (3,), world; attitude (3, 3), body to world; body rates (3,). The speeds (4,) [rad/s]
-        were commanded over the period that ends.
+        Measured values: velocity (3,), world; attitude (3, 3), body to world; body rates (3,). The command was held
+        over the period that ends: rotor speeds (4,) [rad/s], or the thrust [N] with `thrust_lag`.
         """
         period, J = self._period, np.array(self._vehicle.inertia)
-        spun, squares = self._rotors, self._mean_squares(speeds)
+        thrust, torque = self._mean_wrench(command)
         axis, turning = attitude[:, 2], attitude @ np.array([rates[1], -rates[0], 0.0])
         v_b = attitude.T @ velocity
         drag = -attitude @ ((self._drag + self._quadratic * np.abs(v_b)) * v_b)
@@ -129,20 +175,30 @@ class RampObserver:
         # Mean over the period from its two ends; for the thrust axis also from its derivative (Euler-Maclaurin).
         b = 0.5 * (last[2][:3] + axis) + period / 12.0 * (last[2][3:] - turning)
         drag, gyroscopic = np.split(0.5 * (last[3] + now[3]), 2)
-        thrust, torque = np.split(self._vehicle.allocation @ squares, [1])
-        torque[2] -= self._momentum @ (self._rotors - spun) / period
+        lift = thrust / self._vehicle.mass * b
         missed = np.concatenate(
             [
-                (velocity - last[0]) / period + self._up - thrust / self._vehicle.mass * b - drag,
+                (velocity - last[0]) / period + self._up - lift - drag,
                 (rates - last[1]) / period - (torque - gyroscopic) / J,
             ]
         )
+        holds = False
+        if self._scaled:
+            g = self._vehicle.gravity
+            if holds := bool(lift[2] < LEAST_THRUST * g):
+                self._change[2] = 0.0
+            s = self._value[2] / g if holds else missed[2] / lift[2]
+            missed[:2], missed[2] = missed[:2] - s * lift[:2], g * s
         predicted = self._value + period * self._change
         surprise = missed - predicted
         value = predicted + self._gain * surprise
         self._value = np.clip(value, -self._largest, self._largest)
         self._change = np.where(value == self._value, self._change + self._gain_of_change * surprise, 0.0)
+        if holds:
+            return
         d_b = attitude.T @ self.foreseen(0.0)[0]
+        if self._scaled:
+            d_b[2] = 0.0
         self._products, self._squares = self._decay * self._products + d_b * v_b, self._decay * self._squares + v_b**2
 
     def foreseen(self, ahead: float) -> tuple[Array, Array, Array]:
@@ -151,7 +207,18 @@ class RampObserver:
         Acceleration [m/s^2] and its rate of change [m/s^3], world axes; angular acceleration [rad/s^2], body axes.
         """
         value = self._value + (0.5 * self._period + ahead) * self._change  # the estimate is for mid-period
-        return value[:3], self._change[:3], value[3:]
+        change = self._change[:3].copy()
+        if self._scaled:
+            value[2] = change[2] = 0.0
+        return value[:3], change, value[3:]
+
+    @property
+    def thrust_scale(self) -> float:
+        """The thrust that rotors give over the modelled one, kappa, in the period that follows the last measurement."""
+        if not self._scaled:
+            return 1.0
+        change = (self._value[2] + self._period * self._change[2]) / self._vehicle.gravity
+        return 1.0 + min(max(float(change), -LARGEST_CHANGE), LARGEST_CHANGE)
 
     @property
     def drag(self) -> Array:
@@ -160,6 +227,19 @@ class RampObserver:
         A least-squares fit of d_b + diag(drag) v_b that weights older samples less; zero while the vehicle is slow.
         """
         return np.maximum(-self._products / (self._squares + self._ballast), 0.0)
+
+    def _mean_wrench(self, command: Array | float) -> tuple[float, Array]:
+        """The mean thrust [N], before its scale, and torque (3,) [N m] of a period with this command."""
+        if self._thrust_lag is None:
+            spun, squares = self._rotors, self._mean_squares(np.asarray(command))
+            wrench = self._vehicle.allocation @ squares
+            torque = self.thrust_scale * wrench[1:]
+            torque[2] -= self._momentum @ (self._rotors - spun) / self._period
+            return float(wrench[0]), torque
+        thrust, share = float(command), self._thrust_lag / self._period
+        left, away = math.exp(-1.0 / share) if share else 0.0, self._thrust - thrust
+        self._thrust = thrust + left * away
+        return thrust + share * (1.0 - left) * away, np.zeros(3)
 
     def _mean_squares(self, speeds: Array) -> Array:
         """(4,) mean squares of the rotor speeds over the period, which tend to `speeds` exponentially [rad^2/s^2]."""

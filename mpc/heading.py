@@ -50,6 +50,8 @@ def slope(model: LinearModel) -> Array:
 
 def anchored(model: LinearModel, trim: Trim) -> LinearModel:
     """Linearise the hover model at the trim, where thrust has another slope and causes a torque."""
+    if model.targets:  # linear in its inputs, and an inner loop balances the torque
+        return replace(model, u_bar=trim.speeds)
     B = model.B * (trim.speeds / model.u_bar)
     if trim.twist.any():
         there = slope(model)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import scipy.linalg
 
-from quadsim.state import INDEX, N_STATES, Array, read_only
+from quadsim.state import EULER_RATE, INDEX, N_STATES, Array, read_only
 from quadsim.vehicle import N_ROTORS, Vehicle
+
+SHORTEST_LAG: Final = 1e-4
+"""Shortest lag [s] for which gains can be computed; far below any period."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +28,7 @@ class LinearModel:
     B: Array  # (n, nu) input matrix
     u_bar: Array  # (nu,) equilibrium input; for a quadrotor, omega_bar on all rotors [rad/s]
     period: float  # tau_s [s]
+    targets: bool = False  # whether the inputs are an inner loop's targets, collective thrust [N] and body rates [rad/s]
 
     @property
     def n(self) -> int:
@@ -78,3 +84,19 @@ def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
     A, B = discretise(*continuous_model(vehicle), period)
     u_bar = np.full(N_ROTORS, vehicle.hover_speed)
     return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(u_bar), period=period)
+
+
+def target_model(vehicle: Vehicle, period: float, lag: Sequence[float]) -> LinearModel:
+    """The discrete model at hover above an inner loop, whose targets are the inputs.
+
+    The rates follow with the time constants `lag` (thrust, p, q, r) [s], of at least `SHORTEST_LAG`; the thrust at once.
+    """
+    A, B = continuous_model(vehicle)
+    B = np.zeros_like(B)
+    B[INDEX["vz"], 0] = 1.0 / vehicle.mass
+    for rate, column, tau in zip(EULER_RATE, (1, 2, 3), lag[1:], strict=True):
+        B[rate, column] = 1.0 / max(tau, SHORTEST_LAG)
+        A[rate, rate] = -B[rate, column]
+    u_bar = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
+    A, B = discretise(A, B, period)
+    return LinearModel(A=read_only(A), B=read_only(B), u_bar=read_only(u_bar), period=period, targets=True)

@@ -1211,8 +1211,10 @@ def vehicle_report(
     """
     from quadsim.assets import vehicle_path
     from quadsim.report.film.video import render_portrait
+    from quadsim.sim.autopilot import AutopilotSettings, own_lags
     from quadsim.vehicle import vehicle_sources
     from scenarios import loading, results
+    from scenarios.assembly import stated_autopilot
     from scenarios.design import shortfalls, vehicle_report
 
     if template:
@@ -1226,9 +1228,13 @@ def vehicle_report(
         if Path(out).suffix != ".png":
             raise ParameterError("", "--out", str(out), "a file ending in .png")
         render_portrait(loaded, Path(out), overwrite=overwrite)
+    path = vehicle_path(str(name))
+    autopilot = (stated_autopilot(path) or AutopilotSettings()).resolved(loaded)
     return vehicle_report.VehicleReport(
         vehicle=loaded,
-        sources=vehicle_sources(vehicle_path(str(name))),
+        sources=vehicle_sources(path),
+        autopilot=autopilot,
+        inner_lag=own_lags(loaded, autopilot, 1e-3),
         figures=vehicle_report.make_sheet(loaded),
         scenario=None if against is None else against.name,
         shortfalls=None if against is None else shortfalls.shortfalls(against, loaded),

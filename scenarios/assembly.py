@@ -154,11 +154,7 @@ class Assembly:
             path = vehicle_path(self.scenario.vehicle.file)
         except InputError:  # a resolved scenario needs no file
             return stated
-        of_file = vehicle_autopilot(path)
-        if not of_file:
-            return stated
-        table = {**of_file, **(plain(stated) if stated is not None else {})}
-        return parse_table(_Piloted, {AUTOPILOT: table}, str(path)).autopilot
+        return stated_autopilot(path, stated)
 
     @cached_property
     def actual(self) -> Vehicle:
@@ -543,6 +539,19 @@ class Assembly:
         if initial.cold and feet > AIRBORNE:
             rule = f"on the floor where initial.cold is true, or it would fall: its feet are {feet:.3g} m above it"
             raise ParameterError("initial", "position", position, rule)
+
+
+def stated_autopilot(path: Path, stated: AutopilotSettings | None = None) -> AutopilotSettings | None:
+    """Return the `[autopilot]` of a vehicle file with the fields that `stated` has; None if neither has any.
+
+    Raises:
+        InputError: a field of the file's is wrong.
+    """
+    of_file = vehicle_autopilot(path)
+    if not of_file:
+        return stated
+    table = {**of_file, **(plain(stated) if stated is not None else {})}
+    return parse_table(_Piloted, {AUTOPILOT: table}, str(path)).autopilot
 
 
 def preferring_core(scenario: Scenario) -> Scenario:

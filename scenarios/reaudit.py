@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from quadsim.controller import ROTORS
 from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, audit
@@ -203,7 +204,10 @@ def _where(wrong: np.ndarray[Any, np.dtype[np.bool_]], columns: Sequence[str], t
 def _holds_commands(scenario: Scenario) -> bool:
     """Return whether the rotors turn at the commanded speeds throughout each period."""
     laws = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
-    commands_held = all(spec.type in _HOLDING and getattr(spec, "indi", None) is None for spec in laws)
+    commands_held = all(
+        spec.type in _HOLDING and getattr(spec, "indi", None) is None and getattr(spec, "commands", ROTORS) == ROTORS
+        for spec in laws
+    )
     return (
         commands_held and scenario.effects.rotors is None and not any(isinstance(e, LagChange) for e in scenario.events)
     )

@@ -101,6 +101,21 @@ def prioritised_error(attitude: Array, desired: Array, yaw_weight: float) -> Arr
     return 2.0 * np.array([x * c + y * s, y * c - x * s, w * s / yaw_weight])
 
 
+def quaternion_of(rotation: Array) -> Array:
+    """(4,) unit quaternion q, wxyz, of a matrix (3, 3): the longest column of 4 q q'."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation
+    outer = np.array(
+        [
+            [1.0 + a + e + i, h - f, c - g, d - b],
+            [h - f, 1.0 + a - e - i, b + d, c + g],
+            [c - g, b + d, 1.0 - a + e - i, f + h],
+            [d - b, c + g, f + h, 1.0 - a - e + i],
+        ]
+    )
+    column = outer[np.argmax(np.diag(outer))]
+    return np.asarray(column / np.linalg.norm(column))
+
+
 def attitude_error(attitude: Array, desired: Array) -> Array:
     """e_R = (R_d' R - R' R_d)^vee / 2 (3,).  Lee, Leok, McClamroch (2010)."""
     return vee(desired.T @ attitude)

@@ -24,21 +24,28 @@ from mpc.baselines.attitude import (
     desired_attitude,
     limit_force,
     motion_of,
+    quaternion_of,
     rate_error,
 )
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
 from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
+from mpc.bounded import Range, Seconds, TargetBounds
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import within
 from mpc.indi import Incremental, INDISettings
+from mpc.model import target_model
 from mpc.nonlinear.model import zero
 from mpc.obstacles import Shape
 from quadsim.controller import Command, Controller, Phase, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
+from quadsim.rotation import multiply
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
+
+USUAL_TARGETS: Final = TargetBounds()
+Commands: TypeAlias = Literal["rotors", "rates", "attitude"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,11 +73,24 @@ class GeometricSettings:
     drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # d of the drag acceleration -R diag(d) R' v that is fed forward [1/s]
     disturbance: RampSettings | None = None  # settings of the disturbance observer; None for none
     horizon: int = 10  # N, preview samples, from which the reference's velocity and acceleration are computed
-    bounds: ActuatorBounds | None = None  # limits of the commands; None for the vehicle's range of speeds
+    bounds: ActuatorBounds | None = None
+    """Limits of the commands; None for the vehicle's range of speeds, or of targets `USUAL_TARGETS`."""
+    commands: Commands = "rotors"
+    inner_lag: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    """Time constants of thrust, p, q, r behind an autopilot's targets [s]."""
+    k_attitude: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """Gains from the attitude error about body x, y, z to the rates commanded [1/s]; only for rates."""
 
 
 def geometric_settings(
-    vehicle: Vehicle, *, period: float, lag: float | None = None, integral: bool = False, **others: object
+    vehicle: Vehicle,
+    *,
+    period: float,
+    lag: float | None = None,
+    integral: bool = False,
+    commands: Commands = "rotors",
+    inner_lag: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    **others: object,
 ) -> GeometricSettings:
     """Return settings whose gains follow from the period and the lag [s]; `others` sets further fields.
 
@@ -79,11 +99,23 @@ def geometric_settings(
     1 / (2 (period / 2 + lag)), as in `bandwidths`. The outer pair is four times slower than the inner pair (twice the
     cascade's separation of 2), and both have the damping 1 / sqrt(2): k_R = k_Omega^2 / 2. The integrals of Goodarzi et
     al.  (2013) act at a quarter of the bandwidth of the loops that they support.
+
+    An autopilot's rates follow with `inner_lag` (thrust, p, q, r) [s]; `lag` replaces that of p and q.  About each
+    axis, an attitude error has the gain k = k_R / k_Omega, with the sum k + k_v = 1 / (2 (period / 2 + lag)), that of
+    the loop which is the innermost then, and k_v = k / 2, as above.  The polynomial is (lag s^2 + s + k)(s^2 + k_v s +
+    k_x), with a damping of at least 1 / sqrt(2).  The slower of p and q counts for k_v, and the autopilot integrates in
+    place of the second integral.  One that takes attitudes is assumed to have about this k; allow for a slower one by
+    `lag`.
     """
     require_positive("period", period)
     allowed = lag_to_allow_for(vehicle, period) if lag is None else lag
     k_Omega = 1.0 / (2.0 * (0.5 * period + allowed)) / (1.0 + SEPARATION**-2)
     k_v = k_Omega / SEPARATION**2
+    k = np.zeros(3)
+    if commands != "rotors":
+        lags = np.array(inner_lag[1:]) if lag is None else np.array([lag, lag, inner_lag[3]])
+        k = 1.0 / (2.0 * (0.5 * period + lags)) / (1.0 + SEPARATION**-1)
+        k_v = float(k[:2].min()) / SEPARATION
     values: dict[str, object] = {
         "k_x": k_v**2 / SEPARATION,
         "k_v": k_v,
@@ -92,7 +124,10 @@ def geometric_settings(
         "c_1": k_v / SEPARATION,
         "c_2": k_Omega / SEPARATION,
         "k_i": 0.25 * k_v**2 / SEPARATION if integral else 0.0,
-        "k_I": 0.05 * k_Omega**2 / SEPARATION if integral else 0.0,
+        "k_I": 0.05 * k_Omega**2 / SEPARATION if integral and commands == "rotors" else 0.0,
+        "commands": commands,
+        "inner_lag": tuple(inner_lag),
+        "k_attitude": tuple(k.tolist()),
         **others,
     }
     return GeometricSettings(period=period, **values)  # type: ignore[arg-type]
@@ -114,6 +149,9 @@ UNDISTURBED: Final[Disturbance] = (zero(), zero(), zero())
 class GeometricController(FeedbackLaw):
     """Thrust along the body axis and a moment from errors on SE(3).  Frames: `docs/conventions.md`.
 
+    It commands rotor speeds, or to an autopilot targets: thrust and body rates (4,) [N, rad/s], or these and a
+    quaternion wxyz (8,), with rates that are fed forward. With targets, `reset` and `StepInputs.acting` are targets.
+
     Attributes:
         k_R: (3,) gains of the attitude error about body x, y, z [1/s^2].
         k_Omega: (3,) gains of the rate error [1/s].
@@ -123,12 +161,20 @@ class GeometricController(FeedbackLaw):
 
     def __init__(self, vehicle: Vehicle, settings: GeometricSettings) -> None:
         self.settings, self._vehicle, self._drag = settings, vehicle, np.array(settings.drag)
-        self._observer = (
-            None
-            if settings.disturbance is None
-            else RampObserver(settings.disturbance, vehicle, settings.period, drag=settings.drag)
-        )
-        super().__init__(vehicle, settings.period, settings.horizon, settings.bounds)
+        self._targets, half = settings.commands != "rotors", 0.5 * settings.period
+        self._ahead = half + (settings.inner_lag[0] if self._targets else 0.0)  # of the thrust that is fed forward
+        self._lead = np.array(settings.inner_lag[1:]) + (half if settings.feedforward else 0.0)
+        self._observer = None
+        if settings.disturbance is not None:
+            lag = settings.inner_lag[0] if self._targets else None
+            self._observer = RampObserver(
+                settings.disturbance, vehicle, settings.period, drag=settings.drag, thrust_lag=lag
+            )
+        bounds, model = settings.bounds, None
+        if self._targets:
+            bounds = USUAL_TARGETS.actuators(vehicle) if bounds is None else bounds
+            model = target_model(vehicle, settings.period, settings.inner_lag)
+        super().__init__(vehicle, settings.period, settings.horizon, bounds, model)
         if settings.feedforward:
             self._operator = differentiator(settings.horizon, settings.period, degree=PREVIEW_DEGREE)
         self.k_R = settings.k_R * np.array([1.0, 1.0, settings.yaw_share**2])
@@ -136,11 +182,11 @@ class GeometricController(FeedbackLaw):
         self._allocation = make_allocation(vehicle)
 
     def reset(self, speeds: Array) -> None:
-        """Restart after the command u(-1) (4,) [rad/s]."""
+        """Restart after the command u(-1) (4,) [rad/s], or target."""
         super().reset(speeds)
         self._integrals = Integrals(translation=np.zeros(3), rotation=np.zeros(3))
         if self._observer is not None:
-            self._observer.reset(speeds)
+            self._observer.reset(speeds[0] if self._targets else speeds)
 
     def adopt(self, previous: object) -> None:
         """Take over the integrals and the observer of the previous law."""
@@ -151,19 +197,29 @@ class GeometricController(FeedbackLaw):
                 self._observer.adopt(law._observer)
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
-        """Return the law's wrench as rotor speeds; the integrals hold while bounds limit it."""
+        """Return the law's wrench as rotor speeds, or its targets; the integrals hold while bounds limit it."""
         exact = self.settings.feedforward or self._observer is not None
         motion = motion_of(state, now.attitude, now.body_rates) if exact else motion_of(state)
         target = target_of(reference, self._operator)
         if self.settings.feedforward and now.motion is not None:
             yaw = np.array([target.yaw, target.yaw_rate, target.yaw_acceleration])
             target = target_of_motion(now.motion, yaw, self.settings.period)
-        wrench, desired = self.wrench(motion, target, self._integrals, self._observed(now, motion, before))
-        lower, upper = self.bounds.reach(before)
-        speeds = allocate(self._allocation, wrench, lower, upper)
-        attained = np.allclose(
-            self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max()
-        )
+        disturbance = self._observed(now, motion, before)
+        kappa = 1.0 if self._observer is None else self._observer.thrust_scale
+        if self._targets:
+            speeds, desired = self.targets(motion, target, self._integrals, disturbance)
+            speeds[0] /= kappa
+            demanded = speeds[:3].copy()  # translation does not depend on yaw
+            speeds[:4] = self.bounds.clip(speeds[:4], before)
+            attained = np.array_equal(speeds[:3], demanded)
+        else:
+            wrench, desired = self.wrench(motion, target, self._integrals, disturbance)
+            wrench /= kappa
+            lower, upper = self.bounds.reach(before)
+            speeds = allocate(self._allocation, wrench, lower, upper)
+            attained = np.allclose(
+                self._allocation.M @ speeds**2, wrench, rtol=0.0, atol=1e-6 * self._allocation.scale.max()
+            )
         if attained and now.phase is Phase.FLYING:
             self._integrals = self.integrate(self._integrals, motion, target, desired)
         return self._held_for_a_period(speeds)
@@ -172,10 +228,11 @@ class GeometricController(FeedbackLaw):
         """Predict the disturbance in the middle of the period that starts now; zero until the vehicle flies."""
         if self._observer is None:
             return UNDISTURBED
+        acting = before[0] if self._targets else before
         if now.phase is not Phase.FLYING:
-            self._observer.reset(before)
+            self._observer.reset(acting)
             return UNDISTURBED
-        self._observer.update(now.time, motion.velocity, motion.attitude, motion.rates, before)
+        self._observer.update(now.time, motion.velocity, motion.attitude, motion.rates, acting)
         return self._observer.foreseen(0.5 * self.settings.period)
 
     def wrench(
@@ -192,8 +249,51 @@ class GeometricController(FeedbackLaw):
 
         Where the limits of tilt or lift change A, the desired attitude counts as constant.
         """
-        settings, m, gravity = self.settings, self._vehicle.mass, self._vehicle.gravity
         J, R, Omega = np.array(self._vehicle.inertia), motion.attitude, motion.rates
+        thrust, desired = self._force(motion, target, integrals, disturbance)
+        e_R, e_Omega = attitude_error(R, desired.attitude), rate_error(R, Omega, desired.attitude, desired.rates)
+        R_rel = R.T @ desired.attitude
+        ahead = np.cross(Omega, R_rel @ desired.rates) - R_rel @ desired.acceleration + disturbance[2]
+        moment = np.cross(Omega, J * Omega) - J * (self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
+        return np.concatenate([[thrust], moment]), desired
+
+    def targets(
+        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance = UNDISTURBED
+    ) -> tuple[Array, DesiredAttitude]:
+        """Return thrust and body rates (4,) [N, rad/s], for "attitude" (8,) with a quaternion wxyz, and R_c.
+
+        f is that of `wrench`, with feed-forward that of half a period and the thrust's lag later.  The rates are
+
+            Omega_d + lag Omega_d' - k e_R,    Omega_d = R' R_c Omega_c,
+
+        which the inner loop, Omega' = (command - Omega) / lag, turns into
+
+            lag (Omega - Omega_d)' + (Omega - Omega_d) + k e_R = 0,
+
+        as the moment of `wrench` would with k_Omega = 1 / lag and k_R = k / lag.  Feed-forward adds half a period to
+        the lag in the command.  An autopilot that takes R_c, with feed-forward that of half a period later, adds its
+        own k e_R.
+        """
+        R, Omega = motion.attitude, motion.rates
+        thrust, desired = self._force(motion, target, integrals, disturbance)
+        R_rel = R.T @ desired.attitude
+        Omega_d = R_rel @ desired.rates
+        rates = Omega_d + self._lead * (R_rel @ desired.acceleration - np.cross(Omega, Omega_d))
+        if self.settings.commands == "rates":
+            rates -= np.array(self.settings.k_attitude) * attitude_error(R, desired.attitude)
+            return np.concatenate([[thrust], rates]), desired
+        q = quaternion_of(desired.attitude)
+        if self.settings.feedforward:
+            q = multiply(q, np.append(1.0, 0.25 * self.settings.period * desired.rates))
+            q /= np.linalg.norm(q)
+        return np.concatenate([[thrust], rates, q]), desired
+
+    def _force(
+        self, motion: Measured, target: Target, integrals: Integrals, disturbance: Disturbance
+    ) -> tuple[float, DesiredAttitude]:
+        """Return the thrust [N] along body z, and the desired attitude; see `wrench`."""
+        settings, m, gravity = self.settings, self._vehicle.mass, self._vehicle.gravity
+        R, Omega = motion.attitude, motion.rates
         e_x, e_v = motion.position - target.position, motion.velocity - target.velocity
         weight = np.array([0.0, 0.0, gravity])
         demanded = m * (-settings.k_x * e_x - settings.k_v * e_v - integrals.translation + weight + target.acceleration)
@@ -209,16 +309,11 @@ class GeometricController(FeedbackLaw):
             self._drag,
             _heading(motion.yaw, target) if target.heading is None else target.heading,
         )
-        R_rel = R.T @ desired.attitude
-        e_R, e_Omega = attitude_error(R, desired.attitude), rate_error(R, Omega, desired.attitude, desired.rates)
-        ahead = np.cross(Omega, R_rel @ desired.rates) - R_rel @ desired.acceleration + disturbance[2]
-        moment = np.cross(Omega, J * Omega) - J * (self.k_R * e_R + self.k_Omega * e_Omega + integrals.rotation + ahead)
         if not settings.feedforward:
-            return np.concatenate([[A @ R[:, 2]], moment]), desired
-        half = 0.5 * settings.period
-        up = R[:, 2] + half * R @ np.array([Omega[1], -Omega[0], 0.0])
+            return float(A @ R[:, 2]), desired
+        up = R[:, 2] + self._ahead * R @ np.array([Omega[1], -Omega[0], 0.0])
         along, along1 = A + m * self._drag[2] * target.velocity, A1 + self._drag[2] * p1
-        return np.concatenate([[(along + half * along1) @ up], moment]), desired
+        return float((along + self._ahead * along1) @ up), desired
 
     def integrate(self, integrals: Integrals, motion: Measured, target: Target, desired: DesiredAttitude) -> Integrals:
         """Return the integrals of e_v + c_1 e_x and e_Omega + c_2 e_R one period later, saturated."""
@@ -291,24 +386,60 @@ class Geometric(Tuned):
     ] = (0.0, 0.0, 0.0)
     disturbance: Annotated[RampSettings | None, doc("absent: no disturbance observer")] = None
     indi: Annotated[INDISettings | None, doc("absent: rotors hold each command for a period")] = None
+    commands: Annotated[
+        Commands, doc("rotor speeds, or to an autopilot thrust and body rates, or thrust and attitude")
+    ] = "rotors"
+    inner_lag: Annotated[
+        Annotated[tuple[Seconds, ...], Len(4, 4)] | None,
+        doc("[s] time constants of thrust, p, q, r behind an autopilot's targets; absent: identified by steps on it"),
+    ] = None
+    target_bounds: Annotated[TargetBounds, doc('only where commands is not "rotors"')] = USUAL_TARGETS
 
     def __post_init__(self) -> None:
+        self._require_space()
         if any(self.drag) and not self.feedforward:
             raise ParameterError("", "drag", [*self.drag], "zero where feedforward is not true")
         if self.feedforward and self.horizon <= PREVIEW_DEGREE:
             rule = f"at least {PREVIEW_DEGREE + 1} where feedforward is true"
             raise ParameterError("", "horizon", self.horizon, rule)
 
+    def _require_space(self) -> None:
+        """Reject fields of the other space of commands: rotor speeds, or targets."""
+        others: dict[str, object] = {"inner_lag": None, "target_bounds": USUAL_TARGETS}
+        reason = "rotor speeds pass no autopilot, whose lags and targets these are"
+        if self.commands != "rotors":
+            others = {"input_bounds": None, "indi": None}
+            reason = "the autopilot turns the rotors: target_bounds limits its targets, and it is the inner loop"
+            if self.disturbance is not None and self.disturbance.rotor_lag is not None:
+                rule = f'absent where commands = "{self.commands}": inner_lag takes its place'
+                raise ParameterError("", "disturbance.rotor_lag", self.disturbance.rotor_lag, rule)
+        for name, usual in others.items():
+            if getattr(self, name) != usual:
+                raise ParameterError(
+                    "", name, getattr(self, name), f'absent where commands = "{self.commands}": {reason}'
+                )
+
+    def audited(self, vehicle: Vehicle) -> dict[str, Range]:
+        """See `mpc.bounded.ControllerTable.audited`."""
+        return super().audited(vehicle) if self.commands == "rotors" else self.target_bounds.audited(vehicle)
+
     def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
         """See `mpc.bounded.ControllerTable.build`."""
+        shared = self.shared(vehicle, period)
+        if self.commands != "rotors":
+            if self.inner_lag is None:
+                rule = "four time constants [s]: give them, or identify them on the vehicle's autopilot"
+                raise ParameterError("controller", "inner_lag", None, rule)
+            shared |= {"inner_lag": self.inner_lag, "bounds": self.target_bounds.actuators(vehicle)}
         settings = geometric_settings(
             vehicle,
             lag=self.lag,
+            commands=self.commands,
             integral=self.integral,
             feedforward=self.feedforward,
             drag=self.drag,
             disturbance=self.disturbance,
-            **self.shared(vehicle, period),
+            **shared,
         )
         law = GeometricController(vehicle, settings)
         return law if self.indi is None else Incremental(law, vehicle, self.indi, law.bounds)

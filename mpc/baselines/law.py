@@ -13,7 +13,7 @@ from mpc.answer import ActuatorBounds
 from mpc.baselines.preview import SMALLEST_PREVIEW, differentiator
 from mpc.bounded import LARGEST_HORIZON, ControllerTable, InputBounds, Range
 from mpc.heading import predict_in_heading_frame
-from mpc.model import hover_model
+from mpc.model import LinearModel, hover_model
 from quadsim.controller import GROUNDED, Command, StepInputs, stopped
 from quadsim.errors import CommandError
 from quadsim.fields import NonNegative
@@ -26,9 +26,16 @@ class FeedbackLaw(ABC):
 
     solver: Final = ""
 
-    def __init__(self, vehicle: Vehicle, period: float, horizon: int, bounds: ActuatorBounds | None) -> None:
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        period: float,
+        horizon: int,
+        bounds: ActuatorBounds | None,
+        model: LinearModel | None = None,
+    ) -> None:
         self.bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
-        self.model = hover_model(vehicle, period)
+        self.model = hover_model(vehicle, period) if model is None else model
         self.horizon = horizon
         self._operator = differentiator(horizon, period)
         self.reset(self.model.u_bar)
@@ -43,9 +50,9 @@ class FeedbackLaw(ABC):
         Raises:     CommandError: the state or the reference is not finite; no command is sent, and the law's state is
         unchanged.
         """
-        before = self._before if now.acting is None else now.acting
+        before = (self._before if now.acting is None else now.acting)[: self.model.nu]
         if now.phase in GROUNDED:
-            command = stopped(self.bounds.reach(before)[0], self.horizon, now.phase)
+            command = stopped(self.bounds.lowest(before), self.horizon, now.phase)
             self.reset(command.speeds)
             return command
         if not np.isfinite(state).all():
@@ -59,16 +66,16 @@ class FeedbackLaw(ABC):
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
-        return predict_in_heading_frame(self.model, states, plans)
+        return predict_in_heading_frame(self.model, states, plans[..., : self.model.nu])
 
     @abstractmethod
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """Return the command in the air after `before` (4,) [rad/s], for finite numbers; see `Controller.step`."""
 
     def _held_for_a_period(self, speeds: Array) -> Command:
-        """Return `speeds` (4,) [rad/s] with a plan that holds them for one period and hover after it."""
-        plan = np.tile(self.model.u_bar, (self.horizon, 1))
-        plan[0] = speeds
+        """Return `speeds` (4,) [rad/s], or targets, with a plan that holds them for one period and hover after it."""
+        plan = np.tile(speeds, (self.horizon, 1))
+        plan[1:, : self.model.nu] = self.model.u_bar
         return Command(speeds=speeds.copy(), plan=plan)
 
 

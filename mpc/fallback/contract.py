@@ -99,7 +99,7 @@ class Guarded:
             return
         self._completion.adopt(law._completion)
         self._age, self._target, self._hovered = law._age, law._target, law._hovered
-        if law._good is not None:
+        if law._good is not None and law._model.targets is self._model.targets:
             state, plan = law._good
             self._good = state, resized(plan, self.horizon)
 
@@ -115,7 +115,7 @@ class Guarded:
         status, answer = self._call(completed, known, reference)
         if now.phase in GROUNDED:
             self._forget()
-            command = stopped(self._bounds.reach(acting)[0], self.horizon, now.phase)
+            command = stopped(self._bounds.lowest(acting), self.horizon, now.phase)
         elif answer is None or status not in ACCEPTED:
             command = self._fall_back(status, answer, known, acting)
         else:

@@ -41,7 +41,7 @@ from mpc.nonlinear.rigidbody import (
     rotation,
     thrust_axis,
 )
-from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
+from mpc.nonlinear.settings import USUAL_TARGETS, AttitudeError, NonlinearSettings
 from mpc.observer import DisturbanceObserver
 from mpc.obstacles import ObstacleQP, Space
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
@@ -114,7 +114,9 @@ class NonlinearMPC:
     ) -> None:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
-        self._bounds = ActuatorBounds.of_vehicle(vehicle) if bounds is None else bounds
+        self._targets = settings.inputs is Inputs.RATES
+        usual = USUAL_TARGETS.actuators if self._targets else ActuatorBounds.of_vehicle
+        self._bounds = usual(vehicle) if bounds is None else bounds
         self._nodes = settings.horizon
         self.horizon = settings.horizon * settings.stride
         self._model = rigid_body(
@@ -123,11 +125,16 @@ class NonlinearMPC:
             substeps=settings.substeps,
             inputs=settings.inputs,
             rotor_lag=settings.rotor_lag or None,
+            lag=settings.inner_lag,
             drag=np.array(settings.drag),
             quadratic_drag=np.array(settings.quadratic_drag),
         )
         self._inverse = np.linalg.inv(self._model.effectiveness)
         self._hover = vehicle.mass * vehicle.gravity / N_ROTORS
+        self._level = np.full(N_ROTORS, vehicle.hover_speed)
+        if self._targets:
+            self._level = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
+        self._lag = settings.inner_lag[0] if self._targets else settings.rotor_lag or 0.0  # of actuator states [s]
         self._tilted = settings.tilt is not None
         self._lower, self._upper = self._shares(self._bounds.u_min), self._shares(self._bounds.u_max)
         self.problem = self._problem(constraints)
@@ -139,30 +146,41 @@ class NonlinearMPC:
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
         self._ramp: RampObserver | None = None
         if settings.ramp is not None:
-            lag = settings.rotor_lag if settings.ramp.rotor_lag is None else settings.ramp.rotor_lag
+            lag = self._lag if settings.ramp.rotor_lag is None else settings.ramp.rotor_lag
             self._ramp = RampObserver(
                 replace(settings.ramp, rotor_lag=lag),
                 vehicle,
                 period,
                 drag=self._model.drag / vehicle.mass,
                 quadratic_drag=self._model.quadratic_drag / vehicle.mass,
+                thrust_lag=self._lag if self._targets else None,
             )
         self._shift = settings.stride == 1 if settings.shift is None else settings.shift
-        self.reset(np.full(N_ROTORS, vehicle.hover_speed))
+        self.reset(self._level)
 
     def _shares(self, speeds: Array) -> Array:
+        """Return the inputs for commands (..., 4): rotor speeds [rad/s] or targets [N], [rad/s]."""
+        if self._targets:
+            return speeds / self._model.scale
         return self._model.shares(self._vehicle.thrust_coefficient * np.square(speeds))
+
+    @property
+    def _in_force(self) -> Array | float:
+        """The command in force, for the observer of forces: rotor speeds (4,) [rad/s], or collective thrust [N]."""
+        return float(self._acting[0]) if self._targets else self._acting
 
     def _clip(self, shares: Array) -> Array:
         return np.minimum(np.maximum(shares, self._lower), self._upper)
 
     def _speeds(self, shares: Array) -> Array:
-        """Return the rotor speeds [rad/s] of inputs."""
+        """Return the commands of inputs: rotor speeds [rad/s] or targets [N], [rad/s]."""
+        if self._targets:
+            return shares * self._model.scale
         return np.sqrt(self._model.thrusts(np.maximum(shares, 0.0)) / self._vehicle.thrust_coefficient)
 
     def _problem(self, constraints: tuple[Constraint, ...]) -> Problem:
         settings, model = self.settings, self._model
-        hover, x = self._shares(np.full(N_ROTORS, self._vehicle.hover_speed)), np.zeros(model.n)
+        hover, x = self._shares(self._level), np.zeros(model.n)
         x[3] = 1.0
         x[N_BODY:] = hover[: model.n - N_BODY]
         A, B, _ = linearise_nodes(model, x[None], hover[None])
@@ -251,7 +269,7 @@ class NonlinearMPC:
         return P
 
     def reset(self, speeds: Array) -> None:
-        """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
+        """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed; or after a target that acts."""
         self._acting = np.array(speeds, float)
         self._rotors = self._rotors_before = self._shares(self._acting)
         self._forget()
@@ -269,20 +287,23 @@ class NonlinearMPC:
         if self._observer is not None:
             self._observer.reset()
         if self._ramp is not None:
-            self._ramp.reset(self._acting)
-            self._model = replace(self._model, drag=np.array(self.settings.drag))
+            self._ramp.reset(self._in_force)
+            self._model = replace(
+                self._model, drag=np.array(self.settings.drag), thrust_scale=self._ramp.thrust_scale
+            )
         self._update_disturbance(np.zeros(6))
 
     def adopt(self, previous: object) -> None:
-        """Take over rotor speeds, disturbance and plan of the previous law."""
+        """Take over disturbance, rotor speeds and plan of the previous law, these only from one with like commands."""
         law = within(previous, NonlinearMPC)
         if law is not None:
             alike = self.settings.inputs is law.settings.inputs
-            for name in ("_rotors", "_rotors_before"):
+            same_space = self._targets is law._targets
+            for name in ("_rotors", "_rotors_before") if same_space else ():
                 shares = getattr(law, name)
                 setattr(self, name, shares if alike else self._shares(law._speeds(shares)))
             self._quaternion, self._called_at = law._quaternion, law._called_at
-            if law._last is not None:
+            if law._last is not None and same_space:
                 time, x = law._last
                 self._last = time, np.concatenate([x[:N_BODY], self._rotors])[: self._model.n]
             alike = alike and self._model.n == law._model.n and self._model.step == law._model.step
@@ -302,12 +323,12 @@ class NonlinearMPC:
             self._acting = np.array(now.acting, float)
         last, self._last = self._last, None
         before, self._called_at, self._rotors_before = self._called_at, now.time, self._rotors
-        if self.settings.rotor_lag and math.isfinite(before):  # the rotors have followed the command
-            left = math.exp(-(now.time - before) / self.settings.rotor_lag)
+        if self._lag and math.isfinite(before):  # the rotors have followed the command
+            left = math.exp(-(now.time - before) / self._lag)
             commanded = self._shares(self._acting)
             self._rotors = commanded + left * (self._rotors - commanded)
         if now.phase in GROUNDED:
-            self._acting, _ = self._bounds.reach(self._acting)
+            self._acting = self._bounds.lowest(self._acting)
             self._forget()
             return stopped(self._acting.copy(), self.horizon, now.phase)
         measured = self._measured(now, state)
@@ -355,8 +376,10 @@ class NonlinearMPC:
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`; with the latest disturbance estimate, without rotor lag."""
-        model = replace(self._model, step=self._period, rotor_lag=None, substeps=1)
-        x, predicted = _body(states), np.empty((*plans.shape[:2], N_STATES))
+        lag = (0.0, *self._model.lag[1:])
+        model = replace(self._model, step=self._period, rotor_lag=None, lag=lag, substeps=1)
+        x, predicted = np.zeros((len(states), model.n)), np.empty((*plans.shape[:2], N_STATES))
+        x[:, :N_BODY] = _body(states)
         for i in range(plans.shape[1]):
             x = advance_nodes(model, x, self._shares(plans[:, i]))
             x[:, Q] /= np.linalg.norm(x[:, Q], axis=1, keepdims=True)
@@ -387,19 +410,21 @@ class NonlinearMPC:
         assert self._observer is not None
         model = replace(self._model, step=self._period)
         if x.size > N_BODY:
-            x = np.concatenate([x[:N_BODY], self._rotors_before])
+            x = np.concatenate([x[:N_BODY], self._rotors_before])[: model.n]
         expected = advance_nodes(model, x, self._shares(self._acting))
-        self._observer.learn(np.concatenate([measured[V] - expected[V], measured[W] - expected[W]]))
+        turned = np.zeros(3) if self._targets else measured[W] - expected[W]  # an inner loop balances torques
+        self._observer.learn(np.concatenate([measured[V] - expected[V], turned]))
         self._update_disturbance(self._observer.estimate)
 
     def _update_disturbance(self, estimate: Array) -> None:
         """Use this disturbance (6,) in predictions from now on."""
-        self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=estimate[3:])
+        torque = np.zeros(3) if self._targets else estimate[3:]
+        self._model = replace(self._model, acceleration=estimate[:3], angular_acceleration=torque)
 
     def _follow(self, ramp: RampObserver, time: float, measured: Array) -> None:
         """Split the observed force into drag, as far as it follows the velocity, and a constant remainder."""
         R, velocity = rotation(measured[Q] / np.linalg.norm(measured[Q])), measured[V]
-        ramp.update(time, velocity, R, measured[W], self._acting)
+        ramp.update(time, velocity, R, measured[W], self._in_force)
         acceleration, _, angular = ramp.foreseen(0.5 * self._period)
         drag = ramp.drag
         self._model = replace(
@@ -407,6 +432,7 @@ class NonlinearMPC:
             drag=self.settings.drag + self._vehicle.mass * drag,
             acceleration=acceleration + R @ (drag * (R.T @ velocity)),
             angular_acceleration=angular,
+            thrust_scale=ramp.thrust_scale,
         )
 
     def _balanced(self, nodes: Nodes) -> Nodes:
@@ -437,11 +463,24 @@ class NonlinearMPC:
         effort[:, 0], effort[:, 1:] = size[:-1] - total, -model.angular_acceleration
         return Nodes(states, thrusts + effort @ self._inverse.T)
 
+    def _reference_inputs(self, nodes: Nodes) -> tuple[Array, Array]:
+        """Return the inputs (N, 4) that hold the reference, and what the actuators do, as shares (N + 1, 4).
+
+        Targets y lead their lags tau, at a node's middle: y + tau y', within their bounds.
+        """
+        model, thrusts = self._model, nodes.thrusts / self._model.thrust_scale
+        if not self._targets:
+            inputs = model.shares(thrusts)
+            return inputs, np.vstack([inputs, inputs[-1:]])
+        total = np.sum(thrusts, axis=1)
+        y = np.column_stack([np.append(total, total[-1]), nodes.states[:, W]]) / model.scale
+        return self._clip(0.5 * (y[:-1] + y[1:]) + np.array(model.lag) / model.step * np.diff(y, axis=0)), y
+
     def _iterate(self, time: float, measured: Array, nodes: Nodes) -> tuple[Query, Answer, Problem, SQP | None]:
         """Take SQP steps from the stored plan; the returned problem is that of the answer."""
         frames, n = frames_of(nodes.states[:, Q]), self._model.n
-        inputs = self._model.shares(nodes.thrusts)
-        start = np.hstack([nodes.states, np.vstack([inputs, inputs[-1:]])])[:, :n]
+        inputs, actuators = self._reference_inputs(nodes)
+        start = np.hstack([nodes.states, actuators])[:, :n]
         target, s0 = start.copy(), measured.copy()
         target[:, Q], s0[Q] = 0.0, frames[0] @ measured[Q]
         target[:, 3] = self.settings.attitude_error is AttitudeError.DIFFERENCE

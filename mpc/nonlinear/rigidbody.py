@@ -10,6 +10,13 @@ R(q) is polynomial and not divided by |q|^2, so the derivatives are valid for a 
 rotors' thrusts or speeds as shares of the largest, held between nodes; T = thrust / m and I^-1 tau are known exactly at
 every instant.  The classical Runge-Kutta method integrates the body.
 
+With `Inputs.RATES`, the inputs are targets of an inner loop, which follows each of them with a first-order lag. T is
+the only further state then, and omega has no torque in its equation:
+
+    omega' = (omega_c - omega) / tau_omega,    T' = (T_c - T) / tau_T.
+
+Both are known exactly at every instant; only p, q and v are integrated, so that a lag may be short, or 0.
+
 All terms but drag are quadratic in (q, omega), for given T and I^-1 tau: with F the Jacobian of that part, linear in
 (q, omega, T q), its value is F x / 2. So derivatives and value are the columns of one matrix that passes through the
 Runge-Kutta stages.
@@ -34,6 +41,8 @@ N_BODY: Final = 13
 P, Q, V, W = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
 _TURNING: Final = 10
 """Rows and columns of (q, v, omega), on which the derivatives depend."""
+RATE_SCALE: Final = 10.0
+"""The body rate [rad/s] that is a share of 1, where inputs are targets."""
 _q, _v, _w = slice(0, 4), slice(4, 7), slice(7, 10)
 
 
@@ -42,6 +51,8 @@ class Inputs(StrEnum):
 
     THRUST = "thrust"
     SPEED = "speed"
+    RATES = "rates"
+    """Collective thrust, as a share of the largest, and body rates, as shares of `RATE_SCALE`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,14 +68,18 @@ class RigidBody:
     substeps: int = 1  # Runge-Kutta steps in it
     inputs: Inputs = Inputs.THRUST
     rotor_lag: float | None = None  # time constant of thrusts or speeds [s]; None for none
+    lag: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # time constants of collective thrust, p, q, r behind targets [s]
+    thrust_scale: float = 1.0  # thrust that acts per thrust of the inputs
     drag: Array = field(default_factory=zero)  # (3,) D_1, linear, body axes [N s/m]
     quadratic_drag: Array = field(default_factory=zero)  # (3,) D_2, body axes [N s^2/m^2]
     acceleration: Array = field(default_factory=zero)  # (3,) a of the disturbance, world frame [m/s^2]
-    angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha of the disturbance, body frame [rad/s^2]
+    angular_acceleration: Array = field(default_factory=zero)  # (3,) alpha, body frame [rad/s^2]; none with targets
 
     @cached_property
     def features(self) -> Array:
         """(11, 100): maps (q, omega, T q) to F, the Jacobian of (q, v, omega)' in (q, v, omega) without drag."""
+        if self.targets:
+            return _features((0.0, 0.0, 0.0))
         ixx, iyy, izz = self.inertia.tolist()
         return _features(((iyy - izz) / ixx, (izz - ixx) / iyy, (ixx - iyy) / izz))
 
@@ -74,13 +89,30 @@ class RigidBody:
         return bool(np.any(self.drag) or np.any(self.quadratic_drag))
 
     @property
+    def targets(self) -> bool:
+        """Whether the inputs are targets of an inner loop."""
+        return self.inputs is Inputs.RATES
+
+    @property
+    def actuators(self) -> int:
+        """Number of actuator states: four rotors, the collective thrust, or none."""
+        if self.targets:
+            return 1
+        return 0 if self.rotor_lag is None else N_ROTORS
+
+    @property
     def n(self) -> int:
         """Number of states."""
-        return N_BODY if self.rotor_lag is None else N_BODY + N_ROTORS
+        return N_BODY + self.actuators
+
+    @property
+    def scale(self) -> Array:
+        """(4,) the target [N], [rad/s] that is a share of 1."""
+        return np.array([N_ROTORS * self.largest_thrust, RATE_SCALE, RATE_SCALE, RATE_SCALE])
 
     def thrusts(self, shares: Array) -> Array:
         """Return the rotor thrusts [N] for inputs, or for the rotors' states."""
-        return self.largest_thrust * (shares if self.inputs is Inputs.THRUST else np.square(shares))
+        return self.largest_thrust * (np.square(shares) if self.inputs is Inputs.SPEED else shares)
 
     def shares(self, thrusts: Array) -> Array:
         """Return the inputs for rotor thrusts [N]; negative ones count as zero if inputs are speeds."""
@@ -167,28 +199,31 @@ def linearise_nodes(model: RigidBody, x: Array, u: Array, frames: Array | None =
     Returns:
         (M, n, n), (M, n, 4) and (M, n): exact derivatives of the Runge-Kutta map; x(k+1) is not transformed.
     """
-    m = model.n - 3 + N_ROTORS + 1  # columns: q, v, omega, rotors, inputs, and the value
+    m = model.n - 3 + N_ROTORS + 1  # columns: q, v, omega, actuators, inputs, and the value
     Y = np.empty((len(x), _TURNING, m))
     Y[:] = _START[:, :m]
     if frames is not None:
         Y[:, _q, _q] = frames[:-1].transpose(0, 2, 1)
     Y[:, :, -1] = x[:, 3:N_BODY]
-    Y, travelled = _integrate(model, _drives(model, x, u), Y)
+    Y, travelled = _integrate(model, *_drives(model, x, u), Y)
     return _assemble(model, x, u, Y, travelled, frames)
 
 
-def _integrate(model: RigidBody, drives: Array, Y: Array) -> tuple[Array, Array]:
+def _integrate(model: RigidBody, drives: Array, turning: Array | None, Y: Array) -> tuple[Array, Array]:
     """Integrate columns Y (M, 10, m) through the Runge-Kutta stages; also return (M, 3, m) the change of position.
 
     The columns are derivatives of (q, v, omega), and last its value, or the value alone; `drives` are those of the
-    last.
+    last. The rows of omega are `turning` (K, M, 3, m) at the K instants, where they are known.
     """
     M, _, m = Y.shape
-    lagging, driven = model.rotor_lag is not None, slice(m - drives.shape[-1], m)
+    lagging, driven = len(drives) > 1, slice(m - drives.shape[-1], m)
     h = model.step / model.substeps
     constant = model.acceleration - model.gravity * _UP
 
     def slope(k: int, Y: Array) -> Array:
+        if turning is not None:
+            Y = Y.copy()
+            Y[:, _w] = turning[k]
         state, drive = Y[:, :, -1], drives[k if lagging else 0]
         q = state[:, _q]
         z = np.concatenate([q, state[:, _w], q * drive[:, 0, -1:]], axis=1)
@@ -199,7 +234,8 @@ def _integrate(model: RigidBody, drives: Array, Y: Array) -> tuple[Array, Array]
         along = thrust_axis(q)[:, :, None] * drive[:, :1]
         along[:, :, -1] += constant
         K[:, _v, driven] += along
-        K[:, _w, driven] += drive[:, 1:]
+        if turning is None:
+            K[:, _w, driven] += drive[:, 1:]
         K[:, _v, -1] += drag
         return np.asarray(K)
 
@@ -212,6 +248,8 @@ def _integrate(model: RigidBody, drives: Array, Y: Array) -> tuple[Array, Array]
         total = first + second + third
         travelled += h * Y[:, _v] + (h * h / 6.0) * total[:, _v]
         Y = Y + h / 6.0 * (total + second + third + fourth)
+    if turning is not None:
+        Y[:, _w] = turning[-1]
     return Y, travelled
 
 
@@ -228,30 +266,43 @@ def _assemble(
     A[:, P, 3:] = travelled[:, :, : n - 3]
     A[:, 3:N_BODY, 3:] = Y[:, :, : n - 3]
     B[:, P], B[:, 3:N_BODY] = travelled[:, :, inputs], Y[:, :, inputs]
-    if model.rotor_lag is not None:
-        rotors, decay = np.arange(N_BODY, n), math.exp(-model.step / model.rotor_lag)
-        A[:, rotors, rotors] = decay
-        B[:, rotors] = (1.0 - decay) * np.eye(N_ROTORS)
-        end[:, N_BODY:] = _rotors_after(model, x, u)
+    if model.actuators:
+        states, inputs = np.arange(N_BODY, n), np.arange(model.actuators)
+        A[:, states, states] = decay = _left(model)
+        B[:, N_BODY:] = 0.0
+        B[:, states, inputs] = 1.0 - decay
+        end[:, N_BODY:] = _actuators_after(model, x, u)
     return A, B, end
 
 
-def _rotors_after(model: RigidBody, x: Array, u: Array) -> Array:
-    """(M, 4) the rotors' states after a step; only with lag."""
-    assert model.rotor_lag is not None
-    return u + math.exp(-model.step / model.rotor_lag) * (x[:, N_BODY:] - u)
+def _left(model: RigidBody) -> float:
+    """Return the share of an actuator state's distance from its input that a step leaves; only with these states."""
+    lag = model.lag[0] if model.targets else model.rotor_lag
+    return math.exp(-model.step / lag) if lag else 0.0
 
 
-def _drives(model: RigidBody, x: Array, u: Array) -> Array:
-    """(K, M, 4, 4 or 8, and 1): slopes of (T, I^-1 tau) in the rotors' states and inputs, and values, at K instants."""
+def _actuators_after(model: RigidBody, x: Array, u: Array) -> Array:
+    """(M, 4 or 1) the actuators' states after a step; only with these states."""
+    followed = u[:, : model.actuators]
+    return followed + _left(model) * (x[:, N_BODY:] - followed)
+
+
+def _drives(model: RigidBody, x: Array, u: Array) -> tuple[Array, Array | None]:
+    """Slopes of (T, I^-1 tau) in the actuators' states and inputs, and values, at K instants; see `_integrate`.
+
+    Returns:
+        (K, M, 4, 4 or 8, and 1), and None; with targets, T alone (K, M, 1, 6), and omega (K, M, 3, 16).
+    """
+    instants = (np.arange(model.substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel()
+    if model.targets:
+        return _followed(model, instants * (model.step / model.substeps), x, u)
     if model.rotor_lag is None:
         decay = np.zeros(1)
     else:
-        instants = (np.arange(model.substeps)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel()
         decay = np.exp(-instants * (model.step / model.substeps / model.rotor_lag))
     lagging = model.rotor_lag is not None
     now = u[None] if not lagging else u + decay[:, None, None] * (x[:, N_BODY:] - u)  # (K, M, 4)
-    effect = model.effectiveness * model.largest_thrust
+    effect = model.effectiveness * (model.largest_thrust * model.thrust_scale)
     drives = np.empty((len(decay), len(x), 4, N_ROTORS * (1 + lagging) + 1))
     by_share = effect if model.inputs is Inputs.THRUST else effect * (2.0 * now[:, :, None, :])
     drives[..., -N_ROTORS - 1 : -1] = by_share
@@ -260,7 +311,23 @@ def _drives(model: RigidBody, x: Array, u: Array) -> Array:
         drives[..., N_ROTORS:-1] *= 1.0 - decay[:, None, None, None]
     drives[..., -1] = (now if model.inputs is Inputs.THRUST else np.square(now)) @ effect.T
     drives[..., 1:, -1] += model.angular_acceleration
-    return drives
+    return drives, None
+
+
+def _followed(model: RigidBody, instants: Array, x: Array, u: Array) -> tuple[Array, Array]:
+    """See `_drives`, with targets, which T and omega approach exponentially; at once where a lag is 0."""
+    lag = np.array(model.lag)
+    left = np.where(lag > 0.0, np.exp(-instants[:, None] / np.where(lag > 0.0, lag, 1.0)), 0.0)  # (K, 4)
+    effect = model.scale * [model.thrust_scale / model.mass, 1.0, 1.0, 1.0]  # T [m/s^2] and omega of a share of 1
+    start = np.concatenate([effect[0] * x[:, N_BODY:], x[:, W]], axis=1)
+    now = effect * u + left[:, None] * (start - effect * u)  # (K, M, 4): T, omega
+    T, turning = np.zeros((len(left), len(x), 1, 6)), np.zeros((len(left), len(x), 3, 16))
+    T[..., 0, 0], T[..., 0, 1], T[..., 0, -1] = *(effect[0] * np.stack([left[:, :1], 1.0 - left[:, :1]])), now[..., 0]
+    axes = np.arange(3)
+    turning[:, :, axes, 7 + axes] = left[:, None, 1:]
+    turning[:, :, axes, 12 + axes] = effect[1:] * (1.0 - left[:, None, 1:])
+    turning[..., -1] = now[..., 1:]
+    return T, turning
 
 
 def _drag(model: RigidBody, F: Array, state: Array) -> Array:
@@ -290,8 +357,11 @@ def drag_acceleration(model: RigidBody, q: Array, v: Array) -> Array:
 def advance_nodes(model: RigidBody, x: Array, u: Array) -> Array:
     """Return the states (..., n) one step after states x (..., n) under inputs u (..., 4), without derivatives."""
     shape, x, u = x.shape, x.reshape(-1, model.n), u.reshape(-1, N_ROTORS)
-    Y, travelled = _integrate(model, _drives(model, x, u)[..., -1:], x[:, 3:N_BODY, None])
+    drives, turning = _drives(model, x, u)
+    Y, travelled = _integrate(
+        model, drives[..., -1:], None if turning is None else turning[..., -1:], x[:, 3:N_BODY, None]
+    )
     end = [x[:, P] + travelled[:, :, 0], Y[:, :, 0]]
-    if model.rotor_lag is not None:
-        end.append(_rotors_after(model, x, u))
+    if model.actuators:
+        end.append(_actuators_after(model, x, u))
     return np.concatenate(end, axis=1).reshape(shape)

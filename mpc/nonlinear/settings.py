@@ -22,8 +22,11 @@ from mpc.bounded import (
     Lag,
     Polytope,
     Range,
+    Rates,
     RotorBounds,
+    Seconds,
     Soft,
+    TargetBounds,
     ranges,
     require_lag,
     require_ordered,
@@ -35,7 +38,8 @@ from mpc.bounded import (
 from mpc.constraints import Constraint
 from mpc.disturbance import RampSettings
 from mpc.indi import INDISettings
-from mpc.nonlinear.rigidbody import Inputs
+from mpc.model import SHORTEST_LAG, target_model
+from mpc.nonlinear.rigidbody import RATE_SCALE, Inputs
 from mpc.observer import ObserverSettings
 from mpc.qp import KKT_EVERY
 from mpc.solvers import CORE_OR_PIQP, SOLVERS
@@ -50,8 +54,8 @@ if TYPE_CHECKING:
 
 LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states in which the quaternion model is linear, too
 VEHICLES_SPEEDS: Final = RotorBounds()
+USUAL_TARGETS: Final = TargetBounds()
 Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
-Rates = Positive | Annotated[tuple[Positive, ...], Len(3, 3)]
 
 AxisWeights = Weight | Annotated[Sequence[Weight], Len(3, 3)]
 """One weight for three axes, or one per axis."""
@@ -74,7 +78,13 @@ class Weights:
     attitude: Annotated[AxisWeights, doc("[1/rad^2] one weight, or about body x, y, z")] = 0.1
     velocity: Annotated[AxisWeights, doc("[1/(m/s)^2] one weight, or x, y, z")] = 0.05
     body_rates: Annotated[AxisWeights, doc("[1/(rad/s)^2] one weight, or about body x, y, z")] = 0.05
-    input: Annotated[Weight, doc("[-] weight of the inputs' distance from the reference, as shares")] = 0.1
+    input: Annotated[
+        Weight,
+        doc(
+            "[-] weight of the inputs' distance from the reference, as shares of the rotors' largest or, of targets, of "
+            f"the largest collective thrust and {RATE_SCALE:g} rad/s"
+        ),
+    ] = 0.1
     move: Annotated[NonNegative, doc("[-] weight of the inputs' change from node to node, as shares")] = 0.0
 
     def __post_init__(self) -> None:
@@ -103,6 +113,7 @@ class NonlinearSettings:
     shift: bool | None = None  # whether the plan is shifted by a node before it is linearised; None: if stride is 1
     substeps: int = 1  # Runge-Kutta steps per node
     inputs: Inputs = Inputs.THRUST  # physical quantity of the inputs
+    inner_lag: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)  # of thrust, p, q, r behind targets [s]; only with these
     rotor_lag: float | None = None  # time constant of the rotors' thrusts or speeds [s]; None for none
     drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # linear drag in the model, body axes [N s/m]
     quadratic_drag: tuple[float, ...] = (0.0, 0.0, 0.0)  # in each component of the velocity [N s^2/m^2]
@@ -150,6 +161,18 @@ class Nonlinear(ControllerTable):
         bool | None, doc("whether the last plan is shifted by a node; absent: if a node lasts one period")
     ] = None
     substeps: Annotated[int, Ge(1), Le(100), doc("Runge-Kutta steps per node")] = 1
+    commands: Annotated[
+        Literal["rotors", "rates"],
+        doc("what it commands: rotor speeds, or collective thrust and body rates to an autopilot's inner loop"),
+    ] = "rotors"
+    inner_lag: Annotated[
+        Annotated[tuple[Seconds, ...], Len(4, 4)] | None,
+        doc(
+            '[s] time constants of thrust, p, q, r behind their targets, 0 for none; only where commands = "rates"; '
+            "absent: identified by steps on the autopilot at set-up"
+        ),
+    ] = None
+    target_bounds: Annotated[TargetBounds, doc('only where commands = "rates"')] = USUAL_TARGETS
     inputs: Annotated[Literal["thrust", "speed"], doc("quantity of the inputs, as shares of the rotors' largest")] = (
         "thrust"
     )
@@ -225,11 +248,32 @@ class Nonlinear(ControllerTable):
                 rule = f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
                 raise ValueError(rule)
             require_ordered(f"output_bounds.{name}", pair)
+        self._require_space()
         if self.inputs == "thrust" and self.input_bounds.slew is not None:
             raise ValueError(
                 'input_bounds.slew must be absent where inputs = "thrust", in which steps of speeds are not linear: '
                 f'inputs = "speed"; got {[*self.input_bounds.slew]}'
             )
+
+    def _require_space(self) -> None:
+        """Reject fields of the other space of commands: rotor speeds, or targets."""
+        if self.commands == "rotors":
+            others: dict[str, object] = {"inner_lag": None, "target_bounds": USUAL_TARGETS}
+            reason = 'rotors, without an inner loop: commands = "rates"'
+        else:
+            others = {"inputs": "thrust", "rotor_lag": 0.0, "indi": None, "input_bounds": VEHICLES_SPEEDS}
+            reason = "an inner loop, to which rotors belong: inner_lag and target_bounds describe it"
+            if self.disturbance is not None and self.disturbance.rotor_lag is not None:
+                raise ValueError(f'disturbance.rotor_lag must be absent where commands = "rates", which go to {reason}')
+            speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
+            if speeds:
+                raise ValueError(f'polytopes must be without rotor speeds where commands = "rates"; got {speeds}')
+            for lag in self.inner_lag or ():
+                if 0.0 < lag < SHORTEST_LAG:
+                    raise ParameterError("", "inner_lag", self.inner_lag, f"0, or at least {SHORTEST_LAG:g} s, each")
+        for name, usual in others.items():
+            if getattr(self, name) != usual:
+                raise ValueError(f'{name} must be absent where commands = "{self.commands}", which go to {reason}')
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `mpc.bounded.ControllerTable.audited`."""
@@ -239,7 +283,11 @@ class Nonlinear(ControllerTable):
         if self.body_rate is not None:
             rates = _three(self.body_rate).tolist()
             bounds |= {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", rates, strict=True)}
-        return bounds | self.input_bounds.audited(vehicle)
+        if self.commands == "rotors":
+            return bounds | self.input_bounds.audited(vehicle)
+        targets = self.target_bounds.audited(vehicle)
+        tightest = {name: min(bounds.get(name, pair), pair, key=lambda side: side[1]) for name, pair in targets.items()}
+        return bounds | tightest
 
     def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
         """See `mpc.bounded.ControllerTable.build`."""
@@ -256,7 +304,11 @@ class Nonlinear(ControllerTable):
                 positions=(0, 1, 2),
                 largest=True,
             )
-        bounds = self.input_bounds.actuators(vehicle)
+        targets, lag = self.commands == "rates", self.inner_lag
+        if targets and lag is None:
+            rule = "four time constants [s]: give them, or identify them on the vehicle's autopilot before it is built"
+            raise ParameterError("controller", "inner_lag", None, rule)
+        bounds = (self.target_bounds if targets else self.input_bounds).actuators(vehicle)
         mpc = NonlinearMPC(
             vehicle,
             period=period,
@@ -266,7 +318,8 @@ class Nonlinear(ControllerTable):
             space=space,
             kkt_every=self.kkt_every,
         )
-        law = self.fallback.around(mpc, bounds, vehicle, period)
+        hover = target_model(vehicle, period, lag) if targets and lag else None
+        law = self.fallback.around(mpc, bounds, vehicle, period, model=hover)
         return law if self.indi is None else Incremental(law, vehicle, self.indi, bounds)
 
     def settings(self, vehicle: Vehicle, stride: int) -> NonlinearSettings:
@@ -277,7 +330,8 @@ class Nonlinear(ControllerTable):
             iterations=self.iterations,
             shift=self.shift,
             substeps=self.substeps,
-            inputs=Inputs(self.inputs),
+            inputs=Inputs.RATES if self.commands == "rates" else Inputs(self.inputs),
+            inner_lag=self.inner_lag or (0.0, 0.0, 0.0, 0.0),
             rotor_lag=resolved_lag(self.rotor_lag, vehicle),
             drag=self.drag,
             quadratic_drag=self.quadratic_drag,

@@ -32,9 +32,8 @@ import numpy as np
 import scipy.linalg
 from annotated_types import doc
 
-from mpc.bounded import SHORTEST_LAG
 from mpc.constraints import Bounds
-from mpc.model import continuous_model, discretise, lqr
+from mpc.model import SHORTEST_LAG, continuous_model, discretise, lqr
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.state import INDEX, N_STATES, POSITION, Array, read_only

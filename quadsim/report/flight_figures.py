@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -65,7 +66,7 @@ def write_figures(run: Run, directory: Path) -> list[Path]:
         return []
     prefixes = dict(zip(("states", "inputs"), PAPER_FIGURES.get(run.name, ("", "")), strict=True))
     ended = "" if run.log.reason is None else " (aborted)"
-    figures = [states([run]), inputs([run]), times([run]), *effects(run), *space(run), *xy(run)]
+    figures = [states([run]), inputs([run]), *targets(run), times([run]), *effects(run), *space(run), *xy(run)]
     return write_pngs(
         (
             replace(figure, key=prefixes.get(figure.key, "") + figure.key, title=f"{run.name}{ended}: {figure.title}")
@@ -82,7 +83,7 @@ def page_figures(runs: Sequence[Run]) -> list[Figure | Scene]:
         return []
     figures: list[Figure | Scene] = [states(runs), inputs(runs), times(runs)]
     if len(runs) == 1:
-        figures += [*effects(runs[0]), *space(runs[0]), *xy(runs[0])]
+        figures += [*targets(runs[0]), *effects(runs[0]), *space(runs[0]), *xy(runs[0])]
     return [*figures, path(runs)]
 
 
@@ -149,6 +150,23 @@ def inputs(runs: Sequence[Run]) -> Figure:
             title = f"{title}, rotor {rotor + 1}"
             panels.append(Panel(title=title, unit="rad/s", series=curves, bounds=_bounds(runs, name)))
     return _timed("inputs", "rotor speeds and their steps", tuple(panels), runs)
+
+
+def targets(run: Run) -> list[Figure]:
+    """Plot thrust and body rates that an autopilot was to fly, and what it flew; no figure without one."""
+    target, plant = run.log.control.target, run.log.plant
+    if target is None or plant.thrust is None:
+        return []
+    panels = []
+    for i, name in enumerate(("thrust", "body_rate_x", "body_rate_y", "body_rate_z")):
+        signal, scale = SIGNALS[name], 1.0 if i == 0 else math.degrees(1.0)
+        curves = (
+            Series(x=plant.t, y=signal.finest(run.log)[1], colour=line_colour(0), label="flown"),
+            Series(x=run.log.control.t, y=scale * target[:, i], colour=line_colour(1), label="target", style="steps"),
+        )
+        title = "collective thrust" if i == 0 else f"body rate about {name[-1]}"
+        panels.append(Panel(title=title, unit=signal.unit, series=curves, bounds=_bounds([run], name), legend=True))
+    return [_timed("targets", "targets of the autopilot", tuple(panels), [run])]
 
 
 def times(runs: Sequence[Run]) -> Figure:

@@ -13,6 +13,7 @@ import numpy as np
 from mpc.model import continuous_model, discretise
 from quadsim.errors import ParameterError
 from quadsim.report.table import Cell, Grid, format_number
+from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import TorqueRange, authority, torque_ranges
@@ -73,6 +74,8 @@ class VehicleReport(Result):
     vehicle: Vehicle  # its numbers
     sources: Mapping[str, str]  # of each parameter, as its file names them
     figures: VehicleSheet  # what follows from the numbers
+    autopilot: AutopilotSettings  # of its file, what is absent by rule
+    inner_lag: tuple[float, ...]  # first-order lags of thrust, p, q, r under it [s], by steps from hover
     scenario: str | None = None  # scenario that it was compared with, or None
     shortfalls: tuple[str, ...] | None = None
     """Bounds of that scenario that it cannot meet, a sentence each; None without a scenario."""
@@ -102,6 +105,7 @@ class VehicleReport(Result):
                 for name, value, unit in self.parameters
             },
             "derived": asdict(self.figures),
+            "autopilot": {**asdict(self.autopilot), "inner_lag": self.inner_lag},
         }
         if self.shortfalls is not None:
             data |= {"scenario": self.scenario, "shortfalls": self.shortfalls}
@@ -176,6 +180,12 @@ def vehicle_tables(report: VehicleReport) -> list[Grid]:
             _abilities(sheet),
             note="quadsim scenario --for VEHICLE makes it; the rules: scenarios/design/rules.py",
         ),
+        _grid(
+            "its autopilot, for controllers of thrust and body rates",
+            ("", "value", "unit"),
+            _autopilot(report),
+            note="gains by rule where its file states none; lags by steps from hover",
+        ),
         _grid("linear model at hover", ("", "continuous [1/s]", f"discrete, {1e3 * sheet.period:g} ms"), _poles(sheet)),
         _grid(
             "parameters",
@@ -239,6 +249,21 @@ def _abilities(sheet: VehicleSheet) -> list[tuple[str, ...]]:
         ("additional delay that the loop tolerates", format_number(made.delay_margin), "s"),
         ("control period", format_number(made.period), "s"),
     ]
+
+
+def _autopilot(report: VehicleReport) -> list[tuple[str, ...]]:
+    settings, (thrust, *rates) = report.autopilot, (1e3 * lag for lag in report.inner_lag)
+    gains = {"p": "1/s", "i": "1/s^2", "d": "-", "i_max": "rad/s^2", "attitude": "1/s"}
+    return [
+        *((f"{name}, roll, pitch, yaw", _listed(getattr(settings, name)), unit) for name, unit in gains.items()),
+        ("rate", format_number(settings.rate or 0.0), "Hz"),
+        ("lag of body rates, roll, pitch, yaw", _listed(rates), "ms"),
+        ("lag of thrust", format_number(thrust), "ms"),
+    ]
+
+
+def _listed(numbers: Sequence[float]) -> str:
+    return ", ".join(f"{number:.3g}" for number in numbers)
 
 
 def _poles(sheet: VehicleSheet) -> list[tuple[str, ...]]:

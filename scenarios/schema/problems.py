@@ -31,7 +31,9 @@ _NAMES: Final = {float: "number", int: "whole number", str: "text"}
 _LIMITS: Final = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
 _REASONS: Final = {
     "controller.compiled": " with this controller: only MPC with fixed matrices (unconstrained, constrained, robust) "
-    "can be compiled"
+    "can be compiled",
+    "controller.commands": " with this controller: only nonlinear and geometric can command thrust and rates; "
+    "models and gains of the others are for rotor speeds",
 }
 """Reasons why a controller lacks a field that a reader may expect."""
 _KNOWN: Final = frozenset(get_args(core_schema.ErrorType))  # pydantic's kinds of error; a custom one states its rule

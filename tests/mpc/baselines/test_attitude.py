@@ -16,6 +16,7 @@ from mpc.baselines.attitude import (
     hat,
     limit_force,
     prioritised_error,
+    quaternion_of,
     unit_derivatives,
     vee,
 )
@@ -121,3 +122,13 @@ def test_derivatives_of_a_direction_match_finite_differences() -> None:
     np.testing.assert_allclose(u, direction(0.0))
     np.testing.assert_allclose(u1, (direction(h) - direction(-h)) / (2.0 * h), atol=1e-7)
     np.testing.assert_allclose(u2, (direction(h) - 2.0 * direction(0.0) + direction(-h)) / h**2, atol=1e-6)
+
+
+@given(seed=SEEDS)
+def test_the_quaternion_of_a_matrix_is_that_of_its_rotation(seed: int) -> None:
+    """Up to its sign; also of half turns, whose scalar part vanishes."""
+    random = rotations(seed, 1)[0]
+    for R in (random, np.eye(3), random @ np.diag([1.0, -1.0, -1.0]) @ random.T, np.diag([-1.0, -1.0, 1.0])):
+        q = quaternion_of(R)
+        assert np.linalg.norm(q) == pytest.approx(1.0)
+        np.testing.assert_allclose(Rotation.from_quat(np.roll(q, -1)).as_matrix(), R, atol=1e-12)

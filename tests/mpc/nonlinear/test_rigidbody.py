@@ -49,7 +49,7 @@ def points(model: RigidBody, rng: np.random.Generator, count: int = 10) -> tuple
     return x, u
 
 
-CASES = [*itertools.product(Inputs, (None, 0.03), (1, 3), ({}, DRAG, DISTURBED))]
+CASES = [*itertools.product((Inputs.THRUST, Inputs.SPEED), (None, 0.03), (1, 3), ({}, DRAG, DISTURBED))]
 
 
 @pytest.mark.parametrize(("inputs", "lag", "substeps", "others"), CASES)

@@ -1,0 +1,209 @@
+"""Flights through an autopilot: own controllers of targets, logs, audit, late commands, sensors, vehicle files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import quadsim
+from quadsim.assets import vehicle_path
+from quadsim.controller import StepInputs
+from quadsim.errors import InputError
+from quadsim.rotation import conjugate, multiply
+from quadsim.state import Array, State
+from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
+from scenarios.reaudit import reaudit
+
+START = {
+    "vehicle.file": "hummingbird",
+    "duration": 3.0,
+    "control_period": 0.02,
+    "effects.rotors": {},
+    "plant.limit_speeds": True,
+    "initial.position": [0.5, -0.3, 0.2],
+    "reference.response_time": 0.0,
+    "constraints": [],
+}
+
+
+def home(t: float) -> list[float]:
+    return [0.0, 0.0, 0.0, 0.0]
+
+
+class Rates:
+    """Position by PD, the thrust axis by proportional body rates."""
+
+    commands = "rates"
+
+    def __init__(self, vehicle: Vehicle, period: float, horizon: int) -> None:
+        self.mass, self.gravity = vehicle.mass, vehicle.gravity
+
+    def force(self, state: State, reference: Array) -> Array:
+        away = reference[0, :3] - [state.x, state.y, state.z]
+        return np.asarray(4.0 * away - 3.0 * np.array([state.vx, state.vy, state.vz]) + [0.0, 0.0, self.gravity])
+
+    def step(self, now: StepInputs, state: State, reference: Array) -> Any:
+        assert now.attitude is not None
+        force = self.force(state, reference)
+        along = multiply(multiply(conjugate(now.attitude), np.append(0.0, force)), now.attitude)[1:]
+        return [self.mass * along[2], -8.0 * along[1] / 9.8, 8.0 * along[0] / 9.8, -2.0 * state.yaw]
+
+
+class Attitude(Rates):
+    """The same force, its attitude held by the autopilot."""
+
+    commands = "attitude"
+
+    def step(self, now: StepInputs, state: State, reference: Array) -> Any:
+        force = self.force(state, reference)
+        size = float(np.linalg.norm(force))
+        tilted = np.array([1.0 + force[2] / size, -force[1] / size, force[0] / size, 0.0])
+        return [self.mass * size, 0.0, 0.0, 0.0, *(tilted / np.linalg.norm(tilted))]
+
+
+@pytest.fixture(scope="module")
+def scenario() -> quadsim.Scenario:
+    return quadsim.load("hover").replace(START)
+
+
+@pytest.fixture(scope="module")
+def flight(scenario: quadsim.Scenario) -> quadsim.Flight:
+    limits = [
+        {"name": "thrust", "signal": "thrust", "lower": 2.0, "upper": 15.0},
+        {"name": "rate", "signal": "body_rate_x", "lower": -200.0, "upper": 200.0},
+    ]
+    return quadsim.fly(scenario.replace({"constraints": limits}), controller=Rates, reference=home, progress=False)
+
+
+@pytest.mark.parametrize("law", [Rates, Attitude])
+def test_an_own_controller_of_targets_comes_to_its_set_point(scenario: quadsim.Scenario, law: type) -> None:
+    flight = quadsim.fly(scenario, controller=law, reference=home, progress=False)
+    assert flight.log.reason is None
+    assert [abs(flight.state[axis][-1]) for axis in "xyz"] == pytest.approx([0.0] * 3, abs=0.03)
+    assert (flight.log.control.target_attitude is not None) == (law is Attitude)
+
+
+def test_targets_and_what_was_flown_are_logged(flight: quadsim.Flight, tmp_path: Path) -> None:
+    control, plant = flight.log.control, flight.log.plant
+    assert control.target is not None
+    assert plant.thrust is not None
+    assert control.target.shape == (150, 4)
+    np.testing.assert_allclose(control.target[-1], [0.716 * 9.81, 0, 0, 0], atol=0.1)
+    # Rotor speeds are those that the autopilot commanded last in a period; thrust is that of the rotors between steps.
+    b = Assembly(flight.scenario).vehicle.thrust_coefficient
+    mid = b * np.square(0.5 * (plant.speeds[1:] + plant.speeds[:-1])).sum(axis=1)
+    np.testing.assert_allclose(plant.thrust[:-1], mid, rtol=2e-3)
+    read = quadsim.read(flight.save(tmp_path / "run", video=False, recording=True, figures=True))
+    assert read.log.control.target is not None
+    assert read.log.plant.thrust is not None
+    np.testing.assert_array_equal(read.log.control.target, control.target)
+    np.testing.assert_array_equal(read.log.plant.thrust, plant.thrust[::5])
+    assert (tmp_path / "run" / "figures" / "targets.png").is_file()
+    assert reaudit(tmp_path / "run").satisfied
+
+
+def test_thrust_is_audited_as_commanded_and_as_flown(flight: quadsim.Flight) -> None:
+    finding = {finding.limit.name: finding for finding in flight.findings}["thrust"]
+    control, plant = flight.log.control, flight.log.plant
+    assert control.target is not None
+    assert plant.thrust is not None
+    commanded, flown = (min((v - 2.0).min(), (15.0 - v).min()) for v in (control.target[:, 0], plant.thrust))
+    assert finding.worst_margin_sampled == pytest.approx(commanded)
+    assert finding.worst_margin == pytest.approx(flown)
+
+
+def test_thrust_has_no_bound_where_nothing_commands_it(scenario: quadsim.Scenario) -> None:
+    entry = {"name": "thrust", "signal": "thrust", "lower": 0.0}
+    flight = quadsim.fly(scenario.replace({"constraints": [entry], "duration": 0.1}), progress=False)
+    assert flight.findings[0].verdict == "incomplete"
+
+
+def test_a_late_target_leaves_the_one_in_force_to_the_autopilot(scenario: quadsim.Scenario) -> None:
+    class Turning(Rates):
+        def step(self, now: StepInputs, state: State, reference: Array) -> Any:
+            return [7.0, 0.0, 0.0, 0.1 + 0.1 * round(now.time / 0.02)]
+
+    late = scenario.replace({"computation.delay": 0.01, "duration": 0.2, "initial.position": [0.0, 0.0, 0.0]})
+    log = quadsim.fly(late, controller=Turning, progress=False).log
+    assert log.control.target is not None
+    np.testing.assert_allclose(log.control.target[:, 3], 0.1 + 0.1 * np.arange(10), atol=1e-12)
+    missed = quadsim.fly(late.replace({"computation.delay": 0.03}), controller=Turning, progress=False).log
+    assert set(missed.control.status) == {"missed"}
+    assert missed.control.target is None  # hover's rotor speeds stay in force
+    np.testing.assert_allclose(missed.plant.speeds, missed.plant.speeds[0, 0], rtol=1e-12)
+
+
+def test_what_the_gyro_measures_reaches_the_autopilot(scenario: quadsim.Scenario) -> None:
+    biased = scenario.replace({"sensors.rates": {"rate": 1000.0, "bias": [0.0, 0.0, 20.0]}, "duration": 1.0})
+
+    class Still(Rates):
+        def step(self, now: StepInputs, state: State, reference: Array) -> Any:
+            return [self.mass * self.gravity, 0.0, 0.0, 0.0]
+
+    flight = quadsim.fly(biased, controller=Still, progress=False)
+    rates = flight.log.plant.body_rates
+    spin = flight.log.plant.state[-1, 11] if rates is None else rates[-1, 2]
+    assert np.degrees(spin) == pytest.approx(-20.0, abs=1.0)
+
+
+def test_sensor_faults_leave_the_autopilot_its_last_finite_rates(scenario: quadsim.Scenario) -> None:
+    fault = {"type": "sensor_fault", "sensor": "rates", "fault": "nan", "at": 1.0, "duration": 0.05}
+    changes = {"sensors.rates": {"rate": 1000.0}, "events": [fault], "duration": 2.0}
+    assert quadsim.fly(scenario.replace(changes), controller=Rates, progress=False).log.reason is None
+
+
+def test_the_autopilot_of_a_vehicle_file_flies_unless_the_scenario_states_another(
+    scenario: quadsim.Scenario, tmp_path: Path
+) -> None:
+    text = vehicle_path("hummingbird").read_text()
+    file = tmp_path / "mine.toml"
+    file.write_text(text + '\n[autopilot]\nsource = "step on the bench"\np = [11.0, 12.0, 13.0]\nrate = 500.0\n')
+    settings = Assembly(scenario.replace({"vehicle.file": str(file)})).autopilot
+    assert settings is not None
+    assert (settings.p, settings.rate, settings.d) == ((11.0, 12.0, 13.0), 500.0, None)
+    stated = scenario.replace({"vehicle.file": str(file), "autopilot.rate": 1000.0})
+    assembly = Assembly(stated)
+    assert assembly.autopilot is not None
+    assert (assembly.autopilot.p, assembly.autopilot.rate) == ((11.0, 12.0, 13.0), 1000.0)
+    assert Assembly(assembly.resolved.scenario.replace({"vehicle.file": "gone.toml"})).autopilot == assembly.autopilot
+    assert quadsim.load_vehicle(str(file)).mass == quadsim.load_vehicle("hummingbird").mass
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("[autopilot]\np = [1.0, 1.0, 1.0]\n", "autopilot must be a table with a source"),
+        ('[autopilot]\nsource = "x"\np = 3.0\n', "autopilot.p"),
+        ('[autopilot]\nsource = "x"\nspeed = 3.0\n', "autopilot.speed"),
+    ],
+)
+def test_a_wrong_autopilot_of_a_vehicle_file_is_refused(table: str, message: str, tmp_path: Path) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(vehicle_path("hummingbird").read_text() + "\n" + table)
+    with pytest.raises(InputError, match=message):
+        quadsim.vehicle_report(str(file))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"autopilot.rate": 300.0}, r"autopilot.rate must be such that 1 / rate is a whole multiple"),
+        ({"autopilot.p": [1.0, 2.0]}, r"autopilot.p must be a list of 3"),
+        ({"autopilot.idle": 1.5}, r"autopilot.idle"),
+    ],
+)
+def test_a_wrong_autopilot_is_refused(scenario: quadsim.Scenario, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        scenario.replace(changes)
+
+
+def test_an_unknown_kind_of_command_is_refused(scenario: quadsim.Scenario) -> None:
+    class Odd(Rates):
+        commands = "velocity"
+
+    with pytest.raises(InputError, match="commands must be one of"):
+        quadsim.fly(scenario, controller=Odd, progress=False)
