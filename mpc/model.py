@@ -28,7 +28,9 @@ class LinearModel:
     B: Array  # (n, nu) input matrix
     u_bar: Array  # (nu,) equilibrium input; for a quadrotor, omega_bar on all rotors [rad/s]
     period: float  # tau_s [s]
-    targets: bool = False  # whether the inputs are an inner loop's targets, collective thrust [N] and body rates [rad/s]
+    targets: bool = (
+        False  # whether the inputs are an inner loop's targets, collective thrust [N] and body rates [rad/s]
+    )
 
     @property
     def n(self) -> int:

@@ -1126,7 +1126,8 @@ def scenario(
         seed: replace the seed of everything random in the scenario.
         vehicle: print a first scenario for this vehicle instead.
         course: its course: hover, step (of 1 m) or figure-eight, at 60 % of the vehicle's limits (default: hover).
-        controller: its controller: robust, lqr, pid or geometric (default: robust).
+        controller: its controller: robust, lqr, pid or geometric, or rates for nonlinear MPC of thrust and body rates
+            through its autopilot (default: robust).
         schema: print the JSON Schema of scenario files instead.
 
     Returns:

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
+from mpc.baselines.geometric import Geometric
 from mpc.bounded import Bounded, FallbackSettings, Weighted
 from mpc.flatness import motion_along
+from mpc.nonlinear.settings import Nonlinear
 from mpc.piloted import Piloted
 from mpc.solvers import CORE_OR_PIQP
 from quadsim.assets import vehicle_path
@@ -302,10 +304,11 @@ class Assembly:
             InputError: it cannot be built from these numbers, or its code cannot be found or called.
         """
         spec = self.scenario.controller if spec is None else spec
-        commands: str | None = getattr(spec, "commands", None)
-        if commands not in (None, ROTORS) and spec.inner_lag is None:  # type: ignore[union-attr]
-            spec = replace(spec, inner_lag=self.inner_lag)  # type: ignore[call-arg]
-        shapes = (*self.scenario.obstacles, *self.regions)
+        commands, shapes = None, (*self.scenario.obstacles, *self.regions)
+        if isinstance(spec, Nonlinear | Geometric):
+            commands = spec.commands
+            if commands != ROTORS and spec.inner_lag is None:
+                spec = replace(spec, inner_lag=self.inner_lag)
         return self.piloted(spec.build(self.vehicle, self.scenario.control_period, shapes), commands)
 
     def piloted(self, law: Controller, commands: str | None = None) -> Controller:

@@ -273,6 +273,7 @@ def small_log(periods: int = 4, *, steps: int = 5, seed: int = 0, reason: str | 
             speeds=rng.uniform(100.0, 250.0, (rows, N_ROTORS)),
             wrench=rng.normal(size=(rows, 6)),
             wind=rng.normal(size=(rows, 3)),
+            battery=np.linspace((16.0, 1.0), (14.0, 0.5), rows),
         ),
         predicted=rng.normal(size=(periods, 6, 3)).astype(np.float32) if periods else None,
         reason=reason,

@@ -70,16 +70,17 @@ def test_every_table_that_is_filled_is_known_and_stays_where_its_file_is_not(
 
 def test_the_examples_in_the_page_on_effects_are_a_scenario(tmp_path: Path) -> None:
     page = (ROOT / "docs/effects.md").read_text(encoding="utf-8")
-    example, mismatch, events = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
+    example, mismatch, battery, events = re.findall(r"```toml\n(.*?)```", page, flags=re.DOTALL)
     (tmp_path / "heavy-hover.toml").write_text(mismatch, encoding="utf-8")
     heavy = Rollout(load_scenario(str(tmp_path / "heavy-hover.toml"))).fly()
     assert heavy.state["z"][-1] - heavy.reference["z"][-1] == pytest.approx(-0.2, abs=0.01)
-    (tmp_path / "gusty.toml").write_text(example + events, encoding="utf-8")
+    (tmp_path / "gusty.toml").write_text(example + battery + events, encoding="utf-8")
     scenario = load_scenario(str(tmp_path / "gusty.toml"), ["duration=16.0"])
     assert scenario.effects.air is not None
     assert [event.type for event in scenario.events] == ["gust", "push", "setpoint", "controller"]
     log = Rollout(scenario).fly().log
     assert log.plant.wind is not None
+    assert log.plant.battery is not None
     assert log.predicted is not None
     assert log.predicted.shape[1] == 30
 

@@ -288,9 +288,7 @@ class NonlinearMPC:
             self._observer.reset()
         if self._ramp is not None:
             self._ramp.reset(self._in_force)
-            self._model = replace(
-                self._model, drag=np.array(self.settings.drag), thrust_scale=self._ramp.thrust_scale
-            )
+            self._model = replace(self._model, drag=np.array(self.settings.drag), thrust_scale=self._ramp.thrust_scale)
         self._update_disturbance(np.zeros(6))
 
     def adopt(self, previous: object) -> None:

@@ -27,6 +27,8 @@ WRENCH: Final = {**{f"force_{axis}": "N" for axis in "xyz"}, **{f"torque_{axis}"
 """Columns of the external force, world, and torque, body frame, with units; only if there is any."""
 WIND: Final = {f"wind_{axis}": "m/s" for axis in "xyz"}
 """Columns of the wind, world, with units; only if there is any."""
+BATTERY: Final = {"voltage": "V", "charge": "-"}
+"""Columns of the battery, with units; only if there is one."""
 
 QUATERNION: Final = {f"q{axis}": "-" for axis in "wxyz"}
 """Columns of the attitude, body to world, with units; only for flights that may turn upside down."""
@@ -171,6 +173,7 @@ class PlantLog:
     wrench: Array | None = None
     """(M, 6) external force, world [N], and torque, body frame [N m], from t on; None if there is none."""
     wind: Array | None = None  # (M, 3) velocity of the air, world [m/s]; None without wind
+    battery: Array | None = None  # (M, 2) voltage [V] and charge [-] of the step from t on; None without a battery
     attitude: Array | None = None  # (M, 4) true quaternion wxyz; None if Euler angles suffice
     body_rates: Array | None = None  # (M, 3) true body rates [rad/s]; None if Euler angles suffice
     thrust: Array | None = None  # (M,) collective thrust of the rotors [N]; None without an autopilot

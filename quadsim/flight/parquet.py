@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 
 from quadsim.errors import FileError
 from quadsim.flight.log import (
+    BATTERY,
     BODY_RATES,
     COLUMNS,
     CONTROL,
@@ -49,16 +50,16 @@ _PLANT: Final[Fields] = {
     "speeds": {f"w{i}": "rad/s" for i in range(1, N_ROTORS + 1)},
     "wrench": WRENCH,
     "wind": WIND,
+    "battery": BATTERY,
     "attitude": QUATERNION,
     "body_rates": BODY_RATES,
     "thrust": {"thrust": "N"},
 }
 _OPTIONAL: Final = frozenset(
-    {"truth", "attitude", "body_rates", "sqp", "target", "target_attitude", "wrench", "wind", "thrust"}
+    {"truth", "attitude", "body_rates", "sqp", "target", "target_attitude", "wrench", "wind", "battery", "thrust"}
 )
-_GAPS: Final = frozenset(
-    {*RESIDUALS, *SQP_RESIDUAL, *TARGET, *TARGET_ATTITUDE}
-)  # columns that are null in some periods
+_GAPS: Final = frozenset({*RESIDUALS, *SQP_RESIDUAL, *TARGET, *TARGET_ATTITUDE})
+"""Columns that are null in some periods."""
 
 _Column = tuple[str, str, pa.Array]
 

@@ -81,22 +81,26 @@ _VISIBLE_SPEED: Final = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class EffectCurves:
-    """One quantity along x, y and z at the plant's instants, `values` (M, 3); `key` is a short name, e.g. `wind`."""
+    """One quantity at the plant's instants, `values` (M, n), by `names`; `key` is a short name, e.g. `wind`."""
 
     key: str
     title: str
     unit: str
     values: Array
+    names: tuple[str, ...] = ("x", "y", "z")
 
 
 def effect_curves(log: FlightLog) -> list[EffectCurves]:
-    """Return external force, torque and wind, unless zero throughout."""
+    """Return external force, torque, wind, voltage and charge, unless zero throughout."""
     wrench = np.zeros((1, 6)) if log.plant.wrench is None else log.plant.wrench
     wind = np.zeros((1, 3)) if log.plant.wind is None else log.plant.wind
+    battery = np.zeros((1, 2)) if log.plant.battery is None else log.plant.battery
     curves = (
         EffectCurves(key="force", title="external force, world", unit="N", values=wrench[:, :3]),
         EffectCurves(key="torque", title="external torque, body", unit="N m", values=wrench[:, 3:]),
         EffectCurves(key="wind", title="wind, world", unit="m/s", values=wind),
+        EffectCurves(key="voltage", title="battery voltage", unit="V", values=battery[:, :1], names=("voltage",)),
+        EffectCurves(key="charge", title="battery charge", unit="-", values=battery[:, 1:], names=("charge",)),
     )
     return [entry for entry in curves if np.any(entry.values)]
 

@@ -197,13 +197,13 @@ def times(runs: Sequence[Run]) -> Figure:
 
 
 def effects(run: Run) -> list[Figure]:
-    """Plot, as far as recorded: commanded and actual rotor speeds, forces, torques, wind, measurement errors."""
+    """Plot, as far as recorded: commanded and actual rotor speeds, forces, wind, battery, measurement errors."""
     plant, control = run.log.plant, run.log.control
     commanded = commanded_speeds(run.log)
     panels = (
         [] if commanded is None else [_acting(rotor, plant.t, commanded, plant.speeds) for rotor in range(N_ROTORS)]
     )
-    panels += [_several(curves.title, curves.unit, plant.t, curves.values, "xyz") for curves in effect_curves(run.log)]
+    panels += [_several(each.title, each.unit, plant.t, each.values, each.names) for each in effect_curves(run.log)]
     if not control.measured_perfectly:
         for what, names in {"position": ("x", "y", "z"), "attitude": ("roll", "pitch", "yaw")}.items():
             errors = [SIGNALS[f"{name}_estimate_error"] for name in names]

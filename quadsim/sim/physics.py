@@ -78,7 +78,8 @@ class Segment:
     """(M, 6) force, world [N], and torque, body frame about its origin [N m], of all effects but contact, over each
     step; None if no effect causes any."""
     wind: Array | None  # (M, 3) velocity of the air in the middle of each step, world [m/s]; None without wind
-    thrust: Array  # (M,) collective thrust in the middle of each step [N]
+    thrust: Array | None = None  # (M,) collective thrust in the middle of each step [N]; None if the plant knows none
+    battery: Array | None = None  # (M, 2) voltage [V] over each step, charge [-] at its start; None without a battery
 
     @staticmethod
     def join(parts: Sequence[Segment]) -> Segment:
@@ -142,8 +143,8 @@ def flight_log(
         physics = np.concatenate([start[None], *(sample.segment.physics for sample in samples)])
         plant = replace(plant, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
     if control.target is not None:
-        thrust = np.concatenate([sample.segment.thrust for sample in samples])
-        plant = replace(plant, thrust=np.append(thrust, thrust[-1]))
+        thrusts = [sample.segment.thrust for sample in samples if sample.segment.thrust is not None]
+        plant = replace(plant, thrust=np.concatenate([*thrusts, thrusts[-1][-1:]]))
     return FlightLog(control=control, timing=_timing_log(samples, control.t), plant=plant)
 
 
@@ -227,6 +228,7 @@ def _plant_log(
         speeds=np.concatenate([segment.speeds, samples[-1].rotors[None]]),
         wrench=None if segment.wrench is None else np.concatenate([segment.wrench, segment.wrench[-1:]]),
         wind=None if segment.wind is None else np.concatenate([segment.wind, segment.wind[-1:]]),
+        battery=None if segment.battery is None else np.concatenate([segment.battery, segment.battery[-1:]]),
     )
 
 

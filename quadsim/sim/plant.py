@@ -169,6 +169,7 @@ class Plant:
         self._rotors = self.effects.rotors or RotorDynamics()
         self._speeds = self.hover_speeds if speeds is None else np.array(speeds, float)
         self._efficiency = np.array(self._rotors.efficiency)
+        self._charge = 0.0 if self.effects.battery is None else self.effects.battery.charge
         self._velocity_before = self._physics[0, 8:].tolist()
         if self._reweighed:
             self._carry(self._load.payloads, self._load.mass_factor)
@@ -276,6 +277,13 @@ class Plant:
             before, self._speeds = speeds[:steps].copy(), speeds[steps].copy()
             middle, slopes = speeds[steps + 1 :], slopes[steps + 1 :]
         thrusts = self._efficiency * self.vehicle.thrust_coefficient * np.square(middle)
+        battery = None
+        if self.effects.battery is not None:
+            ratio = middle / self.vehicle.hover_speed
+            demands = (self._efficiency * ratio * np.square(ratio)).mean(axis=1).tolist()
+            rows, self._charge = self.effects.battery.discharge(self._charge, demands, timestep)
+            battery = np.array(rows)
+            thrusts = thrusts * np.array([[self.effects.battery.factor(voltage)] for voltage, _ in rows])
         if self.effects.thrust_noise is not None:
             largest = self.vehicle.thrust_coefficient * self.vehicle.speed_max**2
             thrusts = self.effects.thrust_noise.applied(thrusts, largest, self._rng)
@@ -289,7 +297,8 @@ class Plant:
         self._check(trajectory)
         self._physics[0] = trajectory[-1]
         self._step += steps
-        return Segment(physics=trajectory, speeds=before, wrench=wrench, wind=wind, thrust=thrusts.sum(axis=1))
+        thrust = thrusts.sum(axis=1)
+        return Segment(physics=trajectory, speeds=before, wrench=wrench, wind=wind, thrust=thrust, battery=battery)
 
     def _run(self, thrusts: Array) -> Array:
         """Take all steps in one call: thrusts (M, 4) [N] -> states (M, 14)."""

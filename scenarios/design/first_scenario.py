@@ -34,7 +34,10 @@ if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario
 
 COURSES: Final = ("hover", "step", "figure-eight")
-LAWS: Final = ("robust", "lqr", "pid", "geometric")
+LAWS: Final = ("robust", "lqr", "pid", "geometric", "rates")
+"""Controllers: `rates` is nonlinear MPC of thrust and body rates, through the vehicle's autopilot."""
+NODE: Final = 0.04  # shortest time between its nodes [s]
+AHEAD: Final = 0.8  # its horizon [s]
 SHARE: Final = 0.6
 """Share of what the vehicle can do that a figure eight requires: of the largest acceleration within the tilt bound, or
 of the fastest level speed where that is reached first."""
@@ -119,14 +122,10 @@ position = [0.0, 0.0, {_height(vehicle, size)}]  # m, world; at rest
 limit_speeds = true  # rotors saturate at their lowest and highest speed
 
 {reference}
-{_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning)}
-[controller.input_bounds]
-speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {vehicle.hover_speed:.4g}
-slew = {[*_slew(tuning)]}  # rad/s per period: what a rotor's own speed makes in one, from hover towards its limits
-
+{_controller(law, vehicle, tuning)}
 {_rotors(vehicle)}
 [effects.air]  # drag of the vehicle file
-{_constraints(vehicle, tuning, size)}"""
+{_constraints(law, vehicle, tuning, size)}"""
     return FirstScenario(text=text, size=size)
 
 
@@ -220,6 +219,34 @@ ramp = {round(0.5 * turn, 3)}  # s, half a turn to gain its speed, and to lose i
     return text, None, length
 
 
+def _controller(law: str, vehicle: Vehicle, tuning: Design) -> str:
+    if law == "rates":
+        return _rates(tuning)
+    return f"""{_robust(vehicle, tuning) if law == "robust" else _baseline(law, vehicle, tuning)}
+[controller.input_bounds]
+speed = {[vehicle.speed_min, vehicle.speed_max]}  # rad/s, what the rotors hold; hover is {vehicle.hover_speed:.4g}
+slew = {[*_slew(tuning)]}  # rad/s per period: what a rotor's own speed makes in one, from hover towards its limits
+"""
+
+
+def _rates(tuning: Design) -> str:
+    stride = math.ceil(NODE / tuning.period - 1e-9)
+    nodes = math.ceil(AHEAD / (stride * tuning.period) - 1e-9)
+    return f"""[controller]
+type = "nonlinear"
+commands = "rates"  # thrust and body rates, flown by the vehicle's autopilot: its file's [autopilot], or by rule
+horizon = {stride * nodes}  # periods, {stride * nodes * tuning.period:.3g} s
+node = {round(stride * tuning.period, 9)}  # s, whole periods of {NODE:g} s or more
+terminal = "lqr"
+tilt = {_tilt(tuning)}  # deg, the bound of the linear controllers
+
+[controller.soft]
+
+[controller.disturbance]  # unknown forces and drag are estimated and compensated,
+thrust_scale = true  # and how much thrust the rotors give for a command: batteries sag
+"""
+
+
 def _robust(vehicle: Vehicle, tuning: Design) -> str:
     place, height, heading = (_rounded(weight) for weight in tuning.weights)
     speed, w, tilt = _rounded(tuning.speed_weight), tuning.bandwidth, _tilt(tuning)
@@ -278,8 +305,8 @@ horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for t
     return text
 
 
-def _constraints(vehicle: Vehicle, tuning: Design, size: float) -> str:
-    """Return the audited constraints, the same for every controller; `size` of the course [m]."""
+def _constraints(law: str, vehicle: Vehicle, tuning: Design, size: float) -> str:
+    """Return the audited constraints, the same for every controller of rotor speeds; `size` of the course [m]."""
     tilt, off = _tilt(tuning), _rounded(ROOM * size)
     rounding = _rounded(1e-9 * vehicle.speed_max)
 
@@ -297,7 +324,11 @@ def _constraints(vehicle: Vehicle, tuning: Design, size: float) -> str:
         [
             *(entry(name, name, -tilt, tilt, "deg, the tilt bound, at every instant") for name in ("roll", "pitch")),
             entry("speed", "speed", vehicle.speed_min, vehicle.speed_max, reached, rounding),
-            entry("slew", "slew", *_slew(tuning), "rad/s per period, the controller's bound", rounding),
+            *(
+                [entry("slew", "slew", *_slew(tuning), "rad/s per period, the controller's bound", rounding)]
+                if law != "rates"
+                else []
+            ),
             entry("floor", "z", _floor(vehicle), None, hull),
             *(entry(f"hold_{axis}", f"{axis}_error", -off, off, room) for axis in "xyz"),
         ]

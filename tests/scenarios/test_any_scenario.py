@@ -75,6 +75,11 @@ EFFECTS = some(
                 "torque_noise": number(0, 1),
             }
         ),
+        "battery": some(
+            {"resistance": number(0.0, 0.5), "charge": number(0.0, 1.0), "exponent": number(0.0, 3.0)},
+            cells=st.integers(1, 12),
+            capacity=number(1e-3, 10.0),
+        ),
     }
 )
 CONTROLLED = kind("controller", fields=some({"type": st.just("pid")}, horizon=st.integers(5, 30)))

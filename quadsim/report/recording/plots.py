@@ -151,7 +151,7 @@ def _send_solver(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeries
 
 
 def _send_effects(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
-    """Send commands that rotors do not follow at once, external force and torque, and wind, where they exist."""
+    """Send commands that rotors do not follow at once, external force, wind, and battery, where they exist."""
     t, views = run.log.plant.t, []
     commanded = commanded_speeds(run.log)
     if commanded is not None:
@@ -159,7 +159,7 @@ def _send_effects(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSerie
         _send_curves(recording, "effects/commanded", t, commanded, labels, stepped=True)
         views.append(_view("Rotor speeds, commanded and acting", ["effects/commanded", "signals/speed"], run))
     for entry in effect_curves(run.log):
-        labels = {f"{axis} [{entry.unit}]": colour for axis, colour in zip("xyz", SERIES, strict=False)}
+        labels = {f"{axis} [{entry.unit}]": colour for axis, colour in zip(entry.names, SERIES, strict=False)}
         _send_curves(recording, f"effects/{entry.key}", t, entry.values, labels)
         views.append(_view(f"{entry.title[0].upper()}{entry.title[1:]}", [f"effects/{entry.key}"], run))
     return views

@@ -11,6 +11,7 @@ from annotated_types import doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Instant, NonNegative, Positive, Vector, filled
+from quadsim.sim.effects.battery import Battery
 from quadsim.sim.effects.load import Load, MassChange, PayloadDrop, PayloadPickup
 from quadsim.sim.effects.rotors import LagChange, RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air
@@ -124,6 +125,7 @@ class Effects:
     load: Annotated[Load | None, doc("errors of mass and inertia, payload")] = None
     disturbance: Annotated[Disturbance | None, doc("unmodelled force and torque")] = None
     thrust_noise: Annotated[ThrustNoise | None, doc("loss and fluctuation of thrust")] = None
+    battery: Annotated[Battery | None, doc("voltage, on which thrust depends")] = None
 
     def resolved(self, vehicle: Vehicle) -> Effects:
         """Fill in every size left to the vehicle.
@@ -136,6 +138,7 @@ class Effects:
             rotors=self.rotors and self.rotors.resolved(vehicle),
             air=self.air and self.air.resolved(vehicle),
             ground=self.ground and self.ground.resolved(vehicle),
+            battery=self.battery and self.battery.resolved(vehicle),
         )
 
     @property

@@ -27,7 +27,7 @@ UNITS = {
     PLANT_FILE: (
         "t=s x=m vx=m/s y=m vy=m/s z=m vz=m/s roll=rad roll_rate=rad/s pitch=rad pitch_rate=rad/s yaw=rad "
         "yaw_rate=rad/s w1=rad/s w2=rad/s w3=rad/s w4=rad/s force_x=N force_y=N force_z=N torque_x=N m torque_y=N m "
-        "torque_z=N m wind_x=m/s wind_y=m/s wind_z=m/s"
+        "torque_z=N m wind_x=m/s wind_y=m/s wind_z=m/s voltage=V charge=-"
     ),
     HORIZON_FILE: "t=s predicted_x=m predicted_y=m predicted_z=m",
 }
@@ -98,14 +98,14 @@ def test_every_column_has_its_unit(tmp_path: Path) -> None:
 def test_absent_signals_have_no_columns(tmp_path: Path) -> None:
     log = small_log()
     control = dataclasses.replace(log.control, truth=log.control.state)
-    plant = dataclasses.replace(log.plant, wrench=None, wind=None)
+    plant = dataclasses.replace(log.plant, wrench=None, wind=None, battery=None)
     write(tmp_path, dataclasses.replace(log, control=control, plant=plant))
     names = pq.read_schema(tmp_path / FLIGHT_FILE).names
     assert not [name for name in names if name.startswith("true_") or name == "sqp_defect"]
     assert pq.read_schema(tmp_path / PLANT_FILE).names[-1] == "w4"
     (tmp_path / HORIZON_FILE).unlink()
     back = read_log(tmp_path)
-    assert back.plant.wrench is back.plant.wind is back.predicted is None
+    assert back.plant.wrench is back.plant.wind is back.plant.battery is back.predicted is None
     np.testing.assert_array_equal(back.control.truth, log.control.state)
     assert back.control.measured_perfectly
 

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -211,14 +212,17 @@ def test_a_logarithmic_axis_has_plain_numbers(top: float, shown: set[str]) -> No
     assert not [text for text in texts if "$" in text]
 
 
-def log_with(*, speeds: Array | float = 0.0, wrench: Array | None = None, wind: Array | None = None) -> FlightLog:
+NO_EFFECTS: dict[str, Any] = {"wrench": None, "wind": None, "battery": None}
+
+
+def log_with(*, speeds: Array | float = 0.0, **effects: Array) -> FlightLog:
     """Four periods of 0.1 s with five plant rows each, and one at the end; ideal but for what is given."""
     log = small_log(4, steps=5)
     held = np.concatenate([np.repeat(log.control.speeds, 5, axis=0), log.control.speeds[-1:]])
-    return replace(log, plant=replace(log.plant, speeds=held + speeds, wrench=wrench, wind=wind))
+    return replace(log, plant=replace(log.plant, speeds=held + speeds, **(NO_EFFECTS | effects)))
 
 
-def test_forces_torques_and_wind_have_curves_unless_they_are_zero_throughout() -> None:
+def test_forces_torques_wind_and_battery_have_curves_unless_they_are_zero_throughout() -> None:
     assert effect_curves(log_with()) == []
     wrench = np.zeros((21, 6))
     assert effect_curves(log_with(wrench=wrench, wind=np.zeros((21, 3)))) == []
@@ -227,7 +231,12 @@ def test_forces_torques_and_wind_have_curves_unless_they_are_zero_throughout() -
     np.testing.assert_array_equal(torque.values, wrench[:, 3:])
     curves = effect_curves(log_with(wrench=np.ones((21, 6)), wind=np.ones((21, 3))))
     assert [(entry.key, entry.unit) for entry in curves] == [("force", "N"), ("torque", "N m"), ("wind", "m/s")]
-    empty = replace(small_log(0), plant=replace(small_log(0).plant, wrench=None, wind=None))
+    curves = effect_curves(log_with(battery=np.ones((21, 2))))
+    assert [(entry.key, entry.unit, entry.names) for entry in curves] == [
+        ("voltage", "V", ("voltage",)),
+        ("charge", "-", ("charge",)),
+    ]
+    empty = replace(small_log(0), plant=replace(small_log(0).plant, **NO_EFFECTS))
     assert (commanded_speeds(empty), effect_curves(empty)) == (None, [])
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from quadsim.sim.computation import Computation
 from quadsim.sim.effects import Disturbance, Effects, Ground
+from quadsim.sim.effects.battery import Battery
 from quadsim.sim.effects.load import Load, Payload, PayloadDrop, PayloadPickup
 from quadsim.sim.effects.rotors import RotorChange, RotorDynamics
 from quadsim.sim.effects.wind import Air
@@ -53,6 +54,8 @@ def test_every_field_arrives() -> None:
         "effects.load={mass_factor=1.1, inertia_factor=[1.2, 1.1, 1.05], centre_of_mass=[0.01, 0.02, 0.03], "
         "payloads=[{mass=0.3, position=[0.0, 0.0, -0.1]}]}",
         "effects.disturbance={force=[1.0, 2.0, 3.0], torque=[0.1, 0.2, 0.3], force_noise=0.4, torque_noise=0.5}",
+        "effects.battery={cells=2, capacity=1.5, resistance=0.1, charge=0.8, curve=[[0.0, 3.0], [1.0, 4.0]], "
+        "hover_current=9.0, idle_current=0.5, reference_voltage=7.5, exponent=1.5}",
     )
     assert result == Effects(
         rotors=RotorDynamics(rise=0.01, fall=0.02, acceleration=900.0, inertia=1e-4, efficiency=(1.0, 0.9, 0.8, 0.7)),
@@ -65,11 +68,24 @@ def test_every_field_arrives() -> None:
             payloads=(Payload(mass=0.3, position=(0.0, 0.0, -0.1)),),
         ),
         disturbance=Disturbance(force=(1.0, 2.0, 3.0), torque=(0.1, 0.2, 0.3), force_noise=0.4, torque_noise=0.5),
+        battery=Battery(
+            cells=2,
+            capacity=1.5,
+            resistance=0.1,
+            charge=0.8,
+            curve=((0.0, 3.0), (1.0, 4.0)),
+            hover_current=9.0,
+            idle_current=0.5,
+            reference_voltage=7.5,
+            exponent=1.5,
+        ),
     )
 
 
 def test_sizes_left_out_are_the_vehicle_s() -> None:
-    loaded, vehicle = scenario("effects={rotors={}, air={}, ground={effect=true}}", vehicle="hummingbird")
+    loaded, vehicle = scenario(
+        "effects={rotors={}, air={}, ground={effect=true}, battery={cells=3, capacity=2.1}}", vehicle="hummingbird"
+    )
     result = loaded.effects.resolved(vehicle)
     assert result.rotors is not None
     assert result.air is not None
@@ -78,6 +94,9 @@ def test_sizes_left_out_are_the_vehicle_s() -> None:
     assert result.rotors.inertia == vehicle.rotor_inertia
     assert (result.air.rotor_drag, result.air.body_drag) == (vehicle.rotor_drag, vehicle.body_drag)
     assert result.ground.rotor_radius == vehicle.rotor_radius
+    assert result.battery is not None
+    assert result.battery.reference_voltage == pytest.approx(12.6)
+    assert result.battery.hover_current is not None
     assert result.resolved(vehicle) == result
 
 

@@ -153,15 +153,17 @@ def test_bounds_margins_and_verdicts_of_the_scenario(content: Content, short_run
     assert all(before != after for before, after in itertools.pairwise(states))
 
 
-def test_forces_torques_wind_and_lagging_rotors_have_their_curves(
+def test_forces_torques_wind_battery_and_lagging_rotors_have_their_curves(
     record: Callable[[Run], Content], short_run: Run
 ) -> None:
     plant, rng = short_run.log.plant, np.random.default_rng(0)
     wrench, wind = rng.normal(size=(plant.t.size, 6)), rng.normal(size=(plant.t.size, 3))
-    plant = dataclasses.replace(plant, speeds=plant.speeds - 1.0, wrench=wrench, wind=wind)
+    battery = rng.uniform(size=(plant.t.size, 2))
+    plant = dataclasses.replace(plant, speeds=plant.speeds - 1.0, wrench=wrench, wind=wind, battery=battery)
     run = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, plant=plant))
     content = record(run)
-    for name, expected in {"force": wrench[:, :3], "torque": wrench[:, 3:], "wind": wind}.items():
+    curves = {"force": wrench[:, :3], "torque": wrench[:, 3:], "wind": wind}
+    for name, expected in (curves | {"voltage": battery[:, :1], "charge": battery[:, 1:]}).items():
         np.testing.assert_array_equal(content.rows(f"/effects/{name}", "scalars"), expected)
         np.testing.assert_allclose(content.times(f"/effects/{name}"), plant.t, atol=1e-9)
     np.testing.assert_allclose(content.rows("/effects/commanded", "scalars"), plant.speeds + 1.0, atol=1e-9)
