@@ -97,12 +97,12 @@ def measure(quick: bool, report: Progress) -> list[Record]:
         records.append(
             {
                 "flight": name,
-                "Betaflight [cm]": round(errors[0], 3),
-                "built-in [cm]": round(errors[1], 3),
-                "difference [cm]": round(errors[0] - errors[1], 3),
-                "nearest_bound": f"{worst.limit.name}: {worst.deciding_margin:.2f} {worst.limit.unit}",
+                "Betaflight_cm": round(errors[0], 3),
+                "built-in_cm": round(errors[1], 3),
+                "difference_cm": round(errors[0] - errors[1], 3),
+                "nearest_margin": f"{worst.limit.name}: {worst.deciding_margin:.2f} {worst.limit.unit}",
                 "verdict": flight.outcome,
-                "second run": "same bytes" if digest(flight) == digest(again) else "differs",
+                "second_run": "same bytes" if digest(flight) == digest(again) else "differs",
             }
         )
     return records
@@ -115,8 +115,8 @@ def main() -> None:
     failed = [
         record["flight"]
         for record in records
-        if (record["verdict"], record["second run"]) != ("satisfied", "same bytes")
-        or not abs(record["difference [cm]"]) <= AGREEMENT
+        if (record["verdict"], record["second_run"]) != ("satisfied", "same bytes")
+        or not abs(record["difference_cm"]) <= AGREEMENT
     ]
     if failed:
         sys.exit(f"not as required: {', '.join(failed)}")

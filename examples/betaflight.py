@@ -135,7 +135,8 @@ class Firmware:
     def _await(self, report: bytes) -> None:
         ready = select.select([self._reports], [], [], PATIENCE)[0]
         if not ready or os.read(self._reports, 1) != report:
-            raise RuntimeError(f"Betaflight {'has ended' if ready else 'hangs'}: see {self._log}")
+            log = self._log.read_text(errors="replace")[-300:]
+            raise RuntimeError(f"Betaflight {'has ended' if ready else 'hangs'}; its last words are {log!r}")
 
 
 class Betaflight:
@@ -173,7 +174,7 @@ class Betaflight:
             for _ in range(100 * seconds):
                 self._firmware.step(0.01, sticks, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
         if self._firmware.motors.min() < 0.1:
-            raise RuntimeError(f"Betaflight does not arm: see {folder / 'sitl.log'}")
+            raise RuntimeError("Betaflight does not arm: betaflight.txt sets the switch that arms it")
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
         """Return rotor speeds (4,) [rad/s] for a target (4,); see `quadsim.controller.InnerLoop`."""
@@ -198,7 +199,9 @@ def main() -> None:
         sys.exit(subprocess.call([sys.executable, HERE.parent / "benchmarks/autopilots.py"]))
     scenario = quadsim.load(given.scenario)
     flight = quadsim.fly(scenario, autopilot=Betaflight(assemble(scenario).vehicle))
-    print(flight, "" if given.out is None else f"\nwritten to {flight.save(given.out)}")
+    print(flight)
+    if given.out is not None:
+        print("written to", flight.save(given.out))
 
 
 if __name__ == "__main__":
