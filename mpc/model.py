@@ -91,7 +91,7 @@ def hover_model(vehicle: Vehicle, period: float) -> LinearModel:
 def target_model(vehicle: Vehicle, period: float, lag: Sequence[float]) -> LinearModel:
     """The discrete model at hover above an inner loop, whose targets are the inputs.
 
-    The rates follow with the time constants `lag` (thrust, p, q, r) [s], of at least `SHORTEST_LAG`; the thrust at once.
+    The rates follow with the time constants `lag` (thrust, p, q, r) [s], at least `SHORTEST_LAG`; the thrust at once.
     """
     A, B = continuous_model(vehicle)
     B = np.zeros_like(B)

@@ -68,6 +68,10 @@ SHORTEST: Final = 0.1
 CONVERGED: Final = 0.1
 """Largest dynamics defect of a converged plan (`quadsim.controller.SQP`). Library flights exceed it in at most 9
 periods, after steps of the course and upside down; a tumbling vehicle exceeds it in all."""
+CORRECTIONS: Final = 2
+"""Most further SQP steps in a period whose plan has not `CONVERGED`, where commands are targets; if it still has not,
+the next period starts from the reference. A single step from far away may leave a plan with a full turn in it, which
+further steps keep: that way a stiff soft bound on tilt and unfiltered steps of the reference turned a vehicle over."""
 PATIENCE: Final = 8
 """Steps without a new shortest one after which the largest share of a step is halved."""
 TILT_SIDES: Final = 12
@@ -250,6 +254,9 @@ class NonlinearMPC:
                 raise ParameterError("controller", constraint.name, "of those", rule)
             C[:, P], C[:, V] = constraint.C[:, POSITIONS], constraint.C[:, VELOCITIES]
         if constraint.D is not None and constraint.D.any():
+            if self._targets:
+                rule = 'without rotor speeds where commands = "rates": an inner loop commands the rotors'
+                raise ParameterError("controller", constraint.name, "of those", rule)
             if self.settings.inputs is not Inputs.SPEED:
                 rule = 'without rotor speeds where inputs = "thrust", in which they are not linear: inputs = "speed"'
                 raise ParameterError("controller", constraint.name, "of those", rule)
@@ -493,7 +500,8 @@ class NonlinearMPC:
             self._plan = np.concatenate([x[1:], x[-1:]]), np.concatenate([u[1:], u[-1:]])
         rest, before = Equilibrium(target[-1], inputs), self._shares(self._acting)
         share, largest, last, least, patience = 1.0, 1.0, np.zeros(0), math.inf, PATIENCE
-        for _ in range(self.settings.iterations):
+        iterations = self.settings.iterations
+        for k in range(iterations + CORRECTIONS * self._targets):
             x, u = self._plan
             query = Query(s0, desired, before, rest, self._steps(x, u, frames))
             if self._obstacles is None:
@@ -507,7 +515,9 @@ class NonlinearMPC:
             end[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
             self._plan = end, plan
             moved = max(np.abs(end - x).max(), np.abs(plan - u).max())
-            if self.settings.iterations > 1:
+            if self._targets and k + 1 >= iterations and self._defect(end, plan) <= CONVERGED:
+                break
+            if iterations > 1:
                 if moved <= self.settings.tolerance:
                     break
                 # Full Gauss-Newton steps may oscillate.  Aitken's relaxation (Irons and Tuck 1969) takes a share of
@@ -522,8 +532,14 @@ class NonlinearMPC:
                 share = min(max(share / max(undone, SHORTEST), SHORTEST), largest)
                 last = step
                 self._plan = x + share * (end - x), u + share * (plan - u)
-        defect = np.abs(end[1:] - advance_nodes(self._model, end[:-1], plan)).max()
-        return query, answer, problem, SQP(float(defect), float(moved))
+        defect = self._defect(end, plan)
+        if self._targets and defect > CONVERGED:
+            self._plan = None
+        return query, answer, problem, SQP(defect, float(moved))
+
+    def _defect(self, x: Array, u: Array) -> float:
+        """Return by how much a plan of states (N + 1, n) and inputs (N, 4) misses the dynamics."""
+        return float(np.abs(x[1:] - advance_nodes(self._model, x[:-1], u)).max())
 
     def _steps(self, x: Array, u: Array, frames: Array) -> tuple[Array, Array, Array]:
         """Return A, B, c along a plan of states (N + 1, n) and inputs (N, 4)."""

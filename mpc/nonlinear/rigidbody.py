@@ -267,10 +267,9 @@ def _assemble(
     A[:, 3:N_BODY, 3:] = Y[:, :, : n - 3]
     B[:, P], B[:, 3:N_BODY] = travelled[:, :, inputs], Y[:, :, inputs]
     if model.actuators:
-        states, inputs = np.arange(N_BODY, n), np.arange(model.actuators)
-        A[:, states, states] = decay = _left(model)
-        B[:, N_BODY:] = 0.0
-        B[:, states, inputs] = 1.0 - decay
+        states, decay = np.arange(N_BODY, n), _left(model)
+        A[:, states, states] = decay
+        B[:, N_BODY:] = (1.0 - decay) * np.eye(N_ROTORS)[: model.actuators]
         end[:, N_BODY:] = _actuators_after(model, x, u)
     return A, B, end
 
@@ -322,7 +321,9 @@ def _followed(model: RigidBody, instants: Array, x: Array, u: Array) -> tuple[Ar
     start = np.concatenate([effect[0] * x[:, N_BODY:], x[:, W]], axis=1)
     now = effect * u + left[:, None] * (start - effect * u)  # (K, M, 4): T, omega
     T, turning = np.zeros((len(left), len(x), 1, 6)), np.zeros((len(left), len(x), 3, 16))
-    T[..., 0, 0], T[..., 0, 1], T[..., 0, -1] = *(effect[0] * np.stack([left[:, :1], 1.0 - left[:, :1]])), now[..., 0]
+    T[..., 0, 0] = effect[0] * left[:, :1]
+    T[..., 0, 1] = effect[0] * (1.0 - left[:, :1])
+    T[..., 0, -1] = now[..., 0]
     axes = np.arange(3)
     turning[:, :, axes, 7 + axes] = left[:, None, 1:]
     turning[:, :, axes, 12 + axes] = effect[1:] * (1.0 - left[:, None, 1:])

@@ -81,8 +81,8 @@ class Weights:
     input: Annotated[
         Weight,
         doc(
-            "[-] weight of the inputs' distance from the reference, as shares of the rotors' largest or, of targets, of "
-            f"the largest collective thrust and {RATE_SCALE:g} rad/s"
+            "[-] weight of the inputs' distance from the reference, as shares of the rotors' largest; of targets, as "
+            f"shares of the largest collective thrust and of {RATE_SCALE:g} rad/s"
         ),
     ] = 0.1
     move: Annotated[NonNegative, doc("[-] weight of the inputs' change from node to node, as shares")] = 0.0

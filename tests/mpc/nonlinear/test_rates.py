@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import itertools
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from mpc.bounded import FallbackSettings, Polytope, RotorBounds, Soft, TargetBounds
+from mpc.constraints import Constraint
+from mpc.disturbance import RampSettings
+from mpc.fallback.hover import HoverLaw
+from mpc.indi import INDISettings
+from mpc.model import target_model
+from mpc.nonlinear.controller import NonlinearMPC
 from mpc.nonlinear.rigidbody import (
     N_BODY,
     RATE_SCALE,
     Inputs,
+    P,
     Q,
     RigidBody,
     V,
@@ -21,9 +31,15 @@ from mpc.nonlinear.rigidbody import (
     linearise_nodes,
     rigid_body,
     rotation,
+    thrust_axis,
 )
+from mpc.nonlinear.settings import Nonlinear, Weights
+from mpc.observer import ObserverSettings
 from quadsim.assets import vehicle_path
-from quadsim.state import Array
+from quadsim.controller import Command, Controller, Phase, StepInputs
+from quadsim.errors import FlightError, ParameterError
+from quadsim.rotation import body_to_euler_rates, euler_to_quaternion, quaternion_to_euler
+from quadsim.state import ANGLE_RATES, ANGLES, N_STATES, POSITIONS, VELOCITIES, Array
 from quadsim.vehicle import load_vehicle
 
 VEHICLE = load_vehicle(vehicle_path("hummingbird"))
@@ -110,3 +126,240 @@ def test_it_moves_by_the_equations_of_the_rigid_body_and_four_lags(others: dict[
     start = x[0] * np.array([*[1.0] * N_BODY, model.scale[0]])
     end = solve_ivp(slopes, (0.0, 0.05), start, rtol=1e-11, atol=1e-12).y[:, -1]
     np.testing.assert_allclose(advance_nodes(model, x, u)[0, :N_BODY], end[:N_BODY], atol=1e-7)
+
+
+# --- the controller ------------------------------------------------------------------------------------------------
+
+WEIGHTS = Weights(position=20.0, attitude=(1.0, 1.0, 2.0), velocity=1.0, body_rates=0.02, input=5.0, move=2.0)
+LEVEL = np.array([VEHICLE.mass * VEHICLE.gravity, 0.0, 0.0, 0.0])
+Course = Callable[[float], tuple[float, ...]]
+
+
+def table(**fields: Any) -> Nonlinear:
+    usual = {"horizon": 40, "node": 0.04, "terminal": "lqr", "weights": WEIGHTS}
+    return Nonlinear(**{"commands": "rates", "inner_lag": LAG, **usual, **fields})
+
+
+def at_rest(**plant: Any) -> Array:
+    """(14,) hover, with the thrust that the plant needs."""
+    x = np.zeros(14)
+    x[3], x[N_BODY] = 1.0, LEVEL[0] / model_of().scale[0] / plant.get("thrust_scale", 1.0)
+    return x
+
+
+def step_of(*target: float, at: float = 0.5) -> Course:
+    return lambda time: target if time >= at - 1e-9 else (0.0, 0.0, 0.0, 0.0)
+
+
+def fly(
+    controller: Controller, period: float, seconds: float, course: Course, x: Array | None = None, **plant: Any
+) -> tuple[Array, list[Command]]:
+    """States (K, 14) every 5 ms above an inner loop of exact lags, and the commands."""
+    model = model_of(5e-3, **{"lag": LAG, **plant})
+    x, states, commands = at_rest(**plant) if x is None else x, [], []
+    for k in range(round(seconds / period)):
+        state, euler = np.zeros(N_STATES), quaternion_to_euler(x[Q])
+        state[POSITIONS], state[VELOCITIES], state[ANGLES] = x[P], x[V], euler
+        state[ANGLE_RATES] = body_to_euler_rates(euler, x[W])
+        preview = np.array([course((k + 1 + i) * period) for i in range(controller.horizon)])
+        now = StepInputs(time=k * period, attitude=x[Q].copy(), body_rates=x[W].copy())
+        commands.append(controller.step(now, state, preview))
+        for _ in range(round(200.0 * period)):
+            x = advance_nodes(model, x, commands[-1].speeds / model.scale)
+            x[Q] /= np.linalg.norm(x[Q])
+            states.append(x)
+    return np.array(states), commands
+
+
+def tilts(states: Array) -> Array:
+    """(K,) angles of the thrust axis from the vertical [deg]."""
+    return np.degrees(np.arccos(np.clip(thrust_axis(states[:, Q])[:, 2], -1.0, 1.0)))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_it_follows_a_previewed_step_quickly_with_small_overshoot(axis: int) -> None:
+    target = np.zeros(4)
+    target[axis] = 1.0
+    states, commands = fly(table().build(VEHICLE, 0.02), 0.02, 2.5, step_of(*target))
+    way = states[:, axis]
+    assert 5e-3 * np.argmax(way > 0.9) - 0.5 < 0.26
+    assert way.max() < 1.06
+    np.testing.assert_allclose(states[-1, P], target[:3], atol=5e-3)
+    bounds = TargetBounds().actuators(VEHICLE)
+    rows = np.array([command.speeds for command in commands])
+    assert np.all((rows >= bounds.u_min) & (rows <= bounds.u_max))
+    assert {command.fallback for command in commands} == {0}
+
+
+@pytest.mark.parametrize(("period", "node", "horizon"), [(0.02, 0.04, 40), (0.05, 0.05, 20)])
+@pytest.mark.parametrize(("tilt", "linear"), [(20.0, 200.0), (20.0, 600.0), (30.0, 2000.0)])
+def test_a_stiff_soft_tilt_does_not_turn_it_over(
+    period: float, node: float, horizon: int, tilt: float, linear: float
+) -> None:
+    """On an unfiltered step in all directions; with single SQP steps alone, some of these flights turned over."""
+    soft = Soft(linear=linear, quadratic=10.0)
+    made = table(horizon=horizon, node=node, tilt=tilt, soft=soft)
+    states, _ = fly(made.build(VEHICLE, period), period, 3.5, step_of(1.0, 1.0, 1.0, math.radians(45.0)))
+    assert tilts(states).max() < tilt + 0.5
+    np.testing.assert_allclose(states[-1, P], 1.0, atol=0.02)
+
+
+def test_targets_and_body_rates_hold_their_bounds() -> None:
+    bounds = TargetBounds(thrust=(3.5, 8.0), body_rate=(120.0, 90.0, 60.0))
+    made = table(target_bounds=bounds, body_rate=100.0, soft=Soft(linear=1e4, quadratic=10.0))
+    states, commands = fly(made.build(VEHICLE, 0.02), 0.02, 2.5, step_of(1.0, 1.0, 1.0, math.radians(45.0)))
+    rows = np.array([command.speeds for command in commands])
+    largest = np.radians([120.0, 90.0, 60.0])
+    assert rows[:, 0].min() >= 3.5
+    assert rows[:, 0].max() == pytest.approx(8.0)
+    assert np.abs(rows[:, 2]).max() == pytest.approx(largest[1])
+    assert np.all(np.abs(rows[:, 1:]) <= largest + 1e-12)
+    assert np.abs(np.degrees(states[:, W])).max() < 101.0
+    sides = made.audited(VEHICLE)
+    assert sides["thrust"] == (3.5, 8.0)
+    assert [sides[f"body_rate_{axis}"][1] for axis in "xyz"] == [100.0, 90.0, 60.0]
+    assert not {"speed", "slew"} & set(sides)
+
+
+def test_bounds_of_targets_follow_the_vehicle() -> None:
+    largest = 4.0 * VEHICLE.thrust_coefficient * VEHICLE.speed_max**2
+    bounds = TargetBounds().actuators(VEHICLE)
+    np.testing.assert_allclose(bounds.u_min, [0.1 * largest, *np.radians([-300.0, -300.0, -90.0])])
+    np.testing.assert_allclose(bounds.u_max, [0.9 * largest, *np.radians([300.0, 300.0, 90.0])])
+    assert np.isinf(bounds.delta_max).all()
+    np.testing.assert_allclose(bounds.lowest(LEVEL), [0.1 * largest, 0.0, 0.0, 0.0])
+
+
+def test_grounded_it_turns_nowhere_with_the_least_thrust() -> None:
+    made = table().build(VEHICLE, 0.02)
+    least = [TargetBounds().actuators(VEHICLE).u_min[0], 0.0, 0.0, 0.0]
+    for controller in (made, made.inner):  # type: ignore[attr-defined]
+        now = StepInputs(phase=Phase.LANDED)
+        np.testing.assert_allclose(
+            controller.step(now, np.zeros(N_STATES), np.zeros((controller.horizon, 4))).speeds, least
+        )
+
+
+def test_offset_free_it_finds_the_thrust_that_holds_the_height() -> None:
+    weak = {"thrust_scale": 0.8}
+    still: Course = step_of(0.0, 0.0, 0.0, 0.0)
+    coarse = {"horizon": 20, "node": 0.05}
+    sagging, _ = fly(table(**coarse).build(VEHICLE, 0.05), 0.05, 3.0, still, **weak)
+    made = table(offset_free=ObserverSettings(), **coarse)
+    states, commands = fly(made.build(VEHICLE, 0.05), 0.05, 6.0, still, **weak)
+    assert sagging[-1, 2] < -0.03
+    assert abs(states[-1, 2]) < 1e-3
+    assert commands[-1].speeds[0] == pytest.approx(LEVEL[0] / 0.8, rel=1e-3)
+
+
+def test_it_predicts_its_own_flight() -> None:
+    controller = table(fallback=FallbackSettings(enabled=False)).build(VEHICLE, 0.02)
+    x = at_rest()
+    x[W] = 0.3, -0.2, 0.1
+    states, commands = fly(controller, 0.02, 0.02, step_of(0.2, 0.1, 0.3, 0.0, at=0.0), x)
+    start = np.zeros((1, N_STATES))
+    start[:, ANGLE_RATES] = x[W]
+    predicted = controller.predict(start, commands[0].plan[None])[0]
+    np.testing.assert_allclose(predicted[0, POSITIONS], states[-1, P], atol=2e-3)
+    np.testing.assert_allclose(predicted[0, ANGLES], quaternion_to_euler(states[-1, Q]), atol=1e-4)
+    np.testing.assert_allclose(predicted[0, ANGLE_RATES], states[-1, W], atol=5e-3)
+
+
+def test_it_takes_over_from_a_law_that_commands_rotors_without_a_jump() -> None:
+    rotors = Nonlinear(offset_free=ObserverSettings()).build(VEHICLE, 0.02)
+    rotors.inner._observer.adopt(np.array([0.3, 0.0, 0.5, 1.0, 0.0, 0.0]))  # type: ignore[attr-defined]
+    rotors.step(StepInputs(), np.zeros(N_STATES), np.zeros((rotors.horizon, 4)))
+    rates = table(offset_free=ObserverSettings()).build(VEHICLE, 0.02)
+    for law, previous, row in ((rates, rotors, LEVEL), (rotors, rates, np.full(4, VEHICLE.hover_speed))):
+        law.reset(row)
+        law.adopt(previous)  # type: ignore[attr-defined]
+        np.testing.assert_allclose(law.inner.disturbance[:3], [0.3, 0.0, 0.5])  # type: ignore[attr-defined]
+        np.testing.assert_allclose(law.inner._acting, row)  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(rates.inner.disturbance[3:], 0.0)  # type: ignore[attr-defined]
+    command = rates.step(StepInputs(), np.zeros(N_STATES), np.zeros((rates.horizon, 4)))
+    assert command.fallback == 0
+    assert command.speeds[0] == pytest.approx(LEVEL[0] * (1.0 - 0.5 / VEHICLE.gravity), rel=0.05)
+
+
+# --- the fallback --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("period", [0.02, 0.05])
+@pytest.mark.parametrize("lag", [LAG, (0.072, 0.072, 0.072, 0.15), (0.0, 0.0, 0.0, 0.0)])
+def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tuple[float, ...]) -> None:
+    model = target_model(VEHICLE, period, lag)
+    law = HoverLaw(model, tilt=math.radians(10.0))
+    assert np.abs(np.linalg.eigvals(model.A - model.B @ np.linalg.solve(law.slope, law.gain))).max() < 1.0
+    made = table(inner_lag=lag, horizon=1, node=None).build(VEHICLE, period)
+    made.inner.step = _fails  # type: ignore[attr-defined]
+    x = at_rest()
+    x[Q] = euler_to_quaternion(np.radians([20.0, -8.0, 0.0]))
+    states, commands = fly(made, period, 5.0, step_of(0.0, 0.0, 0.0, 0.0), x, lag=lag)
+    assert {command.fallback for command in commands} == {2}
+    assert {command.status for command in commands} == {"flight_error"}
+    assert tilts(states).max() < 22.0
+    assert tilts(states[-1:])[0] < 1.0
+    assert np.linalg.norm(states[-1, V]) < 0.1
+
+
+def _fails(*_: object) -> Command:
+    raise FlightError("no answer", time=0.0)
+
+
+def test_the_target_model_is_that_of_small_motions() -> None:
+    model, x = target_model(VEHICLE, 0.02, LAG), at_rest()
+    states = 1e-4 * np.random.default_rng(5).normal(size=N_STATES)
+    x[P], x[V], x[W] = states[POSITIONS], states[VELOCITIES], states[ANGLE_RATES]
+    x[Q] = euler_to_quaternion(states[ANGLES])
+    u = LEVEL + np.array([0.0, 1e-4, -2e-4, 3e-4])
+    end = advance_nodes(model_of(0.02, substeps=20), x, u / model_of().scale)
+    expected = model.A @ states + model.B @ (u - model.u_bar)
+    np.testing.assert_allclose(expected[POSITIONS], end[P], atol=1e-9)
+    np.testing.assert_allclose(expected[VELOCITIES], end[V], atol=1e-7)
+    np.testing.assert_allclose(expected[ANGLE_RATES], end[W], atol=1e-7)
+
+
+# --- refusals ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fields", "rule"),
+    [
+        ({"inputs": "speed"}, "inputs must be absent"),
+        ({"rotor_lag": 0.02}, "rotor_lag must be absent"),
+        ({"indi": INDISettings()}, "indi must be absent"),
+        ({"input_bounds": RotorBounds(speed=(100.0, 200.0))}, "input_bounds must be absent"),
+        ({"disturbance": RampSettings(rotor_lag=0.02)}, "disturbance.rotor_lag must be absent"),
+        ({"inner_lag": (1e-5, 0.0, 0.0, 0.0)}, "inner_lag must be 0, or at least 0.0001 s"),
+        (
+            {"polytopes": (Polytope(name="total", of=("speed_1", "speed_2"), rows=((1.0, 1.0),), upper=(300.0,)),)},
+            "polytopes must be without rotor speeds",
+        ),
+        ({"commands": "rotors"}, 'inner_lag must be absent where commands = "rotors"'),
+        (
+            {"commands": "rotors", "inner_lag": None, "target_bounds": TargetBounds(body_rate=10.0)},
+            "target_bounds must be absent",
+        ),
+    ],
+)
+def test_it_refuses_fields_of_the_other_space_of_commands(fields: dict[str, Any], rule: str) -> None:
+    with pytest.raises(ValueError, match=rule):
+        table(**fields)
+
+
+def test_it_is_not_built_without_the_lag_of_its_inner_loop() -> None:
+    with pytest.raises(ParameterError, match="inner_lag must be four time constants"):
+        table(inner_lag=None).build(VEHICLE, 0.02)
+
+
+@pytest.mark.parametrize("thrust", [(5.0, 4.0), (-1.0, 4.0)])
+def test_it_refuses_bounds_on_thrust(thrust: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="thrust must have"):
+        TargetBounds(thrust=thrust)
+
+
+def test_rows_over_rotor_speeds_have_no_meaning_for_targets() -> None:
+    row = Constraint(name="total", lower=np.zeros(1), upper=np.ones(1), D=np.ones((1, 4)))
+    settings = table().settings(VEHICLE, 2)
+    with pytest.raises(ParameterError, match="without rotor speeds"):
+        NonlinearMPC(VEHICLE, period=0.02, settings=settings, constraints=(row,))
