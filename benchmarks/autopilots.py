@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import sys
 import tempfile
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from runpy import run_path
 from typing import Any, Final
@@ -58,6 +58,7 @@ FLIGHTS: Final[dict[str, dict[str, Any]]] = {
     "circle, rotors at 80 %": {"reference": CIRCLE, "effects": {"rotors": {"efficiency": [0.8] * 4}, "air": {}}},
     "circle, gyro noise 6 deg/s": {"reference": CIRCLE, "sensors": {"rates": {"rate": 1000.0, "noise": 6.0}}},
     "circle, stock gains": {"reference": CIRCLE},
+    "circle, Crazyflie": {"reference": {**CIRCLE, "radius": 1.0, "speed": 1.5}, "vehicle.file": "crazyflie2"},
 }
 
 
@@ -81,15 +82,15 @@ def digest(flight: quadsim.Flight) -> str:
 
 def measure(quick: bool, report: Progress) -> list[Record]:
     """Each flight through the firmware, twice, and through the built-in autopilot."""
-    make, vehicle = run_path(str(EXAMPLE))["Betaflight"], quadsim.load_vehicle("hummingbird")
-    firmwares = {stock: make(vehicle, stock=stock) for stock in (False, True)}
+    make = cache(run_path(str(EXAMPLE))["Betaflight"])
     records: list[Record] = []
     names = ["hover"] if quick else [*FLIGHTS]
     for i, name in enumerate(names):
         report("flights", i, len(names))
-        firmware = firmwares["stock" in name]
+        flown = scenario(name)
+        firmware = make(quadsim.load_vehicle(flown.vehicle.file), stock="stock" in name)
         flight, again, builtin = (
-            quadsim.fly(scenario(name), autopilot=autopilot, progress=False) for autopilot in (firmware, firmware, None)
+            quadsim.fly(flown, autopilot=autopilot, progress=False) for autopilot in (firmware, firmware, None)
         )
         worst = worst_finding(flight.findings)
         assert worst is not None

@@ -326,7 +326,7 @@ def betaflight() -> Figure:
 
     make = run_path(str(autopilots.EXAMPLE))["Betaflight"]
     vehicle = quadsim.load_vehicle("hummingbird")
-    flown = {"built-in": None, "Betaflight, tuned": make(vehicle), "Betaflight, stock": make(vehicle, stock=True)}
+    flown = {"built-in": None, "Betaflight": make(vehicle), "stock gains": make(vehicle, stock=True)}
     steps = autopilots.scenario("steps").replace({"duration": 4.5})
     flights = {label: quadsim.fly(steps, autopilot=each, progress=False) for label, each in flown.items()}
     titles = {"y": "a step of 1 m at t = 3 s", "body_rate_x": "roll rate"}

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 import quadsim
+from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.state import Array
 from scenarios.loading import assemble
 
@@ -34,6 +35,8 @@ LAYOUTS = {  # azimuth [deg] and spin of the firmware's motors 1 to 4: flight/mi
     "QUADP": ((180.0, 1), (270.0, -1), (90.0, -1), (0.0, 1)),
     "QUADX": ((225.0, 1), (315.0, -1), (135.0, -1), (45.0, 1)),
 }
+SCALES = {"p": 3.2029e-5, "i": 2.44381e-4, "d": 5.29e-7}  # motors' share per unit, deg/s, deg and deg/s^2: flight/pid.h
+AXES = ("roll", "pitch", "yaw")
 STOCK_IDLE = 0.055  # of the motors' range
 PATIENCE = 20.0  # s, of the wall clock
 
@@ -45,6 +48,20 @@ def motor_layout(vehicle: quadsim.Vehicle) -> tuple[str, list[int]]:
         if set(motors) == set(rotors):
             return mixer, [motors.index(rotor) for rotor in rotors]
     raise ValueError(f"Betaflight has no mixer for {vehicle.name}: azimuths and spins {rotors} are none of {LAYOUTS}")
+
+
+def gains(vehicle: quadsim.Vehicle, settings: AutopilotSettings | None = None) -> list[str]:
+    """Return the lines that set the gains of the built-in autopilot [1/s, 1/s^2, -] in the firmware's units, up to 250.
+
+    A motor's share of its range, du, accelerates axis k by 2 w_hover w_max sum |allocation_k| / J_k du at hover.
+    """
+    torques = np.abs(vehicle.allocation[1:]).sum(axis=1)
+    effect = 2.0 * vehicle.hover_speed * vehicle.speed_max * torques / vehicle.inertia
+    resolved, lines = (settings or AutopilotSettings()).resolved(vehicle), []
+    for name, scale in SCALES.items():
+        numbers = getattr(resolved, name) / (np.degrees(scale) * effect)
+        lines += [f"set {name}_{axis} = {min(round(x), 250)}" for axis, x in zip(AXES, numbers, strict=True)]
+    return lines
 
 
 def channels(target: Array, largest_thrust: float, idle: float = 0.0) -> list[int]:
@@ -147,21 +164,23 @@ class Betaflight:
 
     takes_targets = True
 
-    def __init__(self, vehicle: quadsim.Vehicle, *, stock: bool = False, rate: float = 1000.0) -> None:
-        """Configure it for a vehicle: tuned, or with its stock gains, filters and idle."""
+    def __init__(
+        self, vehicle: quadsim.Vehicle, settings: AutopilotSettings | None = None, *, stock: bool = False
+    ) -> None:
+        """Configure it for a vehicle: with the gains of the built-in autopilot, or with its stock gains and filters."""
         if not BINARY.exists():
             raise FileNotFoundError(f"{BINARY} is not there: make betaflight builds it")
         mixer, self._motor_of_rotor = motor_layout(vehicle)
-        self.rate, self._fastest, self._idle = rate, vehicle.speed_max, STOCK_IDLE if stock else 0.0
+        self.rate, self._fastest, self._idle = 1000.0, vehicle.speed_max, STOCK_IDLE if stock else 0.0
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._largest_thrust = 4.0 * vehicle.thrust_coefficient * vehicle.speed_max**2
         self._folder = Path(tempfile.mkdtemp(prefix="betaflight-"))
         weakref.finalize(self, shutil.rmtree, self._folder)
         subprocess.run([*COMPILE, self._folder / "lockstep.so"], check=True)
-        text = (HERE / "betaflight.txt").read_text(encoding="utf-8")
-        lines = (text.partition("# Tuning")[0] if stock else text).splitlines()
+        arming, _, tuning = (HERE / "betaflight.txt").read_text(encoding="utf-8").partition("# Tuning")
+        lines = [*arming.splitlines(), *([] if stock else [*tuning.splitlines()[1:], *gains(vehicle, settings)])]
         setup = self._start(self._folder)
-        setup.configure([f"mixer {mixer}", *(line for line in lines if line[:1] != "#")])
+        setup.configure([f"mixer {mixer}", *lines[1:]])
 
     def reset(self) -> None:
         """Start it anew with its configuration, arm it and let it hover."""
@@ -198,7 +217,8 @@ def main() -> None:
     if given.scenario is None:
         sys.exit(subprocess.call([sys.executable, HERE.parent / "benchmarks/autopilots.py"]))
     scenario = quadsim.load(given.scenario)
-    flight = quadsim.fly(scenario, autopilot=Betaflight(assemble(scenario).vehicle))
+    parts = assemble(scenario)
+    flight = quadsim.fly(scenario, autopilot=Betaflight(parts.vehicle, parts.autopilot))
     print(flight)
     if given.out is not None:
         print("written to", flight.save(given.out))

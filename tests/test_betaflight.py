@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import quadsim
+from quadsim.sim.autopilot import AutopilotSettings
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
@@ -57,6 +58,20 @@ def test_channels_are_degrees_per_second_and_the_root_of_the_thrust(example: Mod
     assert 0.2 + 0.8 * (idling - 1010) / 990 == pytest.approx(0.5, abs=2e-3)
     with pytest.raises(ValueError, match='commands = "rates"'):
         example.channels(np.array([5.0, *rest, 1.0, *rest]), 20.0)
+
+
+def test_the_firmwares_gains_turn_the_vehicle_as_the_built_in_autopilots_do(example: ModuleType) -> None:
+    """A rate error of 1 rad/s accelerates roll at hover by p [1/s], to the firmware's whole numbers."""
+    vehicle = quadsim.load_vehicle("hummingbird")
+    lines = dict(line.split(" = ") for line in example.gains(vehicle, AutopilotSettings(p=(60.0, 50.0, 10.0))))
+    mixer = {"roll": (0, 1, 0, -1), "pitch": (-1, 0, 1, 0), "yaw": (1, -1, 1, -1)}  # of the vehicle's rotors
+    for axis, (name, motors) in enumerate(mixer.items()):
+        share = 0.032029 * int(lines[f"set p_{name}"]) * np.degrees(1.0) / 1000.0 * np.array(motors)
+        h = 1e-6
+        speeds = vehicle.hover_speed + h * share * vehicle.speed_max
+        acceleration = (vehicle.allocation @ speeds**2)[1:] / np.array(vehicle.inertia) / h
+        assert acceleration[axis] == pytest.approx((60.0, 50.0, 10.0)[axis], rel=0.01)
+    assert max(int(value) for value in lines.values()) <= 250
 
 
 def test_every_firmware_has_an_address_of_its_own_or_is_told_that_there_is_none(
