@@ -178,16 +178,18 @@ class Betaflight:
         weakref.finalize(self, shutil.rmtree, self._folder)
         subprocess.run([*COMPILE, self._folder / "lockstep.so"], check=True)
         arming, _, tuning = (HERE / "betaflight.txt").read_text(encoding="utf-8").partition("# Tuning")
-        lines = [*arming.splitlines(), *([] if stock else [*tuning.splitlines()[1:], *gains(vehicle, settings)])]
-        setup = self._start(self._folder)
-        setup.configure([f"mixer {mixer}", *lines[1:]])
+        lines = arming.splitlines()[1:]  # below a comment, as is the tuning
+        if not stock:
+            lines += tuning.splitlines()[1:] + gains(vehicle, settings)
+        self._start(self._folder).configure([f"mixer {mixer}", *lines])
 
     def reset(self) -> None:
         """Start it anew with its configuration, arm it and let it hover."""
-        folder = Path(tempfile.mkdtemp(dir=self._folder))
-        shutil.copy(self._folder / "eeprom.bin", folder)
         self._close()
-        self._firmware = self._start(folder)
+        flight = self._folder / "flight"
+        flight.mkdir(exist_ok=True)
+        shutil.copy(self._folder / "eeprom.bin", flight)
+        self._firmware = self._start(flight)
         low, hover = [1500, 1500, 1000, 1500], channels(self._hover, self._largest_thrust, self._idle)
         for sticks, seconds in (([*low, 1000], 6), ([*low, 2000], 1), (hover, 1)):  # it does not arm in its first 5 s
             for _ in range(100 * seconds):
