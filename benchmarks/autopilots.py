@@ -58,7 +58,10 @@ FLIGHTS: Final[dict[str, dict[str, Any]]] = {
     "circle, rotors at 80 %": {"reference": CIRCLE, "effects": {"rotors": {"efficiency": [0.8] * 4}, "air": {}}},
     "circle, gyro noise 6 deg/s": {"reference": CIRCLE, "sensors": {"rates": {"rate": 1000.0, "noise": 6.0}}},
     "circle, stock gains": {"reference": CIRCLE},
-    "circle, Crazyflie": {"reference": {**CIRCLE, "radius": 1.0, "speed": 1.5}, "vehicle.file": "crazyflie2"},
+    "circle, Crazyflie": {
+        "reference": {**CIRCLE, "radius": 1.0, "speed": 1.5, "ramp": 0.5},
+        "vehicle.file": "crazyflie2",
+    },
 }
 
 
@@ -84,10 +87,9 @@ def measure(quick: bool, report: Progress) -> list[Record]:
     """Each flight through the firmware, twice, and through the built-in autopilot."""
     make = cache(run_path(str(EXAMPLE))["Betaflight"])
     records: list[Record] = []
-    names = ["hover"] if quick else [*FLIGHTS]
-    for i, name in enumerate(names):
-        report("flights", i, len(names))
-        flown = scenario(name)
+    scenarios = {name: scenario(name) for name in (["hover"] if quick else FLIGHTS)}
+    for i, (name, flown) in enumerate(scenarios.items()):
+        report("flights", i, len(scenarios))
         firmware = make(quadsim.load_vehicle(flown.vehicle.file), stock="stock" in name)
         flight, again, builtin = (
             quadsim.fly(flown, autopilot=autopilot, progress=False) for autopilot in (firmware, firmware, None)
