@@ -294,7 +294,7 @@ def tuning() -> Figure:
 def learning() -> Figure:
     """A random agent in turbulence, alone and behind the safety filter."""
     example = run_path(str(ROOT / "examples" / "safety_filter.py"))
-    scenario = example["filtered_air"]("turbulence").replace({"duration": 5.0})
+    scenario = example["filtered_air"]("turbulence").replace({"duration": 4.5})
     flights = {}
     for label in ("random agent", "behind the filter"):
         env: Any = quadsim.gym.make_env(scenario)
@@ -319,17 +319,39 @@ def scenarios() -> Figure:
     return Figure(key="scenarios", title="", panels=(panel,), columns=1)
 
 
+def betaflight() -> Figure:
+    """A step of 1 m in y by one MPC through three autopilots; `make betaflight` builds two of them."""
+    sys.path.append(str(ROOT / "benchmarks"))
+    import autopilots
+
+    make = run_path(str(autopilots.EXAMPLE))["Betaflight"]
+    vehicle = quadsim.load_vehicle("hummingbird")
+    flown = {"built-in": None, "Betaflight": make(vehicle), "stock gains": make(vehicle, stock=True)}
+    steps = autopilots.scenario("steps").replace({"duration": 4.5})
+    flights = {label: quadsim.fly(steps, autopilot=each, progress=False) for label, each in flown.items()}
+    titles = {"y": "a step of 1 m at t = 3 s", "body_rate_x": "roll rate"}
+    panels = tuple(
+        replace(curves(name, flights, title, start=2.5), x_label="time [s]") for name, title in titles.items()
+    )
+    return Figure(key="betaflight", title="", panels=panels)
+
+
 FIGURES: Final[dict[str, Callable[[], Figure]]] = {
     made.__name__: made
     for made in (controllers, linear, robust, nonlinear, effects, space, campaigns, export, tuning, learning, scenarios)
 }
 
+OF_FIRMWARE: Final = {"betaflight": betaflight}
+"""Figures that are drawn only by name: they take a firmware."""
+
 
 def main(names: Sequence[str]) -> None:
-    """Write the figures named, or all."""
+    """Write the figures named, or all of `FIGURES`."""
     figures.STYLE.update(figures.LOOKS)
     for name in names or FIGURES:
-        (figures.ASSETS / f"{name}.svg").write_text(figures.to_svg(FIGURES[name]()), encoding="utf-8")
+        (figures.ASSETS / f"{name}.svg").write_text(
+            figures.to_svg({**FIGURES, **OF_FIRMWARE}[name]()), encoding="utf-8"
+        )
 
 
 if __name__ == "__main__":

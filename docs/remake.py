@@ -30,7 +30,7 @@ from scenarios.schema.scenario import Group
 ROOT: Final = Path(__file__).resolve().parent.parent
 MADE: Final = ROOT / "runs" / "numbers"
 BLOCK: Final = re.compile(r"<!-- (\S+): filled by docs/remake.py from (\S+) -->\n(.*?)<!-- \1 end -->", re.DOTALL)
-BENCHMARKS: Final = ("solvers", "flight", "film", "campaign", "mismatch", "speed")
+BENCHMARKS: Final = ("solvers", "flight", "film", "campaign", "mismatch", "speed", "autopilots")
 CAMPAIGNS: Final = ("paper-robustness", "paper-robustness-robust", "paper-nominal")
 TUNINGS: Final = ("hummingbird-figure-eight", "paper-robust")
 FIGURES: Final = {
@@ -316,7 +316,7 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "campaigns": campaigns,
     "tunings": tunings,
     "solvers": solvers,
-    **dict.fromkeys(("flight", "film", "campaign"), records),
+    **dict.fromkeys(("flight", "film", "campaign", "autopilots"), records),
 }
 
 
