@@ -201,6 +201,12 @@ def test_a_wrong_autopilot_is_refused(scenario: quadsim.Scenario, changes: dict[
         scenario.replace(changes)
 
 
+def test_tables_of_changes_stay_as_they_are(scenario: quadsim.Scenario) -> None:
+    changes = {"effects": {"rotors": {"rise": 0.05}}, "effects.rotors.fall": 0.1}
+    assert scenario.replace(changes).effects.rotors.fall == 0.1  # type: ignore[union-attr]
+    assert changes["effects"] == {"rotors": {"rise": 0.05}}
+
+
 def test_an_unknown_kind_of_command_is_refused(scenario: quadsim.Scenario) -> None:
     class Odd(Rates):
         commands = "velocity"
