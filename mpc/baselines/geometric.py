@@ -233,6 +233,7 @@ class GeometricController(FeedbackLaw):
             self._observer.reset(acting)
             return UNDISTURBED
         self._observer.update(now.time, motion.velocity, motion.attitude, motion.rates, acting)
+        self._observer.log(now)
         return self._observer.foreseen(0.5 * self.settings.period)
 
     def wrench(
