@@ -26,11 +26,11 @@ is a horizontal force,
 
 T is the thrust commanded, at kappa = 1, and each period splits its own d, so that the filters of a_x, a_y and g s, in
 place of those of d, do not act on each other.  A vertical force and a scale cannot be told apart in hover: estimates of
-both drift, one growing against the other.  Where T b_z is less than `LEAST_THRUST` g, d hardly depends on the scale,
-which holds, as does the fit of drag.  The torque of the commands counts kappa times, with the scale that was foreseen
-for the period, by which a controller divides the wrench that it demands.  (a_x, a_y, 0) differs from d by s T b, which
-has no component along the body's x and y axes; so drag is fitted along these two.  Drag along z counts as a change of
-the thrust.
+both drift, one growing against the other.  Where T b_z is less than `OBSERVABLE_THRUST` g, d hardly depends on the
+scale, which holds, as does the fit of drag.  The torque of the commands counts kappa times, with the scale that was
+foreseen for the period, by which a controller divides the wrench that it demands.  (a_x, a_y, 0) differs from d by
+s T b, which has no component along the body's x and y axes; so drag is fitted along these two.  Drag along z counts as
+a change of the thrust.
 
 An autopilot takes collective thrust, which acts with the lag tau_T.  Its mean over a period is then
 
@@ -60,7 +60,7 @@ TORQUE_SHARE: Final = 0.25
 """Default bandwidth of the torque estimate times the control period."""
 FITTED_FROM: Final = 1.0
 """Speed along an axis [m/s] at which the fitted drag explains half of the force."""
-LEAST_THRUST: Final = 0.3
+OBSERVABLE_THRUST: Final = 0.3
 """Vertical thrust as a share of the weight below which the thrust scale holds."""
 LARGEST_CHANGE: Final = 0.7
 """Largest difference of the thrust scale from 1; larger estimates are clipped."""
@@ -187,7 +187,7 @@ class RampObserver:
         holds = False
         if self._scaled:
             g = self._vehicle.gravity
-            if holds := bool(lift[2] < LEAST_THRUST * g):
+            if holds := bool(lift[2] < OBSERVABLE_THRUST * g):
                 self._change[2] = 0.0
             s = self._value[2] / g if holds else missed[2] / lift[2]
             missed[:2], missed[2] = missed[:2] - s * lift[:2], g * s

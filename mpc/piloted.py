@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mpc.handover import hand_over, within
-from quadsim.controller import GROUNDED, AutopilotLoop, Command, Phase, StepInputs, stopped
+from quadsim.controller import GROUNDED, AutopilotLoop, Command, StepInputs, stopped
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
@@ -32,14 +32,13 @@ class Piloted:
         self.name, self.solver, self.horizon = law.name, law.solver, law.horizon
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._slowest = np.full(4, vehicle.speed_min)
-        self._target, self._integrates = self._hover, False
+        self._target, self._fresh = self._hover, True  # the autopilot is reset before its first call
         if hasattr(law, "predict"):
             self.predict = law.predict
 
     def reset(self, speeds: Array) -> None:
         """Restart; the target before the first is hover."""
-        self._target, self._integrates = self._hover, False
-        self.autopilot.reset()
+        self._target, self._fresh = self._hover, True
         self.inner.reset(self._hover.copy())
 
     def adopt(self, previous: object) -> None:
@@ -47,22 +46,21 @@ class Piloted:
         hand_over(self.inner, previous)
         law = within(previous, Piloted)
         if law is not None and isinstance(law.autopilot, type(self.autopilot)):
-            self.autopilot, self._target = law.autopilot, law._target
+            self.autopilot, self._target, self._fresh = law.autopilot, law._target, law._fresh
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the law's target, to be flown by the autopilot; on the ground the rotors stop."""
         command: Command = self.inner.step(replace(now, acting=self._target), state, reference)
-        if now.phase is not Phase.FLYING and self._integrates:  # what stands integrates nothing
-            self.autopilot.reset()
-            self._integrates = False
         if now.phase in GROUNDED:
-            self._target = self._hover
+            self._target, self._fresh = self._hover, True
             return stopped(self._slowest.copy(), self.horizon, now.phase)
         return replace(command, inner=self)
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
         """See `quadsim.controller.InnerLoop`."""
-        self._target, self._integrates = commanded, True
+        if self._fresh:
+            self.autopilot.reset()
+        self._target, self._fresh = commanded, False
         return self.autopilot.speeds(time, commanded, rates, rotors, attitude)
 
     @property

@@ -123,7 +123,7 @@ class InnerLoop(Protocol):
 
     @property
     def rate(self) -> float:
-        """Rate of calls [Hz], a whole number of physics steps apart; the first at the start of each period."""
+        """Rate of calls [Hz], a whole number of physics steps apart, from when it comes into force."""
         ...
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
@@ -132,9 +132,9 @@ class InnerLoop(Protocol):
         Args:
             time: [s].
             commanded: the command in force: rotor speeds (4,) [rad/s], or a target.
-            rates: (3,) body rates [rad/s], of the sensor if there is one.
+            rates: (3,) body rates [rad/s]: true, or for an autopilot those of the sensor, if there is one.
             rotors: (4,) rotor speeds [rad/s].
-            attitude: (4,) quaternion wxyz, body to world, of the sensor if there is one.
+            attitude: (4,) quaternion wxyz, body to world, likewise.
         """
         ...
 

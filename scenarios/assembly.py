@@ -81,7 +81,7 @@ _UNITS: Final = {
     SensorName.RATES: math.radians(1.0),
 }
 """SI units per unit of the scenario file, by sensor."""
-_OF_ALL_EVENTS: Final = ("vehicle", "autopilot", "own_autopilot", "actual", "effects", "course")
+_OF_ALL_EVENTS: Final = ("vehicle", "autopilot", "own_autopilot", "inner_lag", "actual", "effects", "course")
 """Parts that do not depend on events, controller or duration."""
 
 
@@ -320,7 +320,7 @@ class Assembly:
             return law
         return Piloted(law, self.own_autopilot or Autopilot(self.vehicle, self.autopilot), self.vehicle)
 
-    @property
+    @cached_property
     def inner_lag(self) -> tuple[float, ...]:
         """(4,) first-order lags of thrust and body rates [s], by a step on the autopilot."""
         timestep = self.scenario.plant.timestep

@@ -33,7 +33,7 @@ from quadsim.fields import is_plain
 from quadsim.flight.log import RESIDUALS
 from quadsim.sim.effects import Force
 from quadsim.state import Array, State
-from quadsim.vehicle import Vehicle
+from quadsim.vehicle import N_ROTORS, Vehicle
 
 FORM: Final = "package.module:Class"  # form of a controller's name
 ENTRY_POINTS: Final = "quadsim.controllers"
@@ -140,7 +140,7 @@ class PluginController:
         self.name = printable(str(getattr(law, "name", type(law).__name__)))[:200]
         self.solver = printable(str(getattr(law, "solver", "")))[:200]
         self.commands = getattr(law, "commands", ROTORS)
-        if self.commands not in TARGET_SIZES:
+        if not isinstance(self.commands, str) or self.commands not in TARGET_SIZES:
             raise ParameterError("controller", f"{self.name}.commands", self.commands, f"one of {[*TARGET_SIZES]}")
         self._size = TARGET_SIZES[self.commands]
         if hasattr(law, "predict"):
@@ -182,11 +182,18 @@ class PluginController:
             parts["sqp"] = None if answer.sqp is None else SQP(*map(float, answer.sqp))
             parts["speeds"] = _numbers(answer.speeds, (self._size,), "its speeds")
             parts["plan"] = _numbers(answer.plan, (self.horizon, self._size), "its plan")
+            if self._size > N_ROTORS:
+                for row in (parts["speeds"], *parts["plan"]):
+                    if not abs(float(np.linalg.norm(row[N_ROTORS:])) - 1.0) < 1e-6:
+                        raise ValueError("its attitude must be a unit quaternion")
+            if answer.inner is not None and self.commands != ROTORS:
+                raise ValueError("it commands targets, so the autopilot is its inner loop")
             if answer.inner is not None and not answer.inner.rate > 0.0:
                 raise ValueError("its inner loop must have a positive rate")
             return replace(answer, **parts)
         except (AttributeError, TypeError, ValueError) as error:
-            problem = f"{self.name} answered {answer!r:.100}, neither {self._size} numbers nor a Command: {error}"
+            what = "speeds" if self.commands == ROTORS else "numbers of a target"
+            problem = f"{self.name} answered {answer!r:.100}, neither {self._size} {what} nor a Command: {error}"
             raise CommandError(problem, time=now.time) from error
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from mpc.piloted import Piloted
 from quadsim.controller import Command, Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import audit, smallest_margins
@@ -133,6 +134,9 @@ class Rollout:
         if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
             raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
         controller = assembly.controller() if law is None else law
+        if assembly.own_autopilot is not None and not isinstance(controller, Piloted):
+            rule = 'given with a controller that commands thrust and body rates, e.g. commands = "rates"'
+            raise ParameterError("", "autopilot", type(assembly.own_autopilot).__name__, rule)
         for _, spec in scenario.controller_changes:
             assembly.controller(spec)  # checked before the flight, one by one, as each may take megabytes
         self._law = controller.name, controller.solver

@@ -516,7 +516,8 @@ class NonlinearMPC:
             end[1:, Q] = (frames[1:].transpose(0, 2, 1) @ states[:, Q, None])[:, :, 0]
             self._plan = end, plan
             moved = max(np.abs(end - x).max(), np.abs(plan - u).max())
-            if self._targets and k + 1 >= iterations and self._defect(end, plan) <= CONVERGED:
+            defect = self._defect(end, plan)
+            if self._targets and k + 1 >= iterations and defect <= CONVERGED:
                 break
             if iterations > 1:
                 if moved <= self.settings.tolerance:
@@ -533,7 +534,6 @@ class NonlinearMPC:
                 share = min(max(share / max(undone, SHORTEST), SHORTEST), largest)
                 last = step
                 self._plan = x + share * (end - x), u + share * (plan - u)
-        defect = self._defect(end, plan)
         if self._targets and defect > CONVERGED:
             self._plan = None
         return query, answer, problem, SQP(defect, float(moved))

@@ -176,7 +176,8 @@ class PlantLog:
     battery: Array | None = None  # (M, 2) voltage [V] and charge [-] of the step from t on; None without a battery
     attitude: Array | None = None  # (M, 4) true quaternion wxyz; None if Euler angles suffice
     body_rates: Array | None = None  # (M, 3) true body rates [rad/s]; None if Euler angles suffice
-    thrust: Array | None = None  # (M,) collective thrust of the rotors [N]; None without an autopilot
+    thrust: Array | None = None
+    """(M,) collective thrust of the rotors [N], NaN where no autopilot has a target; None without an autopilot."""
 
     def every(self, stride: int) -> PlantLog:
         """Return every `stride`-th row, starting with the first."""

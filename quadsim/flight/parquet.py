@@ -58,7 +58,7 @@ _PLANT: Final[Fields] = {
 _OPTIONAL: Final = frozenset(
     {"truth", "attitude", "body_rates", "sqp", "target", "target_attitude", "wrench", "wind", "battery", "thrust"}
 )
-_GAPS: Final = frozenset({*RESIDUALS, *SQP_RESIDUAL, *TARGET, *TARGET_ATTITUDE})
+_GAPS: Final = frozenset({*RESIDUALS, *SQP_RESIDUAL, *TARGET, *TARGET_ATTITUDE, "thrust"})
 """Columns that are null in some periods."""
 
 _Column = tuple[str, str, pa.Array]

@@ -6,9 +6,10 @@ At its own rate, from measured body rates omega, low-pass filtered to y, and att
     alpha   = p (omega_c - y) + I - d dy/dt,     dI/dt = i (omega_c - y),  |I| <= i_max
     tau     = J alpha + y x J y
 
-and the mixer turns thrust and torque into rotor speeds.  Roll and pitch come first, then as much yaw as fits, then the
-collective thrust, which is shifted until no rotor saturates: airmode.  Without airmode the thrust stays, and torques
-are cut.  An axis that was cut does not integrate.  This is the structure of Betaflight and PX4, in SI units.
+and the mixer turns thrust and torque into rotor speeds.  Roll and pitch come first, then as much yaw as fits into the
+rotors' range beside them, then the collective thrust, which is shifted until no rotor saturates: airmode.  Without
+airmode the thrust stays, and torques are cut.  An axis that was cut does not integrate.  This is the structure of
+Betaflight and PX4, in SI units.
 
 Gains that a file does not state follow from the vehicle (`AutopilotSettings.resolved`).
 """
@@ -25,7 +26,9 @@ import numpy as np
 from annotated_types import Len, doc
 
 from quadsim.controller import AutopilotLoop
+from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Fraction, NonNegative, Positive, filled
+from quadsim.rotation import conjugate, multiply
 from quadsim.sim.effects import Effects
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.sim.physics import inner_steps
@@ -71,10 +74,10 @@ class AutopilotSettings:
         NonNegative | None, doc("[s] from measured rates to rotor commands, whole periods of the loop; absent: one")
     ] = None
     attitude: Annotated[
-        Gains | None, doc("[1/s] gain of the attitude error; absent: a quarter of the rate loop's bandwidth")
+        Gains | None, doc("[1/s] gain of the attitude error; absent: a quarter of the bandwidth that p has by rule")
     ] = None
     largest_rate: Annotated[
-        Gains | None, doc("[deg/s] larger body-rate targets are clipped; absent: 500, 500, 200")
+        Gains | None, doc("[deg/s] clips the body rates that hold an attitude; absent: 500, 500, 200")
     ] = None
     idle: Annotated[
         Fraction | None, doc("[-] slowest rotor, as a share of speed_max; absent: the vehicle's speed_min")
@@ -87,7 +90,7 @@ class AutopilotSettings:
         With T the rotors' rise time plus filter and delay, the loop s^2 T + (1 + d) s + p has the bandwidth
         w = min(40 rad/s, (1 + 2) / (2 zeta T)), for d <= 2, and the damping zeta = 0.7: p = w^2 T, d = 2 zeta w T - 1;
         where T is so short that d would be negative, p = w / (2 zeta).  Yaw, whose reaction torque saturates first,
-        has d = 0 and p = 1 / (2 T), at most that of roll.
+        has d = 0 and p = 1 / (2 T), at most half that of roll.
         """
         usual = filled(
             self, rate=RATE, gyro_cutoff=GYRO_CUTOFF, d_cutoff=D_CUTOFF, largest_rate=LARGEST_RATE, airmode=True
@@ -99,7 +102,7 @@ class AutopilotSettings:
         lag = (vehicle.rotor_rise or 0.0) + filtering + (usual.delay or 0.0) + 0.5 / rate
         w = min(FASTEST, (1.0 + LARGEST_D) / (2.0 * DAMPING * lag))
         p, d = w * max(w * lag, 0.5 / DAMPING), max(2.0 * DAMPING * w * lag - 1.0, 0.0)
-        gains = filled(usual, p=(p, p, min(p, 0.5 / lag)), d=(d, d, 0.0))
+        gains = filled(usual, p=(p, p, min(0.5 * p, 0.5 / lag)), d=(d, d, 0.0))
         assert gains.p is not None
         effect = np.abs(vehicle.allocation[1:]).sum(axis=1) / np.array(vehicle.inertia)
         room = min(vehicle.hover_speed**2 - vehicle.speed_min**2, vehicle.speed_max**2 - vehicle.hover_speed**2)
@@ -120,7 +123,6 @@ class Autopilot:
 
     Attributes:
         settings: resolved.
-        saturated: calls so far in which an axis was cut.
     """
 
     takes_targets: Final = True
@@ -151,6 +153,9 @@ class Autopilot:
         self._inertia, self._coefficient = np.array(vehicle.inertia), vehicle.thrust_coefficient
         self._to_thrusts = np.linalg.inv(vehicle.allocation / vehicle.thrust_coefficient)
         assert settings.idle is not None
+        if settings.idle * vehicle.speed_max >= vehicle.hover_speed:
+            share = vehicle.hover_speed / vehicle.speed_max
+            raise ParameterError("autopilot", "idle", settings.idle, f"below {share:.3g}, at which it hovers")
         slowest, fastest = speeds or (settings.idle * vehicle.speed_max, vehicle.speed_max)
         self._range = self._coefficient * slowest**2, self._coefficient * fastest**2
         self._hover = np.full(N_ROTORS, vehicle.hover_speed)
@@ -160,17 +165,17 @@ class Autopilot:
         """Start anew: no integral, filters at rest, rotors at hover."""
         self._filtered, self._slope, self._integral = np.zeros(3), np.zeros(3), np.zeros(3)
         self._queue: deque[Array] = deque([self._hover] * self._delay)
-        self.saturated = 0
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
         """Return the rotor speeds (4,) [rad/s] until the next call, for the target `commanded` (4,) or (8,)."""
-        wanted = commanded[1:4]
+        target = commanded[1:4]
         if commanded.size > N_ROTORS:
-            wanted = wanted + self._attitude * attitude_error(attitude, commanded[4:])
+            turning = target + self._attitude * attitude_error(attitude, commanded[4:])
+            target = np.minimum(np.maximum(turning, -self._largest), self._largest)
         before, self._filtered = self._filtered, self._filtered + self._gyro_share * (rates - self._filtered)
         y = self._filtered
         self._slope = self._slope + self._d_share * ((y - before) / self._step - self._slope)
-        error = np.minimum(np.maximum(wanted, -self._largest), self._largest) - y
+        error = target - y
         momentum = self._inertia * y
         gyroscopic = np.array(
             [
@@ -183,7 +188,6 @@ class Autopilot:
         thrusts, cut = self.mix(float(commanded[0]), torque)
         integral = self._integral + self._step * self._i * error
         self._integral = np.where(cut, self._integral, np.minimum(np.maximum(integral, -self._i_max), self._i_max))
-        self.saturated += bool(cut.any())
         self._queue.append(np.sqrt(thrusts / self._coefficient))
         return self._queue.popleft()
 
@@ -193,46 +197,32 @@ class Autopilot:
         Each thrust is within the rotors' range; `cut` (3,) says which torques are smaller than demanded.
         """
         low, high = self._range
-        level, tilting = self._to_thrusts[:, 1:3] @ torque[:2], self._to_thrusts[:, 3] * torque[2]
-        base, share = min(max(0.25 * thrust, low), high), 1.0
-        if self.settings.airmode:
-            room = high - low
-            extent = float(level.max() - level.min())
-        else:
-            room, extent = min(base - low, high - base), float(np.abs(level).max())
-        if extent > room:
-            level, share = level * (room / extent), room / extent
-        yaw = self._yaw_share(level, tilting, base)
-        parts = level + yaw * tilting
-        if self.settings.airmode:
+        level, yaw = self._to_thrusts[:, 1:3] @ torque[:2], self._to_thrusts[:, 3] * torque[2]
+        base, airmode = min(max(0.25 * thrust, low), high), self.settings.airmode
+        room = high - low if airmode else min(base - low, high - base)
+        extent = float(level.max() - level.min()) if airmode else float(np.abs(level).max())
+        share = min(1.0, room / extent) if extent else 1.0
+        level = share * level
+        # With airmode the parts need room for their differences alone: the collective thrust yields.
+        rows = [*zip(level.tolist(), yaw.tolist(), strict=True)]
+        pairs = [(a - c, b - d) for a, b in rows for c, d in rows] if airmode else [*rows, *((-a, -b) for a, b in rows)]
+        turn = max(min([1.0, *((room - part) / change for part, change in pairs if change > 0.0)]), 0.0)
+        parts = level + turn * yaw
+        if airmode:
             base = min(max(base, low - float(parts.min())), high - float(parts.max()))
-        return np.minimum(np.maximum(base + parts, low), high), np.array([share < 1.0, share < 1.0, yaw < 1.0])
-
-    def _yaw_share(self, level: Array, yaw: Array, base: float) -> float:
-        """Return the largest share, up to 1, of the yaw parts that fits: collective thrust does not yield to yaw."""
-        low, high = self._range
-        if self.settings.airmode:
-            base = min(max(base, low - float(level.min())), high - float(level.max()))
-        share = 1.0
-        for part, turn in zip((base + level).tolist(), yaw.tolist(), strict=True):
-            if turn:
-                share = min(share, max((high - part) / turn, (low - part) / turn))
-        return max(share, 0.0)
+        return np.minimum(np.maximum(base + parts, low), high), np.array([share < 1.0, share < 1.0, turn < 1.0])
 
 
 def attitude_error(attitude: Array, target: Array) -> Array:
     """(3,) 2 vec(q* q_c), the shorter way: the rotation from q to q_c, wxyz, about body axes [rad], to first order."""
-    w, x, y, z = attitude.tolist()
-    a, b, c, d = target.tolist()
-    sign = 2.0 if w * a + x * b + y * c + z * d >= 0.0 else -2.0
-    return sign * np.array(
-        [w * b - x * a - y * d + z * c, w * c + x * d - y * a - z * b, w * d - x * c + y * b - z * a]
-    )
+    w, *vector = multiply(conjugate(tuple(attitude.tolist())), tuple(target.tolist()))
+    return math.copysign(2.0, w) * np.array(vector)
 
 
 STEPS: Final = (0.1, 1.0, 1.0, 0.5)
 """Steps by which lags are identified: of the weight, and of body rates [rad/s]."""
 WINDOW: Final = 0.3  # time of a step response that is fitted [s]
+SHORTEST_LAG, LONGEST_LAG = 1e-4, 0.6  # [s]
 
 
 def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float = 1e-3) -> tuple[float, ...]:
@@ -254,13 +244,17 @@ def identify_lags(vehicle: Vehicle, autopilot: AutopilotLoop, *, timestep: float
             def misfit(lag: float, response: Array = response) -> float:
                 return float(np.square(1.0 - np.exp(-times / lag) - response).sum())
 
-            lags.append(float(minimize_scalar(misfit, bounds=(timestep, 2.0 * WINDOW), method="bounded").x))
+            lag = float(minimize_scalar(misfit, bounds=(SHORTEST_LAG, LONGEST_LAG), method="bounded").x)
+            if lag > 0.95 * LONGEST_LAG:
+                name = ("thrust", "p", "q", "r")[axis]
+                raise InputError(f"autopilot: a step of {name} is not reached, so no lag fits it; state inner_lag")
+            lags.append(lag)
     return tuple(lags)
 
 
 def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
     """(WINDOW / timestep,) the share of a step of a target, 0 thrust, 1 to 3 body rates, that is reached."""
-    vehicle, stride = plant.vehicle, inner_steps(autopilot.rate, plant.timestep)
+    vehicle, stride = plant.vehicle, inner_steps(autopilot.rate, plant.timestep, "autopilot")
     weight = vehicle.mass * vehicle.gravity
     target, size = np.array([weight, 0.0, 0.0, 0.0]), STEPS[axis] * (weight if axis == 0 else 1.0)
     plant.reset(np.zeros(N_STATES))

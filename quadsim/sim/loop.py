@@ -139,7 +139,9 @@ class ClosedLoop:
         self._lowest = float(initial_state[INDEX["z"]])
         self._acting = self._initial_speeds  # the command in force, flown by an inner loop, and the rotor speeds of it
         self._inner: InnerLoop | None = None
-        self._speeds = self._initial_speeds
+        self._speeds = self._answer = self._initial_speeds
+        self._called: InnerLoop | None = None  # the inner loop called last, and the physics steps until its next call
+        self._until_call = 0
         self._plan, self._age = self._acting[None], 0  # the last plan that came in time, and how many periods ago
         self._observed: Observation | None = None
         self._samples: list[FlownPeriod] | None = [] if recorded else None
@@ -347,11 +349,16 @@ class ClosedLoop:
             return
         with _ending_flight(plant.time):
             stride = inner_steps(inner.rate, plant.timestep)
-        for first in range(0, steps, stride):
-            attitude, rates = plant.attitude if self._navigation is None else self._navigation.sensed()
-            with _ending_flight(plant.time):
-                commanded = inner.speeds(plant.time, row, rates, plant.speeds, attitude)
-            yield plant.advance(commanded, min(stride, steps - first)), plant.applied(commanded)
+        measured = self._navigation if getattr(inner, "takes_targets", False) else None
+        while steps > 0:
+            if self._called is not inner or self._until_call == 0:
+                attitude, rates = plant.attitude if measured is None else measured.sensed()
+                with _ending_flight(plant.time):
+                    self._answer = inner.speeds(plant.time, row, rates, plant.speeds, attitude)
+                self._called, self._until_call = inner, stride
+            count = min(self._until_call, steps)
+            self._until_call, steps = self._until_call - count, steps - count
+            yield plant.advance(self._answer, count), plant.applied(self._answer)
 
 
 def fly(

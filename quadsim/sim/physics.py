@@ -29,14 +29,14 @@ def steps_per_period(control_period: float, timestep: float) -> int:
     return whole("scenario", "control_period", control_period, control_period / timestep, rule)
 
 
-def inner_steps(rate: float, timestep: float) -> int:
+def inner_steps(rate: float, timestep: float, owner: str = "controller.inner") -> int:
     """Return the number of physics steps between two calls of an inner loop.
 
     Raises:
         ParameterError: it is not a whole, positive number.
     """
     rule = f"such that 1 / rate is a whole multiple of the physics step of {timestep} s"
-    return whole("controller.inner", "rate", rate, 1.0 / (rate * timestep), rule)
+    return whole(owner, "rate", rate, 1.0 / (rate * timestep), rule)
 
 
 def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
@@ -143,8 +143,8 @@ def flight_log(
         physics = np.concatenate([start[None], *(sample.segment.physics for sample in samples)])
         plant = replace(plant, attitude=physics[:, 4:8], body_rates=physics[:, 11:14])
     if control.target is not None:
-        thrusts = [sample.segment.thrust for sample in samples if sample.segment.thrust is not None]
-        plant = replace(plant, thrust=np.concatenate([*thrusts, thrusts[-1][-1:]]))
+        thrust = np.concatenate([_thrusts(sample) for sample in samples])
+        plant = replace(plant, thrust=np.append(thrust, thrust[-1]))
     return FlightLog(control=control, timing=_timing_log(samples, control.t), plant=plant)
 
 
@@ -194,6 +194,12 @@ def _control_log(samples: Sequence[FlownPeriod], initial_speeds: Array, period: 
         target_attitude=None if target is None or np.isnan(target[:, 4:]).all() else target[:, 4:],
         logged=stacked([s for o in observed if isinstance(s := o.moment.signals, LoggedSignals)]),
     )
+
+
+def _thrusts(sample: FlownPeriod) -> Array:
+    """(M,) collective thrust over the steps of a period [N]; NaN where no autopilot has a target."""
+    thrust = sample.segment.thrust
+    return np.full(len(sample.segment.physics), math.nan) if sample.target is None or thrust is None else thrust
 
 
 def _targets(samples: Sequence[FlownPeriod]) -> Array | None:

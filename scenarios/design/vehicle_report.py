@@ -252,13 +252,12 @@ def _abilities(sheet: VehicleSheet) -> list[tuple[str, ...]]:
 
 
 def _autopilot(report: VehicleReport) -> list[tuple[str, ...]]:
-    settings, (thrust, *rates) = report.autopilot, (1e3 * lag for lag in report.inner_lag)
+    settings = report.autopilot
     gains = {"p": "1/s", "i": "1/s^2", "d": "-", "i_max": "rad/s^2", "attitude": "1/s"}
     return [
         *((f"{name}, roll, pitch, yaw", _listed(getattr(settings, name)), unit) for name, unit in gains.items()),
         ("rate", format_number(settings.rate or 0.0), "Hz"),
-        ("lag of body rates, roll, pitch, yaw", _listed(rates), "ms"),
-        ("lag of thrust", format_number(thrust), "ms"),
+        ("inner_lag, thrust, roll, pitch, yaw", _listed(report.inner_lag), "s"),
     ]
 
 

@@ -13,6 +13,7 @@ from quadsim.assets import vehicle_path
 from quadsim.controller import StepInputs
 from quadsim.errors import InputError
 from quadsim.rotation import conjugate, multiply
+from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from quadsim.state import Array, State
 from quadsim.vehicle import Vehicle
 from scenarios.assembly import Assembly
@@ -207,12 +208,72 @@ def test_tables_of_changes_stay_as_they_are(scenario: quadsim.Scenario) -> None:
     assert changes["effects"] == {"rotors": {"rise": 0.05}}
 
 
-def test_an_unknown_kind_of_command_is_refused(scenario: quadsim.Scenario) -> None:
+@pytest.mark.parametrize("kind", ["velocity", ["rates"]])
+def test_an_unknown_kind_of_command_is_refused(scenario: quadsim.Scenario, kind: object) -> None:
     class Odd(Rates):
-        commands = "velocity"
+        commands = kind  # type: ignore[assignment]
 
     with pytest.raises(InputError, match="commands must be one of"):
         quadsim.fly(scenario, controller=Odd, progress=False)
+
+
+@pytest.mark.parametrize("attitude", [[0.0, 0.0, 0.0, 0.0], [3.0, 0.0, 0.0, 0.0]])
+def test_an_attitude_is_a_unit_quaternion(scenario: quadsim.Scenario, attitude: list[float]) -> None:
+    class Odd(Attitude):
+        def step(self, now: StepInputs, state: State, reference: Array) -> Any:
+            return [7.0, 0.0, 0.0, 0.0, *attitude]
+
+    flight = quadsim.fly(scenario, controller=Odd, progress=False)
+    assert flight.log.reason is not None
+    assert "its attitude must be a unit quaternion" in flight.log.reason
+
+
+class Counting(Autopilot):
+    """The built-in autopilot, counting."""
+
+    resets = calls = 0
+
+    def reset(self) -> None:
+        self.resets += 1
+        super().reset()
+
+    def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
+        self.calls += 1
+        return super().speeds(time, commanded, rates, rotors, attitude)
+
+
+MPC = {"type": "nonlinear", "commands": "rates", "horizon": 20, "terminal": "lqr"}
+
+
+def test_a_controller_that_takes_over_leaves_the_autopilot_flying(scenario: quadsim.Scenario) -> None:
+    event = {"type": "controller", "at": 0.2, "fields": {"tilt": 30.0}}
+    changes = {"controller": MPC, "duration": 0.4, "events": [event], "initial.position": [0.0, 0.0, 0.0]}
+    autopilot = Counting(quadsim.load_vehicle("hummingbird"))
+    assert quadsim.fly(scenario.replace(changes), autopilot=autopilot, progress=False).satisfied
+    identified = autopilot.calls - 400
+    assert identified == 4 * 300  # once, before the flight
+    assert autopilot.resets == 1 + 4 + 1  # built, identified, flown
+
+
+def test_an_autopilot_of_ones_own_needs_a_controller_of_targets(scenario: quadsim.Scenario) -> None:
+    with pytest.raises(InputError, match="autopilot must be given with a controller that commands thrust"):
+        quadsim.fly(scenario, autopilot=Counting(quadsim.load_vehicle("hummingbird")), progress=False)
+
+
+def test_thrust_is_not_bounded_on_the_ground() -> None:
+    take_off = quadsim.load("take-off-and-landing").replace({"controller": MPC})
+    flight = quadsim.fly(take_off, progress=False)
+    assert flight.log.plant.thrust is not None
+    assert np.isnan(flight.log.plant.thrust).any()
+    finding = {finding.limit.signal: finding for finding in flight.findings}["thrust"]
+    assert finding.worst_margin > -5.0  # not the whole weight
+
+
+def test_the_autopilot_is_called_at_its_rate_also_where_commands_are_late(scenario: quadsim.Scenario) -> None:
+    autopilot = Counting(quadsim.load_vehicle("hummingbird"), AutopilotSettings(rate=500.0))
+    late = {"controller": {**MPC, "inner_lag": [0.02, 0.04, 0.04, 0.05]}, "duration": 1.0, "computation.delay": 0.005}
+    quadsim.fly(scenario.replace(late), autopilot=autopilot, progress=False)
+    assert autopilot.calls == pytest.approx((1.0 - 0.005) * 500.0, abs=1.0)
 
 
 @pytest.mark.parametrize("law", [{"type": "nonlinear", "horizon": 10, "node": 0.04}, {"type": "geometric"}])
@@ -221,7 +282,7 @@ def test_the_thrust_scale_that_is_logged_is_the_share_that_a_battery_leaves(
 ) -> None:
     """(V / V0)^2, which falls by a tenth; the estimate tracks it, and one that is not asked for is not logged."""
     battery = {"cells": 3, "capacity": 0.005, "resistance": 0.1, "charge": 0.9}
-    controller = {**law, "commands": "rates", "disturbance": {"thrust_scale": True}}
+    controller = {**law, "commands": "rates", "disturbance": {}}
     changes = {"controller": controller, "effects.battery": battery, "duration": 1.5, "initial.position": [0.0] * 3}
     flight = quadsim.fly(scenario.replace(changes), progress=False)
     log, settled = flight.log.plant, flight.time > 0.5
@@ -229,5 +290,7 @@ def test_the_thrust_scale_that_is_logged_is_the_share_that_a_battery_leaves(
     share = np.square(log.battery[np.searchsorted(log.t, flight.time - 1e-9), 0] / 12.6)[settled]
     assert share[-1] < share[0] - 0.05
     np.testing.assert_allclose(flight.logged["thrust_scale"][settled], share, rtol=0.02)
-    force = scenario.replace({**changes, "controller": {**controller, "disturbance": {}}, "duration": 0.1})
+    force = scenario.replace(
+        {**changes, "controller": {**controller, "disturbance": {"thrust_scale": False}}, "duration": 0.1}
+    )
     assert "thrust_scale" not in quadsim.fly(force, progress=False).logged
