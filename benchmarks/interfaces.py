@@ -146,9 +146,7 @@ def draw(records: Sequence[Record], path: Path) -> None:
             for panel, course in zip(axes[:2], COURSES, strict=True):
                 if record[course] is not None:
                     half = record[f"{course}_half"] or 0.0
-                    panel.errorbar(
-                        100.0 * record[course], y, xerr=100.0 * half, fmt="o", capsize=3, **look
-                    )
+                    panel.errorbar(100.0 * record[course], y, xerr=100.0 * half, fmt="o", capsize=3, **look)
             axes[2].plot(100.0 * record["violated"], y, "o", **look)
             if record["lost"]:
                 note = f"lost {record['lost']} of {record['flights']}"
