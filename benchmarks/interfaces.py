@@ -35,6 +35,7 @@ Row = tuple[str, str]  # vehicle and controller
 CONDITIONS: Final = read_toml(Path(__file__).with_suffix(".toml"))
 COURSES: Final = ("circle", "steps")
 SEEDS: Final = 16
+LEAST_MARGIN: Final = -10.0  # worse margins are drawn there [deg]
 QUICK: Final = ("hummingbird", ("rotors 20 Hz", "rates 20 Hz", "geometric, rates"), 1)  # vehicle, controllers, seeds
 
 
@@ -130,40 +131,44 @@ def measure(quick: bool, workers: int | None, report: Progress) -> list[Record]:
 
 
 def draw(records: Sequence[Record], path: Path) -> None:
-    """Draw errors, violations and step times, a line for each controller, a row of panels for each vehicle."""
+    """Draw errors, worst margins and step times, a line for each controller, a row of panels for each vehicle."""
     import matplotlib.pyplot as plt
 
     vehicles = list(dict.fromkeys(record["vehicle"] for record in records))
-    titles = ("circle: RMS error [cm]", "steps of 1 m: RMS error [cm]", "tilt violated [% of flights]", "step [ms]")
-    size = (12.0, 0.6 + 3.0 * len(vehicles))
-    figure, panels = plt.subplots(len(vehicles), 4, sharey=True, sharex="col", squeeze=False, figsize=size)
+    titles = (
+        *("circle: RMS error [cm]", "steps of 1 m: RMS error [cm]"),
+        *("worst margin of tilt [deg]; violated", "step: median to p99 [ms]"),
+    )
+    size = (12.5, 0.6 + 2.9 * len(vehicles))
+    figure, panels = plt.subplots(len(vehicles), 4, sharex="col", squeeze=False, figsize=size)
     for axes, vehicle in zip(panels, vehicles, strict=True):
         selected = [record for record in records if record["vehicle"] == vehicle]
         for y, record in enumerate(selected):
-            name = record["controller"]
-            colour = "C2" if name.startswith("geometric") else "C0" if "rotors" in name else "C1"
-            look: Table = {"color": colour, "markersize": 5}
+            name, n = record["controller"], record["flights"]
+            look: Table = {"color": "C2" if name.startswith("geometric") else "C0" if "rotors" in name else "C1"}
             for panel, course in zip(axes[:2], COURSES, strict=True):
                 if record[course] is not None:
-                    half = record[f"{course}_half"] or 0.0
-                    panel.errorbar(100.0 * record[course], y, xerr=100.0 * half, fmt="o", capsize=3, **look)
-            axes[2].plot(100.0 * record["violated"], y, "o", **look)
-            if record["lost"]:
-                note = f"lost {record['lost']} of {record['flights']}"
-                axes[2].annotate(note, (50.0, y), va="center", ha="center", fontsize=8)
-            axes[3].plot([record["p50_ms"], record["p99_ms"]], [y, y], "-", color=colour)
-            axes[3].plot(record["p50_ms"], y, "o", **look)
-            axes[3].plot(record["p99_ms"], y, "|", **look)
-        axes[0].set_yticks(range(len(selected)), [record["controller"] for record in selected])
-        axes[0].invert_yaxis()
-        axes[0].set_ylabel(vehicle, fontsize=11)
-        axes[2].set_xlim(-5.0, 105.0)
-        axes[3].set_xscale("log")
+                    half = 100.0 * (record[f"{course}_half"] or 0.0)
+                    panel.errorbar(100.0 * record[course], y, xerr=half, fmt="o", capsize=3, markersize=5, **look)
+            axes[2].plot(max(record["worst_margin"], LEAST_MARGIN), y, "o", markersize=5, **look)
+            lost = f", lost {record['lost']}" if record["lost"] else ""
+            note = f"{round(n * record['violated'])} of {n}{lost}"
+            axes[2].annotate(note, (0.98, y), xycoords=("axes fraction", "data"), va="center", ha="right", fontsize=8)
+            axes[3].plot([record["p50_ms"], record["p99_ms"]], [y, y], "-", **look)
+            axes[3].plot(record["p50_ms"], y, "o", markersize=5, **look)
         for panel in axes:
+            panel.set_yticks(range(len(selected)), [""] * len(selected))
+            panel.set_ylim(len(selected) - 0.5, -0.5)
             panel.grid(axis="x", alpha=0.3)
+        axes[0].set_yticklabels([record["controller"] for record in selected])
+        axes[0].set_ylabel(vehicle, fontsize=11)
+        axes[2].axvline(0.0, color="black", linewidth=0.8)
+        axes[2].set_xlim(LEAST_MARGIN - 1.0, 40.0)
+        axes[3].set_xscale("log")
+        axes[3].xaxis.set_major_formatter("{x:g}")
     for panel, title in zip(panels[0], titles, strict=True):
         panel.set_title(title, loc="left", fontsize=10)
-    for panel in panels[:, 0]:
+    for panel in panels[-1, :2]:
         panel.set_xlim(left=0.0)
     figure.tight_layout()
     figure.savefig(path, dpi=150)

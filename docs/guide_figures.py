@@ -18,6 +18,7 @@ import quadsim
 import quadsim.gym
 from quadsim.flight.audit import SIGNALS
 from quadsim.report.figure import BOUND, LINES, OBSTACLE, REFERENCE, Area, Band, Bound, Figure, Panel, Series, outlines
+from quadsim.sim.effects.battery import LIPO
 from quadsim.state import POSITION
 
 ROOT: Final = Path(__file__).resolve().parent.parent
@@ -197,6 +198,35 @@ def effects() -> Figure:
     return Figure(key="effects", title="", panels=panels)
 
 
+def battery() -> Figure:
+    """Thrust and body rates as a battery runs down, under three observers: distance from the course, thrust scale."""
+    small = {"cells": 3, "capacity": 0.03, "resistance": 0.1, "charge": 0.8}
+    changes = {"effects.battery": small, "effects.rotors": {}, "reference.acceleration": 0.5, **FREE}
+    observers = {
+        "no observer": {"controller.disturbance": None},
+        "force": {"controller.disturbance.thrust_scale": False},
+        "thrust scale": {},
+    }
+    flights = {label: fly("autopilot", {**changes, **observer}) for label, observer in observers.items()}
+    missed = []
+    for colour, (label, flight) in zip((ORANGE, GREEN, BLUE), flights.items(), strict=True):
+        away = np.linalg.norm([flight.state[axis] - flight.reference[axis] for axis in "xyz"], axis=0)
+        missed.append(Series(x=flight.time, y=100.0 * away, colour=colour, label=label))
+    scaled = flights["thrust scale"]
+    log = scaled.log.plant
+    assert log.battery is not None
+    share = np.square(log.battery[:, 0] / (3 * LIPO[-1][1]))
+    scale = (
+        Series(x=log.t, y=share, colour=REFERENCE, label="(V / V0)^2"),
+        Series(x=scaled.time, y=scaled.logged["thrust_scale"], colour=BLUE, label="estimate"),
+    )
+    panels = (
+        Panel(title="distance from the course [cm]", y_label="distance", series=tuple(missed)),
+        Panel(title="thrust scale", series=scale),
+    )
+    return Figure(key="battery", title="", panels=panels)
+
+
 def clipped(lines: Sequence[Series], start: float, stop: float) -> tuple[Series, ...]:
     """The part of curves from `start` to `stop`."""
     shown = [(line, (line.x >= start) & (line.x <= stop)) for line in lines]
@@ -294,7 +324,7 @@ def tuning() -> Figure:
 def learning() -> Figure:
     """A random agent in turbulence, alone and behind the safety filter."""
     example = run_path(str(ROOT / "examples" / "safety_filter.py"))
-    scenario = example["filtered_air"]("turbulence").replace({"duration": 5.0})
+    scenario = example["filtered_air"]("turbulence").replace({"duration": 4.5})
     flights = {}
     for label in ("random agent", "behind the filter"):
         env: Any = quadsim.gym.make_env(scenario)
@@ -319,17 +349,52 @@ def scenarios() -> Figure:
     return Figure(key="scenarios", title="", panels=(panel,), columns=1)
 
 
+def betaflight() -> Figure:
+    """A step of 1 m in y by one MPC through three autopilots; `make betaflight` builds two of them."""
+    sys.path.append(str(ROOT / "benchmarks"))
+    import autopilots
+
+    make = run_path(str(autopilots.EXAMPLE))["Betaflight"]
+    vehicle = quadsim.load_vehicle("hummingbird")
+    flown = {"built-in": None, "Betaflight": make(vehicle), "stock gains": make(vehicle, stock=True)}
+    steps = autopilots.scenario("steps").replace({"duration": 4.5})
+    flights = {label: quadsim.fly(steps, autopilot=each, progress=False) for label, each in flown.items()}
+    titles = {"y": "a step of 1 m at t = 3 s", "body_rate_x": "roll rate"}
+    panels = tuple(
+        replace(curves(name, flights, title, start=2.5), x_label="time [s]") for name, title in titles.items()
+    )
+    return Figure(key="betaflight", title="", panels=panels)
+
+
 FIGURES: Final[dict[str, Callable[[], Figure]]] = {
     made.__name__: made
-    for made in (controllers, linear, robust, nonlinear, effects, space, campaigns, export, tuning, learning, scenarios)
+    for made in (
+        controllers,
+        linear,
+        robust,
+        nonlinear,
+        effects,
+        battery,
+        space,
+        campaigns,
+        export,
+        tuning,
+        learning,
+        scenarios,
+    )
 }
+
+OF_FIRMWARE: Final = {"betaflight": betaflight}
+"""Figures that are drawn only by name: they take a firmware."""
 
 
 def main(names: Sequence[str]) -> None:
-    """Write the figures named, or all."""
+    """Write the figures named, or all of `FIGURES`."""
     figures.STYLE.update(figures.LOOKS)
     for name in names or FIGURES:
-        (figures.ASSETS / f"{name}.svg").write_text(figures.to_svg(FIGURES[name]()), encoding="utf-8")
+        (figures.ASSETS / f"{name}.svg").write_text(
+            figures.to_svg({**FIGURES, **OF_FIRMWARE}[name]()), encoding="utf-8"
+        )
 
 
 if __name__ == "__main__":

@@ -31,8 +31,14 @@ from scenarios.schema.scenario import Group
 ROOT: Final = Path(__file__).resolve().parent.parent
 MADE: Final = ROOT / "runs" / "numbers"
 BLOCK: Final = re.compile(r"<!-- (\S+): filled by docs/remake.py from (\S+) -->\n(.*?)<!-- \1 end -->", re.DOTALL)
-BENCHMARKS: Final = ("solvers", "flight", "film", "campaign", "mismatch", "speed", "interfaces")
+BENCHMARKS: Final = ("solvers", "flight", "film", "campaign", "mismatch", "speed", "autopilots", "interfaces")
 CAMPAIGNS: Final = ("paper-robustness", "paper-robustness-robust", "paper-nominal")
+BATTERIES: Final = {
+    "battery-none": ("none", ["battery", "--set", "controller.disturbance.largest_force=1e-6"]),
+    "battery": ("a force of three axes", ["battery"]),
+    "battery-thrust-scale": ("the thrust's scale", ["battery-thrust-scale"]),
+}
+"""Of each campaign on a battery, what the observer estimates, and the arguments of `quadsim campaign`."""
 TUNINGS: Final = ("hummingbird-figure-eight", "paper-robust")
 FIGURES: Final = {
     "campaign-paper-nominal.png": "runs/campaigns/paper-nominal/campaign.png",
@@ -64,7 +70,7 @@ Row = Sequence[object]
 
 
 def commands(name: str) -> list[list[str]]:
-    """What makes the files of a name: a benchmark, `papers`, `first-flights`, `campaigns`, `tunings` or `pictures`."""
+    """What makes the files of a name: a benchmark, `papers`, `first-flights`, `campaigns`, `battery`, `tunings`, ..."""
     python, quadsim = sys.executable, str(Path(sys.executable).with_name("quadsim"))
     match name:
         case "papers":
@@ -83,6 +89,12 @@ def commands(name: str) -> list[list[str]]:
             return [[python, f"docs/{script}", *rest] for script, *rest in scripts]
         case "campaigns":
             return [[quadsim, "campaign", each, "--out", f"runs/campaigns/{each}", "--resume"] for each in CAMPAIGNS]
+        case "battery":
+            flown = {each: arguments for each, (_, arguments) in BATTERIES.items()}
+            return [
+                [quadsim, "campaign", *arguments, "--out", f"runs/campaigns/{each}", "--resume"]
+                for each, arguments in flown.items()
+            ]
         case "tunings":
             return [[quadsim, "tune", each, "--out", f"runs/tunings/{each}", "--resume"] for each in TUNINGS]
         case _:
@@ -92,7 +104,7 @@ def commands(name: str) -> list[list[str]]:
 def make(name: str) -> None:
     """Run the commands of a name; what prints its JSON has it saved."""
     MADE.mkdir(parents=True, exist_ok=True)
-    tells = name in (*BENCHMARKS, "campaigns", "tunings")  # how far it is
+    tells = name in (*BENCHMARKS, "campaigns", "battery", "tunings")  # how far it is
     for command in commands(name):
         with reporting(not tells) as report:
             report(name, 0, 1)
@@ -248,6 +260,20 @@ def campaigns(summaries: dict[str, Any]) -> str:
     return markdown(("campaign", "flights", "failed", "lost", "violated or lost", "95 % interval of its share"), rows)
 
 
+def batteries(summaries: dict[str, Any]) -> str:
+    """How many flights on a battery failed, and by which constraint, with their largest errors of height."""
+    rows = []
+    for name, (estimate, _) in BATTERIES.items():
+        found = summaries[name]
+        height = found["metrics"]["max_error.z"]
+        held = (found["constraints"][f"hold_{axis}"]["not_satisfied"]["count"] for axis in "xyz")
+        thrust = found["constraints"]["thrust"]["not_satisfied"]["count"]
+        errors = (f"{100.0 * height[size]:.1f} cm" for size in ("p50", "max"))
+        rows.append((estimate, f"{found['events']['failure']['count']} of {found['flights']}", *held, thrust, *errors))
+    beyond = ("x beyond 5 cm", "y beyond 5 cm", "height beyond 5 cm", "thrust beyond its bounds")
+    return markdown(("estimate", "failed", *beyond, "largest error of height: median", "and most"), rows)
+
+
 def tunings(summaries: dict[str, Any]) -> str:
     """What the shipped tunings found, on fresh draws."""
     rows = []
@@ -344,16 +370,17 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "export": export,
     "first-flights": first_flights,
     "campaigns": campaigns,
+    "battery": batteries,
     "tunings": tunings,
     "solvers": solvers,
     "interfaces": interfaces,
-    **dict.fromkeys(("flight", "film", "campaign"), records),
+    **dict.fromkeys(("flight", "film", "campaign", "autopilots"), records),
 }
 
 
 def read(name: str, source: str) -> Any:
     """A file's JSON, with `*` that of each campaign or tuning, by its name; None where a file is not there."""
-    members = {"campaigns": CAMPAIGNS, "tunings": TUNINGS}.get(name, (name,))
+    members = {"campaigns": CAMPAIGNS, "battery": tuple(BATTERIES), "tunings": TUNINGS}.get(name, (name,))
     paths = {each: ROOT / source.replace("*", each) for each in members}
     if not all(path.is_file() for path in paths.values()):
         return None
@@ -379,7 +406,7 @@ def filled(text: str) -> tuple[str, list[str]]:
 def main() -> None:
     """Make what was named, then fill every page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = [*BENCHMARKS, "papers", "first-flights", "campaigns", "tunings", "pictures"]
+    names = [*BENCHMARKS, "papers", "first-flights", "campaigns", "battery", "tunings", "pictures"]
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(names))
     chosen = parser.parse_args().names
     if unknown := sorted({*chosen} - {*names}):

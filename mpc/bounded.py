@@ -52,8 +52,8 @@ LARGEST_HORIZON: Final = 1000
 MOST_ENTRIES: Final = 1000  # most entries in a list of tables
 USUAL_TILT: Final = 10.0
 """Default limit of the fallback's tilt [deg], for a controller without a bound on tilt."""
-USUAL_THRUST: Final = (0.1, 0.9)
-"""Default bounds on a target of collective thrust, as shares of the vehicle's largest."""
+LEAST_THRUST, MOST_THRUST = 0.5, 0.9
+"""Default bounds on a target of collective thrust: shares of the weight, and of the largest; see `TargetBounds`."""
 _FALLBACK_SHARE: Final = 0.8
 """Fallback tilt as a share of the tightest bound on it, so that the controller resumes within its bounds."""
 _SMALLEST_TILT: Final = (
@@ -137,8 +137,8 @@ class TargetBounds:
     thrust: Annotated[
         Pair | None,
         doc(
-            f"[N] collective; absent: {100 * USUAL_THRUST[0]:g} and {100 * USUAL_THRUST[1]:g} % of the vehicle's "
-            "largest, which leaves the rotors a range for torques"
+            f"[N] collective, around the weight; absent: {100 * LEAST_THRUST:g} % of the weight to "
+            f"{100 * MOST_THRUST:g} % of the largest, at least half way to it: the rest is for torques"
         ),
     ] = None
     body_rate: Annotated[Rates, doc("[deg/s] largest magnitude, one or about body x, y, z")] = (300.0, 300.0, 90.0)
@@ -151,8 +151,14 @@ class TargetBounds:
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """Return the bounds on collective thrust [N] and on each body rate [deg/s]."""
-        largest = N_ROTORS * vehicle.thrust_coefficient * vehicle.speed_max**2
-        lower, upper = self.thrust or (USUAL_THRUST[0] * largest, USUAL_THRUST[1] * largest)
+        largest, weight = N_ROTORS * vehicle.thrust_coefficient * vehicle.speed_max**2, vehicle.mass * vehicle.gravity
+        lower, upper = self.thrust or (
+            LEAST_THRUST * weight,
+            max(MOST_THRUST * largest, 0.5 * (weight + largest)),
+        )
+        if not lower < weight < upper:
+            rule = f"below and above the weight, {weight:.4g} N"
+            raise ParameterError("controller", "target_bounds.thrust", [lower, upper], rule)
         rates = np.broadcast_to(np.asarray(self.body_rate, float), 3).tolist()
         sides = {f"body_rate_{axis}": (-rate, rate) for axis, rate in zip("xyz", rates, strict=True)}
         return {"thrust": (lower, upper), **sides}

@@ -49,6 +49,7 @@ import numpy as np
 from annotated_types import doc
 from numpy.typing import ArrayLike
 
+from quadsim.controller import StepInputs
 from quadsim.fields import NonNegative, Positive
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -219,6 +220,11 @@ class RampObserver:
             return 1.0
         change = (self._value[2] + self._period * self._change[2]) / self._vehicle.gravity
         return 1.0 + min(max(float(change), -LARGEST_CHANGE), LARGEST_CHANGE)
+
+    def log(self, now: StepInputs) -> None:
+        """Log the thrust scale, where it is estimated, as `thrust_scale`."""
+        if self._scaled:
+            now.log("thrust_scale", self.thrust_scale)
 
     @property
     def drag(self) -> Array:

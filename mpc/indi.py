@@ -34,6 +34,7 @@ from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from mpc.answer import ActuatorBounds
+    from mpc.disturbance import RampSettings
 
 DAMPING: Final = math.sqrt(0.5)
 """Damping of the second-order Butterworth low-pass filter, as in Tal and Karaman."""
@@ -45,6 +46,16 @@ class INDISettings:
 
     rate: Annotated[Positive, doc("[Hz] inner loop; its period is a whole number of physics steps")] = 500.0
     cutoff: Annotated[Positive, doc("[Hz] cutoff of the filter on measured angular accelerations and torques")] = 30.0
+
+
+def require_one_scale(indi: INDISettings | None, disturbance: RampSettings | None) -> None:
+    """Refuse INDI with a disturbance observer's thrust scale.
+
+    Raises:
+        ValueError: both are given.
+    """
+    if indi is not None and disturbance is not None and disturbance.thrust_scale:
+        raise ValueError("disturbance.thrust_scale must be false where indi is given: both make up for torque lost")
 
 
 class TorqueIncrement:

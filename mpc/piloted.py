@@ -32,13 +32,13 @@ class Piloted:
         self.name, self.solver, self.horizon = law.name, law.solver, law.horizon
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._slowest = np.full(4, vehicle.speed_min)
-        self._target = self._hover
+        self._target, self._integrates = self._hover, False
         if hasattr(law, "predict"):
             self.predict = law.predict
 
     def reset(self, speeds: Array) -> None:
         """Restart; the target before the first is hover."""
-        self._target = self._hover
+        self._target, self._integrates = self._hover, False
         self.autopilot.reset()
         self.inner.reset(self._hover.copy())
 
@@ -52,8 +52,9 @@ class Piloted:
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the law's target, to be flown by the autopilot; on the ground the rotors stop."""
         command: Command = self.inner.step(replace(now, acting=self._target), state, reference)
-        if now.phase is not Phase.FLYING:  # what stands integrates nothing
+        if now.phase is not Phase.FLYING and self._integrates:  # what stands integrates nothing
             self.autopilot.reset()
+            self._integrates = False
         if now.phase in GROUNDED:
             self._target = self._hover
             return stopped(self._slowest.copy(), self.horizon, now.phase)
@@ -61,7 +62,7 @@ class Piloted:
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
         """See `quadsim.controller.InnerLoop`."""
-        self._target = commanded
+        self._target, self._integrates = commanded, True
         return self.autopilot.speeds(time, commanded, rates, rotors, attitude)
 
     @property

@@ -33,7 +33,7 @@ from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target
 from mpc.bounded import Range, Seconds, TargetBounds
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import within
-from mpc.indi import Incremental, INDISettings
+from mpc.indi import Incremental, INDISettings, require_one_scale
 from mpc.model import target_model
 from mpc.nonlinear.model import zero
 from mpc.obstacles import Shape
@@ -233,6 +233,7 @@ class GeometricController(FeedbackLaw):
             self._observer.reset(acting)
             return UNDISTURBED
         self._observer.update(now.time, motion.velocity, motion.attitude, motion.rates, acting)
+        self._observer.log(now)
         return self._observer.foreseen(0.5 * self.settings.period)
 
     def wrench(
@@ -397,6 +398,7 @@ class Geometric(Tuned):
 
     def __post_init__(self) -> None:
         self._require_space()
+        require_one_scale(self.indi, self.disturbance)
         if any(self.drag) and not self.feedforward:
             raise ParameterError("", "drag", [*self.drag], "zero where feedforward is not true")
         if self.feedforward and self.horizon <= PREVIEW_DEGREE:

@@ -354,6 +354,7 @@ class NonlinearMPC:
                 self._learn(last, now.time, measured)
             if self._ramp is not None:
                 self._follow(self._ramp, now.time, measured)
+                self._ramp.log(now)
             self._last = now.time, measured
         nodes = self._balanced(nodes)
         start = {"_plan": self._plan, "_acting": self._acting, "_model": self._model}

@@ -41,8 +41,10 @@ N_BODY: Final = 13
 P, Q, V, W = slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 13)
 _TURNING: Final = 10
 """Rows and columns of (q, v, omega), on which the derivatives depend."""
-RATE_SCALE: Final = 10.0
-"""The body rate [rad/s] that is a share of 1, where inputs are targets."""
+RATE_SCALE: Final = 1.5
+"""The body rate [rad/s] that is a share of 1, where inputs are targets, beside the weight as thrust.  Shares of the
+largest would be penalised too little: where noise reaches the controller, rates then move by hundreds of deg/s, for
+which the mixer raises the thrust."""
 _q, _v, _w = slice(0, 4), slice(4, 7), slice(7, 10)
 
 
@@ -52,7 +54,7 @@ class Inputs(StrEnum):
     THRUST = "thrust"
     SPEED = "speed"
     RATES = "rates"
-    """Collective thrust, as a share of the largest, and body rates, as shares of `RATE_SCALE`."""
+    """Collective thrust, as a share of the weight, and body rates, as shares of `RATE_SCALE`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +110,7 @@ class RigidBody:
     @property
     def scale(self) -> Array:
         """(4,) the target [N], [rad/s] that is a share of 1."""
-        return np.array([N_ROTORS * self.largest_thrust, RATE_SCALE, RATE_SCALE, RATE_SCALE])
+        return np.array([self.mass * self.gravity, RATE_SCALE, RATE_SCALE, RATE_SCALE])
 
     def thrusts(self, shares: Array) -> Array:
         """Return the rotor thrusts [N] for inputs, or for the rotors' states."""

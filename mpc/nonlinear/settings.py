@@ -37,7 +37,7 @@ from mpc.bounded import (
 )
 from mpc.constraints import Constraint
 from mpc.disturbance import RampSettings
-from mpc.indi import INDISettings
+from mpc.indi import INDISettings, require_one_scale
 from mpc.model import SHORTEST_LAG, target_model
 from mpc.nonlinear.rigidbody import RATE_SCALE, Inputs
 from mpc.observer import ObserverSettings
@@ -82,7 +82,7 @@ class Weights:
         Weight,
         doc(
             "[-] weight of the inputs' distance from the reference, as shares of the rotors' largest; of targets, as "
-            f"shares of the largest collective thrust and of {RATE_SCALE:g} rad/s"
+            f"shares of the weight and of {RATE_SCALE:g} rad/s"
         ),
     ] = 0.1
     move: Annotated[NonNegative, doc("[-] weight of the inputs' change from node to node, as shares")] = 0.0
@@ -243,6 +243,7 @@ class Nonlinear(ControllerTable):
             raise ParameterError("", "weights.attitude", self.weights.attitude, rule)
         if self.offset_free is not None and self.disturbance is not None:
             raise ValueError("disturbance must be absent where offset_free is given: both estimate the same force")
+        require_one_scale(self.indi, self.disturbance)
         for name, pair in self.output_bounds.items():
             if name not in LINEAR:
                 rule = f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
@@ -259,12 +260,12 @@ class Nonlinear(ControllerTable):
         """Reject fields of the other space of commands: rotor speeds, or targets."""
         if self.commands == "rotors":
             others: dict[str, object] = {"inner_lag": None, "target_bounds": USUAL_TARGETS}
-            reason = 'rotors, without an inner loop: commands = "rates"'
+            reason = "rotor speeds pass no autopilot, whose lags and targets these are"
         else:
             others = {"inputs": "thrust", "rotor_lag": 0.0, "indi": None, "input_bounds": VEHICLES_SPEEDS}
-            reason = "an inner loop, to which rotors belong: inner_lag and target_bounds describe it"
+            reason = "the autopilot turns the rotors; inner_lag and target_bounds describe it"
             if self.disturbance is not None and self.disturbance.rotor_lag is not None:
-                raise ValueError(f'disturbance.rotor_lag must be absent where commands = "rates", which go to {reason}')
+                raise ValueError(f'disturbance.rotor_lag must be absent where commands = "rates": {reason}')
             speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
             if speeds:
                 raise ValueError(f'polytopes must be without rotor speeds where commands = "rates"; got {speeds}')
@@ -273,7 +274,7 @@ class Nonlinear(ControllerTable):
                     raise ParameterError("", "inner_lag", self.inner_lag, f"0, or at least {SHORTEST_LAG:g} s, each")
         for name, usual in others.items():
             if getattr(self, name) != usual:
-                raise ValueError(f'{name} must be absent where commands = "{self.commands}", which go to {reason}')
+                raise ValueError(f'{name} must be absent where commands = "{self.commands}": {reason}')
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `mpc.bounded.ControllerTable.audited`."""

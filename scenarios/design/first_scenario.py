@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from mpc.baselines.bandwidths import lag_to_allow_for
-from mpc.bounded import SHORTEST_LAG
+from mpc.model import SHORTEST_LAG
 from quadsim.errors import UnknownNameError, printable
 from quadsim.vehicle import Vehicle
 from scenarios.design.rules import (

@@ -19,6 +19,7 @@ from mpc.export.ctext import CText, Precision
 from mpc.export.source import CHANGES, DATA, CController, part
 from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
+from quadsim.controller import ROTORS
 from quadsim.errors import ExportError, ParameterError
 from quadsim.outputs import absolute, reserving, writing
 from quadsim.state import N_STATES, POSITION, VELOCITY, Array
@@ -182,7 +183,10 @@ def exported_law(scenario: Scenario) -> Exportable:
     """
     controller, shapes = scenario.controller, (*scenario.obstacles, *scenario.regions)
     if not isinstance(controller, Weighted):
-        raise ExportError(f"it is {controller.type!r}; exported are unconstrained, constrained and robust")
+        commands = getattr(controller, "commands", ROTORS)
+        how = "" if commands == ROTORS else f' with commands = "{commands}"'
+        exported = "exported are unconstrained, constrained and robust, whose matrices are fixed"
+        raise ExportError(f"it is {controller.type!r}{how}; {exported}")
     return controller.exportable(Assembly(scenario).vehicle, scenario.control_period, shapes)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
@@ -55,7 +56,7 @@ def set_field(data: dict[str, Any], path: str, value: Any, *, source: str, given
     if isinstance(holder, dict) and value is None:
         holder.pop(last, None)
     elif isinstance(holder, dict):
-        holder[last] = value
+        holder[last] = copy.deepcopy(value)  # later changes must not reach the caller's tables
     else:
         _require_numbers(holder, path, source=source, given=given or path)
         holder[_index(holder, ".".join(through), last)] = value

@@ -21,6 +21,7 @@ from quadsim.vehicle import Vehicle
 
 STEP = 0.002
 OFFSET = (0.3, -0.2, 0.05)  # [N m]
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def turn(vehicle: Vehicle, torque: Array, duration: float, cutoff: float = 30.0) -> tuple[Array, Array]:
@@ -30,7 +31,7 @@ def turn(vehicle: Vehicle, torque: Array, duration: float, cutoff: float = 30.0)
     commanded = vehicle.hover_speed + np.array([1.0, -0.5, -0.5, 0.5])
     rates, modelled, rotors = np.array([0.4, 0.2, -0.3]), np.array([0.4, 0.2, -0.3]), commanded
     for k in range(round(duration / STEP)):
-        rotors = loop.speeds(k * STEP, commanded, rates, rotors)
+        rotors = loop.speeds(k * STEP, commanded, rates, rotors, LEVEL)
         for _ in range(20):
             rates = rates + STEP / 20 * ((M @ rotors**2)[1:] + torque - np.cross(rates, J * rates)) / J
             modelled = modelled + STEP / 20 * ((M @ commanded**2)[1:] - np.cross(modelled, J * modelled)) / J

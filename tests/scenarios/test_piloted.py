@@ -201,9 +201,33 @@ def test_a_wrong_autopilot_is_refused(scenario: quadsim.Scenario, changes: dict[
         scenario.replace(changes)
 
 
+def test_tables_of_changes_stay_as_they_are(scenario: quadsim.Scenario) -> None:
+    changes = {"effects": {"rotors": {"rise": 0.05}}, "effects.rotors.fall": 0.1}
+    assert scenario.replace(changes).effects.rotors.fall == 0.1  # type: ignore[union-attr]
+    assert changes["effects"] == {"rotors": {"rise": 0.05}}
+
+
 def test_an_unknown_kind_of_command_is_refused(scenario: quadsim.Scenario) -> None:
     class Odd(Rates):
         commands = "velocity"
 
     with pytest.raises(InputError, match="commands must be one of"):
         quadsim.fly(scenario, controller=Odd, progress=False)
+
+
+@pytest.mark.parametrize("law", [{"type": "nonlinear", "horizon": 10, "node": 0.04}, {"type": "geometric"}])
+def test_the_thrust_scale_that_is_logged_is_the_share_that_a_battery_leaves(
+    scenario: quadsim.Scenario, law: dict[str, Any]
+) -> None:
+    """(V / V0)^2, which falls by a tenth; the estimate tracks it, and one that is not asked for is not logged."""
+    battery = {"cells": 3, "capacity": 0.005, "resistance": 0.1, "charge": 0.9}
+    controller = {**law, "commands": "rates", "disturbance": {"thrust_scale": True}}
+    changes = {"controller": controller, "effects.battery": battery, "duration": 1.5, "initial.position": [0.0] * 3}
+    flight = quadsim.fly(scenario.replace(changes), progress=False)
+    log, settled = flight.log.plant, flight.time > 0.5
+    assert log.battery is not None
+    share = np.square(log.battery[np.searchsorted(log.t, flight.time - 1e-9), 0] / 12.6)[settled]
+    assert share[-1] < share[0] - 0.05
+    np.testing.assert_allclose(flight.logged["thrust_scale"][settled], share, rtol=0.02)
+    force = scenario.replace({**changes, "controller": {**controller, "disturbance": {}}, "duration": 0.1})
+    assert "thrust_scale" not in quadsim.fly(force, progress=False).logged

@@ -136,6 +136,12 @@ def test_campaigns_on_the_same_draws_differ_in_their_controller_alone() -> None:
     assert {field.partition(".")[0] for field, *_ in plan_differences(paper, robust)} == {"controller"}
 
 
+def test_the_campaigns_on_a_battery_differ_in_what_the_observer_estimates() -> None:
+    force, scale = load_plan("battery"), load_plan("battery-thrust-scale")
+    assert [force.identity(k) for k in range(20)] == [scale.identity(k) for k in range(20)]
+    assert [field for field, *_ in plan_differences(force, scale)] == ["controller.disturbance.thrust_scale"]
+
+
 def test_the_nominal_campaign_is_of_small_errors_at_the_papers_own_tolerance() -> None:
     """Its controller, its bounds and its tolerance at them; lag to 8 ms, mass within 5 %, perfect sensors."""
     nominal, paper = load_plan("paper-nominal"), load_scenario("paper-constrained")
