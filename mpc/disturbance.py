@@ -85,12 +85,12 @@ class RampSettings:
         doc("[s] rotor time constant; absent: that of the controller's prediction, or 0"),
     ] = None
     thrust_scale: Annotated[
-        bool,
+        bool | None,
         doc(
             "true: a vertical misfit scales the thrust, as a battery's charge does, and only a horizontal one is a "
-            "force; false: a force along three axes"
+            "force; false: a force along three axes; absent: true where an autopilot takes the commands"
         ),
-    ] = False
+    ] = None
     largest_force: Annotated[Positive, doc("[m/s^2] larger estimates are clipped")] = 20.0
     largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 100.0
 
@@ -118,7 +118,8 @@ class RampObserver:
         pole = np.exp(-period * np.repeat([force, torque], 3))
         self._gain, self._gain_of_change = 1.0 - pole**2, (1.0 - pole) ** 2 / period
         self._largest = np.repeat([settings.largest_force, settings.largest_torque], 3)
-        self._scaled, self._thrust_lag = settings.thrust_scale, thrust_lag
+        self._thrust_lag, scaled = thrust_lag, settings.thrust_scale
+        self._scaled = thrust_lag is not None if scaled is None else scaled
         if self._scaled:
             self._largest[2] = LARGEST_CHANGE * vehicle.gravity
         if thrust_lag is not None:

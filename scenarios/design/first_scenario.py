@@ -242,8 +242,7 @@ tilt = {_tilt(tuning)}  # deg, the bound of the linear controllers
 
 [controller.soft]
 
-[controller.disturbance]  # unknown forces and drag are estimated and compensated,
-thrust_scale = true  # and how much thrust the rotors give for a command: batteries sag
+[controller.disturbance]  # unknown force, drag, and how much thrust the rotors give for a command: batteries sag
 """
 
 
