@@ -87,27 +87,27 @@ def undisturbed() -> Iterator[None]:
 
 
 class Stopwatch:
-    """Seconds since it was made, and those that watched calls took."""
+    """Seconds since it was made, and those that watched calls took, by a clock such as `time.thread_time`."""
 
-    def __init__(self) -> None:
-        self._started = clock.perf_counter()
+    def __init__(self, now: Callable[[], float] = clock.perf_counter) -> None:
+        self._now, self._started = now, now()
         self.laps: dict[str, list[float]] = {}  # [s] of each call, by its name
 
     @property
     def elapsed(self) -> float:
         """Seconds since it was made."""
-        return clock.perf_counter() - self._started
+        return self._now() - self._started
 
     def watch(self, owner: object, method: str, name: str) -> None:
         """Have each call of a method leave its seconds in `laps[name]`."""
         function, laps = getattr(owner, method), self.laps.setdefault(name, [])
 
         def timed(*arguments: Any, **named: Any) -> Any:
-            started = clock.perf_counter()
+            started = self._now()
             try:
                 return function(*arguments, **named)
             finally:
-                laps.append(clock.perf_counter() - started)
+                laps.append(self._now() - started)
 
         setattr(owner, method, timed)
 

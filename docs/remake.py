@@ -2,7 +2,7 @@
 
 A table stands between `<!-- NAME: filled by docs/remake.py from FILE -->` and `<!-- NAME end -->`.  Golden numbers are
 in the repository, under tests/golden; all other files are made by a command, under runs/.  A table whose file is not
-there stays as it is.  The records of three benchmarks are kept as CSV, docs/data.
+there stays as it is.  The records of four benchmarks are kept as CSV, docs/data.
 
     python docs/remake.py                    # fill all tables from the files that are there
     python docs/remake.py speed mismatch     # run the commands that make these files first
@@ -23,6 +23,7 @@ from typing import Any, Final, get_args
 
 from PIL import Image
 
+from scenarios.campaign.statistics import interval
 from scenarios.loading import load_scenario
 from scenarios.progress import reporting
 from scenarios.schema.scenario import Group
@@ -30,7 +31,7 @@ from scenarios.schema.scenario import Group
 ROOT: Final = Path(__file__).resolve().parent.parent
 MADE: Final = ROOT / "runs" / "numbers"
 BLOCK: Final = re.compile(r"<!-- (\S+): filled by docs/remake.py from (\S+) -->\n(.*?)<!-- \1 end -->", re.DOTALL)
-BENCHMARKS: Final = ("solvers", "flight", "film", "campaign", "mismatch", "speed", "autopilots")
+BENCHMARKS: Final = ("solvers", "flight", "film", "campaign", "mismatch", "speed", "autopilots", "interfaces")
 CAMPAIGNS: Final = ("paper-robustness", "paper-robustness-robust", "paper-nominal")
 BATTERIES: Final = {
     "battery-none": ("none", ["battery", "--set", "controller.disturbance.largest_force=1e-6"]),
@@ -41,7 +42,7 @@ BATTERIES: Final = {
 TUNINGS: Final = ("hummingbird-figure-eight", "paper-robust")
 FIGURES: Final = {
     "campaign-paper-nominal.png": "runs/campaigns/paper-nominal/campaign.png",
-    **{f"{name}.png": f"runs/numbers/{name}.png" for name in ("solvers", "mismatch", "speed")},
+    **{f"{name}.png": f"runs/numbers/{name}.png" for name in ("solvers", "mismatch", "speed", "interfaces")},
 }
 """Pictures of docs/, and the files that they are copies of."""
 COLOURS: Final = 128
@@ -298,6 +299,35 @@ def solvers(data: Any) -> str:
     return markdown(("scenario", "solver", "p50 [ms]", "p99 [ms]", "p50, ratio", "p99, ratio"), rows)
 
 
+def interfaces(data: Any) -> str:
+    """How each law does through each interface."""
+    rows = []
+    for row in _records(data):
+        errors = (_with_half(row[course], row[f"{course}_half"]) for course in ("circle", "steps"))
+        lost = f"{row['lost']} of {row['flights']}, {interval(row['lost_from'], row['lost_to'])}"
+        held = f"{100.0 * row['violated']:.0f} %", f"{row['worst_margin']:+.1f}"
+        rows.append(
+            (row["vehicle"], row["controller"], *errors, lost, *held, *(f"{row[k]:.1f}" for k in ("p50_ms", "p99_ms")))
+        )
+    head = (
+        "vehicle",
+        "controller",
+        "circle [cm]",
+        "steps [cm]",
+        "lost, 95 % interval",
+        "tilt violated",
+        "worst margin [deg]",
+    )
+    return markdown((*head, "step: median [ms]", "p99 [ms]"), rows)
+
+
+def _with_half(mean: float | None, half: float | None) -> str:
+    """A mean error in centimetres, with half its interval."""
+    if mean is None:
+        return "-"
+    return f"{100.0 * mean:.1f}" if half is None else f"{100.0 * mean:.1f} ± {100.0 * half:.1f}"
+
+
 def records(data: Any) -> str:
     """A benchmark's records, one a row, under their keys."""
     rows = _records(data)
@@ -343,6 +373,7 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "battery": batteries,
     "tunings": tunings,
     "solvers": solvers,
+    "interfaces": interfaces,
     **dict.fromkeys(("flight", "film", "campaign", "autopilots"), records),
 }
 
@@ -387,7 +418,7 @@ def main() -> None:
         page.write_text(text, encoding="utf-8")
         for source in missing:
             print(f"{page.relative_to(ROOT)}: stays as it is without {source}")
-    for name in ("mismatch", "solvers", "speed"):
+    for name in ("mismatch", "solvers", "speed", "interfaces"):
         write_csv(name)
     for name, drawn in FIGURES.items():
         if (ROOT / drawn).is_file():

@@ -81,6 +81,16 @@ def test_nonlinear_mpc_follows_where_lqr_does_not(tmp_path: Path) -> None:
     assert (tmp_path / "speed.png").is_file()
 
 
+def test_rates_fly_as_rotor_speeds_do(tmp_path: Path) -> None:
+    records = {record["controller"]: record for record in quick("interfaces", tmp_path)}
+    assert not any(record["lost"] for record in records.values())
+    assert records["rates 20 Hz"]["circle"] < 1.5 * records["rotors 20 Hz"]["circle"]
+    for record in records.values():
+        assert record["circle"] < record["steps"]
+        assert record["p50_ms"] <= record["p99_ms"] <= record["max_ms"]
+    assert (tmp_path / "interfaces.png").is_file()
+
+
 def test_wrong_input_is_one_message(tmp_path: Path) -> None:
     done = script("benchmarks/solvers.py", "--scenario", "hover-pid", "--json", tmp_path / "out.json")
     assert done.returncode == 2
