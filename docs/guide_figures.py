@@ -198,6 +198,34 @@ def effects() -> Figure:
     return Figure(key="effects", title="", panels=panels)
 
 
+def autopilot() -> Figure:
+    """The first seconds of the targets of the scenario `autopilot`, and what was flown."""
+    log = fly("autopilot", FREE).log
+    target, rates, thrust = log.control.target, log.plant.body_rates, log.plant.thrust
+    assert target is not None
+    assert rates is not None
+    panels = [
+        Panel(
+            title=title,
+            unit=unit,
+            series=clipped(
+                (
+                    Series(x=log.plant.t, y=flown, colour=BLUE, label="flown"),
+                    Series(x=log.control.t, y=demanded, colour=ORANGE, label="target", style="steps"),
+                ),
+                0.3,
+                1.3,
+            ),
+            x_label="time [s]",
+        )
+        for title, unit, flown, demanded in (
+            ("thrust", "N", thrust, target[:, 0]),
+            ("pitch rate", "deg/s", np.degrees(rates[:, 1]), np.degrees(target[:, 2])),
+        )
+    ]
+    return Figure(key="autopilot", title="", panels=tuple(panels))
+
+
 def battery() -> Figure:
     """Thrust and body rates as a battery runs down, under three observers: distance from the course, thrust scale."""
     small = {"cells": 3, "capacity": 0.03, "resistance": 0.1, "charge": 0.8}
@@ -374,6 +402,7 @@ FIGURES: Final[dict[str, Callable[[], Figure]]] = {
         robust,
         nonlinear,
         effects,
+        autopilot,
         battery,
         space,
         campaigns,

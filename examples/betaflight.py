@@ -37,6 +37,7 @@ LAYOUTS = {  # azimuth [deg] and spin of the firmware's motors 1 to 4: flight/mi
 }
 SCALES = {"p": 3.2029e-5, "i": 2.44381e-4, "d": 5.29e-7}  # motors' share per unit, deg/s, deg and deg/s^2: flight/pid.h
 AXES = ("roll", "pitch", "yaw")
+LARGEST_GAIN = 250  # that its command line takes
 STOCK_IDLE = 0.055  # of the motors' range
 PATIENCE = 20.0  # s, of the wall clock
 
@@ -60,7 +61,10 @@ def gains(vehicle: quadsim.Vehicle, settings: AutopilotSettings | None = None) -
     resolved, lines = (settings or AutopilotSettings()).resolved(vehicle), []
     for name, scale in SCALES.items():
         numbers = getattr(resolved, name) / (np.degrees(scale) * effect)
-        lines += [f"set {name}_{axis} = {min(round(x), 250)}" for axis, x in zip(AXES, numbers, strict=True)]
+        if numbers.max() > LARGEST_GAIN:
+            cut = f"{name} of {vehicle.name} is cut from {numbers.max():.0f} to {LARGEST_GAIN}, the firmware's largest"
+            print(cut, file=sys.stderr)
+        lines += [f"set {name}_{axis} = {min(round(x), LARGEST_GAIN)}" for axis, x in zip(AXES, numbers, strict=True)]
     return lines
 
 
@@ -102,8 +106,12 @@ class Firmware:
             self.process = subprocess.Popen(command, cwd=folder, env=environment, pass_fds=ends, stdout=log, stderr=log)
         for end in ends:
             os.close(end)
-        self._await(b"d")
-        self.run(1.0)  # by then its sockets are bound
+        try:
+            self._await(b"d")
+            self.run(1.0)  # by then its sockets are bound
+        except RuntimeError:
+            self.close()
+            raise
 
     def run(self, seconds: float) -> None:
         """Let its clock advance."""
@@ -134,7 +142,7 @@ class Firmware:
                     raise RuntimeError(f"Betaflight refuses {line.strip()!r}: {answer}")
             cli.sendall(b"save\n")
             with contextlib.suppress(RuntimeError):  # until it has ended
-                while True:
+                for _ in range(round(1e3 * PATIENCE)):
                     self.run(0.001)
 
     def close(self) -> None:

@@ -328,6 +328,13 @@ class Assembly:
             return identify_lags(self.vehicle, self.own_autopilot, timestep=timestep)
         return own_lags(self.vehicle, self.autopilot or AutopilotSettings(), timestep)
 
+    @property
+    def autopilot_flown(self) -> dict[str, Any]:
+        """What flew the targets: the class of an autopilot passed in, or `built-in`, and the lags that the law knew."""
+        name = "built-in" if self.own_autopilot is None else type(self.own_autopilot).__name__
+        lag = getattr(self.scenario.controller, "inner_lag", None) or vars(self).get("inner_lag")
+        return {"name": name, **({} if lag is None else {"inner_lag": [*lag]})}
+
     def problem(self) -> Problem:
         """The controller's optimisation.
 

@@ -484,6 +484,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
             "solver": flight.solver,
             "horizon": scenario.controller.horizon,
             **numbers["controller"],
+            **({} if log.control.target is None else {"autopilot": flight.assembly.autopilot_flown}),
         },
         **({"computation": metrics.computation(log.control)} if flown and flight.assembly.computation() else {}),
         **({"estimation": estimation} if estimation else {}),

@@ -249,7 +249,11 @@ def test_a_controller_that_takes_over_leaves_the_autopilot_flying(scenario: quad
     event = {"type": "controller", "at": 0.2, "fields": {"tilt": 30.0}}
     changes = {"controller": MPC, "duration": 0.4, "events": [event], "initial.position": [0.0, 0.0, 0.0]}
     autopilot = Counting(quadsim.load_vehicle("hummingbird"))
-    assert quadsim.fly(scenario.replace(changes), autopilot=autopilot, progress=False).satisfied
+    flight = quadsim.fly(scenario.replace(changes), autopilot=autopilot, progress=False)
+    assert flight.satisfied
+    flown = flight.summary["controller"]["autopilot"]
+    assert flown["name"] == "Counting"
+    assert flown["inner_lag"] == pytest.approx([0.0137, 0.0333, 0.0333, 0.05], abs=0.005)
     identified = autopilot.calls - 400
     assert identified == 4 * 300  # once, before the flight
     assert autopilot.resets == 1 + 4 + 1  # built, identified, flown
