@@ -9,6 +9,7 @@ import pytest
 
 import quadsim
 from quadsim.assets import vehicle_path
+from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.vehicle import OPTIONAL_PARAMETERS, VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.cli import main
 from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
@@ -65,7 +66,10 @@ def test_the_template_documents_every_parameter() -> None:
         assert tables[name]["unit"] == unit
         meaning = (fields_of(Vehicle)[name].description or "").partition("] ")[2]
         assert f"{name}: {meaning} Find it: " in text
-    assert text.count("May be left out:") == len(OPTIONAL_PARAMETERS)
+    assert text.count("May be left out:") == len(OPTIONAL_PARAMETERS) + 1  # and the autopilot, commented out
+    autopilot = tomllib.loads(TEMPLATE[TEMPLATE.index("# [autopilot]") :].replace("# ", ""))["autopilot"]
+    assert autopilot["source"]
+    assert AutopilotSettings(p=tuple(autopilot["p"])).p == (30.0, 30.0, 10.0)
 
 
 def test_the_command_reports_them_where_a_scenario_is_named(capsys: pytest.CaptureFixture[str]) -> None:
