@@ -9,7 +9,7 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
@@ -20,7 +20,7 @@ from mpc.obstacles import AvoidanceSettings, Shape, Space
 from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
 from mpc.solvers import ALIASES, CORE_OR_PIQP, SOLVERS, Solver, find_solver, make_solver
-from quadsim.controller import CORE, Controller
+from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ExportError, MissingCoreError, ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number, Pair, Positive, Weight
 from quadsim.state import (
@@ -171,6 +171,39 @@ class TargetBounds:
         lower, upper = np.array([thrust, *np.radians(rates)]).T
         steps = np.full(N_ROTORS, math.inf)
         return ActuatorBounds(u_min=lower, u_max=upper, delta_min=-steps, delta_max=steps, targets=True)
+
+
+USUAL_TARGETS: Final = TargetBounds()
+
+
+def require_space(table: Any, of_rotors: Mapping[str, object]) -> None:
+    """Refuse fields of the other space of commands: those `of_rotors` with an autopilot, of its targets without one.
+
+    `of_rotors` has the names of fields and the values that say nothing; a lag may be 0, or at least `SHORTEST_LAG`.
+
+    Raises:
+        ValueError: a field is given that does not act.
+    """
+    if table.commands == ROTORS:
+        others: Mapping[str, object] = {"inner_lag": None, "target_bounds": USUAL_TARGETS}
+        reason = "rotor speeds pass no autopilot, whose lags and targets these are"
+    else:
+        others, reason = of_rotors, "the autopilot turns the rotors; inner_lag and target_bounds describe it"
+        if table.disturbance is not None and table.disturbance.rotor_lag is not None:
+            raise ValueError(f'disturbance.rotor_lag must be absent where commands = "{table.commands}": {reason}')
+        if any(0.0 < lag < SHORTEST_LAG for lag in table.inner_lag or ()):
+            raise ParameterError("", "inner_lag", table.inner_lag, f"0, or at least {SHORTEST_LAG:g} s, each")
+    for name, usual in others.items():
+        if getattr(table, name) != usual:
+            raise ValueError(f'{name} must be absent where commands = "{table.commands}": {reason}')
+
+
+def require_lags(inner_lag: tuple[float, ...] | None) -> tuple[float, ...]:
+    """Return the lags of an autopilot; raises ParameterError where there are none."""
+    if inner_lag is None:
+        rule = "four time constants [s]: give them, or identify them on the vehicle's autopilot before it is built"
+        raise ParameterError("controller", "inner_lag", None, rule)
+    return inner_lag
 
 
 @dataclass(frozen=True, kw_only=True)

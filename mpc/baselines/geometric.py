@@ -30,7 +30,7 @@ from mpc.baselines.attitude import (
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
 from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
-from mpc.bounded import Range, Seconds, TargetBounds
+from mpc.bounded import USUAL_TARGETS, Range, Seconds, TargetBounds, require_lags, require_space
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import within
 from mpc.indi import Incremental, INDISettings, require_one_scale
@@ -44,7 +44,6 @@ from quadsim.rotation import multiply
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 
-USUAL_TARGETS: Final = TargetBounds()
 Commands: TypeAlias = Literal["rotors", "rates", "attitude"]
 
 
@@ -397,29 +396,13 @@ class Geometric(Tuned):
     target_bounds: Annotated[TargetBounds, doc('only where commands is not "rotors"')] = USUAL_TARGETS
 
     def __post_init__(self) -> None:
-        self._require_space()
+        require_space(self, {"input_bounds": None, "indi": None})
         require_one_scale(self.indi, self.disturbance)
         if any(self.drag) and not self.feedforward:
             raise ParameterError("", "drag", [*self.drag], "zero where feedforward is not true")
         if self.feedforward and self.horizon <= PREVIEW_DEGREE:
             rule = f"at least {PREVIEW_DEGREE + 1} where feedforward is true"
             raise ParameterError("", "horizon", self.horizon, rule)
-
-    def _require_space(self) -> None:
-        """Reject fields of the other space of commands: rotor speeds, or targets."""
-        others: dict[str, object] = {"inner_lag": None, "target_bounds": USUAL_TARGETS}
-        reason = "rotor speeds pass no autopilot, whose lags and targets these are"
-        if self.commands != "rotors":
-            others = {"input_bounds": None, "indi": None}
-            reason = "the autopilot turns the rotors: target_bounds limits its targets, and it is the inner loop"
-            if self.disturbance is not None and self.disturbance.rotor_lag is not None:
-                rule = f'absent where commands = "{self.commands}": inner_lag takes its place'
-                raise ParameterError("", "disturbance.rotor_lag", self.disturbance.rotor_lag, rule)
-        for name, usual in others.items():
-            if getattr(self, name) != usual:
-                raise ParameterError(
-                    "", name, getattr(self, name), f'absent where commands = "{self.commands}": {reason}'
-                )
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `mpc.bounded.ControllerTable.audited`."""
@@ -429,10 +412,7 @@ class Geometric(Tuned):
         """See `mpc.bounded.ControllerTable.build`."""
         shared = self.shared(vehicle, period)
         if self.commands != "rotors":
-            if self.inner_lag is None:
-                rule = "four time constants [s]: give them, or identify them on the vehicle's autopilot"
-                raise ParameterError("controller", "inner_lag", None, rule)
-            shared |= {"inner_lag": self.inner_lag, "bounds": self.target_bounds.actuators(vehicle)}
+            shared |= {"inner_lag": require_lags(self.inner_lag), "bounds": self.target_bounds.actuators(vehicle)}
         settings = geometric_settings(
             vehicle,
             lag=self.lag,

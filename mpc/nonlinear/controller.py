@@ -22,8 +22,10 @@ import numpy as np
 import scipy.linalg
 
 from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused
+from mpc.bounded import USUAL_TARGETS
 from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver
+from mpc.equilibrium import LEAST_LIFT, Trim
 from mpc.handover import observed, resized, within
 from mpc.model import LinearModel
 from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
@@ -41,7 +43,7 @@ from mpc.nonlinear.rigidbody import (
     rotation,
     thrust_axis,
 )
-from mpc.nonlinear.settings import USUAL_TARGETS, AttitudeError, NonlinearSettings
+from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
 from mpc.observer import DisturbanceObserver
 from mpc.obstacles import ObstacleQP, Space
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
@@ -399,6 +401,17 @@ class NonlinearMPC:
     def disturbance(self) -> Array:
         """(6,) estimated acceleration now, world [m/s^2], and angular acceleration, body [rad/s^2]."""
         return np.concatenate([self._model.acceleration, self._model.angular_acceleration])
+
+    @property
+    def trim(self) -> Trim | None:
+        """The target at rest under the estimated force and thrust scale, for the fallback; None for rotor speeds."""
+        if not self._targets:
+            return None
+        model = self._model
+        lift = np.array([0.0, 0.0, model.gravity]) - model.acceleration
+        lift[2] = max(lift[2], LEAST_LIFT * model.gravity)
+        thrust = model.mass * float(np.linalg.norm(lift)) / model.thrust_scale
+        return Trim(speeds=np.array([thrust, 0.0, 0.0, 0.0]), lift=lift)
 
     def _measured(self, now: StepInputs, state: Array) -> Array:
         """(n,) the model's state."""

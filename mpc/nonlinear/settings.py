@@ -14,6 +14,7 @@ from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 from mpc.bounded import (
     MOST_ENTRIES,
     USUAL_FALLBACK,
+    USUAL_TARGETS,
     Avoidance,
     ControllerTable,
     FallbackSettings,
@@ -29,8 +30,10 @@ from mpc.bounded import (
     TargetBounds,
     ranges,
     require_lag,
+    require_lags,
     require_ordered,
     require_solver,
+    require_space,
     resolved_lag,
     rows_of,
     selection,
@@ -38,12 +41,12 @@ from mpc.bounded import (
 from mpc.constraints import Constraint
 from mpc.disturbance import RampSettings
 from mpc.indi import INDISettings, require_one_scale
-from mpc.model import SHORTEST_LAG, target_model
+from mpc.model import target_model
 from mpc.nonlinear.rigidbody import RATE_SCALE, Inputs
 from mpc.observer import ObserverSettings
 from mpc.qp import KKT_EVERY
 from mpc.solvers import CORE_OR_PIQP, SOLVERS
-from quadsim.controller import CORE, Controller
+from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Positive, Weight
 from quadsim.state import Array
@@ -54,7 +57,6 @@ if TYPE_CHECKING:
 
 LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states in which the quaternion model is linear, too
 VEHICLES_SPEEDS: Final = RotorBounds()
-USUAL_TARGETS: Final = TargetBounds()
 Drag = Annotated[tuple[NonNegative, ...], Len(3, 3)]
 
 AxisWeights = Weight | Annotated[Sequence[Weight], Len(3, 3)]
@@ -249,32 +251,16 @@ class Nonlinear(ControllerTable):
                 rule = f"output_bounds must be of {', '.join(LINEAR)}; got {name!r}: tilt bounds the attitude"
                 raise ValueError(rule)
             require_ordered(f"output_bounds.{name}", pair)
-        self._require_space()
+        of_rotors = {"inputs": "thrust", "rotor_lag": 0.0, "indi": None, "input_bounds": VEHICLES_SPEEDS}
+        require_space(self, of_rotors)
+        speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
+        if speeds and self.commands != ROTORS:
+            raise ValueError(f'polytopes must be without rotor speeds where commands = "rates"; got {speeds}')
         if self.inputs == "thrust" and self.input_bounds.slew is not None:
             raise ValueError(
                 'input_bounds.slew must be absent where inputs = "thrust", in which steps of speeds are not linear: '
                 f'inputs = "speed"; got {[*self.input_bounds.slew]}'
             )
-
-    def _require_space(self) -> None:
-        """Reject fields of the other space of commands: rotor speeds, or targets."""
-        if self.commands == "rotors":
-            others: dict[str, object] = {"inner_lag": None, "target_bounds": USUAL_TARGETS}
-            reason = "rotor speeds pass no autopilot, whose lags and targets these are"
-        else:
-            others = {"inputs": "thrust", "rotor_lag": 0.0, "indi": None, "input_bounds": VEHICLES_SPEEDS}
-            reason = "the autopilot turns the rotors; inner_lag and target_bounds describe it"
-            if self.disturbance is not None and self.disturbance.rotor_lag is not None:
-                raise ValueError(f'disturbance.rotor_lag must be absent where commands = "rates": {reason}')
-            speeds = [polytope.name for polytope in self.polytopes if any("speed_" in name for name in polytope.of)]
-            if speeds:
-                raise ValueError(f'polytopes must be without rotor speeds where commands = "rates"; got {speeds}')
-            for lag in self.inner_lag or ():
-                if 0.0 < lag < SHORTEST_LAG:
-                    raise ParameterError("", "inner_lag", self.inner_lag, f"0, or at least {SHORTEST_LAG:g} s, each")
-        for name, usual in others.items():
-            if getattr(self, name) != usual:
-                raise ValueError(f'{name} must be absent where commands = "{self.commands}": {reason}')
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """See `mpc.bounded.ControllerTable.audited`."""
@@ -305,10 +291,8 @@ class Nonlinear(ControllerTable):
                 positions=(0, 1, 2),
                 largest=True,
             )
-        targets, lag = self.commands == "rates", self.inner_lag
-        if targets and lag is None:
-            rule = "four time constants [s]: give them, or identify them on the vehicle's autopilot before it is built"
-            raise ParameterError("controller", "inner_lag", None, rule)
+        targets = self.commands == "rates"
+        lag = require_lags(self.inner_lag) if targets else None
         bounds = (self.target_bounds if targets else self.input_bounds).actuators(vehicle)
         mpc = NonlinearMPC(
             vehicle,
@@ -319,7 +303,7 @@ class Nonlinear(ControllerTable):
             space=space,
             kkt_every=self.kkt_every,
         )
-        hover = target_model(vehicle, period, lag) if targets and lag else None
+        hover = None if lag is None else target_model(vehicle, period, lag)
         law = self.fallback.around(mpc, bounds, vehicle, period, model=hover)
         return law if self.indi is None else Incremental(law, vehicle, self.indi, bounds)
 

@@ -356,6 +356,17 @@ def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tup
     assert np.linalg.norm(states[-1, V]) < 0.1
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_level_hover_holds_its_height_by_the_thrust_scale_that_is_estimated(known: bool) -> None:
+    made = table().build(VEHICLE, 0.02)
+    if known:
+        made.inner._model = replace(made.inner._model, thrust_scale=0.7)  # type: ignore[attr-defined]
+    made.inner.step = _fails  # type: ignore[attr-defined]
+    states, commands = fly(made, 0.02, 4.0, step_of(0.0, 0.0, 0.0, 0.0), thrust_scale=0.7)
+    assert {command.fallback for command in commands} == {2}
+    assert bool(abs(states[:, 2]).max() < 0.02) is known
+
+
 def _fails(*_: object) -> Command:
     raise FlightError("no answer", time=0.0)
 
