@@ -11,14 +11,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from mpc.nonlinear.model import NonlinearModel, zero
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, N_STATES, Array, all_true
 from quadsim.vehicle import N_ROTORS
+
+if TYPE_CHECKING:
+    from mpc.nonlinear.model import NonlinearModel
 
 LEAST_LIFT: Final = 0.1  # least thrust at rest as a share of the weight, so that no equilibrium is upside down
 _ROLL, _PITCH = INDEX["roll"], INDEX["pitch"]
@@ -31,7 +33,7 @@ class Trim:
     speeds: Array  # (4,) rotor speeds [rad/s]
     lift: Array  # (3,) direction of thrust, world frame, upwards, any length
     # (3,) angular acceleration, body frame, that thrust causes, per acceleration by thrust [1/m]
-    twist: Array = field(default_factory=zero)
+    twist: Array = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
         for name, count in (("speeds", N_ROTORS), ("lift", 3), ("twist", 3)):
