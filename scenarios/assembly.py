@@ -561,7 +561,7 @@ def stated_autopilot(path: Path, stated: AutopilotSettings | None = None) -> Aut
     if not of_file:
         return stated
     table = {**of_file, **(plain(stated) if stated is not None else {})}
-    return parse_table(_Piloted, {AUTOPILOT: table}, str(path)).autopilot
+    return parse_table(_Piloted, {AUTOPILOT: table}, str(path), file="vehicle").autopilot
 
 
 def preferring_core(scenario: Scenario) -> Scenario:

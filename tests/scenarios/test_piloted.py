@@ -179,7 +179,7 @@ def test_the_autopilot_of_a_vehicle_file_flies_unless_the_scenario_states_anothe
     [
         ("[autopilot]\np = [1.0, 1.0, 1.0]\n", "autopilot must be a table with a source"),
         ('[autopilot]\nsource = "x"\np = 3.0\n', "autopilot.p"),
-        ('[autopilot]\nsource = "x"\nspeed = 3.0\n', "autopilot.speed"),
+        ('[autopilot]\nsource = "x"\nspeed = 3.0\n', "autopilot.speed is not a field of the vehicle file"),
     ],
 )
 def test_a_wrong_autopilot_of_a_vehicle_file_is_refused(table: str, message: str, tmp_path: Path) -> None:
