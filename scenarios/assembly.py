@@ -26,7 +26,7 @@ from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
 from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance
 from quadsim.sim.airframe import outline
-from quadsim.sim.autopilot import Autopilot, AutopilotSettings, identify_lags, own_lags
+from quadsim.sim.autopilot import Autopilot, AutopilotSettings, built_in_lags, identify_lags
 from quadsim.sim.computation import Computation, ComputationTime, Stall
 from quadsim.sim.effects import Change, Effects, Force, Push, PushChange
 from quadsim.sim.effects.load import Load, mass_properties
@@ -81,7 +81,7 @@ _UNITS: Final = {
     SensorName.RATES: math.radians(1.0),
 }
 """SI units per unit of the scenario file, by sensor."""
-_OF_ALL_EVENTS: Final = ("vehicle", "autopilot", "own_autopilot", "inner_lag", "actual", "effects", "course")
+_OF_ALL_EVENTS: Final = ("vehicle", "autopilot", "user_autopilot", "inner_lag", "actual", "effects", "course")
 """Parts that do not depend on events, controller or duration."""
 
 
@@ -97,10 +97,10 @@ class Assembly:
 
     Attributes:
         scenario: the file's content.
-        own_autopilot: an inner loop that flies in place of the built-in autopilot, for one flight at a time; or None.
+        user_autopilot: an inner loop that flies in place of the built-in autopilot, for one flight at a time; or None.
     """
 
-    own_autopilot: AutopilotLoop | None = None
+    user_autopilot: AutopilotLoop | None = None
 
     def __init__(self, scenario: Scenario, vehicle: Vehicle | None = None) -> None:
         """Build nothing yet; `vehicle` saves loading it again."""
@@ -318,20 +318,20 @@ class Assembly:
         """
         if (getattr(law, "commands", ROTORS) if commands is None else commands) == ROTORS:
             return law
-        return Piloted(law, self.own_autopilot or Autopilot(self.vehicle, self.autopilot), self.vehicle)
+        return Piloted(law, self.user_autopilot or Autopilot(self.vehicle, self.autopilot), self.vehicle)
 
     @cached_property
     def inner_lag(self) -> tuple[float, ...]:
         """(4,) first-order lags of thrust and body rates [s], by a step on the autopilot."""
         timestep = self.scenario.plant.timestep
-        if self.own_autopilot is not None:
-            return identify_lags(self.vehicle, self.own_autopilot, timestep=timestep)
-        return own_lags(self.vehicle, self.autopilot or AutopilotSettings(), timestep)
+        if self.user_autopilot is not None:
+            return identify_lags(self.vehicle, self.user_autopilot, timestep=timestep)
+        return built_in_lags(self.vehicle, self.autopilot or AutopilotSettings(), timestep)
 
     @property
     def autopilot_flown(self) -> dict[str, Any]:
         """What flew the targets: the class of an autopilot passed in, or `built-in`, and the lags that the law knew."""
-        name = "built-in" if self.own_autopilot is None else type(self.own_autopilot).__name__
+        name = "built-in" if self.user_autopilot is None else type(self.user_autopilot).__name__
         lag = getattr(self.scenario.controller, "inner_lag", None) or vars(self).get("inner_lag")
         return {"name": name, **({} if lag is None else {"inner_lag": [*lag]})}
 

@@ -25,7 +25,7 @@ import numpy as np
 from annotated_types import doc
 
 from mpc.bounded import ControllerTable, Horizon
-from mpc.handover import hand_over
+from mpc.handover import hand_over, within
 from mpc.obstacles import Shape
 from quadsim.controller import ROTORS, SQP, TARGET_SIZES, Command, Controller, StepInputs
 from quadsim.errors import CommandError, InputError, ParameterError, UnknownNameError, printable
@@ -166,7 +166,8 @@ class PluginController:
 
     def adopt(self, previous: object) -> None:
         """See `quadsim.controller.Controller`."""
-        hand_over(self._law, previous._law if isinstance(previous, PluginController) else previous)
+        law = within(previous, PluginController)  # perhaps with an autopilot
+        hand_over(self._law, previous if law is None else law._law)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError if the answer is not a command."""

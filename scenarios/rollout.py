@@ -134,9 +134,9 @@ class Rollout:
         if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
             raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
         controller = assembly.controller() if law is None else law
-        if assembly.own_autopilot is not None and not isinstance(controller, Piloted):
+        if assembly.user_autopilot is not None and not isinstance(controller, Piloted):
             rule = 'given with a controller that commands thrust and body rates, e.g. commands = "rates"'
-            raise ParameterError("", "autopilot", type(assembly.own_autopilot).__name__, rule)
+            raise ParameterError("", "autopilot", type(assembly.user_autopilot).__name__, rule)
         for _, spec in scenario.controller_changes:
             assembly.controller(spec)  # checked before the flight, one by one, as each may take megabytes
         self._law = controller.name, controller.solver

@@ -88,7 +88,7 @@ def set_up(
         InputError: the controller, a force or the reference cannot be set up.
     """
     assembly = assembly if reference is None else following(assembly, reference)
-    assembly.own_autopilot = autopilot
+    assembly.user_autopilot = autopilot
     scenario, law, acting = assembly.scenario, None, None
     flown = named(scenario, controller, forces)
     if controller is not None and not isinstance(controller, str):

@@ -82,7 +82,7 @@ class AutopilotSettings:
     idle: Annotated[
         Fraction | None, doc("[-] slowest rotor, as a share of speed_max; absent: the vehicle's speed_min")
     ] = None
-    airmode: Annotated[bool | None, doc("whether thrust yields to roll and pitch; absent: true")] = None
+    airmode: Annotated[bool | None, doc("whether thrust yields to torques; absent: true")] = None
 
     def resolved(self, vehicle: Vehicle) -> AutopilotSettings:
         """Fill in what is absent, by rule.
@@ -274,6 +274,6 @@ def _step_response(plant: Plant, autopilot: AutopilotLoop, axis: int) -> Array:
 
 
 @cache
-def own_lags(vehicle: Vehicle, settings: AutopilotSettings, timestep: float) -> tuple[float, ...]:
+def built_in_lags(vehicle: Vehicle, settings: AutopilotSettings, timestep: float) -> tuple[float, ...]:
     """`identify_lags` of the built-in autopilot, kept: a campaign asks for the same one in every flight."""
     return identify_lags(vehicle, Autopilot(vehicle, settings), timestep=timestep)

@@ -66,7 +66,6 @@ class ClosedLoop:
     navigation at the start.
 
     Attributes:
-    Attributes:
         k: control periods flown so far.
         period: length of one [s].
         controller: the controller in command; see `switch`.
@@ -137,11 +136,11 @@ class ClosedLoop:
         self._start = plant.physics
         self._initial_speeds = np.array(initial_speeds, float)
         self._lowest = float(initial_state[INDEX["z"]])
-        self._acting = self._initial_speeds  # the command in force, flown by an inner loop, and the rotor speeds of it
-        self._inner: InnerLoop | None = None
-        self._speeds = self._answer = self._initial_speeds
-        self._called: InnerLoop | None = None  # the inner loop called last, and the physics steps until its next call
-        self._until_call = 0
+        self._acting = self._initial_speeds  # the command in force: rotor speeds, or the target of an autopilot
+        self._inner: InnerLoop | None = None  # flies it
+        self._speeds = self._initial_speeds  # the rotor speeds commanded last
+        self._called: InnerLoop | None = None  # the inner loop called last, its answer, and the steps until its next
+        self._answer, self._until_call = self._initial_speeds, 0
         self._plan, self._age = self._acting[None], 0  # the last plan that came in time, and how many periods ago
         self._observed: Observation | None = None
         self._samples: list[FlownPeriod] | None = [] if recorded else None

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import quadsim
+from mpc.handover import hand_over
 from quadsim.assets import vehicle_path
 from quadsim.controller import StepInputs
 from quadsim.errors import InputError
@@ -17,6 +18,7 @@ from quadsim.sim.autopilot import Autopilot, AutopilotSettings
 from quadsim.state import Array, State
 from quadsim.vehicle import Vehicle
 from scenarios.assembly import Assembly
+from scenarios.plugin import Plugin, make_law
 from scenarios.reaudit import reaudit
 
 START = {
@@ -257,6 +259,21 @@ def test_a_controller_that_takes_over_leaves_the_autopilot_flying(scenario: quad
     identified = autopilot.calls - 400
     assert identified == 4 * 300  # once, before the flight
     assert autopilot.resets == 1 + 4 + 1  # built, identified, flown
+
+
+def test_a_law_of_targets_takes_over_from_the_law_and_not_from_its_autopilot(scenario: quadsim.Scenario) -> None:
+    class Heir(Rates):
+        seen: object = None
+
+        def adopt(self, previous: object) -> None:
+            Heir.seen = previous
+
+    assembly = Assembly(scenario)
+    spec = Plugin(type="tests:Heir")
+    laws = [Rates(assembly.vehicle, 0.02, 50), Heir(assembly.vehicle, 0.02, 50)]
+    first, second = (assembly.piloted(make_law(law, spec, assembly.vehicle, 0.02)) for law in laws)
+    hand_over(second, first)
+    assert Heir.seen is laws[0]
 
 
 def test_an_autopilot_of_ones_own_needs_a_controller_of_targets(scenario: quadsim.Scenario) -> None:
