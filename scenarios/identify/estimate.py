@@ -1,0 +1,39 @@
+"""What an identification gives: each parameter with its interval, and the verdict of its gates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from quadsim.vehicle import Vehicle
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """One parameter."""
+
+    name: str  # as in the vehicle file, an inertia with its axis: inertia_x
+    unit: str
+    value: float
+    low: float  # of the 95 % interval
+    high: float
+    start: float | None  # value of the start file, None if it has none
+    refused: str = ""
+    """Why a gate refuses the value, so that the start's stays; empty where the value is identified."""
+    advice: str = ""  # what to fly so that it can be identified
+    in_file: bool = True  # whether a vehicle file has a field for it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Identification:
+    """The fit of one or several logs."""
+
+    estimates: tuple[Estimate, ...]
+    vehicle: Vehicle  # the start with what was identified in its place
+    fitted: Vehicle  # the same with every estimate in its place, refused ones too
+    delay: float  # of the commands [s]; 0 where speeds are measured without one
+    offset: tuple[float, float]  # x and y of the centre of mass in the rotors' frame [m]
+    wind: tuple[float, float] = (0.0, 0.0)  # mean, world x and y, where drag shows it [m/s]
+    throttle_curve: float = 0.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle; see `rotors`
+    yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
+    whiteness: dict[str, float] = field(default_factory=dict)  # largest |autocorrelation| of innovations by axis [-]
+    cross_check: dict[str, float] = field(default_factory=dict)  # output-error estimate over this one, by parameter [-]
