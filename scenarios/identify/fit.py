@@ -12,10 +12,10 @@ from scipy.stats import t as student
 from quadsim.errors import InputError, ParameterError
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.identify.estimate import Estimate, Identification
-from scenarios.identify.model import AXES, stretch
+from scenarios.identify.model import AXES, Stretch, stretch
 from scenarios.identify.record import Record
-from scenarios.identify.rotors import lag_of
-from scenarios.identify.search import BLOCK, PLATE, Search
+from scenarios.identify.rotors import smoothed
+from scenarios.identify.search import PLATE, Search
 
 CONFIDENCE: Final = 0.95
 WIDEST: Final = 0.25
@@ -66,18 +66,37 @@ def identify_records(records: Sequence[Record], spans: Sequence[Sequence[slice]]
         InputError: nothing flies, or the records differ in what they say of rotors and battery.
         ParameterError: what was identified makes no vehicle, such as one that cannot hover.
     """
-    parts = [stretch(_part(record, span)) for record, own in zip(records, spans, strict=True) for span in own]
-    if not parts:
+    flown = [_part(record, span) for record, own in zip(records, spans, strict=True) for span in own]
+    if not flown:
         raise InputError("no part of the logs flies")
     if len({(record.speeds is None, record.commands is None, record.voltage is None) for record in records}) > 1:
         names = ", ".join(record.name for record in records)
         raise InputError(f"logs fitted together must have the same columns of rotors and battery; got {names}")
-    search = Search(parts, vehicle)
+    search = _searched([stretch(record) for record in flown], vehicle)
+    richer = _searched(search.parts, vehicle, order=3, start=search)
+    noisier = search
+    if flown[0].commands is None and flown[0].speeds is not None:
+        noisier = _searched([stretch(_noisier(record)) for record in flown], vehicle, start=search)
+    return _Fit(search, richer, noisier).result()
+
+
+def _searched(parts: Sequence[Stretch], vehicle: Vehicle, *, order: int = 2, start: Search | None = None) -> Search:
+    search = Search(parts, vehicle, order=order)
+    if start is not None:
+        search.adopt(start)
     search.run()
-    richer = Search(parts, vehicle, order=3)
-    richer.adopt(search)
-    richer.run()
-    return _Fit(search, richer).result()
+    return search
+
+
+def _noisier(record: Record) -> Record:
+    """The record with the noise of its rotor speeds once more: what that changes, the noise has changed before.
+
+    Noise of an input shrinks what it explains (Cook and Stefanski, "Simulation-extrapolation estimation", 1994).
+    """
+    assert record.speeds is not None
+    rng = np.random.default_rng(0)
+    noise = np.std(record.speeds - smoothed(record.speeds), axis=0)
+    return replace(record, speeds=record.speeds + noise * rng.standard_normal(record.speeds.shape))
 
 
 def _part(record: Record, span: slice) -> Record:
@@ -88,7 +107,7 @@ def _part(record: Record, span: slice) -> Record:
 class _Fit:
     """What a search found, judged."""
 
-    def __init__(self, search: Search, richer: Search) -> None:
+    def __init__(self, search: Search, richer: Search, noisier: Search) -> None:
         self.search, self.vehicle = search, search.vehicle
         blocks, prior = search.blocks(), search.prior(search.x)[1]
         H = sum((block.H for block in blocks), prior.H)
@@ -96,7 +115,9 @@ class _Fit:
         self.left_out = np.array([np.linalg.solve(H - block.H, block.g) for block in blocks])
         self.quantile = _quantile(len(blocks))
         self.rests = np.diag(self.cov) * np.diag(prior.H)
-        self.moved = richer.x[: len(search.sought)] - search.x[: len(search.sought)]
+        count = len(search.sought)
+        self.moved = richer.x[:count] - search.x[:count]
+        self.drift = np.abs(noisier.x[:count] - search.x[:count])  # by the noise of measured speeds
         self.colour = _colour(search)
 
     def _deviations(self, shares: dict[int, float]) -> tuple[float, float]:
@@ -107,7 +128,8 @@ class _Fit:
         return float(np.sqrt(row @ self.cov @ row)), float(np.sqrt((len(each) - 1) * each.var()))
 
     def _half_width(self, shares: dict[int, float]) -> float:
-        return self.quantile * float(np.hypot(max(self._deviations(shares)), FLOOR))
+        drift = sum(abs(share) * self.drift[i] for i, share in shares.items())
+        return self.quantile * float(np.hypot(max(self._deviations(shares)), FLOOR)) + float(drift)
 
     def result(self) -> Identification:
         """Every estimate, and the vehicle with those that are not refused."""
@@ -115,7 +137,7 @@ class _Fit:
         sought = {number.name: i for i, number in enumerate(search.sought) if number.name in _KINDS}
         estimates = {name: self._delay() if name == "delay" else self._estimate(i) for name, i in sought.items()}
         if "rotor_rise" not in estimates:
-            estimates |= self._lag_of_speeds()
+            estimates |= self._lags_as_stated()
         vehicle = self._assembled({name: e.value for name, e in estimates.items() if not e.refused})
         if estimates["inertia_z"].refused:
             estimates["drag_to_thrust"], vehicle = self._yaw_gain(estimates, vehicle)
@@ -191,23 +213,10 @@ class _Fit:
         refused = f"not excited: +-{1e3 * half:.0f} ms" if half > WIDEST_DELAY else ""
         return self._judged("delay", value, value - half, value + half, refused)
 
-    def _lag_of_speeds(self) -> dict[str, Estimate]:
-        """Rotor lag where speeds were measured: by commands beside them, if there are any."""
-        record = self.search.parts[0].record
-        rise, fall = self.vehicle.rotor_rise or 0.03, self.vehicle.rotor_fall or 0.03
-        if record.speeds is None or record.commands is None:
-            why = "the log has the rotors' speeds but not their commands"
-            lags = {"rotor_rise": (rise, rise, rise), "rotor_fall": (fall, fall, fall)}
-            return {name: self._judged(name, *values, why) for name, values in lags.items()}
-        x, pulls = lag_of(record.commands, record.speeds, record.period)
-        count = max(4, int(len(pulls) * record.period / BLOCK))
-        sums = np.array([block.sum(axis=0) for block in np.array_split(pulls, count)])
-        halves = _quantile(count) * np.hypot(np.sqrt(count) * sums.std(axis=0, ddof=1), FLOOR)
-        found = {}
-        for name, at, half in zip(("rotor_rise", "rotor_fall"), x, halves, strict=False):
-            low, value, high = (float(np.exp(at + sign * half)) for sign in (-1.0, 0.0, 1.0))
-            found[name] = self._judged(name, value, low, high, _not_excited(half) if half > WIDEST else "")
-        return found
+    def _lags_as_stated(self) -> dict[str, Estimate]:
+        """Rotor lag where speeds were measured and no commands."""
+        why, lag = "the log has the rotors' speeds but not their commands", self.vehicle.rotor_rise or 0.0
+        return {name: self._judged(name, *3 * [lag], why) for name in ("rotor_rise", "rotor_fall")}
 
     def _yaw_gain(self, estimates: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[Estimate, Vehicle]:
         """The yaw reaction that gives the identified yaw acceleration with the inertia that the file keeps."""

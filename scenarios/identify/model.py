@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -14,7 +14,7 @@ from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.identify.record import Record
-from scenarios.identify.rotors import Turning, lagging, measured
+from scenarios.identify.rotors import Turning, corrected, lagging, measured, smoothed
 
 AXES: Final = ("roll", "pitch", "yaw", "vx", "vy", "vz")
 _SMOOTHING: Final = 0.1
@@ -28,8 +28,8 @@ class Parameters:
     thrust_coefficient: float
     inertia: Array  # (3,)
     drag_to_thrust: float
-    rotor_rise: float
-    rotor_fall: float
+    rotor_rise: float = 0.0  # not used where speeds were measured [s]
+    rotor_fall: float = 0.0
     delay: float  # of the commands [s]
     rotor_inertia: float
     rotor_drag: float
@@ -56,6 +56,8 @@ class Stretch:
 
 def stretch(record: Record) -> Stretch:
     """Prepare a record, all of which flies."""
+    if record.speeds is not None:
+        record = replace(record, speeds=smoothed(record.speeds))
     turn = Rotation.from_quat(np.roll(_smoothed(record), -1, axis=1)).as_matrix()
     return Stretch(
         record=record,
@@ -80,17 +82,19 @@ def _smoothed(record: Record) -> Array:
 
 def turning(record: Record, vehicle: Vehicle, p: Parameters) -> Turning:
     """The rotors' speeds, from whatever the record has of them."""
-    if record.speeds is not None:
+    if record.speeds is not None and record.commands is None:
         return measured(record.speeds, record.period, delay=p.delay)
     if record.commands is not None:
         commands = np.clip(record.commands, vehicle.speed_min, vehicle.speed_max)
     else:
         assert record.throttle is not None
         share = np.clip(record.throttle, 0.0, 1.0)
-        commands = vehicle.speed_max * np.sqrt((1.0 - p.throttle_curve) * share + p.throttle_curve * share**2)
+        slope = np.maximum(1.0 - p.throttle_curve * (1.0 - share), 1e-3)
+        commands = vehicle.speed_max * np.sqrt(slope * share)
     if record.voltage is not None:
         commands = commands * (record.voltage / p.voltage)[:, None] ** (0.5 * p.voltage_exponent)
-    return lagging(commands, record.period, rise=p.rotor_rise, fall=p.rotor_fall, delay=p.delay)
+    follower = lagging(commands, record.period, rise=p.rotor_rise, fall=p.rotor_fall, delay=p.delay)
+    return follower if record.speeds is None else corrected(follower, record.speeds, record.period)
 
 
 def predicted(part: Stretch, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:

@@ -1,4 +1,4 @@
-"""Rotor speeds from their commands: a dead time, then a first-order lag, exact between held commands."""
+"""Rotor speeds from commands (a dead time, then a first-order lag, exact between held commands) or as measured."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.interpolate import make_smoothing_spline
 from scipy.linalg import solve_banded
-from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
 
 _PASSES: Final = 12  # until every step knows whether its rotor speeds up
+_CORRECTION: Final = 0.2  # time constant [s] of the correction by measured speeds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,29 +62,27 @@ def lagging(commands: Array, period: float, *, rise: float, fall: float, delay: 
 
 
 def measured(speeds: Array, period: float, *, delay: float) -> Turning:
-    """Rotors whose speeds (N, 4) [rad/s] were measured `delay` [s] after their sample's time; linear in between."""
+    """Rotors whose speeds (N, 4) [rad/s] were logged `delay` [s] after they were turning so; linear in between."""
     n = len(speeds)
-    when = np.arange(n) - delay / period
-    at = np.stack([np.interp(when, np.arange(n), column) for column in speeds.T], axis=1)
-    before, after = at[:-1], at[1:]
-    return Turning(speeds=at, mean=0.5 * (before + after), square=(before**2 + before * after + after**2) / 3.0)
+    when = np.arange(n) + delay / period
+    return _linear(np.stack([np.interp(when, np.arange(n), column) for column in speeds.T], axis=1))
 
 
-def lag_of(commands: Array, speeds: Array, period: float) -> tuple[Array, Array]:
-    """Logarithms of rise and fall [s] and the delay [ms] of speeds (N, 4) that follow commands, and their slopes.
+def smoothed(speeds: Array) -> Array:
+    """Measured speeds (N, 4) [rad/s] without their noise, which would make torques look larger than they are."""
+    when = np.arange(len(speeds), dtype=float)
+    return np.stack([make_smoothing_spline(when, column)(when) for column in speeds.T], axis=1)
 
-    The second are the rows (N, 3) by which a sample pulls at the three, in standard deviations of their sum.
-    """
-    skip = len(speeds) // 20
 
-    def misfit(x: Array) -> Array:
-        rise, fall = np.exp(x[:2])
-        turning = lagging(commands, period, rise=float(rise), fall=float(fall), delay=1e-3 * float(x[2]))
-        return (turning.speeds - speeds)[skip:].ravel()
+def corrected(follower: Turning, speeds: Array, period: float) -> Turning:
+    """Rotors that follow their commands, slowly corrected by measured speeds (N, 4) [rad/s], such as for a weak one."""
+    share = period / (period + _CORRECTION)
+    off = _linear(lfilter([share], [1.0, share - 1.0], speeds - follower.speeds, axis=0))
+    square = follower.square + 2.0 * follower.mean * off.mean + off.square
+    return Turning(speeds=follower.speeds + off.speeds, mean=follower.mean + off.mean, square=square)
 
-    found = least_squares(
-        misfit, [np.log(0.03), np.log(0.03), 0.0], x_scale=[0.1, 0.1, 1.0], diff_step=1e-4, loss="huber"
-    )
-    J = found.jac
-    pulls = -(J * misfit(found.x)[:, None]) @ np.linalg.inv(J.T @ J)
-    return found.x, pulls.reshape(-1, N_ROTORS, 3).sum(axis=1)
+
+def _linear(speeds: Array) -> Turning:
+    before, after = speeds[:-1], speeds[1:]
+    square = (before**2 + before * after + after**2) / 3.0
+    return Turning(speeds=speeds, mean=0.5 * (before + after), square=square)

@@ -29,7 +29,7 @@ BLOCK: Final = 3.0  # shortest part of a log that is left out in turn [s]
 _MOST_BLOCKS: Final = 20
 _NOISE_AT_FIRST: Final = ((1.0, 0.0), (-1.5, 0.5))  # reflection coefficients of A and C, before tanh
 PLATE: Final = (0.87, 0.12)
-"""Inertia_z over inertia_x + inertia_y, and its standard deviation in logarithms: of a plate 1, of what is tall less."""
+"""Inertia_z over inertia_x + inertia_y, and its standard deviation in logarithms; of a plate it is 1."""
 _LAG_RATIO: Final = 0.5  # standard deviation of log(rise / fall)
 _WIND_STEP: Final = 1.0  # standard deviation of the wind's change from knot to knot [m/s]
 _STEPS, _TRIES, _SMALL = 60, 8, 5e-3  # of the search: how many, shortened how often, until the likelihood gains less
@@ -69,9 +69,9 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch]) -> list[Sought]:
         Sought("munk", 0.0, 0.001 * vehicle.mass, 2.0),
         Sought("yaw_trim", 0.0, 0.01 * weight * vehicle.drag_to_thrust, 10.0),
     ]
-    if record.speeds is None:
+    if record.speeds is None or record.commands is not None:
         numbers += [Sought(name, getattr(vehicle, name) or lag, None, 1.5) for name in ("rotor_rise", "rotor_fall")]
-        if record.commands is None:
+        if record.throttle is not None and record.commands is None:
             numbers.append(Sought("throttle_curve", 1.0, 0.3, 1.0))
         if record.voltage is not None:
             numbers.append(Sought("voltage_exponent", 1.0, 0.5, 2.0))
