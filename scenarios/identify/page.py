@@ -1,0 +1,137 @@
+"""The page of an identified vehicle: intervals, measured against predicted, errors over the horizon, and gates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from quadsim.report.figure import LINES, REFERENCE, Figure, Panel, Series
+from quadsim.report.page import Section, render_page
+from quadsim.report.table import Grid, format_number, line
+from quadsim.report.to_plotly import to_plot
+from scenarios.identify.estimate import Estimate
+from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, Prediction, Trace
+
+if TYPE_CHECKING:
+    from scenarios.identify.report import IdentifiedVehicle
+
+_COLOURS: Final = {IDENTIFIED: LINES[0], THRUST_ONLY: LINES[1], START: LINES[2]}
+_TRACED: Final = (
+    *((f"v{axis}, world", "m/s") for axis in "xyz"),
+    *((f"{axis} rate", "rad/s") for axis in ("roll", "pitch", "yaw")),
+)
+
+
+def render(result: IdentifiedVehicle) -> str:
+    """Return the page as HTML."""
+    parameters, errors = result.tables()
+    trace = result.prediction.trace
+    figures = (trace_figure(trace), horizon_figure(result.prediction))
+    return render_page(
+        "identification",
+        f"Identified: {result.vehicle.name}",
+        [
+            Section(
+                title="Parameters",
+                plots=(to_plot(interval_figure(result.identification.estimates)),),
+                tables=(parameters,),
+            ),
+            Section(title="Prediction of flight not fitted", plots=tuple(map(to_plot, figures)), tables=(errors,)),
+            Section(title="Gates", tables=gates(result)),
+        ],
+        verdict=result.verdict,
+        notes=result.sentences(),
+    )
+
+
+def interval_figure(estimates: Sequence[Estimate]) -> Figure:
+    """Return each parameter's interval and start in percent of its value; those that a gate refuses are grey."""
+    drawn = [estimate for estimate in estimates if estimate.in_file]
+    series = []
+    for refused, colour, label in ((False, LINES[0], "95 % interval"), (True, REFERENCE, "refused by a gate")):
+        at = [(i, e) for i, e in enumerate(drawn) if bool(e.refused) is refused]
+        x = np.ravel([[i, i, np.nan] for i, _ in at])
+        y = np.ravel([[_percent(e.low, e), _percent(e.high, e), np.nan] for _, e in at])
+        series += [Series(x=x, y=y, colour=colour, label=label, width=5.0)] if at else []
+    at = [(i, _percent(e.start, e)) for i, e in enumerate(drawn) if e.start is not None]
+    start = Series(
+        x=np.array([1.0 * i for i, _ in at]), y=np.array([y for _, y in at]),
+        colour=LINES[1], label=START, style="points", marker="diamond", width=6.0,
+    )  # fmt: skip
+    sure = [abs(_percent(end, e)) for e in drawn if not e.refused for end in (e.low, e.high)]
+    reach = 1.2 * min(max([*sure, *np.abs(start.y), 1.0]), 100.0)
+    panel = Panel(
+        title="off the identified value",
+        unit="%",
+        series=(*series, start),
+        y_range=(-reach, reach),
+        x_names=tuple(estimate.name for estimate in drawn),
+        height=1.3,
+    )
+    return Figure(key="intervals", title="intervals", panels=(panel,), columns=1)
+
+
+def _percent(value: float, estimate: Estimate) -> float:
+    return 100.0 * (value / estimate.value - 1.0)
+
+
+def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)) -> Figure:
+    """Return velocity and body rates, measured and as predicted from each window's start."""
+    t = trace.t - trace.t[0, 0]
+    gap = np.full((len(t), 1), np.nan)
+    panels = []
+    for i in (0, 3, 1, 4, 2, 5):  # velocities in the left column
+        title, unit = _TRACED[i]
+        predicted = (
+            Series(
+                x=np.hstack([t, t[:, -1:]]).ravel(), y=np.hstack([trace.predicted[name][..., i], gap]).ravel(),
+                colour=_COLOURS[name], label=f"predicted, {name}",
+            )
+            for name in models
+        )  # fmt: skip
+        measured = Series(x=t.ravel(), y=trace.measured[..., i].ravel(), colour=REFERENCE, label="measured", width=2.2)
+        panels.append(Panel(title=title, unit=unit, series=(measured, *reversed([*predicted]))))
+    title = f"{trace.log} from {trace.t[0, 0]:.4g} s on: every {t[0, -1] - t[0, 0]:.2g} s a prediction starts anew"
+    return Figure(key="trace", title=title, panels=tuple(panels), end=float(t[-1, -1]))
+
+
+def horizon_figure(prediction: Prediction) -> Figure:
+    """Return the mean errors over the horizon."""
+    x = np.array((0.0, *HORIZONS))
+    panels = [
+        Panel(
+            title=quantity, unit=unit, x_label="after [s]",
+            series=tuple(
+                Series(x=x, y=np.insert(errors[:, j], 0, 0.0), colour=_COLOURS[name], label=name)
+                for name, errors in prediction.errors.items()
+            ),
+        )
+        for j, (quantity, unit) in enumerate(QUANTITIES.items())
+        if np.isfinite(next(iter(prediction.errors.values()))[:, j]).all()
+    ]  # fmt: skip
+    return Figure(key="horizon", title="mean error over the horizon", panels=tuple(panels))
+
+
+def gates(result: IdentifiedVehicle) -> tuple[Grid, Grid]:
+    """Return what the gates looked at, beside the verdicts of the table of parameters."""
+    found = result.identification
+    white = [line(axis, format_number(value)) for axis, value in found.whiteness.items()]
+    ratio = [line(name, format_number(value)) for name, value in found.cross_check.items()]
+    return (
+        Grid(
+            key="whiteness",
+            title="Innovations",
+            head=("axis", "largest autocorrelation"),
+            lines=tuple(white),
+            note="What the model does not predict has to be noise: near 0 for every lag.",
+        ),
+        Grid(
+            key="cross-check",
+            title="Cross-check",
+            head=("parameter", "output error over this fit"),
+            lines=tuple(ratio),
+            note="A second method on the same logs: near 1 where no disturbance acts in the loop.",
+        ),
+    )
