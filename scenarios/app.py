@@ -1151,8 +1151,8 @@ def identify(
         raise InputError("identify needs a flight log: CSV, Parquet, ULog, or a run directory")
     if vehicle is None:
         raise InputError(
-            "identify needs --vehicle, a start: no log shows mass or arm length; quadsim vehicle --template > start.toml "
-            f"writes one; give your {NEEDED}, and estimates of the rest"
+            "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template > start.toml"
+            f" writes one; give your {NEEDED}, and estimates of the rest"
         )
     for name, path, ending in (("--out", out, ".toml"), ("--page", page, ".html")):
         if path is not None and Path(path).suffix != ending:

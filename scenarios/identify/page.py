@@ -55,13 +55,20 @@ def interval_figure(estimates: Sequence[Estimate]) -> Figure:
         x = np.ravel([[i, i, np.nan] for i, _ in at])
         y = np.ravel([[_percent(e.low, e), _percent(e.high, e), np.nan] for _, e in at])
         series += [Series(x=x, y=y, colour=colour, label=label, width=5.0)] if at else []
-    at = [(i, _percent(e.start, e)) for i, e in enumerate(drawn) if e.start is not None]
+    series += [
+        Series(x=np.arange(float(len(drawn))), y=np.zeros(len(drawn)), colour=LINES[0], style="points", width=4.0)
+    ]
     start = Series(
-        x=np.array([1.0 * i for i, _ in at]), y=np.array([y for _, y in at]),
-        colour=LINES[1], label=START, style="points", marker="diamond", width=6.0,
-    )  # fmt: skip
+        x=np.arange(float(len(drawn))),
+        y=np.array([np.nan if e.start is None else _percent(e.start, e) for e in drawn]),
+        colour=LINES[1],
+        label=START,
+        style="points",
+        marker="diamond",
+        width=6.0,
+    )
     sure = [abs(_percent(end, e)) for e in drawn if not e.refused for end in (e.low, e.high)]
-    reach = 1.2 * min(max([*sure, *np.abs(start.y), 1.0]), 100.0)
+    reach = 1.2 * min(max([*sure, *np.abs(start.y[np.isfinite(start.y)]), 1.0]), 100.0)
     panel = Panel(
         title="off the identified value",
         unit="%",
@@ -93,7 +100,7 @@ def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)
         )  # fmt: skip
         measured = Series(x=t.ravel(), y=trace.measured[..., i].ravel(), colour=REFERENCE, label="measured", width=2.2)
         panels.append(Panel(title=title, unit=unit, series=(measured, *reversed([*predicted]))))
-    title = f"{trace.log} from {trace.t[0, 0]:.4g} s on: every {t[0, -1] - t[0, 0]:.2g} s a prediction starts anew"
+    title = f"measured and predicted: {trace.log} from {trace.t[0, 0]:.4g} s on, a prediction every {t[0, -1]:.2g} s"
     return Figure(key="trace", title=title, panels=tuple(panels), end=float(t[-1, -1]))
 
 
@@ -102,7 +109,7 @@ def horizon_figure(prediction: Prediction) -> Figure:
     x = np.array((0.0, *HORIZONS))
     panels = [
         Panel(
-            title=quantity, unit=unit, x_label="after [s]",
+            title=quantity, unit=unit, x_label="horizon [s]",
             series=tuple(
                 Series(x=x, y=np.insert(errors[:, j], 0, 0.0), colour=_COLOURS[name], label=name)
                 for name, errors in prediction.errors.items()

@@ -17,7 +17,7 @@ import numpy as np
 from quadsim.errors import InputError
 from quadsim.rotation import conjugate, multiply
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
-from quadsim.state import Array
+from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
 from scenarios.identify.estimate import Identification
 from scenarios.identify.record import Record
@@ -132,7 +132,7 @@ def predict(
     )
 
 
-def _measured(record: Record, rows: Array) -> Array:
+def _measured(record: Record, rows: Indices) -> Array:
     """(W, K, 13) position, velocity, attitude and body rates; positions are NaN where there are none."""
     position = np.full_like(record.velocity, np.nan) if record.position is None else record.position
     return np.concatenate([position, record.velocity, record.attitude, record.rates], axis=1)[rows]
@@ -147,7 +147,7 @@ def _errors(predicted: Array, measured: Array) -> Array:
     return np.stack([*norms[:2], angle, norms[2]], axis=-1)
 
 
-def _simulate(model: _Model, record: Record, rows: Array, initial: Array) -> Array:
+def _simulate(model: _Model, record: Record, rows: Indices, initial: Array) -> Array:
     """(W, K, 13) states from (W, 13) at the samples (W, K) of windows, by the classical Runge-Kutta method."""
     steps = math.ceil(record.period / _STEP - 1e-9)
     h = record.period / steps

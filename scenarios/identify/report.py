@@ -93,9 +93,10 @@ class IdentifiedVehicle(Result):
         errors_grid = Grid(
             key="errors",
             title="Errors of prediction",
-            head=("mean error", "after", *self.prediction.errors),
+            head=("mean error", "horizon", *self.prediction.errors),
             lines=tuple(lines),
-            note=f"{self.prediction.windows} windows of {held_out}. thrust only: the body rates stay as they were.",
+            note=f"{self.prediction.windows} windows of {held_out}. start: the start file as it is. thrust only: the "
+            "identified thrust, the body rates held as they were.",
         )
         return parameters, errors_grid
 
@@ -104,7 +105,7 @@ class IdentifiedVehicle(Result):
         from scenarios import console
 
         yield console.styled((self.verdict.text, "bold"))
-        yield from console.grids(self.tables(), left=("unit", "verdict", "after"))
+        yield from console.grids(self.tables(), left=("unit", "verdict", "horizon"))
         yield from self.sentences()
 
     def sentences(self) -> tuple[str, ...]:
@@ -112,7 +113,7 @@ class IdentifiedVehicle(Result):
         return (
             *(f"check: {note}" for note in self.notes),
             *(f"to identify {names}: {advice}" for advice, names in self.advice.items()),
-            *(f"a scenario takes it, not the vehicle file: {name} = {value}" for name, value in self.settings.items()),
+            *(f"a scenario has it, not the vehicle file: {name} = {value}" for name, value in self.settings.items()),
         )
 
     def outputs(self) -> Shown:
