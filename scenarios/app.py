@@ -1107,7 +1107,7 @@ def export(
 @app.command(
     help_epilogue=_examples(
         "quadsim identify eight.csv --vehicle start.toml --out mine.toml --page mine.html",
-        "quadsim identify eight.ulg hover.ulg --vehicle start.toml --test square.ulg --poles 14",
+        "quadsim identify eight.csv climb.csv --vehicle start.toml --test square.csv --poles 14",
     )
 )
 def identify(
@@ -1128,7 +1128,7 @@ def identify(
         out: TOML file for the identified vehicle (default: none is written).
         page: HTML file for the page: intervals, and measured against predicted.
         overwrite: replace existing files.
-        poles: magnet poles of a motor, where a log has its electrical speed.
+        poles: magnets of a motor, where a log has its electrical speed.
 
     Returns:
         The `vehicle`; its `identification` (estimates with intervals and verdicts); the `prediction` of flight that was
@@ -1160,8 +1160,6 @@ def identify(
     fitted, tested = ([Path(log) for log in paths] for paths in (logs, test))
     if both := [log for log in tested if log.resolve() in {log.resolve() for log in fitted}]:
         raise ParameterError("", "--test", str(both[0]), "a log that is not fitted too")
-    if poles is not None and (poles < 2 or poles % 2):
-        raise ParameterError("", "--poles", poles, "an even number, 2 or more: count the magnets in a motor's bell")
     files = {name: None if path is None else Path(path) for name, path in (("out", out), ("page", page))}
     start = vehicle_path(str(vehicle))
     return identify_logs(fitted, start, test=tested, poles=poles, overwrite=overwrite, **files)

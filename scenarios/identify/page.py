@@ -70,7 +70,7 @@ def interval_figure(estimates: Sequence[Estimate]) -> Figure:
     sure = [abs(_percent(end, e)) for e in drawn if not e.refused for end in (e.low, e.high)]
     reach = 1.2 * min(max([*sure, *np.abs(start.y[np.isfinite(start.y)]), 1.0]), 100.0)
     panel = Panel(
-        title="off the identified value",
+        title="relative to the identified value",
         unit="%",
         series=(*series, start),
         y_range=(-reach, reach),

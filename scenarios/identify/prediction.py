@@ -21,13 +21,14 @@ from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
 from scenarios.identify.estimate import Identification
 from scenarios.identify.record import Record
-from scenarios.identify.rotors import speeds
+from scenarios.identify.rotors import lagging
 
 WINDOW: Final = 0.5  # longest horizon [s]; windows start every half of it
 HORIZONS: Final = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)  # at which errors are taken [s]
 IDENTIFIED, START, THRUST_ONLY = "identified", "start", "thrust only"
 QUANTITIES: Final = {"position": "m", "velocity": "m/s", "attitude": "rad", "body rates": "rad/s"}
 _HELD_OUT: Final = 0.2  # share of the airborne samples of a log
+_AT_ONCE: Final = 1e-6  # lag of rotors that have none [s]
 _STEP: Final = 2.5e-3  # longest step of the integration [s]
 _SHOWN: Final = 10  # windows in a trace
 _VELOCITY_AND_RATES: Final = [3, 4, 5, 10, 11, 12]  # of a state
@@ -180,14 +181,22 @@ def _rotor_speeds(model: _Model, record: Record, fineness: int) -> Array:
     vehicle, period = model.vehicle, record.period / fineness
     if record.speeds is not None:
         t = record.t[0] + period * np.arange(fineness * len(record.t)) - model.delay
-        return np.stack([np.interp(t, record.t, measured) for measured in record.speeds.T], axis=1)
-    commands = record.commands
-    if commands is None:
+        return np.stack([np.interp(t, record.t, measured) for measured in _filled(record.speeds).T], axis=1)
+    if record.commands is not None:
+        commands = record.commands
+    else:
         assert record.throttle is not None
-        u, a = record.throttle, model.throttle_curve
+        u, a = np.clip(record.throttle, 0.0, 1.0), model.throttle_curve
         commands = vehicle.speed_max * np.sqrt((1.0 - a) * u + a * u**2)
-    held = np.repeat(commands, fineness, axis=0)
-    return speeds(held, period, vehicle.rotor_rise or 0.0, vehicle.rotor_fall or 0.0, model.delay)
+    held = np.repeat(_filled(np.clip(commands, vehicle.speed_min, vehicle.speed_max)), fineness, axis=0)
+    rise, fall = vehicle.rotor_rise or _AT_ONCE, vehicle.rotor_fall or _AT_ONCE
+    return lagging(held, period, rise=rise, fall=fall, delay=model.delay).speeds
+
+
+def _filled(rows: Array) -> Array:
+    """Rows (N, 4) with the last finite one held in gaps."""
+    there = np.isfinite(rows).all(axis=1)
+    return rows[np.maximum.accumulate(np.where(there, np.arange(len(rows)), there.argmax()))]
 
 
 def _derivative(model: _Model, x: Array, w: Array) -> Array:
