@@ -187,8 +187,8 @@ def identify_logs(
         if error.owner != "vehicle":
             raise
         raise InputError(
-            f"the logs and {start} give a vehicle that cannot be: {error}; check its mass, arm_length, speed_min and "
-            "speed_max, and that the logs are of this vehicle"
+            f"the logs and {start} give a vehicle that cannot be: {error}; correct mass, arm_length or speed range, "
+            "or what was kept and does not suit what was identified"
         ) from error
     names = tuple(record.name for record in records)
     result = IdentifiedVehicle(
