@@ -47,6 +47,12 @@ class Record:
         return float(self.t[-1] - self.t[0]) / (self.t.size - 1)
 
 
+def driver(record: Record) -> Array:
+    """What drives the rotors (N, 4): measured speeds, else the commands or the throttle."""
+    rows = next(rows for rows in (record.speeds, record.commands, record.throttle) if rows is not None)
+    return np.asarray(rows)
+
+
 def read_record(path: Path | str, *, poles: int | None = None) -> Record:
     """Read a log: a CSV or Parquet table, a run directory of quadsim or its `flight.parquet`, or PX4's ULog.
 
