@@ -176,7 +176,7 @@ def identify_logs(
     notes = [
         note
         for record, parts in zip([*records, *tested], airborne, strict=True)
-        for note in (*record.notes, *check(record, vehicle, parts))
+        for note in check(record, vehicle, parts)
     ]
     fitted, held = airborne[: len(records)], airborne[len(records) :]
     if not tested:
@@ -194,7 +194,7 @@ def identify_logs(
     result = IdentifiedVehicle(
         identification=identification,
         prediction=predict(tested or records, held, identification, vehicle),
-        notes=tuple(dict.fromkeys(notes)),
+        notes=tuple(notes),
         logs=names,
         test=tuple(record.name for record in tested),
         content=vehicle_text(identification, start, names),
