@@ -1140,9 +1140,9 @@ def identify(
 
     Examples:
         >>> import quadsim
-        >>> quadsim.identify("eight.csv")
+        >>> quadsim.identify("not-logged-yet.csv", vehicle="hummingbird")
         Traceback (most recent call last):
-        quadsim.errors.InputError: identify needs --vehicle, a start: ...
+        quadsim.errors.FileError: not-logged-yet.csv: is missing, or not a file
     """
     from quadsim.assets import vehicle_path
     from scenarios.identify.report import NEEDED, identify_logs
