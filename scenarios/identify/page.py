@@ -9,7 +9,6 @@ import numpy as np
 
 from quadsim.report.figure import LINES, REFERENCE, Figure, Panel, Series
 from quadsim.report.page import Section, render_page
-from quadsim.report.table import Grid, format_number, line
 from quadsim.report.to_plotly import to_plot
 from scenarios.identify.estimate import Estimate
 from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, Prediction, Trace
@@ -39,7 +38,6 @@ def render(result: IdentifiedVehicle) -> str:
                 tables=(parameters,),
             ),
             Section(title="Prediction of flight not fitted", plots=tuple(map(to_plot, figures)), tables=(errors,)),
-            Section(title="Gates", tables=gates(result)),
         ],
         verdict=result.verdict,
         notes=result.sentences(),
@@ -119,26 +117,3 @@ def horizon_figure(prediction: Prediction) -> Figure:
         if np.isfinite(next(iter(prediction.errors.values()))[:, j]).all()
     ]  # fmt: skip
     return Figure(key="horizon", title="mean error over the horizon", panels=tuple(panels))
-
-
-def gates(result: IdentifiedVehicle) -> tuple[Grid, Grid]:
-    """Return what the gates looked at, beside the verdicts of the table of parameters."""
-    found = result.identification
-    white = [line(axis, format_number(value)) for axis, value in found.whiteness.items()]
-    ratio = [line(name, format_number(value)) for name, value in found.cross_check.items()]
-    return (
-        Grid(
-            key="whiteness",
-            title="Innovations",
-            head=("axis", "largest autocorrelation"),
-            lines=tuple(white),
-            note="What the model does not predict has to be noise: near 0 for every lag.",
-        ),
-        Grid(
-            key="cross-check",
-            title="Cross-check",
-            head=("parameter", "output error over this fit"),
-            lines=tuple(ratio),
-            note="A second method on the same logs: near 1 where no disturbance acts in the loop.",
-        ),
-    )

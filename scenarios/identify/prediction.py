@@ -54,19 +54,6 @@ class Prediction:
     trace: Trace
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Model:
-    """A vehicle with what its file has no field for; see `Identification`."""
-
-    vehicle: Vehicle
-    delay: float = 0.0
-    offset: tuple[float, float] = (0.0, 0.0)
-    wind: tuple[float, float] = (0.0, 0.0)
-    throttle_curve: float = 0.0
-    yaw_trim: float = 0.0
-    turns: bool = True  # False holds the rates
-
-
 def hold_out(spans: Sequence[slice]) -> tuple[list[slice], list[slice]]:
     """Cut airborne spans into what is fitted and what is held out: the last fifth of their samples."""
     left = round((1.0 - _HELD_OUT) * sum(span.stop - span.start for span in spans))
@@ -87,56 +74,47 @@ def predict(
     Raises:
         InputError: no span is as long as a window.
     """
-    result = identification
-    curve = result.throttle_curve
-    full = _Model(
-        vehicle=result.vehicle, delay=result.delay, offset=result.offset, wind=result.wind,
-        throttle_curve=curve, yaw_trim=result.yaw_trim,
-    )  # fmt: skip
-    bare = replace(result.vehicle, rotor_drag=None, body_drag=None, rotor_inertia=None)
+    known, bare = identification, replace(identification.vehicle, rotor_drag=None, body_drag=None, rotor_inertia=None)
     models = {
-        IDENTIFIED: full,
-        START: _Model(vehicle=start, throttle_curve=curve),
-        THRUST_ONLY: replace(full, vehicle=bare, turns=False),
+        IDENTIFIED: known,
+        START: replace(known, vehicle=start, delay=0.0, offset=(0.0, 0.0), wind=(0.0, 0.0), yaw_trim=0.0),
+        THRUST_ONLY: replace(known, vehicle=bare),
     }
     errors: dict[str, list[Array]] = {name: [] for name in models}
-    longest, trace = 0, None
-    for record, parts in zip(records, spans, strict=True):
+    traces = []
+    for record, part in ((record, part) for record, parts in zip(records, spans, strict=True) for part in parts):
         half = max(1, round(0.5 * WINDOW / record.period))
-        starts = [np.arange(part.start, part.stop - 2 * half, half) for part in parts]
-        rows = np.concatenate([np.empty(0, int), *starts])[:, None] + np.arange(2 * half + 1)
+        rows = np.arange(part.start, part.stop - 2 * half, half)[:, None] + np.arange(2 * half + 1)
         if not rows.size:
             continue
-        measured = _measured(record, rows)
-        predicted = {name: _simulate(model, record, rows, measured[:, 0]) for name, model in models.items()}
+        measured = _measured(record)[rows]
         at = np.rint(np.array(HORIZONS) / record.period).astype(int)
-        for name, states in predicted.items():
+        drawn = np.s_[: 2 * _SHOWN : 2, :, _VELOCITY_AND_RATES]
+        predicted = {}
+        for name, model in models.items():
+            states = _simulate(model, record, rows, measured[:, 0], turns=name != THRUST_ONLY)
             errors[name].append(_errors(states[:, at], measured[:, at]))
-        first, count = max(((sum(map(len, starts[:i])), len(s)) for i, s in enumerate(starts)), key=lambda s: s[1])
-        if count > longest:
-            longest, shown = count, slice(first, first + min(count, 2 * _SHOWN), 2)
-            kept = {name: states[shown][..., _VELOCITY_AND_RATES] for name, states in predicted.items()}
-            trace = Trace(
-                log=record.name,
-                t=record.t[rows[shown]],
-                measured=measured[shown][..., _VELOCITY_AND_RATES],
-                predicted=kept,
-            )
-    if trace is None:
+            predicted[name] = states[drawn]
+        traces.append(
+            Trace(log=record.name, t=record.t[rows[: 2 * _SHOWN : 2]], measured=measured[drawn], predicted=predicted)
+        )
+    if not traces:
         raise InputError(
             f"what is held out for the prediction is shorter than one window of {WINDOW:g} s: fly longer, or give "
             "another log with --test"
         )
     whole = {name: np.concatenate(parts) for name, parts in errors.items()}
     return Prediction(
-        windows=len(whole[IDENTIFIED]), errors={name: e.mean(axis=0) for name, e in whole.items()}, trace=trace
+        windows=len(whole[IDENTIFIED]),
+        errors={name: of.mean(axis=0) for name, of in whole.items()},
+        trace=max(traces, key=lambda trace: len(trace.t)),
     )
 
 
-def _measured(record: Record, rows: Indices) -> Array:
-    """(W, K, 13) position, velocity, attitude and body rates; positions are NaN where there are none."""
+def _measured(record: Record) -> Array:
+    """(N, 13) position, velocity, attitude and body rates; positions are NaN where there are none."""
     position = np.full_like(record.velocity, np.nan) if record.position is None else record.position
-    return np.concatenate([position, record.velocity, record.attitude, record.rates], axis=1)[rows]
+    return np.concatenate([position, record.velocity, record.attitude, record.rates], axis=1)
 
 
 def _errors(predicted: Array, measured: Array) -> Array:
@@ -148,8 +126,11 @@ def _errors(predicted: Array, measured: Array) -> Array:
     return np.stack([*norms[:2], angle, norms[2]], axis=-1)
 
 
-def _simulate(model: _Model, record: Record, rows: Indices, initial: Array) -> Array:
-    """(W, K, 13) states from (W, 13) at the samples (W, K) of windows, by the classical Runge-Kutta method."""
+def _simulate(model: Identification, record: Record, rows: Indices, initial: Array, *, turns: bool) -> Array:
+    """(W, K, 13) states from (W, 13) at the samples (W, K) of windows, by the classical Runge-Kutta method.
+
+    Without `turns`, the body rates stay as they are.
+    """
     steps = math.ceil(record.period / _STEP - 1e-9)
     h = record.period / steps
     rotors = _rotor_speeds(model, record, 2 * steps)  # also at the middle of each step
@@ -159,10 +140,10 @@ def _simulate(model: _Model, record: Record, rows: Indices, initial: Array) -> A
     for sample in rows.T[:-1]:
         for i in range(0, 2 * steps, 2):
             begin, middle, end = (rotors[2 * steps * sample + i + part] for part in range(3))
-            k1 = _derivative(model, x, begin)
-            k2 = _derivative(model, x + 0.5 * h * k1, middle)
-            k3 = _derivative(model, x + 0.5 * h * k2, middle)
-            k4 = _derivative(model, x + h * k3, end)
+            k1 = _derivative(model, x, begin, turns=turns)
+            k2 = _derivative(model, x + 0.5 * h * k1, middle, turns=turns)
+            k3 = _derivative(model, x + 0.5 * h * k2, middle, turns=turns)
+            k4 = _derivative(model, x + h * k3, end, turns=turns)
             x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
         x[:, 6:10] /= np.linalg.norm(x[:, 6:10], axis=1, keepdims=True)
         state = x.copy()
@@ -176,7 +157,7 @@ def _spin(vehicle: Vehicle) -> Array:
     return -(vehicle.rotor_inertia or 0.0) / vehicle.inertia[2] * np.array(vehicle.rotor_spins, float)
 
 
-def _rotor_speeds(model: _Model, record: Record, fineness: int) -> Array:
+def _rotor_speeds(model: Identification, record: Record, fineness: int) -> Array:
     """(fineness N, 4) rotor speeds, so many per sample [rad/s]."""
     vehicle, period = model.vehicle, record.period / fineness
     if record.speeds is not None:
@@ -199,7 +180,7 @@ def _filled(rows: Array) -> Array:
     return rows[np.maximum.accumulate(np.where(there, np.arange(len(rows)), there.argmax()))]
 
 
-def _derivative(model: _Model, x: Array, w: Array) -> Array:
+def _derivative(model: Identification, x: Array, w: Array, *, turns: bool) -> Array:
     """Time derivative of states (W, 13) under rotor speeds (W, 4): rigid body, thrust, drag, and rotors' momentum.
 
     Equations: `quadsim.sim.effects.forces` and, of the body's drag, `quadsim.sim.airframe`.
@@ -219,7 +200,7 @@ def _derivative(model: _Model, x: Array, w: Array) -> Array:
     dx[:, 3:6] = _turned(q, force) / vehicle.mass - [0.0, 0.0, vehicle.gravity]
     dx[:, 6:10] = 0.5 * multiply(q, np.insert(rates, 0, 0.0, axis=1))
     dx[:, 10:] = 0.0
-    if model.turns:
+    if turns:
         torque = np.cross(places, forces).sum(axis=1)
         torque[:, 2] += vehicle.drag_coefficient * w**2 @ np.array(vehicle.rotor_spins) + model.yaw_trim
         whole = J * rates

@@ -75,11 +75,15 @@ class IdentifiedVehicle(Result):
 
     def tables(self) -> tuple[Grid, Grid]:
         """Return the parameters, and the errors of the prediction."""
+        known = self.identification
+        white = ", ".join(f"{axis} {format_number(value)}" for axis, value in known.whiteness.items())
         parameters = Grid(
             key="parameters",
             title="Parameters",
-            head=("parameter", "unit", "start", "identified", "95 % interval", "verdict"),
-            lines=tuple(map(_parameter, self.identification.estimates)),
+            head=("parameter", "unit", "start", "identified", "95 % interval", "cross-check", "verdict"),
+            lines=tuple(_parameter(estimate, known.cross_check.get(estimate.name)) for estimate in known.estimates),
+            note="cross-check: what a second method finds, output error, over this value."
+            + (f" Largest autocorrelation of what is not predicted, 0 for noise: {white}." if white else ""),
         )
         held_out = ", ".join(self.test) or "the last fifth of each log, which is not fitted"
         lines = []
@@ -132,22 +136,13 @@ class IdentifiedVehicle(Result):
 
     def to_json(self) -> dict[str, Any]:
         """All of it as plain values; a number that is not finite is None."""
-        result = self.identification
         errors = {
-            model: {name: _plain(of[:, j]) for j, name in enumerate(QUANTITIES)}
-            for model, of in self.prediction.errors.items()
+            model: {name: of[:, j] for j, name in enumerate(QUANTITIES)} for model, of in self.prediction.errors.items()
         }
-        return {
+        data = {
             "logs": self.logs,
             "test": self.test,
-            "estimates": [_plain(asdict(estimate)) for estimate in result.estimates],
-            "delay": result.delay,
-            "offset": result.offset,
-            "wind": result.wind,
-            "throttle_curve": result.throttle_curve,
-            "yaw_trim": result.yaw_trim,
-            "whiteness": _plain(result.whiteness),
-            "cross_check": _plain(result.cross_check),
+            **asdict(self.identification),
             "notes": self.notes,
             "advice": self.advice,
             "settings": self.settings,
@@ -155,6 +150,7 @@ class IdentifiedVehicle(Result):
             "vehicle_file": self.content,
             "written": [str(path) for path in (self.file, self.page) if path is not None],
         }
+        return {name: _plain(value) for name, value in data.items()}
 
 
 def identify_logs(
@@ -210,19 +206,19 @@ def identify_logs(
     return result
 
 
-def _parameter(estimate: Estimate) -> tuple[Cell, ...]:
-    """Return a line of the table of parameters."""
+def _parameter(estimate: Estimate, ratio: float | None) -> tuple[Cell, ...]:
+    """Return a line of the table of parameters; `ratio` is its cross-check."""
     start = ABSENT if estimate.start is None else f"{estimate.start:.4g}"
-    kept = "kept" if estimate.start is not None else "left out"
+    kept = "left out" if estimate.start is None else "kept"
     verdict = Cell(text=f"{kept}: {estimate.refused}", mark=Mark.WARN) if estimate.refused else "identified"
-    value = f"{rounded(estimate.value, estimate):.7g}"
-    return line(estimate.name, estimate.unit, start, value, interval(estimate), verdict)
+    value, checked = f"{rounded(estimate.value, estimate):.7g}", ABSENT if ratio is None else f"{ratio:.3f}"
+    return line(estimate.name, estimate.unit, start, value, interval(estimate), checked, verdict)
 
 
 def _plain(values: Any) -> Any:
     """Return plain data in which numbers that are not finite are None."""
     if isinstance(values, dict):
         return {name: _plain(value) for name, value in values.items()}
-    if isinstance(values, np.ndarray):
-        return [_plain(value) for value in values.tolist()]
+    if isinstance(values, list | tuple | np.ndarray):
+        return [_plain(value) for value in values]
     return None if isinstance(values, float) and not math.isfinite(values) else values
