@@ -33,7 +33,9 @@ class Identification:
     delay: float  # of the commands [s]; 0 where speeds are measured without one
     offset: tuple[float, float]  # x and y of the centre of mass in the rotors' frame [m]
     wind: tuple[float, float] = (0.0, 0.0)  # mean, world x and y, where drag shows it [m/s]
-    throttle_curve: float = 0.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle; see `rotors`
+    throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle [-]
     yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
+    voltage_exponent: float = 0.0  # n of thrust over voltage, (V / V0)^n [-]
+    voltage: float | None = None  # V0, at which the thrust coefficient holds [V]; None without a battery in the log
     whiteness: dict[str, float] = field(default_factory=dict)  # largest |autocorrelation| of innovations by axis [-]
     cross_check: dict[str, float] = field(default_factory=dict)  # output-error estimate over this one, by parameter [-]

@@ -1,0 +1,141 @@
+"""Increments of velocity and body rates from sample to sample, as measured and as a vehicle's parameters predict."""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from quadsim.rotation import exponential, multiply, normalise
+from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+from scenarios.identify.record import Record
+from scenarios.identify.rotors import Turning, lagging, measured
+
+AXES: Final = ("roll", "pitch", "yaw", "vx", "vy", "vz")
+_SMOOTHING: Final = 0.1
+"""Time constant [s] below which the attitude follows the gyro: it averages the noise of the attitude itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameters:
+    """Everything that the prediction depends on, in SI units; see `Vehicle`."""
+
+    thrust_coefficient: float
+    inertia: Array  # (3,)
+    drag_to_thrust: float
+    rotor_rise: float
+    rotor_fall: float
+    delay: float  # of the commands [s]
+    rotor_inertia: float
+    rotor_drag: float
+    body_drag: Array  # (3,)
+    offset: Array  # (3,) centre of mass in the rotors' frame, x and y, and how far above it rotor drag acts [m]
+    wind: Array  # (W, 2) world x and y, linear between W instants from first sample to last [m/s]
+    munk: float  # mass of air that moves along body z less that along x and y [kg]
+    yaw_trim: float  # constant yaw torque that is not the rotors' [N m]
+    throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle [-]
+    voltage_exponent: float = 0.0  # n of thrust over voltage, (V / V0)^n
+    voltage: float = 0.0  # V0, at which the thrust coefficient holds [V]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stretch:
+    """Part of a record that flies, with what no parameter changes."""
+
+    record: Record
+    increments: Array  # (N - 1, 6) of body rates [rad/s] and world velocity [m/s]
+    rates: Array  # (N - 1, 3) mean of each period [rad/s]
+    turn: Array  # (N - 1, 3, 3) body to world, mean of each period
+    velocity: Array  # (N - 1, 3) world, same [m/s]
+
+
+def stretch(record: Record) -> Stretch:
+    """Prepare a record, all of which flies."""
+    turn = Rotation.from_quat(np.roll(_smoothed(record), -1, axis=1)).as_matrix()
+    return Stretch(
+        record=record,
+        increments=np.diff(np.concatenate([record.rates, record.velocity], axis=1), axis=0),
+        rates=0.5 * (record.rates[1:] + record.rates[:-1]),
+        turn=0.5 * (turn[1:] + turn[:-1]),
+        velocity=0.5 * (record.velocity[1:] + record.velocity[:-1]),
+    )
+
+
+def _smoothed(record: Record) -> Array:
+    """(N, 4) attitude as a complementary filter of attitude and gyro gives it."""
+    share = record.period / (record.period + _SMOOTHING)
+    halves = 0.5 * record.period * (record.rates[1:] + record.rates[:-1])
+    smoothed = [tuple(record.attitude[0].tolist())]
+    for angle, seen in zip(halves.tolist(), record.attitude[1:].tolist(), strict=True):
+        ahead = multiply(smoothed[-1], exponential(tuple(angle)))
+        sign = 1.0 if sum(map(operator.mul, ahead, seen)) >= 0.0 else -1.0
+        smoothed.append(normalise(tuple(a + share * (sign * b - a) for a, b in zip(ahead, seen, strict=True))))
+    return np.array(smoothed)
+
+
+def turning(record: Record, vehicle: Vehicle, p: Parameters) -> Turning:
+    """The rotors' speeds, from whatever the record has of them."""
+    if record.speeds is not None:
+        return measured(record.speeds, record.period, delay=p.delay)
+    if record.commands is not None:
+        commands = np.clip(record.commands, vehicle.speed_min, vehicle.speed_max)
+    else:
+        assert record.throttle is not None
+        share = np.clip(record.throttle, 0.0, 1.0)
+        commands = vehicle.speed_max * np.sqrt((1.0 - p.throttle_curve) * share + p.throttle_curve * share**2)
+    if record.voltage is not None:
+        commands = commands * (record.voltage / p.voltage)[:, None] ** (0.5 * p.voltage_exponent)
+    return lagging(commands, record.period, rise=p.rotor_rise, fall=p.rotor_fall, delay=p.delay)
+
+
+def predicted(part: Stretch, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:
+    """(N - 1, 6) increments of body rates and velocity as the parameters predict them.
+
+    J dw/dt = sum r_i x f_i - w x (J w + h e_z) - dh/dt e_z with h = -sum spin_i J_r w_i, f_i = b w_i^2 e_z -
+    rotor_drag w_i v_perp,i; m dv/dt = R (sum f_i + body drag) - m g e_z.
+    """
+    x, y, _ = vehicle.rotor_positions.T
+    spin = np.array(vehicle.rotor_spins, float)
+    dt, jx, jy, jz = part.record.period, *p.inertia
+    when = np.linspace(0.0, len(p.wind) - 1.0, len(part.rates))
+    wind = np.stack([*(np.interp(when, np.arange(len(p.wind)), w) for w in p.wind.T), np.zeros(len(when))], axis=1)
+    air = np.einsum("kji,kj->ki", part.turn, part.velocity - wind)  # body axes
+    roll, pitch, yaw = part.rates.T
+    thrust = p.thrust_coefficient * rotors.square
+    dragging = p.rotor_drag * rotors.mean
+    side = -(dragging * (air[:, :1] - yaw[:, None] * y)), -(dragging * (air[:, 1:2] + yaw[:, None] * x))
+    total = thrust.sum(axis=1)
+    force = np.stack([side[0].sum(axis=1), side[1].sum(axis=1), total], axis=1)
+    momentum = -(rotors.mean @ spin) * p.rotor_inertia
+    spun_up = -(np.diff(rotors.speeds, axis=0) @ spin) * p.rotor_inertia
+    torque = np.stack(
+        [
+            thrust @ y
+            - p.offset[1] * total
+            - p.offset[2] * force[:, 1]
+            - momentum * pitch
+            - (jz - jy) * pitch * yaw
+            - p.munk * air[:, 1] * air[:, 2],
+            p.offset[0] * total
+            - thrust @ x
+            + p.offset[2] * force[:, 0]
+            + momentum * roll
+            - (jx - jz) * roll * yaw
+            + p.munk * air[:, 0] * air[:, 2],
+            p.drag_to_thrust * (thrust @ spin)
+            + (side[1] * x - side[0] * y).sum(axis=1)
+            + p.yaw_trim
+            - (jy - jx) * roll * pitch,
+        ],
+        axis=1,
+    )
+    angular = dt * torque
+    angular[:, 2] -= spun_up
+    body = force - 0.5 * SEA_LEVEL_DENSITY * p.body_drag * np.linalg.norm(air, axis=1, keepdims=True) * air
+    linear = np.einsum("kij,kj->ki", part.turn, body) / vehicle.mass - [0.0, 0.0, vehicle.gravity]
+    return np.concatenate([angular / p.inertia, dt * linear], axis=1)
