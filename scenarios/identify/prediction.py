@@ -164,12 +164,14 @@ def _rotor_speeds(model: Identification, record: Record, fineness: int) -> Array
         t = record.t[0] + period * np.arange(fineness * len(record.t)) - model.delay
         return np.stack([np.interp(t, record.t, measured) for measured in _filled(record.speeds).T], axis=1)
     if record.commands is not None:
-        commands = record.commands
+        commands = np.clip(record.commands, vehicle.speed_min, vehicle.speed_max)
     else:
         assert record.throttle is not None
         u, a = np.clip(record.throttle, 0.0, 1.0), model.throttle_curve
         commands = vehicle.speed_max * np.sqrt((1.0 - a) * u + a * u**2)
-    held = np.repeat(_filled(np.clip(commands, vehicle.speed_min, vehicle.speed_max)), fineness, axis=0)
+    if record.voltage is not None and model.voltage is not None:
+        commands = commands * (record.voltage / model.voltage)[:, None] ** (0.5 * model.voltage_exponent)
+    held = np.repeat(_filled(commands), fineness, axis=0)
     rise, fall = vehicle.rotor_rise or _AT_ONCE, vehicle.rotor_fall or _AT_ONCE
     return lagging(held, period, rise=rise, fall=fall, delay=model.delay).speeds
 

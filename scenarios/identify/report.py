@@ -22,7 +22,7 @@ from scenarios.identify.fit import identify_records
 from scenarios.identify.page import render
 from scenarios.identify.prediction import HORIZONS, QUANTITIES, Prediction, hold_out, predict
 from scenarios.identify.record import read_record
-from scenarios.identify.vehicle_file import interval, rounded, vehicle_text
+from scenarios.identify.vehicle_file import interval, rounded, vehicle_text, verdict
 from scenarios.results import Result, Shown
 
 NEEDED: Final = "mass, gravity, arm_length, rotor_azimuths, rotor_spins, speed_min and speed_max"
@@ -67,10 +67,11 @@ class IdentifiedVehicle(Result):
 
     @property
     def settings(self) -> dict[str, str]:
-        """What was identified but has no field in a vehicle file: values by field of a scenario."""
-        known = {e.name: rounded(e.value, e) for e in self.identification.estimates if not (e.in_file or e.refused)}
+        """What is certainly not zero and has no field in a vehicle file: values by field of a scenario."""
+        certain = [e for e in self.identification.estimates if not (e.in_file or e.refused or e.low <= 0.0 <= e.high)]
+        known = {estimate.name: rounded(estimate.value, estimate) for estimate in certain}
         offset = [known.get(f"offset_{axis}", 0.0) for axis in "xy"]
-        settings = {"computation.delay": f"{known['delay']:g}"} if known.get("delay") else {}
+        settings = {"computation.delay": f"{known['delay']:g}"} if known.get("delay", 0.0) > 0.0 else {}
         return settings | ({"effects.load.centre_of_mass": f"[{offset[0]:g}, {offset[1]:g}, 0]"} if any(offset) else {})
 
     def tables(self) -> tuple[Grid, Grid]:
@@ -81,7 +82,7 @@ class IdentifiedVehicle(Result):
             key="parameters",
             title="Parameters",
             head=("parameter", "unit", "start", "identified", "95 % interval", "cross-check", "verdict"),
-            lines=tuple(_parameter(estimate, known.cross_check.get(estimate.name)) for estimate in known.estimates),
+            lines=tuple(_parameter(estimate, known) for estimate in known.estimates),
             note="cross-check: what a second method finds, output error, over this value."
             + (f" Largest autocorrelation of what is not predicted, 0 for noise: {white}." if white else ""),
         )
@@ -206,13 +207,14 @@ def identify_logs(
     return result
 
 
-def _parameter(estimate: Estimate, ratio: float | None) -> tuple[Cell, ...]:
-    """Return a line of the table of parameters; `ratio` is its cross-check."""
+def _parameter(estimate: Estimate, known: Identification) -> tuple[Cell, ...]:
+    """Return a line of the table of parameters."""
     start = ABSENT if estimate.start is None else f"{estimate.start:.4g}"
-    kept = "left out" if estimate.start is None else "kept"
-    verdict = Cell(text=f"{kept}: {estimate.refused}", mark=Mark.WARN) if estimate.refused else "identified"
-    value, checked = f"{rounded(estimate.value, estimate):.7g}", ABSENT if ratio is None else f"{ratio:.3f}"
-    return line(estimate.name, estimate.unit, start, value, interval(estimate), checked, verdict)
+    value, ratio = f"{rounded(estimate.value, estimate):.7g}", known.cross_check.get(estimate.name)
+    checked = ABSENT if ratio is None else f"{ratio:.3f}"
+    mark = Mark.WARN if estimate.refused else Mark.NONE
+    found = Cell(text=verdict(estimate, known.vehicle), mark=mark)
+    return line(estimate.name, estimate.unit, start, value, interval(estimate), checked, found)
 
 
 def _plain(values: Any) -> Any:

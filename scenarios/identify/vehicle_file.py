@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import tomlkit
 
-from quadsim.vehicle import VEHICLE_UNITS
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.identify.estimate import Estimate, Identification
 
 _AXES: Final = ("_x", "_y", "_z")
@@ -20,6 +20,23 @@ _DIGITS: Final = 100.0  # the last digit is no more than this part of an interva
 def field_of(estimate: Estimate) -> str:
     """Return the field of a vehicle file that holds an estimate: `inertia` of `inertia_x`."""
     return estimate.name[:-2] if estimate.name.endswith(_AXES) else estimate.name
+
+
+def number_in(vehicle: Vehicle, estimate: Estimate) -> float | None:
+    """Return what a vehicle has for an estimate; of `body_drag` the first number, as the others follow it."""
+    value = getattr(vehicle, field_of(estimate))
+    axis = estimate.name[-1] if field_of(estimate) != estimate.name else "x"
+    return value["xyz".index(axis)] if isinstance(value, tuple) else value
+
+
+def verdict(estimate: Estimate, vehicle: Vehicle) -> str:
+    """Return whether a number is identified, or else why it is not, and what the vehicle has."""
+    if not estimate.refused:
+        return "identified"
+    if not estimate.in_file or number_in(vehicle, estimate) is None:
+        return f"left out: {estimate.refused}"
+    number = number_in(vehicle, estimate)
+    return f"kept: {estimate.refused}" if number == estimate.start else f"set to {number:.4g}: {estimate.refused}"
 
 
 def rounded(value: float, estimate: Estimate) -> float:
@@ -51,10 +68,8 @@ def vehicle_text(identification: Identification, start: Path, logs: Sequence[str
             document.add(tomlkit.nl())
             document[name] = {"value": value, "unit": VEHICLE_UNITS[name], "source": ""}
         table: Any = document[name]
-        before = str(table["source"])
-        if any(not estimate.refused for estimate in estimates):
-            table["value"] = _value(value, estimates)
-        table["source"] = _source(estimates, before, logs)
+        table["value"] = _value(value, estimates)
+        table["source"] = _source(identification.vehicle, estimates, str(table["source"]), logs)
     return tomlkit.dumps(document)
 
 
@@ -66,16 +81,14 @@ def _value(value: Any, estimates: Sequence[Estimate]) -> Any:
     return numbers if isinstance(value, tuple) else numbers[0]
 
 
-def _source(estimates: Sequence[Estimate], before: str, logs: Sequence[str]) -> str:
+def _source(vehicle: Vehicle, estimates: Sequence[Estimate], before: str, logs: Sequence[str]) -> str:
     """Return where each number is from."""
-    identified = f"; logs {', '.join(logs)}"
     parts = []
     for estimate in estimates:
         start = "" if estimate.start is None else f"; start {estimate.start:.4g}"
-        text = (
-            f"kept: {estimate.refused}" if estimate.refused else f"identified: 95 % within {interval(estimate)}{start}"
-        )
-        parts.append(text if len(estimates) == 1 else f"{estimate.name[-1]} {text}")
+        axis = "" if len(estimates) == 1 else f"{estimate.name[-1]} "
+        within = "" if estimate.refused else f": 95 % within {interval(estimate)}{start}"
+        parts.append(f"{axis}{verdict(estimate, vehicle)}{within}")
     refused = [bool(estimate.refused) for estimate in estimates]
-    tail = f"; {before}" if any(refused) and before else ""
-    return "; ".join(parts) + ("" if all(refused) else identified) + tail
+    parts += [] if all(refused) else [f"logs {', '.join(logs)}"]
+    return "; ".join(parts + ([before] if any(refused) and before else []))

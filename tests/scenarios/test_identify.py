@@ -152,6 +152,18 @@ def test_a_parameter_that_the_start_lacks_is_added(place: Path) -> None:
     assert vehicle_sources(path)["rotor_rise"] == "identified: 95 % within 0.0297 to 0.0303; logs a.csv"
 
 
+def test_a_refused_number_that_does_not_suit_the_rest_is_set_and_says_so(place: Path) -> None:
+    start = load_vehicle(place / "start.toml")
+    estimates = (*(estimate(f"inertia_{axis}", 0.005, 0.009) for axis in "xy"),
+                 estimate("inertia_z", 0.03, 0.0139, refused="no yaw excitation"))  # fmt: skip
+    new = replace(start, inertia=(0.005, 0.005, 0.0087))
+    identification = Identification(estimates=estimates, vehicle=new, fitted=new, delay=0.0, offset=(0.0, 0.0))
+    path = place / "set.toml"
+    path.write_text(vehicle_text(identification, place / "start.toml", ["a.csv"]), encoding="utf-8")
+    assert load_vehicle(path).inertia == (0.005, 0.005, 0.0087)
+    assert "z set to 0.0087: no yaw excitation; logs a.csv" in vehicle_sources(path)["inertia"]
+
+
 def test_values_have_the_digits_of_their_intervals() -> None:
     assert rounded(8.5432109e-6, estimate("b", 8.5432109e-6, None)) == 8.543e-6
     assert rounded(123.456, replace(estimate("b", 1.0, None), low=20.0, high=420.0)) == 123.0
@@ -259,8 +271,9 @@ def test_what_to_fly_and_what_a_scenario_takes_are_said_once(
         replace(estimate("delay", 0.0123456, None), in_file=False),
         replace(estimate("offset_x", -0.002, None), in_file=False),
     )
-    result = replace(identified, identification=replace(identified.identification, estimates=estimates))
-    result.show()
+    vehicle = replace(identified.vehicle, inertia=(0.007, 0.007, 0.0139), rotor_fall=None)
+    found = replace(identified.identification, estimates=estimates, vehicle=vehicle)
+    replace(identified, identification=found).show()
     text = capsys.readouterr().out
     assert "3 of 5 parameters identified from eight.csv; not identified: inertia_z, rotor_fall" in text
     assert "to identify inertia_z, rotor_fall: fly yaw steps" in text
