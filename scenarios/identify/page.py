@@ -10,6 +10,7 @@ import numpy as np
 from quadsim.report.figure import LINES, REFERENCE, Figure, Panel, Series
 from quadsim.report.page import Section, render_page
 from quadsim.report.to_plotly import to_plot
+from quadsim.state import shown_unit
 from scenarios.identify.estimate import Estimate
 from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, Prediction, Trace
 
@@ -65,10 +66,10 @@ def interval_figure(estimates: Sequence[Estimate]) -> Figure:
         marker="diamond",
         width=6.0,
     )
-    sure = [abs(_percent(end, e)) for e in drawn if not e.refused for end in (e.low, e.high)]
-    reach = 1.2 * min(max([*sure, *np.abs(start.y[np.isfinite(start.y)]), 1.0]), 100.0)
+    sure = [_percent(end, e) for e in drawn if not e.refused for end in (e.low, e.high, e.start or e.value)]
+    reach = 1.2 * min(max(np.abs([1.0, *sure])), 100.0)
     panel = Panel(
-        title="relative to the identified value",
+        title="relative to the estimate",
         unit="%",
         series=(*series, start),
         y_range=(-reach, reach),
@@ -88,15 +89,17 @@ def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)
     gap = np.full((len(t), 1), np.nan)
     panels = []
     for i in (0, 3, 1, 4, 2, 5):  # velocities in the left column
-        title, unit = _TRACED[i]
+        title, (unit, scale) = _TRACED[i][0], shown_unit(_TRACED[i][1])
         predicted = (
             Series(
-                x=np.hstack([t, t[:, -1:]]).ravel(), y=np.hstack([trace.predicted[name][..., i], gap]).ravel(),
+                x=np.hstack([t, t[:, -1:]]).ravel(), y=np.hstack([scale * trace.predicted[name][..., i], gap]).ravel(),
                 colour=_COLOURS[name], label=f"predicted, {name}",
             )
             for name in models
         )  # fmt: skip
-        measured = Series(x=t.ravel(), y=trace.measured[..., i].ravel(), colour=REFERENCE, label="measured", width=2.2)
+        measured = Series(
+            x=t.ravel(), y=scale * trace.measured[..., i].ravel(), colour=REFERENCE, label="measured", width=1.8
+        )
         panels.append(Panel(title=title, unit=unit, series=(measured, *reversed([*predicted]))))
     title = f"measured and predicted: {trace.log} from {trace.t[0, 0]:.4g} s on, a prediction every {t[0, -1]:.2g} s"
     return Figure(key="trace", title=title, panels=tuple(panels), end=float(t[-1, -1]))
@@ -104,16 +107,13 @@ def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)
 
 def horizon_figure(prediction: Prediction) -> Figure:
     """Return the mean errors over the horizon."""
-    x = np.array((0.0, *HORIZONS))
-    panels = [
-        Panel(
-            title=quantity, unit=unit, x_label="horizon [s]",
-            series=tuple(
-                Series(x=x, y=np.insert(errors[:, j], 0, 0.0), colour=_COLOURS[name], label=name)
-                for name, errors in prediction.errors.items()
-            ),
+    x, panels = np.array((0.0, *HORIZONS)), []
+    for j, (quantity, si) in enumerate(QUANTITIES.items()):
+        unit, scale = shown_unit(si)
+        series = tuple(
+            Series(x=x, y=np.insert(scale * errors[:, j], 0, 0.0), colour=_COLOURS[name], label=name)
+            for name, errors in prediction.errors.items()
+            if np.isfinite(errors[:, j]).all()
         )
-        for j, (quantity, unit) in enumerate(QUANTITIES.items())
-        if np.isfinite(next(iter(prediction.errors.values()))[:, j]).all()
-    ]  # fmt: skip
+        panels += [Panel(title=quantity, unit=unit, x_label="horizon [s]", series=series)] if series else []
     return Figure(key="horizon", title="mean error over the horizon", panels=tuple(panels))

@@ -74,7 +74,8 @@ def predict(
     Raises:
         InputError: no span is as long as a window.
     """
-    known, bare = identification, replace(identification.vehicle, rotor_drag=None, body_drag=None, rotor_inertia=None)
+    known = _without_refused(identification)
+    bare = replace(known.vehicle, rotor_drag=None, body_drag=None, rotor_inertia=None)
     models = {
         IDENTIFIED: known,
         START: replace(known, vehicle=start, delay=0.0, offset=(0.0, 0.0), wind=(0.0, 0.0), yaw_trim=0.0),
@@ -109,6 +110,17 @@ def predict(
         errors={name: of.mean(axis=0) for name, of in whole.items()},
         trace=max(traces, key=lambda trace: len(trace.t)),
     )
+
+
+def _without_refused(known: Identification) -> Identification:
+    """Return the identification without the delay and offset that a gate refuses, and without wind if it refuses drag."""
+    refused = {estimate.name for estimate in known.estimates if estimate.refused}
+    offset = (
+        0.0 if "offset_x" in refused else known.offset[0],
+        0.0 if "offset_y" in refused else known.offset[1],
+    )
+    wind = (0.0, 0.0) if {"rotor_drag", "body_drag"} <= refused else known.wind
+    return replace(known, delay=0.0 if "delay" in refused else known.delay, offset=offset, wind=wind)
 
 
 def _measured(record: Record) -> Array:

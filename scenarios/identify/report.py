@@ -15,6 +15,7 @@ import numpy as np
 from quadsim.errors import InputError, ParameterError
 from quadsim.outputs import require_file, writing_file
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
+from quadsim.state import shown_unit
 from quadsim.vehicle import Vehicle, load_vehicle
 from scenarios.identify.checks import check, spans
 from scenarios.identify.estimate import Estimate, Identification
@@ -81,16 +82,17 @@ class IdentifiedVehicle(Result):
         parameters = Grid(
             key="parameters",
             title="Parameters",
-            head=("parameter", "unit", "start", "identified", "95 % interval", "cross-check", "verdict"),
+            head=("parameter", "unit", "start", "estimate", "95 % interval", "cross-check", "verdict"),
             lines=tuple(_parameter(estimate, known) for estimate in known.estimates),
             note="cross-check: what a second method finds, output error, over this value."
             + (f" Largest autocorrelation of what is not predicted, 0 for noise: {white}." if white else ""),
         )
         held_out = ", ".join(self.test) or "the last fifth of each log, which is not fitted"
         lines = []
-        for j, (quantity, unit) in enumerate(QUANTITIES.items()):
+        for j, (quantity, si) in enumerate(QUANTITIES.items()):
+            unit, scale = shown_unit(si)
             for horizon in _SHOWN_HORIZONS:
-                errors = [float(of[HORIZONS.index(horizon), j]) for of in self.prediction.errors.values()]
+                errors = [scale * float(of[HORIZONS.index(horizon), j]) for of in self.prediction.errors.values()]
                 if all(map(math.isfinite, errors)):
                     best = min(errors)
                     cells = [Cell(text=format_number(e), mark=Mark.BEST if e == best else Mark.NONE) for e in errors]
@@ -117,7 +119,7 @@ class IdentifiedVehicle(Result):
         """Return what the checks noted, what to fly, and what a scenario has to be told."""
         return (
             *(f"check: {note}" for note in self.notes),
-            *(f"to identify {names}: {advice}" for advice, names in self.advice.items()),
+            *(f"to identify {names}, fly: {advice}" for advice, names in self.advice.items()),
             *(f"a scenario has it, not the vehicle file: {name} = {value}" for name, value in self.settings.items()),
         )
 

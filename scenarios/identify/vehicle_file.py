@@ -40,9 +40,12 @@ def verdict(estimate: Estimate, vehicle: Vehicle) -> str:
 
 
 def rounded(value: float, estimate: Estimate) -> float:
-    """Round a value to the digits that an estimate's interval supports."""
+    """Round a value to the digits that an estimate's interval supports, and its own two first ones."""
     width = estimate.high - estimate.low
-    return round(value, math.ceil(-math.log10(width / _DIGITS))) if width > 0.0 and math.isfinite(width) else value
+    if not (width > 0.0 and math.isfinite(width)):
+        return value
+    last = min(width / _DIGITS, 0.1 * abs(value or 1.0))
+    return round(value, math.ceil(-math.log10(last))) + 0.0  # never -0
 
 
 def interval(estimate: Estimate) -> str:

@@ -60,7 +60,7 @@ def here(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def estimate(name: str, value: float, start: float | None, *, width: float = 0.02, refused: str = "") -> Estimate:
     """An estimate whose interval has a width of some share of its value."""
     low, high = sorted((value * (1.0 - 0.5 * width), value * (1.0 + 0.5 * width)))
-    advice = "fly yaw steps" if refused else ""
+    advice = "yaw steps" if refused else ""
     return Estimate(
         name=name, unit="-", value=value, low=low, high=high, start=start, refused=refused, advice=advice
     )  # fmt: skip
@@ -167,6 +167,9 @@ def test_a_refused_number_that_does_not_suit_the_rest_is_set_and_says_so(place: 
 def test_values_have_the_digits_of_their_intervals() -> None:
     assert rounded(8.5432109e-6, estimate("b", 8.5432109e-6, None)) == 8.543e-6
     assert rounded(123.456, replace(estimate("b", 1.0, None), low=20.0, high=420.0)) == 123.0
+    assert rounded(0.0012345, replace(estimate("b", 1.0, None), low=-1.0, high=1.0)) == 0.0012
+    assert str(rounded(-1e-9, replace(estimate("b", 1.0, None), low=-1.0, high=0.0))) == "-1e-09"
+    assert str(rounded(-0.0, replace(estimate("b", 1.0, None), low=-1.0, high=0.0))) == "0.0"
     assert rounded(0.123456789, replace(estimate("b", 1.0, None), low=1.0, high=1.0)) == 0.123456789
 
 
@@ -276,7 +279,7 @@ def test_what_to_fly_and_what_a_scenario_takes_are_said_once(
     replace(identified, identification=found).show()
     text = capsys.readouterr().out
     assert "3 of 5 parameters identified from eight.csv; not identified: inertia_z, rotor_fall" in text
-    assert "to identify inertia_z, rotor_fall: fly yaw steps" in text
+    assert "to identify inertia_z, rotor_fall, fly: yaw steps" in text
     assert ("kept: no yaw excitation" in text, "left out: never slows down" in text) == (True, True)
     assert "computation.delay = 0.012346" in text
     assert (
