@@ -75,7 +75,7 @@ def check(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str
     Raises:
         InputError: naming what is wrong: an axis, a frame, a clock, a unit, the pole count, or the rotors' order.
     """
-    notes = [*record.notes, *check_frames(record, spans, vehicle.gravity)]
+    notes = [*record.notes, *check_frames(record, spans)]
     notes += [*_check_units(record, spans, vehicle)]
     check_rotor_order(record, spans, vehicle)
     return (*notes, *_poor(record, spans))
