@@ -13,8 +13,8 @@ from scipy.signal import lfilter
 from quadsim.errors import InputError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.identify.motion import mean, slope
 from scenarios.identify.record import Record
+from scenarios.identify.windows import mean, slope
 
 WINDOW: Final = 0.02  # [s] of an angular acceleration
 LAGS: Final = (0.0, 0.015, 0.03, 0.06, 0.1)  # [s] of rotors that are tried

@@ -16,8 +16,8 @@ import numpy as np
 from quadsim.errors import InputError
 from quadsim.rotation import conjugate
 from quadsim.state import Array
-from scenarios.identify.motion import body_z, mean, slope, to_world, turn_rate
 from scenarios.identify.record import Record, driver
+from scenarios.identify.windows import body_z, mean, slope, to_world, turn_rate
 
 WINDOW: Final = 0.1  # [s] over which rates and thrust are compared
 SLOW_WINDOW: Final = 0.2  # [s] for lateral accelerations
@@ -35,7 +35,7 @@ READINGS: Final[dict[str, Callable[[Array], Array]]] = {
 Pairs = Sequence[tuple[Array, Array]]
 
 
-def check_frames(record: Record, parts: Sequence[slice]) -> tuple[str, ...]:
+def check_axes(record: Record, parts: Sequence[slice]) -> tuple[str, ...]:
     """Return notes on small shifts between clocks.
 
     Raises:
