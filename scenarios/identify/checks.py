@@ -12,11 +12,11 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 from quadsim.errors import InputError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-from scenarios.identify.frames import check_frames
-from scenarios.identify.motion import body_z, slope
+from scenarios.identify.axes import check_axes
+from scenarios.identify.columns import RPM
 from scenarios.identify.record import INPUTS, Record, driver
 from scenarios.identify.rotor_order import check_rotor_order
-from scenarios.identify.table import RPM
+from scenarios.identify.windows import body_z, slope
 
 SHORTEST: Final = 2.0  # [s] of a span that is used
 LEAST: Final = 4.0  # [s] that the longest must have
@@ -75,7 +75,7 @@ def check(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str
     Raises:
         InputError: naming what is wrong: an axis, a frame, a clock, a unit, the pole count, or the rotors' order.
     """
-    notes = [*record.notes, *check_frames(record, spans, vehicle.gravity)]
+    notes = [*record.notes, *check_axes(record, spans)]
     notes += [*_check_units(record, spans, vehicle)]
     check_rotor_order(record, spans, vehicle)
     return (*notes, *_poor(record, spans))

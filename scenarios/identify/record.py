@@ -12,8 +12,8 @@ import numpy as np
 from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array
+from scenarios.identify.columns import TABLES, read_table
 from scenarios.identify.series import Series
-from scenarios.identify.table import TABLES, read_table
 from scenarios.identify.ulog import ULOGS, read_ulog
 
 LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
@@ -150,7 +150,7 @@ def _clock(name: str, series: Mapping[str, Series]) -> Array:
         raise InputError(f"{name}: its commands, throttle and speeds have no row with a number for each rotor")
     slower = max((series["rates"].t, series[driver].t), key=_usual_period)
     period = _usual_period(slower)
-    if 1.0 / period < SLOWEST_RATE * (1.0 - 1e-6):
+    if 1.0 / period < 0.95 * SLOWEST_RATE:
         raise InputError(
             f"{name}: {1.0 / period:.3g} samples per second, period {period:.4g} s; at least {SLOWEST_RATE:g} Hz are "
             "needed and 100 Hz or more are good (is t in seconds?)"
@@ -158,13 +158,15 @@ def _clock(name: str, series: Mapping[str, Series]) -> Array:
     start, stop = max(s.t[0] for s in series.values()), min(s.t[-1] for s in series.values())
     if stop - start < 2.0 * period:
         raise InputError(f"{name}: its fields share no time: the last starts at {start:.6g} s, one ends at {stop:.6g}")
-    line = np.linspace(slower[0], slower[-1], slower.size)
-    shared = all(s.t is slower for s in series.values())
-    if shared and np.abs(slower - line).max() <= 1e-6 * period + 4.0 * np.spacing(np.abs(slower).max()):
-        return slower
-    if shared and np.abs(slower - line).max() <= min(ROUNDING, 0.25 * period):
-        slower[:] = line  # stamps in whole milliseconds: the clock is uniform, its stamps are rounded
-        return slower
+    if all(s.t is slower for s in series.values()):
+        ticks = np.arange(slower.size) - 0.5 * (slower.size - 1)
+        line = slower.mean() + ticks * float(ticks @ slower / (ticks @ ticks))
+        off = np.abs(slower - line).max()
+        if off <= 1e-6 * period + 4.0 * np.spacing(np.abs(slower).max()):
+            return slower
+        if off <= min(ROUNDING, 0.25 * period):
+            slower[:] = line  # stamps in whole milliseconds: the clock is uniform, its stamps are rounded
+            return slower
     return np.asarray(start + period * np.arange(int((stop - start) / period + 1e-6) + 1))
 
 

@@ -13,14 +13,15 @@ from scipy.signal import lfilter
 from quadsim.errors import InputError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.identify.motion import mean, slope
 from scenarios.identify.record import Record
+from scenarios.identify.windows import mean, slope
 
 WINDOW: Final = 0.02  # [s] of an angular acceleration
 LAGS: Final = (0.0, 0.015, 0.03, 0.06, 0.1)  # [s] of rotors that are tried
 BLOCK: Final = 1.0  # [s] in each of which an order must prove itself
 AGREEING: Final = 0.8  # share of blocks
-EXPLAINED: Final = 0.15  # least share of the angular acceleration that an order must explain to be believed
+INFERIOR: Final = 0.85  # of what the best order explains, at most, by the one given
+EXPLAINED: Final = 0.1  # least share of the angular acceleration that an order must explain to be believed
 
 
 class Block(NamedTuple):
@@ -53,7 +54,7 @@ def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) 
             explained = _best(blocks, arms)
             if explained.mean() > best.mean() + 1e-9:
                 best, order, turn = explained, columns, angle
-    if best.mean() > EXPLAINED and usual.mean() < 0.5 * best.mean() and (best > usual).mean() >= AGREEING:
+    if best.mean() > EXPLAINED and usual.mean() < INFERIOR * best.mean() and (best > usual).mean() >= AGREEING:
         raise InputError(f"{record.name}: {_named(order, turn, vehicle)}, {_shares(best, usual)}")
     _check_spins(record.name, blocks, vehicle)
 
@@ -95,9 +96,12 @@ def _named(order: Sequence[int], turn: float, vehicle: Vehicle) -> str:
         for place, column in enumerate(order):
             azimuths[column] = (vehicle.rotor_azimuths[place] + 45.0 + 180.0) % 360.0 - 180.0
         return f"the arms are 45 deg off: try rotor_azimuths = [{', '.join(f'{a:g}' for a in azimuths)}]"
+    mirrored = np.allclose(vehicle.rotor_positions[list(order)], vehicle.rotor_positions * [-1.0, 1.0, 1.0])
     moved = [i + 1 for i in range(N_ROTORS) if order[i] != i]
     swapped = f"rotors {moved[0]} and {moved[1]} are swapped" if len(moved) == 2 else "the rotors are in another order"
-    return f"{swapped}: try the order {','.join(f'u{column + 1}' for column in order)}"
+    return f"{swapped}: try the order {','.join(f'u{column + 1}' for column in order)}" + (
+        " (or body axes are x forward, y right, z down)" if mirrored else ""
+    )
 
 
 def _shares(best: Array, usual: Array) -> str:
@@ -118,8 +122,9 @@ def _check_spins(name: str, blocks: Sequence[Sequence[Block]], vehicle: Vehicle)
         gain = along.sum() / max(power.sum(), 1e-30)
         shares.append((gain * along.sum() / max(total.sum(), 1e-30), gain, (along < 0.0).mean()))
     explained, gain, against = max(shares)
-    if gain < 0.0 and explained > 0.3 and against >= AGREEING:
+    if gain < 0.0 and explained > 0.05 and against >= AGREEING:
         raise InputError(
             f"{name}: the yaw acceleration is against the rotors' torque: try rotor_spins = "
-            f"{[-int(spin) for spin in spins]}, which explains {100.0 * explained:.0f} % of it"
+            f"{[-int(spin) for spin in spins]}, which explains {100.0 * explained:.0f} % of it, or negate wz if it is "
+            "logged clockwise"
         )

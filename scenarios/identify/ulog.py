@@ -10,8 +10,8 @@ import numpy as np
 from quadsim.errors import FileError, MissingPackageError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS
+from scenarios.identify.columns import RPM
 from scenarios.identify.series import Series
-from scenarios.identify.table import RPM
 
 ULOGS: Final = (".ulg", ".ulog")
 HALF_TURN: Final = np.array([1.0, -1.0, -1.0])  # about x: NED to north, west, up; FRD to x forward, y left, z up
@@ -32,6 +32,11 @@ _TOPICS: Final[dict[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
     "voltage": (("battery_status", ("voltage_v",)),),
 }
 """Topics of each quantity and their fields, the best first."""
+_PULSES: Final = (
+    (1000.0, ("PWM_MAIN_MIN1", "PWM_MAIN_MIN", "PWM_MIN")),
+    (2000.0, ("PWM_MAIN_MAX1", "PWM_MAIN_MAX", "PWM_MAX")),
+)
+"""Shortest and longest pulse of a motor [us]: what is usual, and the parameters that say otherwise."""
 _NEEDED: Final = (("rates",), ("attitude",), ("velocity",), ("throttle", "pwm", "speeds"))
 
 
@@ -48,10 +53,12 @@ def read_ulog(path: Path) -> dict[str, Series]:
         raise MissingPackageError("a ULog", "pyulog", extra="logs") from error
     names = sorted({topic for ways in _TOPICS.values() for topic, _ in ways})
     try:
-        log = ULog(str(path), names)
+        with path.open("rb") as file:  # which pyulog leaves open where it fails
+            log = ULog(file, names)
     except Exception as error:  # pyulog raises whatever its parsing meets
         raise FileError(path, f"is not a readable ULog ({str(error)[:80]})") from error
-    topics = {data.name: data.data for data in reversed(log.data_list)}  # the first instance of each
+    instances = sorted(log.data_list, key=lambda data: data.multi_id, reverse=True)
+    topics = {data.name: data.data for data in instances}  # the first instance of each
     series = {field: found for field, ways in _TOPICS.items() if (found := _series(ways, topics)) is not None}
     for needed in _NEEDED:
         if not {*needed} & {*series}:
@@ -59,9 +66,11 @@ def read_ulog(path: Path) -> dict[str, Series]:
             raise FileError(path, f"lacks the topic {ways}; of those used it has {', '.join(topics) or 'none'}")
     pwm = series.pop("pwm", None)
     if pwm is not None and "throttle" not in series:
-        low, high = (float(log.initial_parameters.get(name, usual)) for name, usual in _PWM.items())
-        scaled = pwm.values if np.nanmax(pwm.values) <= 1.0 else (pwm.values - low) / (high - low)
-        series["throttle"] = Series(t=pwm.t, values=scaled)
+        low, high = (
+            float(next((log.initial_parameters[name] for name in names if name in log.initial_parameters), usual))
+            for usual, names in _PULSES
+        )
+        series["throttle"] = Series(t=pwm.t, values=(pwm.values - low) / (high - low))
     for field in ("rates", "velocity", "position"):
         if field in series:
             series[field] = Series(t=series[field].t, values=series[field].values * HALF_TURN)
@@ -72,10 +81,6 @@ def read_ulog(path: Path) -> dict[str, Series]:
         if np.abs(rpm.values).max() > 0.0:  # speed controllers without telemetry report zeros
             series["speeds"] = Series(t=rpm.t, values=np.abs(rpm.values) * RPM)
     return series
-
-
-_PWM: Final = {"PWM_MAIN_MIN": 1000.0, "PWM_MAIN_MAX": 2000.0}
-"""Parameters of the shortest and longest pulse of a motor [us], and their usual values."""
 
 
 def _series(ways: tuple[tuple[str, tuple[str, ...]], ...], topics: dict[str, Any]) -> Series | None:

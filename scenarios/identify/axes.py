@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import permutations
 from typing import Final
 
@@ -16,15 +16,15 @@ import numpy as np
 from quadsim.errors import InputError
 from quadsim.rotation import conjugate
 from quadsim.state import Array
-from scenarios.identify.motion import body_z, mean, slope, to_world, turn_rate
 from scenarios.identify.record import Record, driver
+from scenarios.identify.windows import body_z, mean, slope, to_world, turn_rate
 
 WINDOW: Final = 0.1  # [s] over which rates and thrust are compared
 SLOW_WINDOW: Final = 0.2  # [s] for lateral accelerations
 LONGEST_SHIFT: Final = 0.3  # [s] between clocks that is looked for
 REFUSED_SHIFT: Final = 0.1  # [s]
 SHOWN_SHIFT: Final = 5e-3  # [s]
-GAIN: Final = 0.7  # by which correlations of three axes must add up to more, as by an axis of -0.6 turned round
+GAIN: Final = 0.7  # by which the correlations of three axes must rise: one of -0.6 negated gains 1.2, and costs 0.5
 READINGS: Final[dict[str, Callable[[Array], Array]]] = {
     "": lambda q: q,
     "the quaternion is world to body: negate qx, qy, qz": conjugate,
@@ -35,7 +35,7 @@ READINGS: Final[dict[str, Callable[[Array], Array]]] = {
 Pairs = Sequence[tuple[Array, Array]]
 
 
-def check_frames(record: Record, parts: Sequence[slice], gravity: float) -> tuple[str, ...]:
+def check_axes(record: Record, parts: Sequence[slice]) -> tuple[str, ...]:
     """Return notes on small shifts between clocks.
 
     Raises:
@@ -43,37 +43,35 @@ def check_frames(record: Record, parts: Sequence[slice], gravity: float) -> tupl
     """
     _check_rates(record, parts)
     _check_velocity(record, parts)
-    _check_tilt(record, parts, gravity)
+    _check_tilt(record, parts)
     return tuple(_shift_notes(record, parts))
 
 
 def _check_rates(record: Record, parts: Sequence[slice]) -> None:
     """Refuse rates that are not those at which the attitude turns."""
-    scores: dict[str, float] = {}
     gyro = [mean(record.rates[part], record.period, WINDOW) for part in parts]
-    for reading, meant in READINGS.items():
-        turns = [turn_rate(meant(record.attitude[part]), record.period, WINDOW) for part in parts]
-        for shift in _shifts(record.period):
-            correlations = _correlations(list(zip(turns, gyro, strict=True)), shift)
-            for text, score in _readings(correlations, ("wx", "wy", "wz")):
-                text, score = (f"{reading}; {text}".strip("; "), score - 0.5 * bool(reading))
-                scores[text] = max(score, scores.get(text, -9.0))
-    _refuse_better(f"{record.name}: the rates are not those at which the attitude turns", scores)
+    pairs = {
+        reading: list(zip((_turns(record, part, meant) for part in parts), gyro, strict=True))
+        for reading, meant in READINGS.items()
+    }
+    if better := _better(pairs, ("wx", "wy", "wz"), record.period):
+        raise InputError(f"{record.name}: the rates are not those at which the attitude turns: {better}")
+
+
+def _turns(record: Record, part: slice, meant: Callable[[Array], Array] = READINGS[""]) -> Array:
+    return turn_rate(meant(record.attitude[part]), record.period, WINDOW)
 
 
 def _check_velocity(record: Record, parts: Sequence[slice]) -> None:
     """Refuse a velocity that is not the slope of the position."""
     if record.position is None:
         return
-    scores: dict[str, float] = {}
     pairs = [
         (slope(record.position[p], record.period, WINDOW), mean(record.velocity[p], record.period, WINDOW))
         for p in parts
     ]
-    for shift in _shifts(record.period):
-        for text, score in _readings(_correlations(pairs, shift), ("vx", "vy", "vz")):
-            scores[text] = max(score, scores.get(text, -9.0))
-    _refuse_better(f"{record.name}: the velocity is not the slope of the position", scores)
+    if better := _better({"": pairs}, ("vx", "vy", "vz"), record.period):
+        raise InputError(f"{record.name}: the velocity is not the slope of the position: {better}")
     turned = [mean(to_world(record.attitude[p], record.velocity[p]), record.period, WINDOW) for p in parts]
     total = sum(float(np.square(place).sum()) for place, _ in pairs)
     world, body = (
@@ -88,38 +86,35 @@ def _check_velocity(record: Record, parts: Sequence[slice]) -> None:
         )
 
 
-def _check_tilt(record: Record, parts: Sequence[slice], gravity: float) -> None:
+def _check_tilt(record: Record, parts: Sequence[slice]) -> None:
     """Refuse a velocity that does not change as tilt and thrust make it."""
-    up = min(_thrust_correlation(record, parts, gravity, lag) for lag in (0.0, 0.05, 0.1))
-    fall = up < -0.5 and max(_thrust_correlation(record, parts, gravity, lag) for lag in (0.0, 0.05, 0.1)) < 0.0
+    falls = max(_thrust_correlation(record, parts, lag) for lag in (0.0, 0.05, 0.1)) < -0.4
     plain, direction = _tilt_fit(record, parts, mirrored=False)
     mirror, mirror_direction = _tilt_fit(record, parts, mirrored=True)
     heading = math.degrees(cmath.phase(direction))
     what = ""
-    if mirror > 0.5 and mirror > plain + 0.3:
+    if mirror > 0.3 and mirror > plain + 0.2:
         turned = round(math.degrees(cmath.phase(mirror_direction)) / 90.0) % 4
         what = ("vy is negated", "vx and vy are swapped", "vx is negated", "vx and vy are swapped and negated")[turned]
-        what = f"against the tilt, {what}{', and vz: a world with z down' if fall else ''}"
-    elif plain > 0.5 and abs(heading) > 135.0 and fall:
+        what = f"against the tilt, {what}{'; vz too: a world with z down' if falls else ''}"
+    elif plain > 0.3 and abs(heading) > 135.0 and falls:
         what = "world and body have z down (NED, FRD): negate qy, qz, wy, wz, vy, vz, y, z"
-    elif plain > 0.5 and abs(heading) > 30.0:
-        what = (
-            f"against the tilt, the velocity's heading is {heading:.0f} deg off: one of them is in another world frame"
-        )
-    elif fall:
-        what = f"more thrust makes it fall (correlation {up:.2f}): vz is negated, or z points down"
+    elif plain > 0.3 and abs(heading) > 30.0:
+        what = f"against the tilt, the velocity's heading is {heading:.0f} deg off: one of them is in another frame"
+        what += ", or z points down (NED, FRD)" if abs(heading) > 135.0 else ""
+    elif falls:
+        what = "more thrust makes it fall: vz is negated, or z points down"
     if what:
         raise InputError(f"{record.name}: {what}; give world z up, body x forward, y left, z up")
 
 
-def _thrust_correlation(record: Record, parts: Sequence[slice], gravity: float, lag: float) -> float:
-    """Correlation of the rotors' thrust with the specific force along body z [-]."""
+def _thrust_correlation(record: Record, parts: Sequence[slice], lag: float) -> float:
+    """Correlation of the upward thrust with the upward acceleration `lag` [s] later [-]."""
     pairs = []
     for part in parts:
-        rate = slope(record.velocity[part], record.period, WINDOW) + np.array([0.0, 0.0, gravity])
-        force = (rate * body_z(record.attitude[part])).sum(axis=1, keepdims=True)
-        effort = np.square(driver(record)[part]).sum(axis=1, keepdims=True)
-        pairs.append((mean(effort, record.period, WINDOW), force))
+        lift = np.square(driver(record)[part]).sum(axis=1, keepdims=True) * body_z(record.attitude[part])[:, 2:]
+        climb = slope(record.velocity[part, 2:], record.period, SLOW_WINDOW)
+        pairs.append((mean(lift, record.period, SLOW_WINDOW), climb))
     return float(_correlations(pairs, round(lag / record.period))[0, 0])
 
 
@@ -148,23 +143,22 @@ def _tilt_fit(record: Record, parts: Sequence[slice], *, mirrored: bool, shift: 
 
 def _shift_notes(record: Record, parts: Sequence[slice]) -> Iterator[str]:
     """Shifts between the clocks of attitude, rates and velocity."""
-    pairs = [
-        (turn_rate(record.attitude[p], record.period, WINDOW), mean(record.rates[p], record.period, WINDOW))
-        for p in parts
-    ]
+    pairs = [(_turns(record, part), mean(record.rates[part], record.period, WINDOW)) for part in parts]
     shifts = _shifts(record.period)
     like = np.array([_likeness(pairs, shift) for shift in shifts])
     if like.max() > 0.7:
-        yield from _shift_note(record, "rates are", "attitude", _peak(like, shifts) * record.period)
+        yield from _shift_note(record, "rates are", _peak(like, shifts) * record.period)
     unlike = 1.0 - np.array([_tilt_fit(record, parts, mirrored=False, shift=shift)[0] for shift in shifts])
-    if unlike.min() < 0.3 and unlike[shifts.index(0)] > 3.0 * unlike.min():
-        yield from _shift_note(record, "velocity is", "attitude", _peak(-unlike, shifts) * record.period)
+    if unlike.min() < 0.7 and unlike[shifts.index(0)] > 1.2 * unlike.min():
+        yield from _shift_note(record, "velocity is", _peak(-unlike, shifts) * record.period)
 
 
-def _shift_note(record: Record, late: str, other: str, shift: float) -> Iterator[str]:
+def _shift_note(record: Record, late: str, shift: float) -> Iterator[str]:
     if abs(shift) < SHOWN_SHIFT:
         return
-    text = f"{record.name}: the {late} {1e3 * abs(shift):.0f} ms {'late' if shift > 0 else 'early'} against the {other}"
+    text = (
+        f"{record.name}: the {late} {1e3 * abs(shift):.0f} ms {'late' if shift > 0 else 'early'} against the attitude"
+    )
     if abs(shift) > REFUSED_SHIFT:
         raise InputError(f"{text}; at most {1e3 * REFUSED_SHIFT:.0f} ms are allowed: shift the columns onto one clock")
     yield f"{text}; shift its columns onto one clock for better estimates"
@@ -211,20 +205,31 @@ def _likeness(pairs: Pairs, shift: int) -> float:
     return float(np.trace(covariance)) / math.sqrt(max(first.sum() * second.sum(), 1e-30))
 
 
-def _readings(correlations: Array, names: tuple[str, str, str]) -> Iterator[tuple[str, float]]:
-    """Each reading of three columns, empty as they are, with the sum of its correlations less 0.5 for each change."""
+def _better(pairs: Mapping[str, Pairs], names: Sequence[str], period: float) -> str:
+    """What is to change in the second vectors of pairs so that they follow the first far better; empty if nothing.
+
+    `pairs` are those of each reading of the first; a reading, a change and a shift each count against an explanation.
+    """
+    best, better = -9.0, ("", 0.0)
+    for reading, of_reading in pairs.items():
+        for shift in _shifts(period):
+            correlations = _correlations(of_reading, shift)
+            usual = float(np.trace(_correlations(pairs[""], shift)))
+            for change, score in _changes(correlations, names):
+                total = score - 0.7 * bool(reading) - abs(shift) * period / 0.3
+                if total > best:
+                    best, better = total, ("; ".join(filter(None, (reading, change))), score - usual)
+    return better[0] if better[1] > GAIN else ""
+
+
+def _changes(correlations: Array, names: Sequence[str]) -> Iterator[tuple[str, float]]:
+    """Each change of three columns, empty for none, with the sum of correlations that it gives, less its own cost."""
     for order in permutations(range(3)):
         along = correlations[list(order), range(3)]
         negated = [name for name, value in zip(names, along, strict=True) if value < -0.25]
         moved = [name for i, name in enumerate(names) if order[i] != i]
         changes = [f"{' and '.join(moved)} are swapped"] if moved else []
         changes += [f"{' and '.join(negated)} {'is' if len(negated) == 1 else 'are'} negated"] if negated else []
-        yield "; ".join(changes), float(np.abs(along).sum()) - 0.5 * len(negated) - 0.3 * len(moved)
+        score = sum(-value if value < -0.25 else value for value in along.tolist())
+        yield "; ".join(changes), score - 0.5 * len(negated) - 0.3 * len(moved)
     yield "", float(np.trace(correlations))
-
-
-def _refuse_better(what: str, scores: dict[str, float]) -> None:
-    """Refuse columns of which another reading fits far better."""
-    best = max(scores, key=lambda text: scores[text])
-    if best and scores[best] > scores[""] + GAIN:
-        raise InputError(f"{what}: {best}")
