@@ -113,7 +113,7 @@ def predict(
 
 
 def _without_refused(known: Identification) -> Identification:
-    """Return the identification without the delay and offset that a gate refuses, and without wind if it refuses drag."""
+    """Return the identification without a delay or offset that a gate refuses, and without wind if it refuses drag."""
     refused = {estimate.name for estimate in known.estimates if estimate.refused}
     offset = (
         0.0 if "offset_x" in refused else known.offset[0],
