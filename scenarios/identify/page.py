@@ -98,7 +98,7 @@ def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)
             for name in models
         )  # fmt: skip
         measured = Series(
-            x=t.ravel(), y=scale * trace.measured[..., i].ravel(), colour=REFERENCE, label="measured", width=1.8
+            x=t.ravel(), y=scale * trace.measured[..., i].ravel(), colour=REFERENCE, label="measured", width=2.4
         )
         panels.append(Panel(title=title, unit=unit, series=(measured, *reversed([*predicted]))))
     title = f"measured and predicted: {trace.log} from {trace.t[0, 0]:.4g} s on, a prediction every {t[0, -1]:.2g} s"

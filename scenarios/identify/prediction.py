@@ -19,6 +19,7 @@ from quadsim.rotation import conjugate, multiply
 from quadsim.sim.effects.wind import SEA_LEVEL_DENSITY
 from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
+from scenarios.identify.checks import SHORTEST
 from scenarios.identify.estimate import Identification
 from scenarios.identify.record import Record
 from scenarios.identify.rotors import lagging
@@ -54,13 +55,18 @@ class Prediction:
     trace: Trace
 
 
-def hold_out(spans: Sequence[slice]) -> tuple[list[slice], list[slice]]:
-    """Cut airborne spans into what is fitted and what is held out: the last fifth of their samples."""
+def hold_out(record: Record, spans: Sequence[slice]) -> tuple[list[slice], list[slice]]:
+    """Cut a record's airborne spans into what is fitted and what is held out: the last fifth of their samples.
+
+    Where what is left of a span is too short to be fitted, all of it is held out.
+    """
     left = round((1.0 - _HELD_OUT) * sum(span.stop - span.start for span in spans))
     fitted, held = [], []
     for span in spans:
         cut = min(span.start + left, span.stop)
         left -= cut - span.start
+        if (cut - span.start) * record.period < SHORTEST * (1.0 - 1e-6):
+            cut = span.start
         fitted += [slice(span.start, cut)] if cut > span.start else []
         held += [slice(cut, span.stop)] if cut < span.stop else []
     return fitted, held

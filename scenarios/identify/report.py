@@ -120,7 +120,10 @@ class IdentifiedVehicle(Result):
         return (
             *(f"check: {note}" for note in self.notes),
             *(f"to identify {names}, fly: {advice}" for advice, names in self.advice.items()),
-            *(f"a scenario has it, not the vehicle file: {name} = {value}" for name, value in self.settings.items()),
+            *(
+                f"a vehicle file has no field for it, a scenario has: {name} = {value}"
+                for name, value in self.settings.items()
+            ),
         )
 
     def outputs(self) -> Shown:
@@ -179,7 +182,7 @@ def identify_logs(
     ]
     fitted, held = airborne[: len(records)], airborne[len(records) :]
     if not tested:
-        fitted, held = map(list, zip(*map(hold_out, fitted), strict=True))
+        fitted, held = map(list, zip(*map(hold_out, records, fitted), strict=True))
     try:
         identification = identify_records(records, fitted, vehicle)
     except ParameterError as error:
