@@ -20,6 +20,7 @@ from quadsim.flight.audit import SIGNALS
 from quadsim.report.figure import BOUND, LINES, OBSTACLE, REFERENCE, Area, Band, Bound, Figure, Panel, Series, outlines
 from quadsim.sim.effects.battery import LIPO
 from quadsim.state import POSITION
+from scenarios.identify.page import trace_figure
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 FREE: Final[dict[str, Any]] = {"constraints": []}
@@ -377,6 +378,20 @@ def scenarios() -> Figure:
     return Figure(key="scenarios", title="", panels=(panel,), columns=1)
 
 
+def identification() -> Figure:
+    """Velocity and body rate of a flight in gusts, measured and predicted half a second at a time."""
+    eight = quadsim.scenario(vehicle="hummingbird", course="figure-eight", controller="geometric").scenario
+    steps = [{"type": "setpoint", "at": 2.0 + 2.0 * i, "yaw": 30.0 * (-1) ** i} for i in range(10)]
+    gusts = {"effects.air": {"turbulence": {"wind_speed_20ft": 8.0, "airspeed": 3.0}}, **FREE}
+    brisk = {"reference.period": 3.2, "reference.ramp": 1.6, "reference.turns": 6, "control_period": 0.01}
+    with tempfile.TemporaryDirectory() as folder:
+        options: dict[str, Any] = {"video": False, "recording": False, "figures": False, "progress": False}
+        quadsim.run(eight.replace({"events": steps, **gusts, **brisk}), out=f"{folder}/eight", **options)
+        trace = quadsim.identify(f"{folder}/eight", vehicle="hummingbird").prediction.trace
+    shown = trace_figure(trace)
+    return replace(shown, key="identification", title="", panels=shown.panels[2:4], columns=1)
+
+
 def betaflight() -> Figure:
     """A step of 1 m in y by one MPC through three autopilots; `make betaflight` builds two of them."""
     sys.path.append(str(ROOT / "benchmarks"))
@@ -410,6 +425,7 @@ FIGURES: Final[dict[str, Callable[[], Figure]]] = {
         tuning,
         learning,
         scenarios,
+        identification,
     )
 }
 

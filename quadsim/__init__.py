@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from scenarios.app import feasibility as feasibility
     from scenarios.app import film as film
     from scenarios.app import fly as fly
+    from scenarios.app import identify as identify
     from scenarios.app import live as live
     from scenarios.app import load as load
     from scenarios.app import load_vehicle as load_vehicle
@@ -57,7 +58,7 @@ _MODULES = {
     "quadsim.errors": "QuadsimError",
     "quadsim.state": "STATE_NAMES State",
     "quadsim.vehicle": "Vehicle",
-    "scenarios.app": "campaign catalogue check compare doctor feasibility film fly live load load_vehicle "
+    "scenarios.app": "campaign catalogue check compare doctor feasibility film fly identify live load load_vehicle "
     "make_controller problem read replay reproduce run scenario start sweep tune vehicle_report view",
     "scenarios.export.exporter": "export",
     "scenarios.export.in_the_loop": "fly_exported",

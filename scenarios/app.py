@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from scenarios.design.vehicle_report import VehicleReport
     from scenarios.flight import Flight
     from scenarios.flight_comparison import FlightComparison
+    from scenarios.identify.report import IdentifiedVehicle
     from scenarios.papers.reproduction import Reproductions
     from scenarios.progress import Progress
     from scenarios.reaudit import Reaudit
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from scenarios.tuning.tuning import TuningResult
 
     File: TypeAlias = str | Path
+    Files: TypeAlias = Sequence[File]
     PaperName: TypeAlias = File
     TuningName: TypeAlias = File
     VehicleName: TypeAlias = File
@@ -76,8 +78,8 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
         return int(text)
 
     PairedComparison = CampaignResult = Catalogue = FlightComparison = Document = Flight = Listing = Reaudit = Any
-    Replay = Reproductions = ScenarioFile = TuningResult = VehicleReport = Any
-    File = Path
+    Replay = Reproductions = ScenarioFile = TuningResult = VehicleReport = IdentifiedVehicle = Any
+    File, Files = Path, Sequence[Path]
     VehicleName = _one_of(vehicle_names)
     Target = ScenarioName = _one_of(scenario_names)
     CampaignName, PaperName = _one_of(campaign_names), _one_of(paper_names)
@@ -1100,6 +1102,67 @@ def export(
     _log.info(text.replace("\n", "; "))
     with run_directory(f"{flown.name}-{target}", None, overwrite=False) as place:
         return in_the_loop.fly_exported(flown, place, progress=progress, **options)  # type: ignore[arg-type]
+
+
+@app.command(
+    help_epilogue=_examples(
+        "quadsim identify eight.csv --vehicle start.toml --out mine.toml --page mine.html",
+        "quadsim identify eight.csv climb.csv --vehicle start.toml --test square.csv --poles 14",
+    )
+)
+def identify(
+    *logs: File,
+    vehicle: VehicleName | None = None,
+    test: Files = (),
+    out: File | None = None,
+    page: File | None = None,
+    overwrite: Flag = False,
+    poles: Whole | None = None,
+) -> IdentifiedVehicle:
+    """Identify a vehicle from flight logs: its file, with an interval for every number.
+
+    Args:
+        logs: flights of one vehicle: CSV, Parquet, ULog, or run directories.
+        vehicle: start: a vehicle's name, or path to a TOML file with its mass, arm length and rotor layout.
+        test: log to predict and not to fit; may be repeated (default: the last fifth of each log, which is not fitted).
+        out: TOML file for the identified vehicle (default: none is written).
+        page: HTML file for the page: intervals, and measured against predicted.
+        overwrite: replace existing files.
+        poles: magnets of a motor, where a log has its electrical speed.
+
+    Returns:
+        The `vehicle`; its `identification` (estimates with intervals and verdicts); the `prediction` of flight that was
+        not fitted; what to fly to learn the rest, `advice`.
+
+    Raises:
+        InputError: a log cannot be used, or the vehicle that it gives cannot fly.
+        OutputError: a file exists, or cannot be written.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.identify("not-logged-yet.csv", vehicle="hummingbird")
+        Traceback (most recent call last):
+        quadsim.errors.FileError: not-logged-yet.csv: is missing, or not a file
+    """
+    from quadsim.assets import vehicle_path
+    from scenarios.identify.report import NEEDED, identify_logs
+
+    if not logs:
+        raise InputError("identify needs a flight log: CSV, Parquet, ULog, or a run directory")
+    if vehicle is None:
+        raise InputError(
+            "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template > start.toml"
+            f" writes one; give your {NEEDED}, and estimates of the rest"
+        )
+    for name, path, ending in (("--out", out, ".toml"), ("--page", page, ".html")):
+        if path is not None and Path(path).suffix != ending:
+            raise ParameterError("", name, str(path), f"a file ending in {ending}")
+    fitted, tested = ([Path(log) for log in paths] for paths in (logs, test))
+    if both := [log for log in tested if log.resolve() in {log.resolve() for log in fitted}]:
+        raise ParameterError("", "--test", str(both[0]), "a log that is not fitted too")
+    files = {name: None if path is None else Path(path) for name, path in (("out", out), ("page", page))}
+    start = vehicle_path(str(vehicle))
+    return identify_logs(fitted, start, test=tested, poles=poles, overwrite=overwrite, **files)
 
 
 @app.command(

@@ -113,7 +113,12 @@ def written_to(path: Path) -> Text:
 
 def to_open(path: Path, program: str = "open") -> Text:
     """Return a command that opens an output, on one line to copy."""
-    line = styled((f"{program} {shlex.quote(short_path(path))}", "bold"))
+    return command(f"{program} {shlex.quote(short_path(path))}")
+
+
+def command(text: str) -> Text:
+    """Return a command, on one line to copy."""
+    line = styled((text, "bold"))
     line.no_wrap = True
     return line
 

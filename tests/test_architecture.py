@@ -34,6 +34,7 @@ OF_ONE_PLACE = {
     "distributed": "scenarios.many",
     "optuna": "scenarios.tuning",
     "gymnasium": "scenarios.gym",
+    "pyulog": "scenarios.identify",
 }
 """What only some outputs need, and where alone it is imported."""
 IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}

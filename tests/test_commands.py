@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from flown_logs import fly_eight, write_log
 from support import NO_PRODUCTS, fly_here
 from tuning_formula import write_tuning
 
@@ -28,6 +29,7 @@ ADDED = {
     "run": ("--no-video", "--set", "duration=2.0", "--set", "constraints=[]", "--overwrite"),
     "compare": ("--overwrite",),
     "export": ("--set", "duration=1.0"),
+    "identify": ("--overwrite",),
     "campaign": (*CAMPAIGN, "--out", "campaign"),
     "tune": ("--no-report",),
     "live": ("--script", "push.toml"),
@@ -62,6 +64,7 @@ def workplace(
     fly_known: Callable[..., Flight],
     flown: Path,
     campaign: Path,
+    eight: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -75,7 +78,9 @@ def workplace(
     write_tuning(tmp_path, trials=2, batch=2, flights=[1], require="P(lost) < 0.9 @ 50%", fresh={"flights": 2}).rename(
         tmp_path / "tuning.toml"
     )
-    (tmp_path / "mine-vehicle.toml").write_text(quadsim.vehicle_report(template=True).content)
+    for name in ("mine-vehicle", "start", "identified"):
+        (tmp_path / f"{name}.toml").write_text(quadsim.vehicle_report(template=True).content)
+    shutil.copy(eight, tmp_path)
     (tmp_path / "first.toml").write_text('base = "hover"\n')  # in the place of the one made for that vehicle
     (tmp_path / "push.toml").write_text(
         'duration = 0.2\ninputs = [{ at = 0.1, type = "pull", to = [1.0, 0.0, 1.0] }]\n'
@@ -102,6 +107,14 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
         fly_here(patch)
         assert main(["campaign", "paper-robustness", *CAMPAIGN, "--out", str(directory)]) == EXIT_DONE
     return directory
+
+
+@pytest.fixture(scope="session")
+def eight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log of the vehicle that the template describes."""
+    directory = tmp_path_factory.mktemp("logged")
+    (directory / "template.toml").write_text(quadsim.vehicle_report(template=True).content)
+    return write_log(fly_eight(directory / "template.toml"), directory / "eight.csv")
 
 
 def test_every_command_is_documented_and_every_documented_one_exists() -> None:

@@ -89,7 +89,9 @@ def to_plot(figure: Figure, *, labelled: bool = True, note: str = "") -> Plot:
             canvas.update_xaxes(matches="x" if i else None, range=[-0.01 * figure.end, figure.end or 1.0], **place)
             if i >= count - columns:
                 canvas.update_xaxes(title={"text": "time [s]", "standoff": 6}, **place)
-    canvas.update_xaxes(tickangle=0, nticks=None if timed else 6)  # a turned label runs into the next row
+    canvas.update_xaxes(nticks=None if timed else 6)
+    if rows > 1:
+        canvas.update_xaxes(tickangle=0)  # a turned label runs into the next row
     canvas.update_annotations(font={"size": 13})
     hover = "x unified" if timed else "closest"
     margin = {"l": 56, "r": 12, "t": _TOP, "b": _BOTTOM}

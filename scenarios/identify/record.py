@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
 
+import numpy as np
+
+from quadsim.errors import FileError, InputError
+from quadsim.flight.parquet import FLIGHT_FILE
 from quadsim.state import Array
+from scenarios.identify.columns import TABLES, read_table
+from scenarios.identify.series import Series
+from scenarios.identify.ulog import ULOGS, read_ulog
+
+LONGEST_GAP: Final = 5.0  # periods that interpolation bridges; samples in longer gaps are NaN
+SLOWEST_RATE: Final = 10.0  # [Hz] of a log
+ROUNDING: Final = 6e-4  # [s] from a uniform clock's time to its stamp in milliseconds
+INPUTS: Final = ("commands", "throttle", "speeds")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Record:
-    """A flight as it was logged: N samples, uniform in time; world z up, body x forward, y left, z up."""
+    """A flight as it was logged: N samples, uniform in time; world z up, body x forward, y left, z up.
+
+    Samples in gaps of the log are NaN; `scenarios.identify.checks.spans` leaves them out.
+    """
 
     name: str  # of the log, for messages and sources
     t: Array  # (N,) [s]
@@ -21,8 +39,150 @@ class Record:
     throttle: Array | None = None  # (N, 4) the same as a share of full throttle [-]; one of these three is there
     speeds: Array | None = None  # (N, 4) measured rotor speeds [rad/s]
     voltage: Array | None = None  # (N,) of the battery [V]
+    notes: tuple[str, ...] = ()  # what was derived or assumed in reading it
 
     @property
     def period(self) -> float:
         """Time between samples [s]."""
-        return float(self.t[1] - self.t[0])
+        return float(self.t[-1] - self.t[0]) / (self.t.size - 1)
+
+
+def driver(record: Record) -> Array:
+    """What drives the rotors (N, 4): measured speeds, else the commands or the throttle."""
+    rows = next(rows for rows in (record.speeds, record.commands, record.throttle) if rows is not None)
+    return np.asarray(rows)
+
+
+def read_record(path: Path | str, *, poles: int | None = None) -> Record:
+    """Read a log: a CSV or Parquet table, a run directory of quadsim or its `flight.parquet`, or PX4's ULog.
+
+    Args:
+        path: file or run directory.
+        poles: magnets of each motor, for a table of electrical speeds: eRPM / (poles / 2) = rpm.
+
+    Raises:
+        FileError: it is missing or damaged, or lacks a column; the message names what is allowed.
+        MissingPackageError: a ULog is to be read without pyulog.
+        InputError: its clock stands still or goes back, or it has fewer than 10 samples per second.
+    """
+    given = Path(path)
+    file = given / FLIGHT_FILE if given.is_dir() else given
+    if not file.is_file():
+        raise FileError(given, "has no flight.parquet" if given.is_dir() else "is missing, or not a file")
+    kind = file.suffix.lower()
+    if kind not in (*TABLES, *ULOGS):
+        raise FileError(given, f"is not a log that can be read (these can: {', '.join((*TABLES, *ULOGS))})")
+    if kind in ULOGS and poles is not None:
+        raise InputError(f"{given.name}: a ULog has no eRPM that poles could turn into speeds; leave poles out")
+    series = read_ulog(file) if kind in ULOGS else read_table(file, poles=poles)
+    return to_record(file.resolve().parent.name if file.name == FLIGHT_FILE else file.name, series)
+
+
+def to_record(name: str, series: Mapping[str, Series]) -> Record:
+    """Sample the series of a log, by field of `Record`, on one uniform clock.
+
+    Commands are held, all else is linear in time. Series that share a uniform clock stay as they are.
+    """
+    for field, samples in series.items():
+        _check_clock(name, field, samples.t)
+    optional = ("position", *INPUTS, "voltage")
+    series = {f: s for f, s in series.items() if f not in optional or np.isfinite(s.values).all(axis=1).any()}
+    notes: tuple[str, ...] = ()
+    if "velocity" not in series:
+        place = series["position"]
+        slope = np.gradient(place.values, place.t, axis=0)
+        series = {**series, "velocity": Series(t=place.t, values=slope)}
+        notes = (f"{name}: no velocity is logged; it is the central difference of the position",)
+    turn = series["attitude"]
+    series = {**series, "attitude": replace(turn, values=_continuous(name, turn.values))}
+    grid = _clock(name, series)
+    values = {field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()}
+    values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
+    if "voltage" in values:
+        values["voltage"] = values["voltage"][:, 0]
+    return Record(name=name, t=grid, notes=notes, **values)
+
+
+def _check_clock(name: str, field: str, t: Array) -> None:
+    steps = np.diff(t)
+    if t.size < 2 or not np.isfinite(t).all():
+        raise InputError(f"{name}: {field} needs at least 2 samples, each with a finite time; got {t.size} rows")
+    if (steps < 0.0).any():
+        row = int(np.argmax(steps < 0.0)) + 1
+        raise InputError(
+            f"{name}: the time of {field} goes back from {t[row - 1]:.6g} to {t[row]:.6g} s at row {row}; give one "
+            "flight per log, in order of time"
+        )
+    if (steps == 0.0).any():
+        row = int(np.argmax(steps == 0.0)) + 1
+        raise InputError(
+            f"{name}: the time of {field} stands still in {np.count_nonzero(steps == 0.0)} rows, first at row {row}, "
+            f"t = {t[row]:.6g} s; drop rows that repeat a time, or log it with more digits"
+        )
+
+
+def _continuous(name: str, quaternion: Array) -> Array:
+    """Unit quaternions (M, 4), each with the sign nearer to the one before; rows with NaN stay."""
+    there = np.isfinite(quaternion).all(axis=1)
+    norms = np.linalg.norm(quaternion[there], axis=1)
+    if norms.size and np.abs(norms - 1.0).max() > 0.02:
+        raise InputError(
+            f"{name}: attitude has quaternions of norm {norms.min():.3g} to {norms.max():.3g}; all must be 1 within "
+            "2 %: look for a column that was scaled, centred or misnamed"
+        )
+    unit = quaternion[there] / norms[:, None]
+    unit[1:] *= np.cumprod(np.where((unit[1:] * unit[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))[:, None]
+    result = quaternion.copy()
+    result[there] = unit
+    return result
+
+
+def _usual_period(t: Array) -> float:
+    """Mean step [s] of a clock outside its gaps."""
+    steps = np.diff(t)
+    return float(steps[steps <= 1.5 * np.median(steps)].mean())
+
+
+def _clock(name: str, series: Mapping[str, Series]) -> Array:
+    """The common clock: of the rates or of the commands, whichever is slower; where all fields have samples."""
+    driver = next((field for field in INPUTS if field in series), None)
+    if driver is None:
+        raise InputError(f"{name}: its commands, throttle and speeds have no row with a number for each rotor")
+    slower = max((series["rates"].t, series[driver].t), key=_usual_period)
+    period = _usual_period(slower)
+    if 1.0 / period < 0.95 * SLOWEST_RATE:
+        raise InputError(
+            f"{name}: {1.0 / period:.3g} samples per second, period {period:.4g} s; at least {SLOWEST_RATE:g} Hz are "
+            "needed and 100 Hz or more are good (is t in seconds?)"
+        )
+    start, stop = max(s.t[0] for s in series.values()), min(s.t[-1] for s in series.values())
+    if stop - start < 2.0 * period:
+        raise InputError(f"{name}: its fields share no time: the last starts at {start:.6g} s, one ends at {stop:.6g}")
+    if all(s.t is slower for s in series.values()):
+        ticks = np.arange(slower.size) - 0.5 * (slower.size - 1)
+        line = slower.mean() + ticks * float(ticks @ slower / (ticks @ ticks))
+        off = np.abs(slower - line).max()
+        if off <= 1e-6 * period + 4.0 * np.spacing(np.abs(slower).max()):
+            return slower
+        if off <= min(ROUNDING, 0.25 * period):
+            slower[:] = line  # stamps in whole milliseconds: the clock is uniform, its stamps are rounded
+            return slower
+    return np.asarray(start + period * np.arange(int((stop - start) / period + 1e-6) + 1))
+
+
+def _sampled(series: Series, grid: Array, *, held: bool) -> Array:
+    """Values (N, n) of a series at the times of a grid, NaN in gaps."""
+    there = np.isfinite(series.values).all(axis=1)
+    if series.t is grid and there.all():
+        return series.values
+    if np.count_nonzero(there) < 2:
+        return np.full((grid.size, series.values.shape[1]), np.nan)
+    t, values = series.t[there], series.values[there]
+    period = max(_usual_period(series.t), float(grid[1] - grid[0]))
+    at = grid + 0.05 * period if held else grid  # a stamp's jitter must not hold a command for a period too long
+    before = np.clip(np.searchsorted(t, at, side="right") - 1, 0, t.size - 1)
+    after = np.minimum(np.searchsorted(t, at, side="left"), t.size - 1)
+    sampled = values[before] if held else np.stack([np.interp(grid, t, column) for column in values.T], axis=1)
+    outside = (at < t[0] - 0.5 * period) | (at > t[-1] + (LONGEST_GAP if held else 0.5) * period)
+    sampled[outside | (t[after] - t[before] > LONGEST_GAP * period * (1.0 + 1e-6))] = np.nan
+    return np.asarray(sampled)

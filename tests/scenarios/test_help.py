@@ -10,7 +10,19 @@ import pytest
 from scenarios.app import app
 from scenarios.cli import main
 
-COMMANDS = ["campaign", "check", "compare", "doctor", "export", "list", "live", "replay", "reproduce", "run"]
+COMMANDS = [
+    "campaign",
+    "check",
+    "compare",
+    "doctor",
+    "export",
+    "identify",
+    "list",
+    "live",
+    "replay",
+    "reproduce",
+    "run",
+]
 COMMANDS += ["scenario", "tune", "vehicle", "video", "view"]
 
 

@@ -1,0 +1,163 @@
+"""What of a log can be used, and whether its columns are what they should be; before any fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
+
+from quadsim.errors import InputError
+from quadsim.state import Array
+from quadsim.vehicle import Vehicle
+from scenarios.identify.axes import check_axes
+from scenarios.identify.columns import RPM
+from scenarios.identify.record import INPUTS, Record, driver
+from scenarios.identify.rotor_order import check_rotor_order
+from scenarios.identify.windows import body_z, slope
+
+SHORTEST: Final = 2.0  # [s] of a span that is used
+LEAST: Final = 4.0  # [s] that the longest must have
+MARGIN: Final = 0.5  # [s] cut beside the ground, where it still acts through the air and the legs
+GOOD_RATE: Final = 50.0  # [Hz] below which lag and inertias are poor
+FACTOR: Final = 1.8  # by which hover speed in the log and by the start may differ
+NOTED_FACTOR: Final = 1.4
+LIKELY: Final = (
+    (1.0 / RPM, "rpm taken for rad/s"),
+    (RPM, "rad/s taken for rpm"),
+    (2.0, "pole pairs given as poles, or a start with half the hover speed"),
+    (0.5, "twice the motor's poles given, or a start with twice the hover speed"),
+    (7.0, "eRPM not divided by the pole pairs"),
+    (7.0 / RPM, "eRPM taken for rad/s"),
+    (1e-3, "a throttle taken for a speed in rad/s"),
+)
+"""Ratios of hover speeds, log over start, and their usual causes."""
+CLIPPED: Final = 0.2  # share of samples at a limit worth a note
+
+
+def spans(record: Record, vehicle: Vehicle) -> list[slice]:
+    """Return the parts of a log in the air and without gaps, each 2 s or longer.
+
+    On the ground, the rotors carry less than the weight while the vehicle rests, or turn at a constant speed.
+
+    Raises:
+        InputError: none is 4 s long.
+    """
+    fields = [getattr(record, name) for name in ("velocity", "attitude", "rates", "position", *INPUTS)]
+    logged = np.logical_and.reduce([np.isfinite(rows).all(axis=1) for rows in fields if rows is not None])
+    second = max(round(1.0 / record.period), 1)
+    whole = _runs(logged, second)
+    grounded = np.ones(logged.size, bool)
+    for part in whole:
+        grounded[part] = False
+    if whole:
+        grounded |= _near(_resting(record, logged, vehicle.gravity), round(MARGIN * second))
+    aloft = _runs(~grounded, round(SHORTEST / record.period))
+    longest = max((part.stop - part.start for part in aloft), default=0) * record.period
+    if longest >= LEAST * (1.0 - 1e-6):
+        return aloft
+    inputs = driver(record)[logged]
+    swing = float(np.ptp(inputs, axis=0).max() / max(np.abs(inputs).max(), 1e-9)) if len(inputs) else 0.0
+    height = "" if record.position is None else f", its altitude by {np.ptp(record.position[logged, 2]):.2f} m"
+    flies = f"flies for {longest:.1f} s at most in one piece" if longest else "never flies"
+    raise InputError(
+        f"{record.name}: {flies}; {LEAST:g} s "
+        f"in the air without a gap are needed ({100.0 * logged.mean():.0f} % of its samples are complete; in them the "
+        f"rotors' {'speeds' if record.speeds is not None else 'commands'} change by {100.0 * swing:.0f} %{height})"
+    )
+
+
+def check(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str, ...]:
+    """Return notes on a log that can be used, empty if nothing is to be said.
+
+    Raises:
+        InputError: naming what is wrong: an axis, a frame, a clock, a unit, the pole count, or the rotors' order.
+    """
+    notes = [*record.notes, *check_axes(record, spans)]
+    notes += [*_check_units(record, spans, vehicle)]
+    check_rotor_order(record, spans, vehicle)
+    return (*notes, *_poor(record, spans))
+
+
+def _resting(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDArray[np.bool_]:
+    """Rows (N,) on the ground; gaps are bridged by a straight line."""
+    velocity, attitude, rates, inputs = (
+        _bridged(rows, logged) for rows in (record.velocity, record.attitude, record.rates, driver(record))
+    )
+    second = max(round(1.0 / record.period), 1)
+    effort = uniform_filter1d(np.square(inputs).mean(axis=1), max(second // 10, 1))
+    acceleration = slope(velocity, record.period, 0.2)
+    load = ((acceleration + np.array([0.0, 0.0, gravity])) * body_z(attitude)).sum(axis=1) / gravity
+    heavy = logged & (effort > 0.5 * effort[logged].max()) & (load > 0.3)
+    hover = float(np.median(effort[heavy] / load[heavy])) if heavy.any() else float(np.median(effort[logged]))
+    lacking = 1.0 - effort / max(hover, 1e-30)  # share of the weight that the rotors do not carry
+    slow, calm = (
+        np.linalg.norm(uniform_filter1d(rows, max(second // 5, 1), axis=0), axis=1) < most
+        for rows, most in ((velocity, 0.3), (rates, 0.5))
+    )
+    change = maximum_filter1d(inputs, second, axis=0) - minimum_filter1d(inputs, second, axis=0)
+    constant = (change <= 3e-3 * np.abs(inputs).mean()).all(axis=1)
+    carried = (lacking > 0.15) & (np.abs(acceleration[:, 2]) < 0.4 * lacking * gravity)
+    return np.asarray(slow & calm & (constant | carried))
+
+
+def _bridged(rows: Array, logged: NDArray[np.bool_]) -> Array:
+    index = np.arange(len(rows))
+    return np.stack([np.interp(index, index[logged], column[logged]) for column in rows.T], axis=1)
+
+
+def _near(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Samples at most `reach` away from a true one."""
+    return np.asarray(maximum_filter1d(mask.astype(np.int8), 2 * reach + 1) > 0)
+
+
+def _runs(mask: NDArray[np.bool_], shortest: int) -> list[slice]:
+    """Runs of true samples with at least the shortest length."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= max(shortest, 2)]
+
+
+def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> Iterator[str]:
+    """Refuse rotor speeds far from those that carry the start vehicle."""
+    for field in ("commands", "speeds"):
+        rows = getattr(record, field)
+        if rows is None:
+            continue
+        squares, loads = [], []
+        for part in parts:
+            rate = slope(record.velocity[part], record.period, 0.2) + np.array([0.0, 0.0, vehicle.gravity])
+            loads.append((rate * body_z(record.attitude[part])).sum(axis=1) / vehicle.gravity)
+            squares.append(np.square(rows[part]).mean(axis=1))
+        hover = float(np.sqrt(np.median(np.concatenate(squares)) / max(np.median(np.concatenate(loads)), 0.1)))
+        ratio = hover / vehicle.hover_speed
+        what = (
+            f"{record.name}: {field} of {hover:.4g} rad/s carry the weight, {ratio:.3g} times the start's hover speed"
+        )
+        start = f"of {vehicle.hover_speed:.4g} rad/s"
+        if not 1.0 / FACTOR <= ratio <= FACTOR:
+            cause = min(LIKELY, key=lambda pair: abs(np.log(max(ratio, 1e-9) / pair[0])))[1]
+            raise InputError(
+                f"{what} {start}; at most a factor of {FACTOR:g} is allowed. Likely: {cause}. Correct the unit, the "
+                "poles, or the start's thrust_coefficient and mass"
+            )
+        if not 1.0 / NOTED_FACTOR <= ratio <= NOTED_FACTOR:
+            yield f"{what} {start}: check unit, poles and the start's thrust_coefficient"
+
+
+def _poor(record: Record, parts: Sequence[slice]) -> Iterator[str]:
+    """Notes on what makes estimates poor: a slow log, commands at a limit."""
+    if record.period > (1.0 + 1e-6) / GOOD_RATE:
+        yield f"{record.name}: {1.0 / record.period:.3g} Hz; below {GOOD_RATE:g} Hz, lag and inertias will be poor"
+    for field in INPUTS[:2]:
+        if (rows := getattr(record, field)) is not None:
+            flown = np.concatenate([rows[part] for part in parts])
+            low, high = flown.min(), flown.max()
+            near = 2e-3 * (high - low)
+            share = float(((flown <= low + near) | (flown >= high - near)).any(axis=1).mean())
+            if share > CLIPPED:
+                yield (
+                    f"{record.name}: in {100.0 * share:.0f} % of its samples a rotor's {field} are at a limit, "
+                    f"{low:.4g} or {high:.4g}; fly more gently"
+                )

@@ -1,0 +1,119 @@
+"""The page of an identified vehicle: intervals, measured against predicted, errors over the horizon, and gates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from quadsim.report.figure import LINES, REFERENCE, Figure, Panel, Series
+from quadsim.report.page import Section, render_page
+from quadsim.report.to_plotly import to_plot
+from quadsim.state import shown_unit
+from scenarios.identify.estimate import Estimate
+from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, Prediction, Trace
+
+if TYPE_CHECKING:
+    from scenarios.identify.report import IdentifiedVehicle
+
+_COLOURS: Final = {IDENTIFIED: LINES[0], THRUST_ONLY: LINES[1], START: LINES[2]}
+_TRACED: Final = (
+    *((f"v{axis}, world", "m/s") for axis in "xyz"),
+    *((f"{axis} rate", "rad/s") for axis in ("roll", "pitch", "yaw")),
+)
+
+
+def render(result: IdentifiedVehicle) -> str:
+    """Return the page as HTML."""
+    parameters, errors = result.tables()
+    trace = result.prediction.trace
+    figures = (trace_figure(trace), horizon_figure(result.prediction))
+    return render_page(
+        "identification",
+        f"Identified: {result.vehicle.name}",
+        [
+            Section(
+                title="Parameters",
+                plots=(to_plot(interval_figure(result.identification.estimates)),),
+                tables=(parameters,),
+            ),
+            Section(title="Prediction of flight not fitted", plots=tuple(map(to_plot, figures)), tables=(errors,)),
+        ],
+        verdict=result.verdict,
+        notes=result.sentences(),
+    )
+
+
+def interval_figure(estimates: Sequence[Estimate]) -> Figure:
+    """Return each parameter's interval and start in percent of its value; those that a gate refuses are grey."""
+    drawn = [estimate for estimate in estimates if estimate.in_file]
+    series = []
+    for refused, colour, label in ((False, LINES[0], "95 % interval"), (True, REFERENCE, "refused by a gate")):
+        at = [(i, e) for i, e in enumerate(drawn) if bool(e.refused) is refused]
+        x = np.ravel([[i, i, np.nan] for i, _ in at])
+        y = np.ravel([[_percent(e.low, e), _percent(e.high, e), np.nan] for _, e in at])
+        series += [Series(x=x, y=y, colour=colour, label=label, width=5.0)] if at else []
+    series += [
+        Series(x=np.arange(float(len(drawn))), y=np.zeros(len(drawn)), colour=LINES[0], style="points", width=4.0)
+    ]
+    start = Series(
+        x=np.arange(float(len(drawn))),
+        y=np.array([np.nan if e.start is None else _percent(e.start, e) for e in drawn]),
+        colour=LINES[1],
+        label=START,
+        style="points",
+        marker="diamond",
+        width=6.0,
+    )
+    sure = [_percent(end, e) for e in drawn if not e.refused for end in (e.low, e.high, e.start or e.value)]
+    reach = 1.2 * min(max(np.abs([1.0, *sure])), 100.0)
+    panel = Panel(
+        title="relative to the estimate",
+        unit="%",
+        series=(*series, start),
+        y_range=(-reach, reach),
+        x_names=tuple(estimate.name for estimate in drawn),
+        height=1.3,
+    )
+    return Figure(key="intervals", title="intervals", panels=(panel,), columns=1)
+
+
+def _percent(value: float, estimate: Estimate) -> float:
+    return 100.0 * (value / estimate.value - 1.0)
+
+
+def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)) -> Figure:
+    """Return velocity and body rates, measured and as predicted from each window's start."""
+    t = trace.t - trace.t[0, 0]
+    gap = np.full((len(t), 1), np.nan)
+    panels = []
+    for i in (0, 3, 1, 4, 2, 5):  # velocities in the left column
+        title, (unit, scale) = _TRACED[i][0], shown_unit(_TRACED[i][1])
+        predicted = (
+            Series(
+                x=np.hstack([t, t[:, -1:]]).ravel(), y=np.hstack([scale * trace.predicted[name][..., i], gap]).ravel(),
+                colour=_COLOURS[name], label=f"predicted, {name}",
+            )
+            for name in models
+        )  # fmt: skip
+        measured = Series(
+            x=t.ravel(), y=scale * trace.measured[..., i].ravel(), colour=REFERENCE, label="measured", width=2.4
+        )
+        panels.append(Panel(title=title, unit=unit, series=(measured, *reversed([*predicted]))))
+    title = f"measured and predicted: {trace.log} from {trace.t[0, 0]:.4g} s on, a prediction every {t[0, -1]:.2g} s"
+    return Figure(key="trace", title=title, panels=tuple(panels), end=float(t[-1, -1]))
+
+
+def horizon_figure(prediction: Prediction) -> Figure:
+    """Return the mean errors over the horizon."""
+    x, panels = np.array((0.0, *HORIZONS)), []
+    for j, (quantity, si) in enumerate(QUANTITIES.items()):
+        unit, scale = shown_unit(si)
+        series = tuple(
+            Series(x=x, y=np.insert(scale * errors[:, j], 0, 0.0), colour=_COLOURS[name], label=name)
+            for name, errors in prediction.errors.items()
+            if np.isfinite(errors[:, j]).all()
+        )
+        panels += [Panel(title=quantity, unit=unit, x_label="horizon [s]", series=series)] if series else []
+    return Figure(key="horizon", title="mean error over the horizon", panels=tuple(panels))

@@ -1,0 +1,231 @@
+"""The result of `quadsim identify`: the vehicle, what its numbers are worth, and what to fly for the rest."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from quadsim.errors import InputError, ParameterError
+from quadsim.outputs import require_file, writing_file
+from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
+from quadsim.state import shown_unit
+from quadsim.vehicle import Vehicle, load_vehicle
+from scenarios.identify.checks import check, spans
+from scenarios.identify.estimate import Estimate, Identification
+from scenarios.identify.fit import identify_records
+from scenarios.identify.page import render
+from scenarios.identify.prediction import HORIZONS, QUANTITIES, Prediction, hold_out, predict
+from scenarios.identify.record import read_record
+from scenarios.identify.vehicle_file import interval, rounded, vehicle_text, verdict
+from scenarios.results import Result, Shown
+
+NEEDED: Final = "mass, gravity, arm_length, rotor_azimuths, rotor_spins, speed_min and speed_max"
+_SHOWN_HORIZONS: Final = (0.1, 0.5)  # of the table of errors [s]
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class IdentifiedVehicle(Result):
+    """A vehicle that was identified from flight logs."""
+
+    identification: Identification
+    prediction: Prediction
+    notes: tuple[str, ...]  # of the checks
+    logs: tuple[str, ...]  # fitted
+    test: tuple[str, ...]  # predicted; empty where the last fifth of each log is
+    content: str  # of the vehicle file
+    file: Path | None = None  # where it was written
+    page: Path | None = None  # where the page was written
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle as its file has it, but for rounding."""
+        return self.identification.vehicle
+
+    @property
+    def verdict(self) -> Cell:
+        """How many parameters are identified, and which are not."""
+        estimates = self.identification.estimates
+        kept = [estimate.name for estimate in estimates if estimate.refused]
+        text = f"{len(estimates) - len(kept)} of {len(estimates)} parameters identified from {', '.join(self.logs)}"
+        tail = f"; not identified: {', '.join(kept)}" if kept else ""
+        return Cell(text=text + tail, mark=Mark.WARN if kept else Mark.GOOD)
+
+    @property
+    def advice(self) -> dict[str, str]:
+        """What to fly, and what that identifies."""
+        names: dict[str, list[str]] = {}
+        for estimate in self.identification.estimates:
+            if estimate.refused and estimate.advice:
+                names.setdefault(estimate.advice, []).append(estimate.name)
+        return {advice: ", ".join(of) for advice, of in names.items()}
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """What is certainly not zero and has no field in a vehicle file: values by field of a scenario."""
+        certain = [e for e in self.identification.estimates if not (e.in_file or e.refused or e.low <= 0.0 <= e.high)]
+        known = {estimate.name: rounded(estimate.value, estimate) for estimate in certain}
+        offset = [known.get(f"offset_{axis}", 0.0) for axis in "xy"]
+        settings = {"computation.delay": f"{known['delay']:g}"} if known.get("delay", 0.0) > 0.0 else {}
+        return settings | ({"effects.load.centre_of_mass": f"[{offset[0]:g}, {offset[1]:g}, 0]"} if any(offset) else {})
+
+    def tables(self) -> tuple[Grid, Grid]:
+        """Return the parameters, and the errors of the prediction."""
+        known = self.identification
+        white = ", ".join(f"{axis} {format_number(value)}" for axis, value in known.whiteness.items())
+        parameters = Grid(
+            key="parameters",
+            title="Parameters",
+            head=("parameter", "unit", "start", "estimate", "95 % interval", "cross-check", "verdict"),
+            lines=tuple(_parameter(estimate, known) for estimate in known.estimates),
+            note="cross-check: what a second method finds, output error, over this value."
+            + (f" Largest autocorrelation of what is not predicted, 0 for noise: {white}." if white else ""),
+        )
+        held_out = ", ".join(self.test) or "the last fifth of each log, which is not fitted"
+        lines = []
+        for j, (quantity, si) in enumerate(QUANTITIES.items()):
+            unit, scale = shown_unit(si)
+            for horizon in _SHOWN_HORIZONS:
+                errors = [scale * float(of[HORIZONS.index(horizon), j]) for of in self.prediction.errors.values()]
+                if all(map(math.isfinite, errors)):
+                    best = min(errors)
+                    cells = [Cell(text=format_number(e), mark=Mark.BEST if e == best else Mark.NONE) for e in errors]
+                    lines.append(line(f"{quantity} [{unit}]", f"{horizon:g} s", *cells))
+        errors_grid = Grid(
+            key="errors",
+            title="Errors of prediction",
+            head=("mean error", "horizon", *self.prediction.errors),
+            lines=tuple(lines),
+            note=f"{self.prediction.windows} windows of {held_out}. start: the start file as it is. thrust only: the "
+            "identified thrust, the body rates held as they were.",
+        )
+        return parameters, errors_grid
+
+    def shown(self) -> Shown:
+        """See `Result.shown`."""
+        from scenarios import console
+
+        yield console.styled((self.verdict.text, "bold"))
+        yield from console.grids(self.tables(), left=("unit", "verdict", "horizon"))
+        yield from self.sentences()
+
+    def sentences(self) -> tuple[str, ...]:
+        """Return what the checks noted, what to fly, and what a scenario has to be told."""
+        return (
+            *(f"check: {note}" for note in self.notes),
+            *(f"to identify {names}, fly: {advice}" for advice, names in self.advice.items()),
+            *(
+                f"a vehicle file has no field for it, a scenario has: {name} = {value}"
+                for name, value in self.settings.items()
+            ),
+        )
+
+    def outputs(self) -> Shown:
+        """See `Result.outputs`."""
+        from scenarios import console
+
+        yield from (console.written_to(path) for path in (self.file, self.page) if path is not None)
+        if self.page is not None:
+            yield console.to_open(self.page)
+        if self.file is None:
+            yield "no vehicle file was written: --out mine.toml writes it"
+        else:
+            yield console.command(f"{console.to_open(self.file, 'quadsim scenario --for')} > first.toml")
+            settings = "".join(f" --set {shlex.quote(f'{name}={value}')}" for name, value in self.settings.items())
+            yield console.command(f"quadsim run first.toml{settings}")
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as plain values; a number that is not finite is None."""
+        errors = {
+            model: {name: of[:, j] for j, name in enumerate(QUANTITIES)} for model, of in self.prediction.errors.items()
+        }
+        data = {
+            "logs": self.logs,
+            "test": self.test,
+            **asdict(self.identification),
+            "notes": self.notes,
+            "advice": self.advice,
+            "settings": self.settings,
+            "prediction": {"windows": self.prediction.windows, "horizons": HORIZONS, "errors": errors},
+            "vehicle_file": self.content,
+            "written": [str(path) for path in (self.file, self.page) if path is not None],
+        }
+        return {name: _plain(value) for name, value in data.items()}
+
+
+def identify_logs(
+    logs: Sequence[Path],
+    start: Path,
+    *,
+    test: Sequence[Path] = (),
+    poles: int | None = None,
+    out: Path | None = None,
+    page: Path | None = None,
+    overwrite: bool = False,
+) -> IdentifiedVehicle:
+    """Identify a vehicle from logs, given a start file; see `quadsim.identify`."""
+    places = {name: None if path is None else require_file(path, overwrite=overwrite)
+              for name, path in (("file", out), ("page", page))}  # fmt: skip
+    vehicle = load_vehicle(start)
+    records, tested = ([read_record(path, poles=poles) for path in paths] for paths in (logs, test))
+    airborne = [spans(record, vehicle) for record in [*records, *tested]]
+    notes = [
+        note
+        for record, parts in zip([*records, *tested], airborne, strict=True)
+        for note in check(record, vehicle, parts)
+    ]
+    fitted, held = airborne[: len(records)], airborne[len(records) :]
+    if not tested:
+        fitted, held = map(list, zip(*map(hold_out, records, fitted), strict=True))
+    try:
+        identification = identify_records(records, fitted, vehicle)
+    except ParameterError as error:
+        if error.owner != "vehicle":
+            raise
+        raise InputError(
+            f"the logs and {start} give a vehicle that cannot be: {error}; correct mass, arm_length or speed range, "
+            "or what was kept and does not suit what was identified"
+        ) from error
+    names = tuple(record.name for record in records)
+    result = IdentifiedVehicle(
+        identification=identification,
+        prediction=predict(tested or records, held, identification, vehicle),
+        notes=tuple(notes),
+        logs=names,
+        test=tuple(record.name for record in tested),
+        content=vehicle_text(identification, start, names),
+        **places,
+    )
+    with ExitStack() as stack:
+        for path, text in ((result.file, result.content), (result.page, render(result) if page else "")):
+            if path is not None:
+                new = stack.enter_context(writing_file(path, overwrite=overwrite))
+                new.write_text(text, encoding="utf-8")
+                if path is result.file:
+                    load_vehicle(new)  # the numbers as they are rounded
+    return result
+
+
+def _parameter(estimate: Estimate, known: Identification) -> tuple[Cell, ...]:
+    """Return a line of the table of parameters."""
+    start = ABSENT if estimate.start is None else f"{estimate.start:.4g}"
+    value, ratio = f"{rounded(estimate.value, estimate):.7g}", known.cross_check.get(estimate.name)
+    checked = ABSENT if ratio is None else f"{ratio:.3f}"
+    mark = Mark.WARN if estimate.refused else Mark.NONE
+    found = Cell(text=verdict(estimate, known.vehicle), mark=mark)
+    return line(estimate.name, estimate.unit, start, value, interval(estimate), checked, found)
+
+
+def _plain(values: Any) -> Any:
+    """Return plain data in which numbers that are not finite are None."""
+    if isinstance(values, dict):
+        return {name: _plain(value) for name, value in values.items()}
+    if isinstance(values, list | tuple | np.ndarray):
+        return [_plain(value) for value in values]
+    return None if isinstance(values, float) and not math.isfinite(values) else values

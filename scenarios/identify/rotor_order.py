@@ -1,0 +1,130 @@
+"""Which rotor is which: does another order or layout of the rotors explain the angular acceleration better?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import permutations
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from quadsim.errors import InputError
+from quadsim.state import Array
+from quadsim.vehicle import N_ROTORS, Vehicle
+from scenarios.identify.record import Record
+from scenarios.identify.windows import mean, slope
+
+WINDOW: Final = 0.02  # [s] of an angular acceleration
+LAGS: Final = (0.0, 0.015, 0.03, 0.06, 0.1)  # [s] of rotors that are tried
+BLOCK: Final = 1.0  # [s] in each of which an order must prove itself
+AGREEING: Final = 0.8  # share of blocks
+INFERIOR: Final = 0.85  # of what the best order explains, at most, by the one given
+EXPLAINED: Final = 0.1  # least share of the angular acceleration that an order must explain to be believed
+
+
+class Block(NamedTuple):
+    """Second moments of a second: squared rotor speeds x (4,), angular acceleration a (3,)."""
+
+    xx: Array  # (4, 4)
+    xa: Array  # (4, 3)
+    aa: Array  # (3,)
+
+
+def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
+    """Refuse rotors whose order, layout or spins another far better one explains.
+
+    Roll and pitch decide on order and layout: a loop's yaw command mostly answers disturbances.
+
+    Raises:
+        InputError: naming the order, azimuths or spins to try.
+    """
+    size = max(round(BLOCK / record.period), 8)
+    lags = LAGS if record.speeds is None else LAGS[:1]
+    blocks = [[block for part in parts for block in _blocks(record, part, lag, size)] for lag in lags]
+    x, y, _ = vehicle.rotor_positions.T / vehicle.arm_length
+    usual = _best(blocks, np.stack([y, -x]))
+    best, order, turn = usual, tuple(range(N_ROTORS)), 0.0
+    for angle in (0.0, math.pi / 4.0):
+        turned_x, turned_y = x * math.cos(angle) - y * math.sin(angle), x * math.sin(angle) + y * math.cos(angle)
+        for columns in permutations(range(N_ROTORS)):
+            arms = np.empty((2, N_ROTORS))
+            arms[:, columns] = np.stack([turned_y, -turned_x])
+            explained = _best(blocks, arms)
+            if explained.mean() > best.mean() + 1e-9:
+                best, order, turn = explained, columns, angle
+    if best.mean() > EXPLAINED and usual.mean() < INFERIOR * best.mean() and (best > usual).mean() >= AGREEING:
+        raise InputError(f"{record.name}: {_named(order, turn, vehicle)}, {_shares(best, usual)}")
+    _check_spins(record.name, blocks, vehicle)
+
+
+def _blocks(record: Record, part: slice, lag: float, size: int) -> list[Block]:
+    period = record.period
+    inputs = next(x for x in (record.speeds, record.commands, record.throttle) if x is not None)[part]
+    if lag:
+        pole = math.exp(-period / lag)
+        rest = np.concatenate([inputs[:1], inputs[:-1]])  # a command moves the rotors after its sample
+        inputs = lfilter([1.0 - pole], [1.0, -pole], rest, axis=0, zi=pole * inputs[:1])[0]
+    squares = mean(np.square(inputs), period, WINDOW)
+    acceleration = slope(record.rates[part], period, WINDOW)
+    rows = [slice(start, start + size) for start in range(0, len(squares) - size + 1, size)]
+    moments = []
+    for row in rows:
+        x, a = squares[row] - squares[row].mean(axis=0), acceleration[row] - acceleration[row].mean(axis=0)
+        moments.append(Block(xx=x.T @ x, xa=x.T @ a, aa=np.square(a).sum(axis=0)))
+    return moments
+
+
+def _best(blocks: Sequence[Sequence[Block]], arms: Array) -> Array:
+    """Share of the roll and pitch acceleration explained in each block by torques of these arms (2, 4), best lag."""
+    return max((_explained(of_lag, arms) for of_lag in blocks), key=lambda shares: float(shares.mean()))
+
+
+def _explained(blocks: Sequence[Block], arms: Array) -> Array:
+    """The same at one lag: one positive gain per axis for all blocks."""
+    along = np.array([(arms @ block.xa)[[0, 1], [0, 1]] for block in blocks])
+    power = np.array([np.diag(arms @ block.xx @ arms.T) for block in blocks])
+    total = np.array([block.aa[:2] for block in blocks]).mean(axis=0)
+    gain = np.maximum(along.sum(axis=0) / np.maximum(power.sum(axis=0), 1e-30), 0.0)
+    return np.asarray(((2.0 * gain * along - gain**2 * power) / np.maximum(total, 1e-30)).mean(axis=1))
+
+
+def _named(order: Sequence[int], turn: float, vehicle: Vehicle) -> str:
+    if turn:
+        azimuths = [0.0] * N_ROTORS
+        for place, column in enumerate(order):
+            azimuths[column] = (vehicle.rotor_azimuths[place] + 45.0 + 180.0) % 360.0 - 180.0
+        return f"the arms are 45 deg off: try rotor_azimuths = [{', '.join(f'{a:g}' for a in azimuths)}]"
+    mirrored = np.allclose(vehicle.rotor_positions[list(order)], vehicle.rotor_positions * [-1.0, 1.0, 1.0])
+    moved = [i + 1 for i in range(N_ROTORS) if order[i] != i]
+    swapped = f"rotors {moved[0]} and {moved[1]} are swapped" if len(moved) == 2 else "the rotors are in another order"
+    return f"{swapped}: try the order {','.join(f'u{column + 1}' for column in order)}" + (
+        " (or body axes are x forward, y right, z down)" if mirrored else ""
+    )
+
+
+def _shares(best: Array, usual: Array) -> str:
+    return (
+        f"which explains {100.0 * best.mean():.0f} % of the roll and pitch acceleration "
+        f"(as given: {100.0 * usual.mean():.0f} %)"
+    )
+
+
+def _check_spins(name: str, blocks: Sequence[Sequence[Block]], vehicle: Vehicle) -> None:
+    """Refuse spins of which all are reversed."""
+    spins = np.array(vehicle.rotor_spins, float)
+    shares = []
+    for of_lag in blocks:
+        along = np.array([spins @ block.xa[:, 2] for block in of_lag])
+        power = np.array([spins @ block.xx @ spins for block in of_lag])
+        total = np.array([block.aa[2] for block in of_lag])
+        gain = along.sum() / max(power.sum(), 1e-30)
+        shares.append((gain * along.sum() / max(total.sum(), 1e-30), gain, (along < 0.0).mean()))
+    explained, gain, against = max(shares)
+    if gain < 0.0 and explained > 0.05 and against >= AGREEING:
+        raise InputError(
+            f"{name}: the yaw acceleration is against the rotors' torque: try rotor_spins = "
+            f"{[-int(spin) for spin in spins]}, which explains {100.0 * explained:.0f} % of it, or negate wz if it is "
+            "logged clockwise"
+        )

@@ -1,0 +1,15 @@
+"""Samples of one quantity on their own clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from quadsim.state import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """M samples of n numbers."""
+
+    t: Array  # (M,) [s]
+    values: Array  # (M, n), NaN where there is none

@@ -1,0 +1,97 @@
+"""The identified vehicle as a file: the start's tables and comments with the identified numbers in their place."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import tomlkit
+
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from scenarios.identify.estimate import Estimate, Identification
+
+_AXES: Final = ("_x", "_y", "_z")
+_DIGITS: Final = 100.0  # the last digit is no more than this part of an interval
+
+
+def field_of(estimate: Estimate) -> str:
+    """Return the field of a vehicle file that holds an estimate: `inertia` of `inertia_x`."""
+    return estimate.name[:-2] if estimate.name.endswith(_AXES) else estimate.name
+
+
+def number_in(vehicle: Vehicle, estimate: Estimate) -> float | None:
+    """Return what a vehicle has for an estimate; of `body_drag` the first number, as the others follow it."""
+    value = getattr(vehicle, field_of(estimate))
+    axis = estimate.name[-1] if field_of(estimate) != estimate.name else "x"
+    return value["xyz".index(axis)] if isinstance(value, tuple) else value
+
+
+def verdict(estimate: Estimate, vehicle: Vehicle) -> str:
+    """Return whether a number is identified, or else why it is not, and what the vehicle has."""
+    if not estimate.refused:
+        return "identified"
+    if not estimate.in_file or number_in(vehicle, estimate) is None:
+        return f"left out: {estimate.refused}"
+    number = number_in(vehicle, estimate)
+    return f"kept: {estimate.refused}" if number == estimate.start else f"set to {number:.4g}: {estimate.refused}"
+
+
+def rounded(value: float, estimate: Estimate) -> float:
+    """Round a value to the digits that an estimate's interval supports, and its own two first ones."""
+    width = estimate.high - estimate.low
+    if not (width > 0.0 and math.isfinite(width)):
+        return value
+    last = min(width / _DIGITS, 0.1 * abs(value or 1.0))
+    return round(value, math.ceil(-math.log10(last))) + 0.0  # never -0
+
+
+def interval(estimate: Estimate) -> str:
+    """Return the 95 % interval as text."""
+    return f"{rounded(estimate.low, estimate):.7g} to {rounded(estimate.high, estimate):.7g}"
+
+
+def vehicle_text(identification: Identification, start: Path, logs: Sequence[str]) -> str:
+    """Return the text of the vehicle file: values with intervals and logs as their sources, in the start's file.
+
+    A value that a gate refuses is the start's, and its source says why; of a vector this is said axis by axis.
+    """
+    document = tomlkit.parse(start.read_text(encoding="utf-8-sig"))
+    of_field: dict[str, list[Estimate]] = {}
+    for estimate in identification.estimates:
+        if estimate.in_file:
+            of_field.setdefault(field_of(estimate), []).append(estimate)
+    for name, estimates in of_field.items():
+        value = getattr(identification.vehicle, name)
+        if value is None:  # neither the start has it, nor is it identified
+            continue
+        if name not in document:
+            document.add(tomlkit.nl())
+            document[name] = {"value": value, "unit": VEHICLE_UNITS[name], "source": ""}
+        table: Any = document[name]
+        table["value"] = _value(value, estimates)
+        table["source"] = _source(identification.vehicle, estimates, str(table["source"]), logs)
+    return tomlkit.dumps(document)
+
+
+def _value(value: Any, estimates: Sequence[Estimate]) -> Any:
+    """Return a number, or the numbers of a vector, rounded where they are identified."""
+    numbers = np.atleast_1d(value).tolist()
+    by_number = estimates if len(estimates) == len(numbers) else [*estimates] * len(numbers)
+    numbers = [n if e.refused else rounded(n, e) for n, e in zip(numbers, by_number, strict=True)]
+    return numbers if isinstance(value, tuple) else numbers[0]
+
+
+def _source(vehicle: Vehicle, estimates: Sequence[Estimate], before: str, logs: Sequence[str]) -> str:
+    """Return where each number is from."""
+    parts = []
+    for estimate in estimates:
+        start = "" if estimate.start is None else f"; start {estimate.start:.4g}"
+        axis = "" if len(estimates) == 1 else f"{estimate.name[-1]} "
+        within = "" if estimate.refused else f": 95 % within {interval(estimate)}{start}"
+        parts.append(f"{axis}{verdict(estimate, vehicle)}{within}")
+    refused = [bool(estimate.refused) for estimate in estimates]
+    parts += [] if all(refused) else [f"logs {', '.join(logs)}"]
+    return "; ".join(parts + ([before] if any(refused) and before else []))

@@ -1,0 +1,53 @@
+"""Rates of change of a log's motion over short windows, against which its columns are checked."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from quadsim.rotation import conjugate, multiply
+from quadsim.state import Array
+
+
+def half_window(period: float, window: float) -> int:
+    """Samples on each side of the middle of a window [s], at least one."""
+    return max(1, round(0.5 * window / period))
+
+
+def slope(values: Array, period: float, window: float) -> Array:
+    """Rate of change (N, n) over a window [s] about each sample; near the ends, that of the nearest whole window."""
+    half = half_window(period, window)
+    return _padded((values[2 * half :] - values[: -2 * half]) / (2 * half * period), half)
+
+
+def mean(values: Array, period: float, window: float) -> Array:
+    """Mean (N, n) over a window [s] about each sample, as `slope` of their integral; likewise at the ends."""
+    half = half_window(period, window)
+    inner = uniform_filter1d(0.5 * (values[1:] + values[:-1]), 2 * half, axis=0)  # of steps k - half .. k + half - 1
+    return _padded(inner[half : len(inner) - half + 1], half)
+
+
+def turn_rate(quaternion: Array, period: float, window: float) -> Array:
+    """Body rates (N, 3) [rad/s] by which attitudes (N, 4) turn over a window [s] about each sample."""
+    half = half_window(period, window)
+    turn = multiply(conjugate(quaternion[: -2 * half]), quaternion[2 * half :])
+    turn *= np.where(turn[:, :1] < 0.0, -1.0, 1.0)
+    sine = np.linalg.norm(turn[:, 1:], axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, turn[:, :1])
+    return _padded(turn[:, 1:] * angle / np.maximum(sine, 1e-12) / (2 * half * period), half)
+
+
+def body_z(quaternion: Array) -> Array:
+    """Thrust axis (N, 3) in the world of attitudes (N, 4), body to world."""
+    w, x, y, z = quaternion.T
+    return np.stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)], axis=1)
+
+
+def to_world(quaternion: Array, vectors: Array) -> Array:
+    """Body vectors (N, 3) in the world."""
+    pure = np.concatenate([np.zeros((len(vectors), 1)), vectors], axis=1)
+    return np.asarray(multiply(multiply(quaternion, pure), conjugate(quaternion)))[:, 1:]
+
+
+def _padded(inner: Array, half: int) -> Array:
+    return np.pad(inner, ((half, half), (0, 0)), mode="edge")
