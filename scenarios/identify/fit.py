@@ -66,7 +66,7 @@ def identify_records(records: Sequence[Record], spans: Sequence[Sequence[slice]]
         InputError: nothing flies, or the records differ in what they say of rotors and battery.
         ParameterError: what was identified makes no vehicle, such as one that cannot hover.
     """
-    flown = [_part(record, span) for record, own in zip(records, spans, strict=True) for span in own]
+    flown = [part_of(record, span) for record, own in zip(records, spans, strict=True) for span in own]
     if not flown:
         raise InputError("no part of the logs flies")
     if len({(record.speeds is None, record.commands is None, record.voltage is None) for record in records}) > 1:
@@ -99,7 +99,8 @@ def _noisier(record: Record) -> Record:
     return replace(record, speeds=record.speeds + noise * rng.standard_normal(record.speeds.shape))
 
 
-def _part(record: Record, span: slice) -> Record:
+def part_of(record: Record, span: slice) -> Record:
+    """A span of a record as one of its own."""
     cut: dict[str, Any] = {name: rows[span] for name, rows in vars(record).items() if isinstance(rows, np.ndarray)}
     return replace(record, **cut)
 
@@ -216,7 +217,7 @@ class _Fit:
     def _lags_as_stated(self) -> dict[str, Estimate]:
         """Rotor lag where speeds were measured and no commands."""
         why, lag = "the log has the rotors' speeds but not their commands", self.vehicle.rotor_rise or 0.0
-        return {name: self._judged(name, *3 * [lag], why) for name in ("rotor_rise", "rotor_fall")}
+        return {name: self._judged(name, lag, lag, lag, why) for name in ("rotor_rise", "rotor_fall")}
 
     def _yaw_gain(self, estimates: Mapping[str, Estimate], vehicle: Vehicle) -> tuple[Estimate, Vehicle]:
         """The yaw reaction that gives the identified yaw acceleration with the inertia that the file keeps."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import operator
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,6 +17,7 @@ from scenarios.identify.record import Record
 from scenarios.identify.rotors import Turning, corrected, lagging, measured, smoothed
 
 AXES: Final = ("roll", "pitch", "yaw", "vx", "vy", "vz")
+AT_ONCE: Final = 1e-6  # lag of rotors that have none [s]
 _SMOOTHING: Final = 0.1
 """Time constant [s] below which the attitude follows the gyro: it averages the noise of the attitude itself."""
 
@@ -30,17 +31,38 @@ class Parameters:
     drag_to_thrust: float
     rotor_rise: float = 0.0  # not used where speeds were measured [s]
     rotor_fall: float = 0.0
-    delay: float  # of the commands [s]
+    delay: float = 0.0  # of the commands [s]
     rotor_inertia: float
     rotor_drag: float
     body_drag: Array  # (3,)
-    offset: Array  # (3,) centre of mass in the rotors' frame, x and y, and how far above it rotor drag acts [m]
-    wind: Array  # (W, 2) world x and y, linear between W instants from first sample to last [m/s]
-    munk: float  # mass of air that moves along body z less that along x and y [kg]
-    yaw_trim: float  # constant yaw torque that is not the rotors' [N m]
+    offset: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) centre of mass in the rotors' frame, x and y, and how far above it rotor drag acts [m]."""
+    wind: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    """(W, 2) world x and y, linear between W instants from first sample to last [m/s]."""
+    munk: float = 0.0  # mass of air that moves along body z less that along x and y [kg]
+    yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
     throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle [-]
     voltage_exponent: float = 0.0  # n of thrust over voltage, (V / V0)^n
     voltage: float = 0.0  # V0, at which the thrust coefficient holds [V]
+
+    @classmethod
+    def of(cls, vehicle: Vehicle, **others: Any) -> Parameters:
+        """Those of a vehicle, with `others` for what its file has no field for."""
+        own: dict[str, Any] = {name: getattr(vehicle, name) or AT_ONCE for name in ("rotor_rise", "rotor_fall")}
+        own |= {name: getattr(vehicle, name) or 0.0 for name in ("rotor_inertia", "rotor_drag")}
+        own |= {name: getattr(vehicle, name) for name in ("thrust_coefficient", "drag_to_thrust")}
+        drag = np.array(vehicle.body_drag or (0.0, 0.0, 0.0))
+        return cls(inertia=np.array(vehicle.inertia), body_drag=drag, **own, **others)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """The motion of a vehicle over M periods, as its mean in each, or of M vehicles over one."""
+
+    period: float  # [s]
+    rates: Array  # (M, 3) body rates [rad/s]
+    turn: Array  # (M, 3, 3) body to world
+    velocity: Array  # (M, 3) world [m/s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,22 +71,20 @@ class Stretch:
 
     record: Record
     increments: Array  # (N - 1, 6) of body rates [rad/s] and world velocity [m/s]
-    rates: Array  # (N - 1, 3) mean of each period [rad/s]
-    turn: Array  # (N - 1, 3, 3) body to world, mean of each period
-    velocity: Array  # (N - 1, 3) world, same [m/s]
+    motion: Motion
 
 
 def stretch(record: Record) -> Stretch:
     """Prepare a record, all of which flies."""
     if record.speeds is not None:
         record = replace(record, speeds=smoothed(record.speeds))
-    turn = Rotation.from_quat(np.roll(_smoothed(record), -1, axis=1)).as_matrix()
+    turn = Rotation.from_quat(_smoothed(record), scalar_first=True).as_matrix()
+    means = (0.5 * (rows[1:] + rows[:-1]) for rows in (record.rates, turn, record.velocity))
+    rates, turns, velocity = means
     return Stretch(
         record=record,
         increments=np.diff(np.concatenate([record.rates, record.velocity], axis=1), axis=0),
-        rates=0.5 * (record.rates[1:] + record.rates[:-1]),
-        turn=0.5 * (turn[1:] + turn[:-1]),
-        velocity=0.5 * (record.velocity[1:] + record.velocity[:-1]),
+        motion=Motion(period=record.period, rates=rates, turn=turns, velocity=velocity),
     )
 
 
@@ -97,26 +117,26 @@ def turning(record: Record, vehicle: Vehicle, p: Parameters) -> Turning:
     return follower if record.speeds is None else corrected(follower, record.speeds, record.period)
 
 
-def predicted(part: Stretch, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:
-    """(N - 1, 6) increments of body rates and velocity as the parameters predict them.
+def predicted(motion: Motion, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:
+    """(M, 6) increments of body rates and velocity in each period, as the parameters predict them.
 
     J dw/dt = sum r_i x f_i - w x (J w + h e_z) - dh/dt e_z with h = -sum spin_i J_r w_i, f_i = b w_i^2 e_z -
     rotor_drag w_i v_perp,i; m dv/dt = R (sum f_i + body drag) - m g e_z.
     """
     x, y, _ = vehicle.rotor_positions.T
     spin = np.array(vehicle.rotor_spins, float)
-    dt, jx, jy, jz = part.record.period, *p.inertia
-    when = np.linspace(0.0, len(p.wind) - 1.0, len(part.rates))
+    dt, jx, jy, jz = motion.period, *p.inertia
+    when = np.linspace(0.0, len(p.wind) - 1.0, len(motion.rates))
     wind = np.stack([*(np.interp(when, np.arange(len(p.wind)), w) for w in p.wind.T), np.zeros(len(when))], axis=1)
-    air = np.einsum("kji,kj->ki", part.turn, part.velocity - wind)  # body axes
-    roll, pitch, yaw = part.rates.T
+    air = np.einsum("kji,kj->ki", motion.turn, motion.velocity - wind)  # body axes
+    roll, pitch, yaw = motion.rates.T
     thrust = p.thrust_coefficient * rotors.square
     dragging = p.rotor_drag * rotors.mean
     side = -(dragging * (air[:, :1] - yaw[:, None] * y)), -(dragging * (air[:, 1:2] + yaw[:, None] * x))
     total = thrust.sum(axis=1)
     force = np.stack([side[0].sum(axis=1), side[1].sum(axis=1), total], axis=1)
     momentum = -(rotors.mean @ spin) * p.rotor_inertia
-    spun_up = -(np.diff(rotors.speeds, axis=0) @ spin) * p.rotor_inertia
+    spun_up = -(rotors.change @ spin) * p.rotor_inertia
     torque = np.stack(
         [
             thrust @ y
@@ -141,5 +161,5 @@ def predicted(part: Stretch, rotors: Turning, vehicle: Vehicle, p: Parameters) -
     angular = dt * torque
     angular[:, 2] -= spun_up
     body = force - 0.5 * SEA_LEVEL_DENSITY * p.body_drag * np.linalg.norm(air, axis=1, keepdims=True) * air
-    linear = np.einsum("kij,kj->ki", part.turn, body) / vehicle.mass - [0.0, 0.0, vehicle.gravity]
+    linear = np.einsum("kij,kj->ki", motion.turn, body) / vehicle.mass - [0.0, 0.0, vehicle.gravity]
     return np.concatenate([angular / p.inertia, dt * linear], axis=1)

@@ -10,7 +10,7 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.linalg import solve_banded
 from scipy.signal import lfilter
 
-from quadsim.state import Array
+from quadsim.state import Array, Indices
 from quadsim.vehicle import N_ROTORS
 
 _PASSES: Final = 12  # until every step knows whether its rotor speeds up
@@ -24,6 +24,17 @@ class Turning:
     speeds: Array  # (N, 4) at the samples [rad/s]
     mean: Array  # (N - 1, 4) of the speed in each period [rad/s]
     square: Array  # (N - 1, 4) mean of its square [rad^2/s^2]
+
+    @property
+    def change(self) -> Array:
+        """(N - 1, 4) of the speed over each period [rad/s]."""
+        return self.speeds[1:] - self.speeds[:-1]
+
+    def during(self, periods: Indices) -> Turning:
+        """The same in some periods alone, as if one followed the other."""
+        change, speeds = self.change[periods], np.zeros((len(periods) + 1, N_ROTORS))
+        np.cumsum(change, axis=0, out=speeds[1:])
+        return Turning(speeds=speeds, mean=self.mean[periods], square=self.square[periods])
 
 
 def lagging(commands: Array, period: float, *, rise: float, fall: float, delay: float) -> Turning:

@@ -82,7 +82,7 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch]) -> list[Sought]:
 
 
 def _knots(part: Stretch) -> int:
-    return int(np.clip(np.ceil(len(part.rates) * part.record.period / KNOT), 2, _MOST_KNOTS))
+    return int(np.clip(np.ceil(len(part.increments) * part.record.period / KNOT), 2, _MOST_KNOTS))
 
 
 class Normal(NamedTuple):
@@ -141,7 +141,7 @@ class Search:
         """(N, 6) measured less predicted increments of a stretch, and its rotors."""
         parameters = self.parameters(x, part)
         rotors = rotors or turning(self.parts[part].record, self.vehicle, parameters)
-        misfit = self.parts[part].increments - predicted(self.parts[part], rotors, self.vehicle, parameters)
+        misfit = self.parts[part].increments - predicted(self.parts[part].motion, rotors, self.vehicle, parameters)
         return misfit[self._skip[part] :], rotors
 
     def _polynomials(self, noise: Array) -> tuple[Array, Array]:
@@ -232,7 +232,7 @@ class Search:
 
     def blocks(self) -> list[Normal]:
         """Normal equations of the log's parts, each of `BLOCK` or longer, without priors."""
-        long = sum(len(part.rates) * part.record.period for part in self.parts)
+        long = sum(len(part.increments) * part.record.period for part in self.parts)
         blocks = []
         for i, part in enumerate(self.parts):
             innovations, slopes = self._slopes(i)
