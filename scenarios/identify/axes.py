@@ -35,7 +35,7 @@ READINGS: Final[dict[str, Callable[[Array], Array]]] = {
 Pairs = Sequence[tuple[Array, Array]]
 
 
-def check_axes(record: Record, parts: Sequence[slice]) -> tuple[str, ...]:
+def check_axes(record: Record, parts: Sequence[slice], gravity: float) -> tuple[str, ...]:
     """Return notes on small shifts between clocks.
 
     Raises:
@@ -43,7 +43,7 @@ def check_axes(record: Record, parts: Sequence[slice]) -> tuple[str, ...]:
     """
     _check_rates(record, parts)
     _check_velocity(record, parts)
-    _check_tilt(record, parts)
+    _check_tilt(record, parts, gravity)
     return tuple(_shift_notes(record, parts))
 
 
@@ -73,7 +73,7 @@ def _check_velocity(record: Record, parts: Sequence[slice]) -> None:
     if better := _better({"": pairs}, ("vx", "vy", "vz"), record.period):
         raise InputError(f"{record.name}: the velocity is not the slope of the position: {better}")
     turned = [mean(to_world(record.attitude[p], record.velocity[p]), record.period, WINDOW) for p in parts]
-    total = sum(float(np.square(place).sum()) for place, _ in pairs)
+    total = max(sum(float(np.square(place).sum()) for place, _ in pairs), 1e-30)
     world, body = (
         sum(float(np.square(place - v).sum()) for (place, _), v in zip(pairs, read, strict=True)) / total
         for read in ([v for _, v in pairs], turned)
@@ -86,9 +86,9 @@ def _check_velocity(record: Record, parts: Sequence[slice]) -> None:
         )
 
 
-def _check_tilt(record: Record, parts: Sequence[slice]) -> None:
+def _check_tilt(record: Record, parts: Sequence[slice], gravity: float) -> None:
     """Refuse a velocity that does not change as tilt and thrust make it."""
-    falls = max(_thrust_correlation(record, parts, lag) for lag in (0.0, 0.05, 0.1)) < -0.4
+    falls = max(_lifting(record, parts, gravity, lag) for lag in (0.0, 0.05, 0.1)) < -0.4
     plain, direction = _tilt_fit(record, parts, mirrored=False)
     mirror, mirror_direction = _tilt_fit(record, parts, mirrored=True)
     heading = math.degrees(cmath.phase(direction))
@@ -108,14 +108,15 @@ def _check_tilt(record: Record, parts: Sequence[slice]) -> None:
         raise InputError(f"{record.name}: {what}; give world z up, body x forward, y left, z up")
 
 
-def _thrust_correlation(record: Record, parts: Sequence[slice], lag: float) -> float:
-    """Correlation of the upward thrust with the upward acceleration `lag` [s] later [-]."""
+def _lifting(record: Record, parts: Sequence[slice], gravity: float, lag: float) -> float:
+    """How like the upward acceleration is to that of the upward thrust `lag` [s] earlier: 1 the same, -1 opposite."""
     pairs = []
     for part in parts:
         lift = np.square(driver(record)[part]).sum(axis=1, keepdims=True) * body_z(record.attitude[part])[:, 2:]
         climb = slope(record.velocity[part, 2:], record.period, SLOW_WINDOW)
-        pairs.append((mean(lift, record.period, SLOW_WINDOW), climb))
-    return float(_correlations(pairs, round(lag / record.period))[0, 0])
+        pairs.append((mean(gravity * lift / lift.mean(), record.period, SLOW_WINDOW), climb))
+    covariance, lifts, climbs = _moments(pairs, round(lag / record.period))
+    return 2.0 * float(covariance[0, 0]) / max(float(lifts[0] + climbs[0]), 1e-30)
 
 
 def _tilt_fit(record: Record, parts: Sequence[slice], *, mirrored: bool, shift: int = 0) -> tuple[float, complex]:
@@ -149,7 +150,8 @@ def _shift_notes(record: Record, parts: Sequence[slice]) -> Iterator[str]:
     if like.max() > 0.7:
         yield from _shift_note(record, "rates are", _peak(like, shifts) * record.period)
     unlike = 1.0 - np.array([_tilt_fit(record, parts, mirrored=False, shift=shift)[0] for shift in shifts])
-    if unlike.min() < 0.7 and unlike[shifts.index(0)] > 1.2 * unlike.min():
+    now, least = unlike[shifts.index(0)], unlike.min()
+    if least < 0.7 and now > 1.3 * least and now > least + 4e-3:
         yield from _shift_note(record, "velocity is", _peak(-unlike, shifts) * record.period)
 
 

@@ -179,10 +179,10 @@ def _sampled(series: Series, grid: Array, *, held: bool) -> Array:
         return np.full((grid.size, series.values.shape[1]), np.nan)
     t, values = series.t[there], series.values[there]
     period = max(_usual_period(series.t), float(grid[1] - grid[0]))
-    at = grid + 0.05 * period if held else grid  # a stamp's jitter must not hold a command for a period too long
-    before = np.clip(np.searchsorted(t, at, side="right") - 1, 0, t.size - 1)
-    after = np.minimum(np.searchsorted(t, at, side="left"), t.size - 1)
+    near = 0.05 * period  # a stamp's jitter must neither hold a command for a period too long nor open a gap
+    before = np.clip(np.searchsorted(t, grid + near, side="right") - 1, 0, t.size - 1)
+    after = np.minimum(np.searchsorted(t, grid - near, side="left"), t.size - 1)
     sampled = values[before] if held else np.stack([np.interp(grid, t, column) for column in values.T], axis=1)
-    outside = (at < t[0] - 0.5 * period) | (at > t[-1] + (LONGEST_GAP if held else 0.5) * period)
-    sampled[outside | (t[after] - t[before] > LONGEST_GAP * period * (1.0 + 1e-6))] = np.nan
+    outside = (grid < t[0] - 0.5 * period) | (grid > t[-1] + (LONGEST_GAP if held else 0.5) * period)
+    sampled[outside | (t[after] - t[before] > LONGEST_GAP * period + near)] = np.nan
     return np.asarray(sampled)
