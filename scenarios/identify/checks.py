@@ -13,6 +13,7 @@ from quadsim.errors import InputError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.identify.axes import check_axes
+from scenarios.identify.clocks import check_clocks
 from scenarios.identify.columns import RPM
 from scenarios.identify.record import INPUTS, Record, driver
 from scenarios.identify.rotor_order import check_rotor_order
@@ -71,8 +72,8 @@ def check(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str
     Raises:
         InputError: naming what is wrong: an axis, a frame, a clock, a unit, the pole count, or the rotors' order.
     """
-    notes = [*record.notes, *check_axes(record, spans, vehicle.gravity)]
-    notes += [*_check_units(record, spans, vehicle)]
+    check_axes(record, spans, vehicle.gravity)
+    notes = [*record.notes, *check_clocks(record, spans), *_check_units(record, spans, vehicle)]
     check_rotor_order(record, spans, vehicle)
     return (*notes, *_poor(record, spans))
 
