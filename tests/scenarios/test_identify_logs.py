@@ -240,6 +240,22 @@ def test_quaternions_must_be_of_length_one(tmp_path: Path, eight: Record) -> Non
         read_record(write_csv(tmp_path / "k.csv", {**table, "qw": table["qw"] - 0.5}))
 
 
+@pytest.mark.parametrize(
+    ("spoilt", "rule"),
+    [
+        (lambda table: {f"throttle{i}": 1000.0 + table[f"u{i}"] for i in range(1, 5)}, "throttle1..4 must be shares"),
+        (lambda table: {"w1": -table["u1"], **{f"w{i}": table[f"u{i}"] for i in (2, 3, 4)}}, "must be 0 or above"),
+        (lambda table: {"roll": 40.0 * table["qx"], "pitch": table["qy"], "yaw": table["qz"]}, "must be in rad; got"),
+    ],
+)
+def test_units_that_cannot_be_meant(tmp_path: Path, eight: Record, spoilt: Any, rule: str) -> None:
+    table = columns(eight)
+    others = spoilt(table)
+    without = "qw" if "roll" in others else "u1"
+    with pytest.raises(InputError, match=rule):
+        read_record(write_csv(tmp_path / "l.csv", {**table, **others}, without=without))
+
+
 # Checks
 
 
@@ -268,6 +284,7 @@ SPOILT: dict[str, Spoil] = {
     "wy is negated": negated("rates", 1),
     "wz is negated": negated("rates", 2),
     "wy and wz are negated": negated("rates", 1, 2),
+    "5[67].* times the rates at which the attitude turns": lambda record: replace(record, rates=np.degrees(record.rates)),
     "wx and wy are swapped": lambda record: replace(record, rates=record.rates[:, [1, 0, 2]]),
     "world to body: negate qx, qy, qz": lambda record: replace(record, attitude=conjugate(record.attitude)),
     "in the order x, y, z, w": lambda record: replace(record, attitude=np.roll(record.attitude, -1, axis=1)),
