@@ -117,7 +117,7 @@ def _check_velocity(record: Record, parts: Sequence[slice], position: Array) -> 
     if better := _better({"": logged}, ("vx", "vy", "vz"), record.period):
         raise InputError(f"{record.name}: the velocity is not the slope of the position: {better}")
     off, off_if_turned = (_difference(p) for p in (logged, beside_slope(to_world(record.attitude, record.velocity))))
-    if off > 0.15 and off > 2.0 * off_if_turned:
+    if off > 0.1 and off > 2.0 * off_if_turned:
         raise InputError(
             f"{record.name}: vx, vy, vz are along the body's axes: turned into the world, they differ from the slope "
             f"of the position by {100.0 * off_if_turned:.0f} % instead of {100.0 * off:.0f} %; give them in the world"

@@ -58,7 +58,11 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
         return aloft
     inputs = driver(record)[logged]
     swing = float(np.ptp(inputs, axis=0).max() / max(np.abs(inputs).max(), 1e-9)) if len(inputs) else 0.0
-    height = "" if record.position is None else f", its altitude by {np.ptp(record.position[logged, 2]):.2f} m"
+    height = (
+        ""
+        if record.position is None or not len(inputs)
+        else f", its altitude by {np.ptp(record.position[logged, 2]):.2f} m"
+    )
     flies = f"flies for {longest:.1f} s at most in one piece" if longest else "never flies"
     raise InputError(
         f"{record.name}: {flies}; {LEAST:g} s in the air without a gap are needed ({100.0 * logged.mean():.0f} % of "

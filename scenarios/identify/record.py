@@ -81,11 +81,14 @@ def read_record(path: Path | str, *, poles: int | None = None) -> Record:
 def to_record(name: str, series: Mapping[str, Series]) -> Record:
     """Sample the series of a log, by field of `Record`, on one uniform clock.
 
-    Commands are held, all else is linear in time. Series that share a uniform clock stay as they are.
+    Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
+    has no gaps: it changes slowly.
     """
+    voltage = series.get("voltage")
+    series = {field: samples for field, samples in series.items() if field != "voltage"}
     for field, samples in series.items():
         _check_clock(name, field, samples.t)
-    optional = ("position", *INPUTS, "voltage")
+    optional = ("position", *INPUTS)
     series = {f: s for f, s in series.items() if f not in optional or np.isfinite(s.values).all(axis=1).any()}
     notes: tuple[str, ...] = ()
     if "velocity" not in series:
@@ -98,8 +101,8 @@ def to_record(name: str, series: Mapping[str, Series]) -> Record:
     grid = _clock(name, series)
     values = {field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()}
     values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
-    if "voltage" in values:
-        values["voltage"] = values["voltage"][:, 0]
+    if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
+        values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
     return Record(name=name, t=grid, notes=notes, **values)
 
 

@@ -155,6 +155,14 @@ def test_gaps(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
         spans(read_record(write_csv(tmp_path / "e.csv", columns(eight), rows=np.r_[0:300, 330:650])), hummingbird)
 
 
+def test_log_without_a_whole_row(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
+    nothing = np.full(800, np.nan)
+    with pytest.raises(InputError, match=r"never flies; .* \(0 % of its samples are complete"):
+        spans(read_record(write_csv(tmp_path / "n.csv", columns(eight, vx=nothing))), hummingbird)
+    with pytest.raises(InputError, match="no row with a number for each rotor"):
+        read_record(write_csv(tmp_path / "n.csv", columns(eight, u4=nothing)))
+
+
 def test_erpm(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
     """ERPM / (poles / 2) = rpm; 65535 is a gap; poles are asked for, and a wrong count is named."""
     table = columns(eight)
@@ -284,7 +292,9 @@ SPOILT: dict[str, Spoil] = {
     "wy is negated": negated("rates", 1),
     "wz is negated": negated("rates", 2),
     "wy and wz are negated": negated("rates", 1, 2),
-    "5[67].* times the rates at which the attitude turns": lambda record: replace(record, rates=np.degrees(record.rates)),
+    "5[67].* times the rates at which the attitude turns": lambda record: replace(
+        record, rates=np.degrees(record.rates)
+    ),
     "wx and wy are swapped": lambda record: replace(record, rates=record.rates[:, [1, 0, 2]]),
     "world to body: negate qx, qy, qz": lambda record: replace(record, attitude=conjugate(record.attitude)),
     "in the order x, y, z, w": lambda record: replace(record, attitude=np.roll(record.attitude, -1, axis=1)),
