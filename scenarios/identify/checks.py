@@ -44,8 +44,8 @@ CLIPPED: Final = 0.2  # share of samples at a limit worth a note
 def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     """Return the parts of a log in the air and without gaps, each 2 s or longer.
 
-    On the ground, the rotors carry less than the weight while the vehicle rests. A log whose outputs are constant,
-    but for a second, never flies.
+    On the ground, the rotors carry less than the weight while the vehicle rests. A log that rests under constant
+    outputs, but for a second, never flies.
 
     Raises:
         InputError: none is 4 s long.
@@ -104,7 +104,7 @@ def _grounded(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDAr
     for rows, most in ((velocity, SLOW), (rates, CALM)):
         calm &= np.linalg.norm(uniform_filter1d(rows, max(second // 5, 1), axis=0), axis=1) < most
     change = maximum_filter1d(inputs, second, axis=0) - minimum_filter1d(inputs, second, axis=0)
-    constant = (change <= CONSTANT * np.abs(inputs).mean()).all(axis=1)
+    constant = calm & (change <= CONSTANT * np.abs(inputs).mean()).all(axis=1)
     if np.count_nonzero(logged & ~constant) < second:
         return constant
     resting = calm & (lacking > 0.15) & (np.abs(acceleration[:, 2]) < 0.4 * lacking * gravity)

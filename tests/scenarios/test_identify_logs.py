@@ -314,6 +314,7 @@ SPOILT: dict[str, Spoil] = {
         record,
         commands=np.full_like(record.velocity[:, [0, 0, 1, 2]], 90.0),
         velocity=0.02 * record.rates,
+        rates=0.02 * record.rates,
         position=np.zeros_like(record.velocity),
     ),
 }
