@@ -13,6 +13,7 @@ from quadsim.errors import InputError
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 from scenarios.identify.axes import check_axes
+from scenarios.identify.clocks import check_clocks
 from scenarios.identify.columns import RPM
 from scenarios.identify.record import INPUTS, Record, driver
 from scenarios.identify.rotor_order import check_rotor_order
@@ -21,6 +22,9 @@ from scenarios.identify.windows import body_z, slope
 SHORTEST: Final = 2.0  # [s] of a span that is used
 LEAST: Final = 4.0  # [s] that the longest must have
 MARGIN: Final = 0.5  # [s] cut beside the ground, where it still acts through the air and the legs
+SLOW, CALM = 0.3, 0.5
+"""Speed [m/s] and turn rate [rad/s] below which a vehicle may stand on the ground."""
+CONSTANT: Final = 3e-3  # share of the outputs below which their change in a second is none
 GOOD_RATE: Final = 50.0  # [Hz] below which lag and inertias are poor
 FACTOR: Final = 1.8  # by which hover speed in the log and by the start may differ
 NOTED_FACTOR: Final = 1.4
@@ -40,32 +44,29 @@ CLIPPED: Final = 0.2  # share of samples at a limit worth a note
 def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     """Return the parts of a log in the air and without gaps, each 2 s or longer.
 
-    On the ground, the rotors carry less than the weight while the vehicle rests, or turn at a constant speed.
+    On the ground, the rotors carry less than the weight while the vehicle rests. A log that rests under constant
+    outputs, but for a second, never flies.
 
     Raises:
         InputError: none is 4 s long.
     """
-    fields = [getattr(record, name) for name in ("velocity", "attitude", "rates", "position", *INPUTS)]
-    logged = np.logical_and.reduce([np.isfinite(rows).all(axis=1) for rows in fields if rows is not None])
-    second = max(round(1.0 / record.period), 1)
-    whole = _runs(logged, second)
-    grounded = np.ones(logged.size, bool)
-    for part in whole:
-        grounded[part] = False
-    if whole:
-        grounded |= _near(_resting(record, logged, vehicle.gravity), round(MARGIN * second))
-    aloft = _runs(~grounded, round(SHORTEST / record.period))
+    logged = _logged(record)
+    shortest = round(SHORTEST / record.period)
+    aloft = _runs(logged, shortest) and _runs(logged & ~_grounded(record, logged, vehicle.gravity), shortest)
     longest = max((part.stop - part.start for part in aloft), default=0) * record.period
     if longest >= LEAST * (1.0 - 1e-6):
         return aloft
     inputs = driver(record)[logged]
     swing = float(np.ptp(inputs, axis=0).max() / max(np.abs(inputs).max(), 1e-9)) if len(inputs) else 0.0
-    height = "" if record.position is None else f", its altitude by {np.ptp(record.position[logged, 2]):.2f} m"
+    height = (
+        ""
+        if record.position is None or not len(inputs)
+        else f", its altitude by {np.ptp(record.position[logged, 2]):.2f} m"
+    )
     flies = f"flies for {longest:.1f} s at most in one piece" if longest else "never flies"
     raise InputError(
-        f"{record.name}: {flies}; {LEAST:g} s "
-        f"in the air without a gap are needed ({100.0 * logged.mean():.0f} % of its samples are complete; in them the "
-        f"rotors' {'speeds' if record.speeds is not None else 'commands'} change by {100.0 * swing:.0f} %{height})"
+        f"{record.name}: {flies}; {LEAST:g} s in the air without a gap are needed ({100.0 * logged.mean():.0f} % of "
+        f"its samples are complete; in them the rotors' outputs change by {100.0 * swing:.0f} %{height})"
     )
 
 
@@ -75,42 +76,45 @@ def check(record: Record, vehicle: Vehicle, spans: Sequence[slice]) -> tuple[str
     Raises:
         InputError: naming what is wrong: an axis, a frame, a clock, a unit, the pole count, or the rotors' order.
     """
-    notes = [*record.notes, *check_axes(record, spans)]
-    notes += [*_check_units(record, spans, vehicle)]
+    check_axes(record, spans, vehicle.gravity)
+    notes = [*record.notes, *check_clocks(record, spans), *_check_units(record, spans, vehicle)]
     check_rotor_order(record, spans, vehicle)
     return (*notes, *_poor(record, spans))
 
 
-def _resting(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDArray[np.bool_]:
-    """Rows (N,) on the ground; gaps are bridged by a straight line."""
+def _logged(record: Record) -> NDArray[np.bool_]:
+    """Rows (N,) in no gap."""
+    fields = [getattr(record, name) for name in ("velocity", "attitude", "rates", "position", *INPUTS)]
+    return np.logical_and.reduce([np.isfinite(rows).all(axis=1) for rows in fields if rows is not None])
+
+
+def _grounded(record: Record, logged: NDArray[np.bool_], gravity: float) -> NDArray[np.bool_]:
+    """Rows (N,) on the ground or near it; gaps are bridged by a straight line."""
     velocity, attitude, rates, inputs = (
         _bridged(rows, logged) for rows in (record.velocity, record.attitude, record.rates, driver(record))
     )
-    second = max(round(1.0 / record.period), 1)
+    second = round(1.0 / record.period)
     effort = uniform_filter1d(np.square(inputs).mean(axis=1), max(second // 10, 1))
     acceleration = slope(velocity, record.period, 0.2)
     load = ((acceleration + np.array([0.0, 0.0, gravity])) * body_z(attitude)).sum(axis=1) / gravity
     heavy = logged & (effort > 0.5 * effort[logged].max()) & (load > 0.3)
     hover = float(np.median(effort[heavy] / load[heavy])) if heavy.any() else float(np.median(effort[logged]))
     lacking = 1.0 - effort / max(hover, 1e-30)  # share of the weight that the rotors do not carry
-    slow, calm = (
-        np.linalg.norm(uniform_filter1d(rows, max(second // 5, 1), axis=0), axis=1) < most
-        for rows, most in ((velocity, 0.3), (rates, 0.5))
-    )
+    calm = np.ones(len(effort), bool)
+    for rows, most in ((velocity, SLOW), (rates, CALM)):
+        calm &= np.linalg.norm(uniform_filter1d(rows, max(second // 5, 1), axis=0), axis=1) < most
     change = maximum_filter1d(inputs, second, axis=0) - minimum_filter1d(inputs, second, axis=0)
-    constant = (change <= 3e-3 * np.abs(inputs).mean()).all(axis=1)
-    carried = (lacking > 0.15) & (np.abs(acceleration[:, 2]) < 0.4 * lacking * gravity)
-    return np.asarray(slow & calm & (constant | carried))
+    constant = calm & (change <= CONSTANT * np.abs(inputs).mean()).all(axis=1)
+    if np.count_nonzero(logged & ~constant) < second:
+        return constant
+    resting = calm & (lacking > 0.15) & (np.abs(acceleration[:, 2]) < 0.4 * lacking * gravity)
+    lasting = minimum_filter1d(resting.astype(np.int8), 2 * (second // 8) + 1)  # not the top of a climb
+    return np.asarray(maximum_filter1d(lasting, 2 * (round(MARGIN * second) + second // 8) + 1) > 0)
 
 
 def _bridged(rows: Array, logged: NDArray[np.bool_]) -> Array:
     index = np.arange(len(rows))
     return np.stack([np.interp(index, index[logged], column[logged]) for column in rows.T], axis=1)
-
-
-def _near(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Samples at most `reach` away from a true one."""
-    return np.asarray(maximum_filter1d(mask.astype(np.int8), 2 * reach + 1) > 0)
 
 
 def _runs(mask: NDArray[np.bool_], shortest: int) -> list[slice]:
@@ -147,7 +151,11 @@ def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
 
 
 def _poor(record: Record, parts: Sequence[slice]) -> Iterator[str]:
-    """Notes on what makes estimates poor: a slow log, commands at a limit."""
+    """Notes on what makes estimates poor: gaps, a slow log, commands at a limit."""
+    logged = _logged(record)
+    if not logged.all():
+        share, first = 100.0 * (1.0 - logged.mean()), record.t[np.argmin(logged)]
+        yield f"{record.name}: {share:.2g} % of its samples, left out, are in gaps, the first at t = {first:.4g} s"
     if record.period > (1.0 + 1e-6) / GOOD_RATE:
         yield f"{record.name}: {1.0 / record.period:.3g} Hz; below {GOOD_RATE:g} Hz, lag and inertias will be poor"
     for field in INPUTS[:2]:

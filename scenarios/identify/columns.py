@@ -43,6 +43,13 @@ TIMES: Final = {
 """Columns of time, with their units [s]."""
 TIMES_OF_ANY_UNIT: Final = ("time", "timestamp")
 """Columns of time in s, ms or us: their step tells which, as a log has 10 to 1000 samples per second."""
+RANGES: Final = {
+    "throttle": (0.0, 1.0, "throttle1..4 must be shares of full throttle, 0 to 1"),
+    "commands": (0.0, math.inf, "u1..4 must be rotor speeds in rad/s, 0 or above"),
+    "speeds": (0.0, math.inf, "rotor speeds must be 0 or above, whichever way a rotor turns"),
+    "euler": (-math.pi, math.pi, "roll and pitch must be in rad"),
+}
+"""Least and largest value of a quantity, and the rule."""
 NEEDED: Final = {
     "velocity": ("velocity", "position"),
     "attitude": ("attitude", "euler"),
@@ -121,7 +128,9 @@ def _in_our_units(name: str, values: dict[str, Array], poles: int | None) -> dic
     """The fields of a record, converted where the table has them otherwise."""
     euler, erpm, rpm = values.pop("euler", None), values.pop("erpm", None), values.pop("rpm", None)
     euler_rates = values.pop("euler_rates", None)
-    if "attitude" not in values and euler is not None:
+    if "attitude" in values:
+        euler = None
+    if euler is not None:
         values["attitude"] = euler_to_quaternion(euler)
     if "rates" not in values and euler is not None and euler_rates is not None:
         values["rates"] = euler_to_body_rates(euler, euler_rates)
@@ -135,4 +144,8 @@ def _in_our_units(name: str, values: dict[str, Array], poles: int | None) -> dic
         raise InputError(f"{name}: poles turn eRPM into speeds, and there is no erpm1..4; leave poles out")
     elif rpm is not None and "speeds" not in values:
         values["speeds"] = rpm * RPM
+    for field, (low, high, rule) in RANGES.items():
+        rows = values.get(field, euler[:, :2] if field == "euler" and euler is not None else None)
+        if rows is not None and not (low <= np.nanmin(rows, initial=low) and np.nanmax(rows, initial=low) <= high):
+            raise InputError(f"{name}: {rule}; got {np.nanmin(rows):.4g} to {np.nanmax(rows):.4g}")
     return values

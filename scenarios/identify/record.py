@@ -81,11 +81,14 @@ def read_record(path: Path | str, *, poles: int | None = None) -> Record:
 def to_record(name: str, series: Mapping[str, Series]) -> Record:
     """Sample the series of a log, by field of `Record`, on one uniform clock.
 
-    Commands are held, all else is linear in time. Series that share a uniform clock stay as they are.
+    Commands are held, all else is linear in time. Series that share a uniform clock stay as they are. The voltage
+    has no gaps: it changes slowly.
     """
+    voltage = series.get("voltage")
+    series = {field: samples for field, samples in series.items() if field != "voltage"}
     for field, samples in series.items():
         _check_clock(name, field, samples.t)
-    optional = ("position", *INPUTS, "voltage")
+    optional = ("position", *INPUTS)
     series = {f: s for f, s in series.items() if f not in optional or np.isfinite(s.values).all(axis=1).any()}
     notes: tuple[str, ...] = ()
     if "velocity" not in series:
@@ -98,8 +101,8 @@ def to_record(name: str, series: Mapping[str, Series]) -> Record:
     grid = _clock(name, series)
     values = {field: _sampled(samples, grid, held=field in INPUTS[:2]) for field, samples in series.items()}
     values["attitude"] /= np.linalg.norm(values["attitude"], axis=1, keepdims=True)
-    if "voltage" in values:
-        values["voltage"] = values["voltage"][:, 0]
+    if voltage is not None and (there := np.isfinite(voltage.values[:, 0])).any():
+        values["voltage"] = np.interp(grid, voltage.t[there], voltage.values[there, 0])
     return Record(name=name, t=grid, notes=notes, **values)
 
 
@@ -179,10 +182,10 @@ def _sampled(series: Series, grid: Array, *, held: bool) -> Array:
         return np.full((grid.size, series.values.shape[1]), np.nan)
     t, values = series.t[there], series.values[there]
     period = max(_usual_period(series.t), float(grid[1] - grid[0]))
-    at = grid + 0.05 * period if held else grid  # a stamp's jitter must not hold a command for a period too long
-    before = np.clip(np.searchsorted(t, at, side="right") - 1, 0, t.size - 1)
-    after = np.minimum(np.searchsorted(t, at, side="left"), t.size - 1)
+    near = 0.05 * period  # a stamp's jitter must neither hold a command for a period too long nor open a gap
+    before = np.clip(np.searchsorted(t, grid + near, side="right") - 1, 0, t.size - 1)
+    after = np.minimum(np.searchsorted(t, grid - near, side="left"), t.size - 1)
     sampled = values[before] if held else np.stack([np.interp(grid, t, column) for column in values.T], axis=1)
-    outside = (at < t[0] - 0.5 * period) | (at > t[-1] + (LONGEST_GAP if held else 0.5) * period)
-    sampled[outside | (t[after] - t[before] > LONGEST_GAP * period * (1.0 + 1e-6))] = np.nan
+    outside = (grid < t[0] - 0.5 * period) | (grid > t[-1] + (LONGEST_GAP if held else 0.5) * period)
+    sampled[outside | (t[after] - t[before] > LONGEST_GAP * period + near)] = np.nan
     return np.asarray(sampled)

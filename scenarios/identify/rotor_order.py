@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from quadsim.errors import InputError
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
-from scenarios.identify.record import Record
+from scenarios.identify.record import Record, driver
 from scenarios.identify.windows import mean, slope
 
 WINDOW: Final = 0.02  # [s] of an angular acceleration
@@ -24,12 +24,12 @@ INFERIOR: Final = 0.85  # of what the best order explains, at most, by the one g
 EXPLAINED: Final = 0.1  # least share of the angular acceleration that an order must explain to be believed
 
 
-class Block(NamedTuple):
-    """Second moments of a second: squared rotor speeds x (4,), angular acceleration a (3,)."""
+class Moments(NamedTuple):
+    """Second moments in each of K blocks: squared rotor speeds x (4,), angular acceleration a (3,)."""
 
-    xx: Array  # (4, 4)
-    xa: Array  # (4, 3)
-    aa: Array  # (3,)
+    xx: Array  # (K, 4, 4)
+    xa: Array  # (K, 4, 3)
+    aa: Array  # (K, 3)
 
 
 def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> None:
@@ -40,9 +40,7 @@ def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) 
     Raises:
         InputError: naming the order, azimuths or spins to try.
     """
-    size = max(round(BLOCK / record.period), 8)
-    lags = LAGS if record.speeds is None else LAGS[:1]
-    blocks = [[block for part in parts for block in _blocks(record, part, lag, size)] for lag in lags]
+    blocks = [_moments(record, parts, lag) for lag in (LAGS if record.speeds is None else LAGS[:1])]
     x, y, _ = vehicle.rotor_positions.T / vehicle.arm_length
     usual = _best(blocks, np.stack([y, -x]))
     best, order, turn = usual, tuple(range(N_ROTORS)), 0.0
@@ -55,51 +53,57 @@ def check_rotor_order(record: Record, parts: Sequence[slice], vehicle: Vehicle) 
             if explained.mean() > best.mean() + 1e-9:
                 best, order, turn = explained, columns, angle
     if best.mean() > EXPLAINED and usual.mean() < INFERIOR * best.mean() and (best > usual).mean() >= AGREEING:
-        raise InputError(f"{record.name}: {_named(order, turn, vehicle)}, {_shares(best, usual)}")
+        raise InputError(f"{record.name}: {_named(order, turn, vehicle, _column(record))}, {_shares(best, usual)}")
     _check_spins(record.name, blocks, vehicle)
 
 
-def _blocks(record: Record, part: slice, lag: float, size: int) -> list[Block]:
-    period = record.period
-    inputs = next(x for x in (record.speeds, record.commands, record.throttle) if x is not None)[part]
-    if lag:
-        pole = math.exp(-period / lag)
-        rest = np.concatenate([inputs[:1], inputs[:-1]])  # a command moves the rotors after its sample
-        inputs = lfilter([1.0 - pole], [1.0, -pole], rest, axis=0, zi=pole * inputs[:1])[0]
-    squares = mean(np.square(inputs), period, WINDOW)
-    acceleration = slope(record.rates[part], period, WINDOW)
-    rows = [slice(start, start + size) for start in range(0, len(squares) - size + 1, size)]
-    moments = []
-    for row in rows:
-        x, a = squares[row] - squares[row].mean(axis=0), acceleration[row] - acceleration[row].mean(axis=0)
-        moments.append(Block(xx=x.T @ x, xa=x.T @ a, aa=np.square(a).sum(axis=0)))
-    return moments
+def _moments(record: Record, parts: Sequence[slice], lag: float) -> Moments:
+    """Moments of the blocks of all parts, the mean of each block removed, the commands behind a lag [s]."""
+    period, size = record.period, max(round(BLOCK / record.period), 8)
+    speeds, accelerations = [], []
+    for part in parts:
+        inputs = driver(record)[part]
+        if lag:
+            pole = math.exp(-period / lag)
+            before = np.concatenate([inputs[:1], inputs[:-1]])  # a command moves the rotors after its sample
+            inputs = lfilter([1.0 - pole], [1.0, -pole], before, axis=0, zi=pole * inputs[:1])[0]
+        whole = len(inputs) // size * size
+        speeds.append(mean(np.square(inputs), period, WINDOW)[:whole].reshape(-1, size, N_ROTORS))
+        accelerations.append(slope(record.rates[part], period, WINDOW)[:whole].reshape(-1, size, 3))
+    x, a = (np.concatenate(rows) for rows in (speeds, accelerations))
+    x, a = x - x.mean(axis=1, keepdims=True), a - a.mean(axis=1, keepdims=True)
+    return Moments(xx=x.transpose(0, 2, 1) @ x, xa=x.transpose(0, 2, 1) @ a, aa=np.square(a).sum(axis=1))
 
 
-def _best(blocks: Sequence[Sequence[Block]], arms: Array) -> Array:
-    """Share of the roll and pitch acceleration explained in each block by torques of these arms (2, 4), best lag."""
+def _best(blocks: Sequence[Moments], arms: Array) -> Array:
+    """Share (K,) of roll and pitch acceleration that arms (2, 4) explain in each block, at the best lag."""
     return max((_explained(of_lag, arms) for of_lag in blocks), key=lambda shares: float(shares.mean()))
 
 
-def _explained(blocks: Sequence[Block], arms: Array) -> Array:
-    """The same at one lag: one positive gain per axis for all blocks."""
-    along = np.array([(arms @ block.xa)[[0, 1], [0, 1]] for block in blocks])
-    power = np.array([np.diag(arms @ block.xx @ arms.T) for block in blocks])
-    total = np.array([block.aa[:2] for block in blocks]).mean(axis=0)
+def _explained(blocks: Moments, arms: Array) -> Array:
+    """The same at one lag, with one positive gain per axis for all blocks."""
+    along = np.einsum("ij,kji->ki", arms, blocks.xa[:, :, :2])
+    power = np.einsum("ij,kjl,il->ki", arms, blocks.xx, arms)
     gain = np.maximum(along.sum(axis=0) / np.maximum(power.sum(axis=0), 1e-30), 0.0)
-    return np.asarray(((2.0 * gain * along - gain**2 * power) / np.maximum(total, 1e-30)).mean(axis=1))
+    total = np.maximum(blocks.aa[:, :2].mean(axis=0), 1e-30)
+    return np.asarray(((2.0 * gain * along - gain**2 * power) / total).mean(axis=1))
 
 
-def _named(order: Sequence[int], turn: float, vehicle: Vehicle) -> str:
+def _column(record: Record) -> str:
+    """What the columns of the rotors' outputs are called."""
+    return "w" if record.speeds is not None else "u" if record.commands is not None else "throttle"
+
+
+def _named(order: Sequence[int], turn: float, vehicle: Vehicle, column: str) -> str:
     if turn:
         azimuths = [0.0] * N_ROTORS
-        for place, column in enumerate(order):
-            azimuths[column] = (vehicle.rotor_azimuths[place] + 45.0 + 180.0) % 360.0 - 180.0
+        for place, i in enumerate(order):
+            azimuths[i] = (vehicle.rotor_azimuths[place] + 45.0 + 180.0) % 360.0 - 180.0
         return f"the arms are 45 deg off: try rotor_azimuths = [{', '.join(f'{a:g}' for a in azimuths)}]"
     mirrored = np.allclose(vehicle.rotor_positions[list(order)], vehicle.rotor_positions * [-1.0, 1.0, 1.0])
     moved = [i + 1 for i in range(N_ROTORS) if order[i] != i]
     swapped = f"rotors {moved[0]} and {moved[1]} are swapped" if len(moved) == 2 else "the rotors are in another order"
-    return f"{swapped}: try the order {','.join(f'u{column + 1}' for column in order)}" + (
+    return f"{swapped}: try the order {','.join(f'{column}{i + 1}' for i in order)}" + (
         " (or body axes are x forward, y right, z down)" if mirrored else ""
     )
 
@@ -111,16 +115,14 @@ def _shares(best: Array, usual: Array) -> str:
     )
 
 
-def _check_spins(name: str, blocks: Sequence[Sequence[Block]], vehicle: Vehicle) -> None:
+def _check_spins(name: str, blocks: Sequence[Moments], vehicle: Vehicle) -> None:
     """Refuse spins of which all are reversed."""
     spins = np.array(vehicle.rotor_spins, float)
     shares = []
-    for of_lag in blocks:
-        along = np.array([spins @ block.xa[:, 2] for block in of_lag])
-        power = np.array([spins @ block.xx @ spins for block in of_lag])
-        total = np.array([block.aa[2] for block in of_lag])
-        gain = along.sum() / max(power.sum(), 1e-30)
-        shares.append((gain * along.sum() / max(total.sum(), 1e-30), gain, (along < 0.0).mean()))
+    for xx, xa, aa in blocks:
+        along, power = xa[:, :, 2] @ spins, float((xx @ spins @ spins).sum())
+        gain = float(along.sum()) / max(power, 1e-30)
+        shares.append((gain * float(along.sum()) / max(float(aa[:, 2].sum()), 1e-30), gain, (along < 0.0).mean()))
     explained, gain, against = max(shares)
     if gain < 0.0 and explained > 0.05 and against >= AGREEING:
         raise InputError(

@@ -42,7 +42,9 @@ def flown(vehicle: str, course: str, **changes: Any) -> Flight:
 def run_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A figure eight of the Hummingbird with a battery, as its run directory has it."""
     directory = tmp_path_factory.mktemp("eight")
-    flight = flown("hummingbird", "figure-eight", **{"effects.battery": {"cells": 3, "capacity": 2.0, "resistance": 0.02}})
+    flight = flown(
+        "hummingbird", "figure-eight", **{"effects.battery": {"cells": 3, "capacity": 2.0, "resistance": 0.02}}
+    )
     write_log(directory, flight.log, plant_stride=5, metadata={})
     return directory
 
@@ -144,12 +146,21 @@ def test_gaps(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
     read = read_record(write_csv(tmp_path / "d.csv", columns(eight), rows=rows))
     np.testing.assert_allclose(read.t, eight.t, atol=1e-9)
     np.testing.assert_array_equal(read.commands[99:103], np.repeat(eight.commands[99:100], 4, axis=0))  # type: ignore[index]
-    assert np.isnan(read.rates[301:329]).all()
+    assert np.isnan(read.rates[300:330]).all()
     parts = spans(read, hummingbird)
-    assert [part.start for part in parts] == pytest.approx([0, 330], abs=2)
-    assert check(read, hummingbird, parts) == ()
+    assert parts == [slice(0, 300), slice(330, 800)]
+    (note,) = check(read, hummingbird, parts)
+    assert note == "d.csv: 3.7 % of its samples, left out, are in gaps, the first at t = 3 s"
     with pytest.raises(InputError, match=r"flies for 3\.. s at most in one piece; .* \(9. % of its samples"):
         spans(read_record(write_csv(tmp_path / "e.csv", columns(eight), rows=np.r_[0:300, 330:650])), hummingbird)
+
+
+def test_log_without_a_whole_row(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
+    nothing = np.full(800, np.nan)
+    with pytest.raises(InputError, match=r"never flies; .* \(0 % of its samples are complete"):
+        spans(read_record(write_csv(tmp_path / "n.csv", columns(eight, vx=nothing))), hummingbird)
+    with pytest.raises(InputError, match="no row with a number for each rotor"):
+        read_record(write_csv(tmp_path / "n.csv", columns(eight, u4=nothing)))
 
 
 def test_erpm(tmp_path: Path, eight: Record, hummingbird: Vehicle) -> None:
@@ -237,6 +248,22 @@ def test_quaternions_must_be_of_length_one(tmp_path: Path, eight: Record) -> Non
         read_record(write_csv(tmp_path / "k.csv", {**table, "qw": table["qw"] - 0.5}))
 
 
+@pytest.mark.parametrize(
+    ("spoilt", "rule"),
+    [
+        (lambda table: {f"throttle{i}": 1000.0 + table[f"u{i}"] for i in range(1, 5)}, "throttle1..4 must be shares"),
+        (lambda table: {"w1": -table["u1"], **{f"w{i}": table[f"u{i}"] for i in (2, 3, 4)}}, "must be 0 or above"),
+        (lambda table: {"roll": 40.0 * table["qx"], "pitch": table["qy"], "yaw": table["qz"]}, "must be in rad; got"),
+    ],
+)
+def test_units_that_cannot_be_meant(tmp_path: Path, eight: Record, spoilt: Any, rule: str) -> None:
+    table = columns(eight)
+    others = spoilt(table)
+    without = "qw" if "roll" in others else "u1"
+    with pytest.raises(InputError, match=rule):
+        read_record(write_csv(tmp_path / "l.csv", {**table, **others}, without=without))
+
+
 # Checks
 
 
@@ -265,6 +292,9 @@ SPOILT: dict[str, Spoil] = {
     "wy is negated": negated("rates", 1),
     "wz is negated": negated("rates", 2),
     "wy and wz are negated": negated("rates", 1, 2),
+    "5[67].* times the rates at which the attitude turns": lambda record: replace(
+        record, rates=np.degrees(record.rates)
+    ),
     "wx and wy are swapped": lambda record: replace(record, rates=record.rates[:, [1, 0, 2]]),
     "world to body: negate qx, qy, qz": lambda record: replace(record, attitude=conjugate(record.attitude)),
     "in the order x, y, z, w": lambda record: replace(record, attitude=np.roll(record.attitude, -1, axis=1)),
@@ -284,6 +314,7 @@ SPOILT: dict[str, Spoil] = {
         record,
         commands=np.full_like(record.velocity[:, [0, 0, 1, 2]], 90.0),
         velocity=0.02 * record.rates,
+        rates=0.02 * record.rates,
         position=np.zeros_like(record.velocity),
     ),
 }
@@ -342,7 +373,7 @@ def test_poor_logs_are_notes(eight: Record, hummingbird: Vehicle) -> None:
     clipped = replace(eight, commands=np.clip(eight.commands, 0.95 * middle, 1.05 * middle))  # type: ignore[arg-type]
     assert any("a rotor's commands are at a limit" in note for note in notes(clipped, hummingbird))
     fast = replace(eight, commands=1.5 * eight.commands)  # type: ignore[operator]
-    assert any("1.48 times the start's hover speed" in note for note in notes(fast, hummingbird))
+    assert any("1.49 times the start's hover speed" in note for note in notes(fast, hummingbird))
 
 
 def test_ground_is_cut(tmp_path: Path) -> None:
