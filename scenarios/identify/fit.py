@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
@@ -15,7 +16,7 @@ from scenarios.identify.estimate import Estimate, Identification
 from scenarios.identify.model import AXES, Stretch, stretch
 from scenarios.identify.record import Record
 from scenarios.identify.rotors import smoothed
-from scenarios.identify.search import PLATE, Search
+from scenarios.identify.search import LEVEL_PLATE, PLATE, Search
 
 CONFIDENCE: Final = 0.95
 WIDEST: Final = 0.25
@@ -105,6 +106,10 @@ def part_of(record: Record, span: slice) -> Record:
     return replace(record, **cut)
 
 
+_RELATIVE: Final = {*_KINDS} - {"delay", "offset_x", "offset_y", "throttle_curve", "voltage_exponent"}
+"""Parameters whose interval is judged by its share of the value."""
+
+
 class _Fit:
     """What a search found, judged."""
 
@@ -130,7 +135,7 @@ class _Fit:
 
     def _half_width(self, shares: dict[int, float]) -> float:
         drift = sum(abs(share) * self.drift[i] for i, share in shares.items())
-        return self.quantile * float(np.hypot(max(self._deviations(shares)), FLOOR)) + float(drift)
+        return self.quantile * math.hypot(*self._deviations(shares), FLOOR) + float(drift)
 
     def result(self) -> Identification:
         """Every estimate, and the vehicle with those that are not refused."""
@@ -175,8 +180,9 @@ class _Fit:
         loud = max(kind.axes, key=self.colour.__getitem__)
         if self.colour[loud] > MOST_COLOUR:
             return f"not white: innovations of {loud} correlate by {self.colour[loud]:.2f}, allowed {MOST_COLOUR:g}"
-        if number.scale is None and half > WIDEST:
-            return _not_excited(half)
+        relative = half if number.scale is None else half * number.scale / abs(number.value(self.search.x[i]))
+        if relative > WIDEST and number.name in _RELATIVE:
+            return _not_excited(relative)
         if self.rests[i] > MOST_PRIOR:
             return f"rests on a rule of thumb for {self.rests[i]:.0%}, allowed {MOST_PRIOR:.0%}"
         if abs(self.moved[i]) > half:
@@ -241,7 +247,7 @@ class _Fit:
         if "inertia_z" not in values and not abs(inertia[0] - inertia[1]) < inertia[2] < inertia[0] + inertia[1]:
             inertia[2] = PLATE[0] * (inertia[0] + inertia[1])
         if "body_drag" in values:
-            ratio = np.array(self.vehicle.body_drag or (1.0, 1.0, 2.0))
+            ratio = np.array(self.vehicle.body_drag or LEVEL_PLATE)
             changes["body_drag"] = tuple((values["body_drag"] * ratio / ratio[0]).tolist())
         return replace(self.vehicle, inertia=tuple(inertia), **changes)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
@@ -30,6 +30,7 @@ _MOST_BLOCKS: Final = 20
 _NOISE_AT_FIRST: Final = ((1.0, 0.0), (-1.5, 0.5))  # reflection coefficients of A and C, before tanh
 PLATE: Final = (0.87, 0.12)
 """Inertia_z over inertia_x + inertia_y, and its standard deviation in logarithms; of a plate it is 1."""
+LEVEL_PLATE: Final = (1.0, 1.0, 2.0)  # drag areas along x, y, z to each other, where the start has none
 _LAG_RATIO: Final = 0.5  # standard deviation of log(rise / fall)
 _WIND_STEP: Final = 1.0  # standard deviation of the wind's change from knot to knot [m/s]
 _STEPS, _TRIES, _SMALL = 60, 8, 5e-3  # of the search: how many, shortened how often, until the likelihood gains less
@@ -55,6 +56,7 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch]) -> list[Sought]:
     """What is searched for, from the vehicle of the start file on."""
     weight, arm = vehicle.mass * vehicle.gravity, vehicle.arm_length
     record = parts[0].record
+    area = vehicle.body_drag[0] if vehicle.body_drag else 0.25 * arm**2
     lag = vehicle.rotor_rise or vehicle.rotor_fall or 0.03
     numbers = [
         Sought("thrust_coefficient", vehicle.thrust_coefficient, None, None),
@@ -62,7 +64,7 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch]) -> list[Sought]:
         Sought("drag_to_thrust", vehicle.drag_to_thrust, None, None),
         Sought("rotor_inertia", vehicle.rotor_inertia or 6e-4 * vehicle.inertia[2], None, 1.0),
         Sought("rotor_drag", vehicle.rotor_drag or 0.005 * weight / vehicle.hover_speed, None, 1.5),
-        Sought("body_drag", vehicle.body_drag[0] if vehicle.body_drag else 0.1 * arm**2, None, 1.5),
+        Sought("body_drag", area, area, 1.0),
         Sought("offset_x", 0.0, 0.01 * arm, 10.0),
         Sought("offset_y", 0.0, 0.01 * arm, 10.0),
         Sought("drag_height", 0.0, 0.1 * arm, 2.0),
@@ -77,7 +79,7 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch]) -> list[Sought]:
             numbers.append(Sought("voltage_exponent", 1.0, 0.5, 2.0))
     for i, part in enumerate(parts):
         numbers.append(Sought("delay", 0.0, 0.005, 4.0, i))
-        numbers += [Sought(f"wind_{axis}_{k}", 0.0, 1.0, 2.0, i) for k in range(_knots(part)) for axis in "xy"]
+        numbers += [Sought("wind", 0.0, 1.0, 2.0, i)] * (2 * _knots(part))
     return numbers
 
 
@@ -109,14 +111,8 @@ class Search:
         deviations = [number.deviation for number in self.sought]
         self._weights = np.array([0.0 if sd is None else sd**-2.0 for sd in deviations] + [1 / 9.0] * len(noise))
         self._weights = np.append(self._weights, np.full(len(self.x) - self._starts, 1 / 16.0))
-        self._walks = [
-            (i, i + 2)
-            for i, number in enumerate(self.sought)
-            if number.name.startswith("wind") and self._same_wind(i, i + 2)
-        ]
-
-    def _same_wind(self, i: int, later: int) -> bool:
-        return later < self._physical and self.sought[later].part == self.sought[i].part
+        winds = [[i for i, n in enumerate(self.sought) if n.name == "wind" and n.part == k] for k in range(len(parts))]
+        self._winds = [np.reshape(wind, (-1, 2)) for wind in winds]  # (K, 2) where each stretch's wind is in `x`
 
     def index(self, name: str, part: int | None = None) -> int | None:
         """Where a number is in `x`, or None if it is not searched for."""
@@ -125,14 +121,15 @@ class Search:
 
     def parameters(self, x: Array, part: int) -> Parameters:
         """The prediction's parameters for a stretch."""
-        own = {n.name: n.value(v) for n, v in zip(self.sought, x, strict=False) if n.part in (None, part)}
-        wind = [own.pop(f"wind_{axis}_{k}") for k in range(_knots(self.parts[part])) for axis in "xy"]
-        area, given = own.pop("body_drag"), self.vehicle.body_drag or (1.0, 1.0, 2.0)
+        own: dict[str, Any] = {
+            n.name: n.value(v) for n, v in zip(self.sought, x, strict=False) if n.part in (None, part)
+        }
+        own["wind"] = x[self._winds[part]]
+        area, given = own.pop("body_drag"), self.vehicle.body_drag or LEVEL_PLATE
         return Parameters(
             inertia=np.array([own.pop(f"inertia_{axis}") for axis in "xyz"]),
             body_drag=area / given[0] * np.array(given),
             offset=np.array([own.pop("offset_x"), own.pop("offset_y"), own.pop("drag_height")]),
-            wind=np.reshape(wind, (-1, 2)),
             voltage=self.voltage,
             **own,
         )
@@ -191,7 +188,9 @@ class Search:
         if rise is not None and fall is not None:
             ratio = self.sought[rise].value(x[rise]) / self.sought[fall].value(x[fall])
             yield [(rise, 1.0), (fall, -1.0)], float(np.log(ratio)), _LAG_RATIO
-        for before, after in self._walks:
+        for before, after in (
+            (b, a) for wind in self._winds for b, a in zip(wind[:-1].flat, wind[1:].flat, strict=True)
+        ):
             yield [(before, -1.0), (after, 1.0)], x[after] - x[before], _WIND_STEP
 
     def cost(self, x: Array) -> float:
@@ -205,12 +204,19 @@ class Search:
         misfit, rotors = self._misfit(x, part)
         slopes = np.zeros((*misfit.shape, self._physical))
         for i, number in enumerate(self.sought):
-            if number.part not in (None, part):
+            if number.part not in (None, part) or number.name == "wind":
                 continue
             step = 1e-4 if number.scale is None else 1e-2
             moved = x.copy()
             moved[i] += step
             slopes[:, :, i] = (self._misfit(moved, part, None if number.name in LAGS else rotors)[0] - misfit) / step
+        when = np.linspace(0.0, 1.0, len(misfit) + self._skip[part])[self._skip[part] :]
+        for wind in self._winds[part].T:  # as it is linear between its knots, so is what a change of all of them does
+            moved = x.copy()
+            moved[wind] += 1e-2
+            slope = (self._misfit(moved, part, rotors)[0] - misfit) / 1e-2
+            for share, i in zip(np.eye(len(wind)), wind, strict=True):
+                slopes[:, :, i] = slope * np.interp(when, np.linspace(0.0, 1.0, len(wind)), share)[:, None]
         return misfit, slopes
 
     def _slopes(self, part: int) -> tuple[Array, Array]:

@@ -1,0 +1,228 @@
+"""How often the 95 % interval of an identified parameter holds the truth, on logs of drawn vehicles.
+
+Each vehicle has the numbers of the Hummingbird times factors, in X layout, flies 20 s under geometric control at 100 Hz
+in a wind of 0.9 m/s with turbulence, and is identified from what its sensors say, given a start file that is wrong by
+up to a factor of two.  Of the logs that pass a parameter's gates, `inside` are those whose interval holds the truth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from interfaces import merged
+from timing import Record, options, run
+
+import quadsim
+from quadsim.errors import QuadsimError
+from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
+from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle
+from scenarios.design.first_scenario import first_scenario
+from scenarios.flight import Flight
+from scenarios.identify.fit import identify_records
+from scenarios.identify.record import Record as Log
+from scenarios.loading import parse_scenario
+from scenarios.many import fly_many
+from scenarios.progress import Progress
+
+Table = dict[str, Any]
+VEHICLES: Final = 20
+FIRST_SEED: Final = 1000
+DURATION: Final = 20.0  # [s]
+TRACKED: Final = {
+    "position": {"rate": 100.0, "noise": 0.003},
+    "velocity": {"rate": 100.0, "noise": 0.03},
+    "attitude": {"rate": 100.0, "noise": 0.3},
+    "rates": {"rate": 100.0, "noise": 1.5},
+}
+RAW: Final = {
+    "position": {"rate": 100.0, "noise": 0.003},
+    "attitude": {"rate": 100.0, "noise": 0.3},
+    "rates": {"rate": 500.0, "noise": 0.6, "bias": 0.5, "bias_walk": 0.0022},
+}
+SHARED: Final[Table] = {
+    "duration": DURATION,
+    "control_period": 0.01,
+    "sensors": TRACKED,
+    "effects": {
+        "air": {"wind": [0.8, -0.5, 0.0], "turbulence": {"altitude": 10.0, "wind_speed_20ft": 7.7}},
+    },
+}
+CONDITIONS: Final[dict[str, Table]] = {
+    "eight, yaw steps": {"yaw_steps": True},
+    "eight": {},
+    "hover": {"hover": True},
+    "body drag": {"yaw_steps": True, "body_drag": True},
+    "torque 0.003, yaw steps": {"yaw_steps": True, "torque": 0.003},
+    "torque 0.01, yaw steps": {"yaw_steps": True, "torque": 0.01},
+    "torque 0.003, eight": {"torque": 0.003},
+    "torque 0.01, eight": {"torque": 0.01},
+    "torque 0.003, hover": {"hover": True, "torque": 0.003},
+    "raw sensors, estimator": {"yaw_steps": True, "estimator": True},
+    "commands 10 ms late": {"yaw_steps": True, "late": 1},
+    "commands 10 ms early": {"yaw_steps": True, "late": -1},
+}
+"""Of each row: the flight, torque noise [N m s^0.5], and by how many periods the log's commands are late."""
+
+
+def drawn(rng: np.random.Generator, *, body_drag: bool) -> Vehicle:
+    """A vehicle."""
+    base = quadsim.load_vehicle("hummingbird")
+    inertia = rng.uniform(0.75, 1.4) * base.inertia[0] * np.array([1.0, rng.uniform(0.85, 1.15), 0.0])
+    inertia[2] = rng.uniform(0.7, 0.97) * inertia.sum()
+    lag, ratio = rng.uniform(0.02, 0.05), rng.choice([1.0, rng.uniform(1.0, 1.6)])
+    return replace(
+        base,
+        rotor_azimuths=(-45.0, -135.0, 135.0, 45.0),
+        rotor_spins=(-1, 1, -1, 1),
+        thrust_coefficient=base.thrust_coefficient * rng.uniform(0.8, 1.25),
+        inertia=tuple(inertia.tolist()),
+        drag_to_thrust=base.drag_to_thrust * rng.uniform(0.7, 1.4),
+        rotor_rise=float(lag / math.sqrt(ratio)),
+        rotor_fall=float(lag * math.sqrt(ratio)),
+        rotor_inertia=(base.rotor_inertia or 0.0) * rng.uniform(0.6, 1.5),
+        rotor_drag=(base.rotor_drag or 0.0) * rng.uniform(1.2, 3.2),
+        body_drag=base.body_drag if body_drag else None,
+    )
+
+
+def wrong(vehicle: Vehicle, rng: np.random.Generator) -> Vehicle:
+    """A start file: some of the vehicle's numbers wrong by up to a factor of two, lag and rotor drag guessed."""
+    inertia = np.array(vehicle.inertia) * np.exp(rng.uniform(-0.6, 0.6, 3))
+    inertia[2] = 0.87 * inertia[:2].sum() * rng.uniform(0.9, 1.1)
+    return replace(
+        vehicle,
+        thrust_coefficient=vehicle.thrust_coefficient * rng.uniform(0.7, 1.4),
+        inertia=tuple(inertia.tolist()),
+        drag_to_thrust=vehicle.drag_to_thrust * rng.uniform(0.5, 2.0),
+        speed_max=1.4 * vehicle.speed_max,
+        rotor_rise=0.03,
+        rotor_fall=0.03,
+        rotor_inertia=5e-6,
+        rotor_drag=1e-4,
+        body_drag=None,
+    )
+
+
+def fly(vehicle: Vehicle, condition: Mapping[str, Any], rng: np.random.Generator) -> Flight:
+    """Fly what is logged."""
+    course = "hover" if condition.get("hover") else "figure-eight"
+    data = first_scenario(vehicle, "drawn", course=course, law="geometric").to_data()
+    numbers = {name: value for name in VEHICLE_UNITS if (value := getattr(vehicle, name)) is not None}
+    changes: Table = {"vehicle": {"file": "drawn", **numbers}, "seed": int(rng.integers(2**31)), "constraints": []}
+    if course == "figure-eight":
+        turn = data["reference"]["period"]
+        changes["reference"] = {"turns": max(1.0, round((DURATION - data["reference"]["ramp"] - 1.0) / turn))}
+    if condition.get("yaw_steps"):
+        angles = rng.uniform(15.0, 35.0, 21) * (-1.0) ** np.arange(21)
+        changes["events"] = [
+            {"type": "setpoint", "at": round(1.6 + 0.8 * i, 2), "yaw": float(angle)} for i, angle in enumerate(angles)
+        ]
+    if torque := condition.get("torque"):
+        changes["effects"] = {"disturbance": {"torque_noise": torque}}
+    table = merged(data, SHARED, changes)
+    if condition.get("estimator"):
+        table |= {"sensors": RAW, "estimator": {"type": "error_state"}}
+    return quadsim.fly(parse_scenario(table), progress=False)
+
+
+def logged(flight: Flight, late: int) -> Log:
+    """The flight's log, its commands late by some periods."""
+    log = flight.log.control
+    angles = log.state[:, ANGLES]
+    return Log(
+        name="drawn",
+        t=log.t,
+        position=log.state[:, POSITIONS],
+        velocity=log.state[:, VELOCITIES],
+        attitude=euler_to_quaternion(angles),
+        rates=euler_to_body_rates(angles, log.state[:, ANGLE_RATES]),
+        commands=log.speeds[np.clip(np.arange(len(log.t)) - late, 0, len(log.t) - 1)],
+    )
+
+
+def truth_of(vehicle: Vehicle, late: int) -> dict[str, float]:
+    """What the estimates are to hold, by name."""
+    true = {name: getattr(vehicle, name) or 0.0 for name in VEHICLE_UNITS}
+    true |= {f"inertia_{axis}": value for axis, value in zip("xyz", vehicle.inertia, strict=True)}
+    return true | {
+        "body_drag": (vehicle.body_drag or [0.0])[0],
+        "delay": -0.01 * late,
+        "offset_x": 0.0,
+        "offset_y": 0.0,
+    }
+
+
+def identify(log: tuple[str, int]) -> Record:
+    """Of one log: by parameter, whether it passes, and whether its interval holds the truth."""
+    name, seed = log
+    rng, condition = np.random.default_rng(seed), CONDITIONS[name]
+    vehicle, late = drawn(rng, body_drag=condition.get("body_drag", False)), condition.get("late", 0)
+    flown = logged(fly(vehicle, condition, rng), late)
+    found = identify_records([flown], [[slice(0, len(flown.t))]], wrong(vehicle, rng))
+    true = truth_of(vehicle, late)
+    return {
+        estimate.name: {
+            "passed": not estimate.refused,
+            "inside": estimate.low <= true[estimate.name] <= estimate.high,
+            "error": estimate.value / true[estimate.name] - 1.0 if true[estimate.name] else estimate.value,
+            "cross_check": found.cross_check.get(estimate.name),
+        }
+        for estimate in found.estimates
+    }
+
+
+def summaries(condition: str, found: Sequence[Mapping[str, Any]]) -> list[Record]:
+    """Of one condition: by parameter, how many passed, how many of these are inside, and the median error of all."""
+    records = []
+    for name in found[0]:
+        each = [log[name] for log in found]
+        records.append(
+            {
+                "condition": condition,
+                "parameter": name,
+                "logs": len(found),
+                "passed": sum(one["passed"] for one in each),
+                "inside": sum(one["passed"] and one["inside"] for one in each),
+                "median_error": float(np.median([abs(one["error"]) for one in each])),
+                "cross_check": each[0]["cross_check"] and float(np.median([one["cross_check"] for one in each])),
+            }
+        )
+    return records
+
+
+def measure(quick: bool, workers: int | None, report: Progress) -> list[Record]:
+    """A record of each condition and parameter."""
+    conditions, vehicles = (["hover"], 1) if quick else ([*CONDITIONS], VEHICLES)
+    logs = [(name, FIRST_SEED + 100 * i + k) for i, name in enumerate(conditions) for k in range(vehicles)]
+    found: dict[int, Record] = {}
+    with closing(fly_many(logs, identify, workers=workers)) as answers:
+        for done, (place, answer) in enumerate(answers, 1):
+            report("logs", done, len(logs))
+            if "verdict" in answer:
+                raise QuadsimError(f"{logs[place]}: {answer['verdict']} ({answer['reason']})")
+            found[place] = answer
+    ordered = [found[place] for place in range(len(logs))]
+    return [
+        record
+        for i, name in enumerate(conditions)
+        for record in summaries(name, ordered[i * vehicles : (i + 1) * vehicles])
+    ]
+
+
+def main() -> None:
+    """Fly, identify, print and write."""
+    chosen = options(__doc__, workers={"type": int, "metavar": "N", "help": "processes (default: one per core)"})
+    run(partial(measure, chosen.quick, chosen.workers), "Truth inside the interval, of the logs that pass", chosen.json)
+
+
+if __name__ == "__main__":
+    from intervals import main as start  # worker processes import `identify` by its module's name
+
+    start()
