@@ -233,10 +233,11 @@ class Search:
     def blocks(self) -> list[Normal]:
         """Normal equations of the log's parts, each of `BLOCK` or longer, without priors."""
         long = sum(len(part.rates) * part.record.period for part in self.parts)
+        fewest = 2 if len(self.parts) == 1 else 1  # left out in turn, so that others remain
         blocks = []
         for i, part in enumerate(self.parts):
             innovations, slopes = self._slopes(i)
-            count = max(1, round(len(innovations) * part.record.period / max(BLOCK, long / _MOST_BLOCKS)))
+            count = max(fewest, round(len(innovations) * part.record.period / max(BLOCK, long / _MOST_BLOCKS)))
             for rows in np.array_split(np.arange(len(innovations)), count):
                 J = (slopes[rows] / self.sigma[:, None]).reshape(-1, len(self.x))
                 blocks.append(Normal(J.T @ J, J.T @ (innovations[rows] / self.sigma).ravel()))
