@@ -38,6 +38,7 @@ MODELS: Final = ("start", "identified", "true")
 VEHICLES: Final = 20
 SEEDS: Final = 8  # flights of each controller on each vehicle
 DRAW: Final = 2026  # seed of the vehicles
+QUICK: Final = ((0, 2), 1)  # vehicles, flights of each controller
 EXCITATION: Final = 20.0  # [s] of the flight that is identified from
 SHORTEST: Final = 4.0  # [s] of a flight that can be identified from
 YAW: Final = 25.0  # [deg] of its yaw steps, there and back
@@ -194,7 +195,7 @@ def finite(number: float) -> float | None:
 
 def measure(quick: bool, workers: int | None, report: Progress) -> list[Record]:
     """A record of each file that controllers are made from."""
-    places, seeds = (range(2), 1) if quick else (range(VEHICLES), SEEDS)
+    places, seeds = QUICK if quick else (range(VEHICLES), SEEDS)
     trips: dict[int, Record] = {}
     with closing(fly_many(places, partial(worth, seeds=seeds), workers=workers)) as answers:
         for done, (i, answer) in enumerate(answers, 1):
