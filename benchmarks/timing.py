@@ -59,12 +59,13 @@ def run(measure: Callable[[Progress], list[Record]], title: str, file: Path | No
 
 
 def show(records: Sequence[Record], title: str) -> None:
-    """Print records as a table, their keys as its head."""
+    """Print records as a table, their keys as its head; lists are for the JSON file."""
     table = Table(title=title, title_justify="left")
-    for key in dict.fromkeys(key for record in records for key in record):
+    keys = [*dict.fromkeys(k for record in records for k in record if not isinstance(record[k], list))]
+    for key in keys:
         table.add_column(key.replace("_", " "), overflow="fold")
     for record in records:
-        table.add_row(*(_cell(record.get(column)) for column in dict.fromkeys(k for r in records for k in r)))
+        table.add_row(*(_cell(record.get(key)) for key in keys))
     Console(width=None if sys.stdout.isatty() else 200).print(table)
 
 

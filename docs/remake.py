@@ -2,7 +2,7 @@
 
 A table stands between `<!-- NAME: filled by docs/remake.py from FILE -->` and `<!-- NAME end -->`.  Golden numbers are
 in the repository, under tests/golden; all other files are made by a command, under runs/.  A table whose file is not
-there stays as it is.  The records of four benchmarks are kept as CSV, docs/data.
+there stays as it is.  The records of five benchmarks are kept as CSV, docs/data.
 
     python docs/remake.py                    # fill all tables from the files that are there
     python docs/remake.py speed mismatch     # run the commands that make these files first
@@ -31,7 +31,19 @@ from scenarios.schema.scenario import Group
 ROOT: Final = Path(__file__).resolve().parent.parent
 MADE: Final = ROOT / "runs" / "numbers"
 BLOCK: Final = re.compile(r"<!-- (\S+): filled by docs/remake.py from (\S+) -->\n(.*?)<!-- \1 end -->", re.DOTALL)
-BENCHMARKS: Final = ("solvers", "flight", "film", "campaign", "mismatch", "speed", "autopilots", "interfaces")
+BENCHMARKS: Final = (
+    "solvers",
+    "flight",
+    "film",
+    "campaign",
+    "mismatch",
+    "speed",
+    "autopilots",
+    "interfaces",
+    "identification",
+)
+KEPT: Final = ("solvers", "mismatch", "speed", "interfaces", "identification")
+"""Benchmarks whose figure and records are kept in docs/."""
 CAMPAIGNS: Final = ("paper-robustness", "paper-robustness-robust", "paper-nominal")
 BATTERIES: Final = {
     "battery-none": ("none", ["battery", "--set", "controller.disturbance.largest_force=1e-6"]),
@@ -42,7 +54,7 @@ BATTERIES: Final = {
 TUNINGS: Final = ("hummingbird-figure-eight", "paper-robust")
 FIGURES: Final = {
     "campaign-paper-nominal.png": "runs/campaigns/paper-nominal/campaign.png",
-    **{f"{name}.png": f"runs/numbers/{name}.png" for name in ("solvers", "mismatch", "speed", "interfaces")},
+    **{f"{name}.png": f"runs/numbers/{name}.png" for name in KEPT},
 }
 """Pictures of docs/, and the files that they are copies of."""
 COLOURS: Final = 128
@@ -321,6 +333,21 @@ def interfaces(data: Any) -> str:
     return markdown((*head, "step: median [ms]", "p99 [ms]"), rows)
 
 
+def identification(data: Any) -> str:
+    """How the same vehicles fly by controllers that are made from each file."""
+    rows = []
+    for row in _records(data):
+        errors = ("lost" if row[key] is None else f"{row[key]:.1f}" for key in ("median_%", "p90_%"))
+        shares = (
+            f"{100.0 * row[event] / row['flights']:.0f} %, {interval(row[f'{event}_from'], row[f'{event}_to'])}"
+            for event in ("violated", "lost")
+        )
+        passed = f"{row['passed']} of {row['sought']}" if "passed" in row else "-"
+        rows.append((row["file"], passed, *errors, *shares, f"{row['vehicles_lost']} of {row['vehicles']}"))
+    head = ("file", "numbers that passed the gates", "error: median [%]", "90 % of vehicles below [%]")
+    return markdown((*head, "violated, 95 % interval", "lost, 95 % interval", "vehicles lost at least once"), rows)
+
+
 def _with_half(mean: float | None, half: float | None) -> str:
     """A mean error in centimetres, with half its interval."""
     if mean is None:
@@ -374,6 +401,7 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "tunings": tunings,
     "solvers": solvers,
     "interfaces": interfaces,
+    "identification": identification,
     **dict.fromkeys(("flight", "film", "campaign", "autopilots"), records),
 }
 
@@ -418,7 +446,7 @@ def main() -> None:
         page.write_text(text, encoding="utf-8")
         for source in missing:
             print(f"{page.relative_to(ROOT)}: stays as it is without {source}")
-    for name in ("mismatch", "solvers", "speed", "interfaces"):
+    for name in KEPT:
         write_csv(name)
     for name, drawn in FIGURES.items():
         if (ROOT / drawn).is_file():

@@ -12,12 +12,11 @@ from dataclasses import asdict, dataclass
 from itertools import product
 from typing import Final
 
-from plausible_vehicles import plausible_vehicles
-
 from quadsim.assets import vehicle_names, vehicle_path
 from quadsim.flight.metrics import peak_tilt, tracking
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
 from scenarios.design.first_scenario import COURSES, LAWS, first_scenario
+from scenarios.design.plausible_vehicles import plausible_vehicles
 from scenarios.loading import parse_scenario
 from scenarios.rollout import Rollout
 

@@ -91,6 +91,16 @@ def test_rates_fly_as_rotor_speeds_do(tmp_path: Path) -> None:
     assert (tmp_path / "interfaces.png").is_file()
 
 
+def test_the_identified_file_flies_as_the_true_one_does(tmp_path: Path) -> None:
+    start, identified, true = quick("identification", tmp_path)
+    assert identified["passed"] > 0.7 * identified["sought"]
+    assert not any((identified["failed"], identified["violated"], true["violated"]))
+    for guess, found, right in zip(*(record["errors_%"] for record in (start, identified, true)), strict=True):
+        assert found == pytest.approx(right, rel=0.2)
+        assert guess is None or guess > 2.0 * right
+    assert (tmp_path / "identification.png").is_file()
+
+
 def test_wrong_input_is_one_message(tmp_path: Path) -> None:
     done = script("benchmarks/solvers.py", "--scenario", "hover-pid", "--json", tmp_path / "out.json")
     assert done.returncode == 2

@@ -19,7 +19,7 @@ from scenarios.identify.series import Series
 
 TABLES: Final = (".csv", ".parquet")
 RPM: Final = math.tau / 60.0  # [rad/s]
-LARGEST_ERPM: Final = 65535  # of 16 bits: no value, but a gap
+NO_ERPM: Final = 65535  # of 16 bits: no value, but a gap
 SPELLINGS: Final[dict[str, tuple[str, ...]]] = {
     "position": ("x y z", "px py pz", "pos_x pos_y pos_z"),
     "velocity": ("vx vy vz", "vel_x vel_y vel_z"),
@@ -139,7 +139,7 @@ def _in_our_units(name: str, values: dict[str, Array], poles: int | None) -> dic
             raise InputError(f"{name}: erpm is an electrical speed: give the poles (magnets) of each motor, e.g. 14")
         if poles < 2 or poles % 2:
             raise ParameterError("", "poles", poles, "an even number of magnets, 2 or more")
-        values["speeds"] = np.where(erpm >= LARGEST_ERPM, np.nan, erpm) / (poles / 2.0) * RPM
+        values["speeds"] = np.where(erpm == NO_ERPM, np.nan, erpm) / (poles / 2.0) * RPM
     elif poles is not None:
         raise InputError(f"{name}: poles turn eRPM into speeds, and there is no erpm1..4; leave poles out")
     elif rpm is not None and "speeds" not in values:

@@ -24,8 +24,8 @@ WIDEST: Final = 0.25
 WIDEST_DELAY: Final = 0.01  # the same of a delay [s]
 MOST_COLOUR: Final = 0.2  # largest autocorrelation of the innovations [-]
 MOST_PRIOR: Final = 0.25  # share of the information on a parameter that rules and start may give
-FLOOR: Final = 0.001
-"""Standard deviation, in logarithms, of what the prediction leaves out: no interval is narrower."""
+FLOOR, DRAG_FLOOR = 0.0015, 0.015
+"""Standard deviations, in logarithms, of what the prediction leaves out, such as fast changes of the wind."""
 WINDOW: Final = 0.5  # of the output-error method [s]
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
 _STEPS: Final = 6  # of the output-error method
@@ -106,6 +106,7 @@ def part_of(record: Record, span: slice) -> Record:
     return replace(record, **cut)
 
 
+_DRAGS: Final = ("rotor_drag", "body_drag")
 _RELATIVE: Final = {*_KINDS} - {"delay", "offset_x", "offset_y", "throttle_curve", "voltage_exponent"}
 """Parameters whose interval is judged by its share of the value."""
 
@@ -135,7 +136,8 @@ class _Fit:
 
     def _half_width(self, shares: dict[int, float]) -> float:
         drift = sum(abs(share) * self.drift[i] for i, share in shares.items())
-        return self.quantile * math.hypot(*self._deviations(shares), FLOOR) + float(drift)
+        floor = DRAG_FLOOR if any(self.search.sought[i].name in _DRAGS for i in shares) else FLOOR
+        return self.quantile * math.hypot(*self._deviations(shares), floor) + float(drift)
 
     def result(self) -> Identification:
         """Every estimate, and the vehicle with those that are not refused."""
@@ -183,6 +185,8 @@ class _Fit:
         relative = half if number.scale is None else half * number.scale / abs(number.value(self.search.x[i]))
         if relative > WIDEST and number.name in _RELATIVE:
             return _not_excited(relative)
+        if number.name == "body_drag" and self.vehicle.body_drag is None:
+            return "its ratio along x, y and z is not known: give body_drag in the start file"
         if self.rests[i] > MOST_PRIOR:
             return f"rests on a rule of thumb for {self.rests[i]:.0%}, allowed {MOST_PRIOR:.0%}"
         if abs(self.moved[i]) > half:

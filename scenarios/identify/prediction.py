@@ -98,8 +98,8 @@ def predict(
     errors: dict[str, list[Array]] = {name: [] for name in models}
     traces = []
     for record, span in ((record, span) for record, own in zip(records, spans, strict=True) for span in own):
-        half = max(1, round(0.5 * WINDOW / record.period))
-        rows = np.arange(span.start, span.stop - 2 * half, half)[:, None] + np.arange(2 * half + 1)
+        length = max(1, round(WINDOW / record.period))
+        rows = np.arange(span.start, span.stop - length, max(1, length // 2))[:, None] + np.arange(length + 1)
         if not rows.size:
             continue
         measured = _measured(record)[rows]

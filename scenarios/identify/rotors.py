@@ -86,11 +86,12 @@ def smoothed(speeds: Array) -> Array:
 
 
 def corrected(follower: Turning, speeds: Array, period: float) -> Turning:
-    """Rotors that follow their commands, slowly corrected by measured speeds (N, 4) [rad/s], such as for a weak one."""
+    """Rotors that follow their commands in a slowly changing ratio, as measured speeds (N, 4) [rad/s] show it."""
     share = period / (period + _CORRECTION)
-    off = _linear(lfilter([share], [1.0, share - 1.0], speeds - follower.speeds, axis=0))
-    square = follower.square + 2.0 * follower.mean * off.mean + off.square
-    return Turning(speeds=follower.speeds + off.speeds, mean=follower.mean + off.mean, square=square)
+    ratio = speeds / np.maximum(follower.speeds, 1e-3 * follower.speeds.max())
+    slow = lfilter([share], [1.0, share - 1.0], ratio, axis=0, zi=(1.0 - share) * ratio[:1])[0]
+    mean = 0.5 * (slow[1:] + slow[:-1])
+    return Turning(speeds=slow * follower.speeds, mean=mean * follower.mean, square=mean**2 * follower.square)
 
 
 def _linear(speeds: Array) -> Turning:

@@ -11,6 +11,7 @@ commands does not bias this estimate, as each e_k is predicted from commands and
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
@@ -26,7 +27,7 @@ TURN_ON: Final = 0.5  # time [s] after a stretch begins until the rotors have fo
 KNOT: Final = 1.5  # time between two instants of the wind [s]
 _MOST_KNOTS: Final = 40
 BLOCK: Final = 3.0  # shortest part of a log that is left out in turn [s]
-_MOST_BLOCKS: Final = 20
+_FEWEST_BLOCKS, _MOST_BLOCKS = 4, 20
 _NOISE_AT_FIRST: Final = ((1.0, 0.0), (-1.5, 0.5))  # reflection coefficients of A and C, before tanh
 PLATE: Final = (0.87, 0.12)
 """Inertia_z over inertia_x + inertia_y, and its standard deviation in logarithms; of a plate it is 1."""
@@ -239,10 +240,11 @@ class Search:
     def blocks(self) -> list[Normal]:
         """Normal equations of the log's parts, each of `BLOCK` or longer, without priors."""
         long = sum(len(part.increments) * part.record.period for part in self.parts)
+        fewest = math.ceil(_FEWEST_BLOCKS / len(self.parts))
         blocks = []
         for i, part in enumerate(self.parts):
             innovations, slopes = self._slopes(i)
-            count = max(1, round(len(innovations) * part.record.period / max(BLOCK, long / _MOST_BLOCKS)))
+            count = max(fewest, round(len(innovations) * part.record.period / max(BLOCK, long / _MOST_BLOCKS)))
             for rows in np.array_split(np.arange(len(innovations)), count):
                 J = (slopes[rows] / self.sigma[:, None]).reshape(-1, len(self.x))
                 blocks.append(Normal(J.T @ J, J.T @ (innovations[rows] / self.sigma).ravel()))

@@ -175,6 +175,15 @@ def test_a_refused_number_that_does_not_suit_the_rest_is_set_and_says_so(place: 
     assert "z set to 0.0087: no yaw excitation; logs a.csv" in vehicle_sources(path)["inertia"]
 
 
+def test_the_shortest_log_that_is_allowed_shows_the_thrust(place: Path, tmp_path: Path) -> None:
+    rows = (place / "eight.csv").read_text(encoding="utf-8").splitlines()
+    (tmp_path / "short.csv").write_text("\n".join(rows[:520]), encoding="utf-8")
+    result = quadsim.identify(tmp_path / "short.csv", vehicle=place / "start.toml")
+    thrust = next(e for e in result.identification.estimates if e.name == "thrust_coefficient")
+    assert not thrust.refused
+    assert thrust.low < load_vehicle(vehicle_path(TRUE)).thrust_coefficient < thrust.high
+
+
 def test_values_have_the_digits_of_their_intervals() -> None:
     assert rounded(8.5432109e-6, estimate("b", 8.5432109e-6, None)) == 8.543e-6
     assert rounded(123.456, replace(estimate("b", 1.0, None), low=20.0, high=420.0)) == 123.0

@@ -1,0 +1,227 @@
+"""The fit: on own logs with known truth its intervals hold it, and its gates refuse what a log does not show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import quadsim
+from quadsim.errors import InputError
+from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
+from quadsim.state import ANGLE_RATES, ANGLES, POSITIONS, VELOCITIES
+from quadsim.vehicle import Vehicle
+from scenarios.flight import Flight
+from scenarios.identify.estimate import Estimate, Identification
+from scenarios.identify.fit import identify_records
+from scenarios.identify.record import Record
+from scenarios.identify.rotors import lagging
+from scenarios.identify.search import _polynomial
+
+TRUE = replace(quadsim.load_vehicle("hummingbird"), rotor_rise=0.03, rotor_fall=0.04)
+START = replace(
+    TRUE,
+    thrust_coefficient=1.2 * TRUE.thrust_coefficient,
+    inertia=(0.012, 0.005, 0.013),
+    drag_to_thrust=0.6 * TRUE.drag_to_thrust,
+    rotor_rise=0.02,
+    rotor_fall=0.02,
+    rotor_inertia=5e-6,
+    rotor_drag=None,
+    body_drag=None,
+)
+SENSORS = {
+    "position": {"rate": 100.0, "noise": 0.003},
+    "velocity": {"rate": 100.0, "noise": 0.03},
+    "attitude": {"rate": 100.0, "noise": 0.3},
+    "rates": {"rate": 100.0, "noise": 1.5},
+}
+
+
+@cache
+def flown(*, course: str = "figure-eight", torque: float = 0.0, offset: float = 0.0) -> Flight:
+    """Some 16 s at 100 Hz, a figure eight with yaw steps or hover, in wind, by geometric control."""
+    first = quadsim.scenario(vehicle="hummingbird", course=course, controller="geometric").scenario
+    changes: dict[str, Any] = {
+        "control_period": 0.01,
+        "constraints": [],
+        "seed": 3,
+        "vehicle.rotor_rise": TRUE.rotor_rise,
+        "vehicle.rotor_fall": TRUE.rotor_fall,
+        "sensors": SENSORS,
+        "effects.air.wind": [0.8, -0.5, 0.0],
+    }
+    if course == "hover":
+        changes["duration"] = 12.0
+    else:
+        changes["reference.turns"] = 4.0
+        changes["events"] = [{"type": "setpoint", "at": 1.6 + 0.8 * i, "yaw": 25.0 * (-1) ** i} for i in range(15)]
+    if torque:
+        changes["effects.disturbance"] = {"torque_noise": torque}
+    if offset:
+        changes["effects.load"] = {"mass": 1e-9, "centre_of_mass": [offset, 0.0, 0.0]}
+    return quadsim.fly(first.replace(changes), progress=False)
+
+
+def record_of(flight: Flight, name: str = "log") -> Record:
+    """What its sensors and its commands say."""
+    log = flight.log.control
+    angles = log.state[:, ANGLES]
+    return Record(
+        name=name,
+        t=log.t,
+        position=log.state[:, POSITIONS],
+        velocity=log.state[:, VELOCITIES],
+        attitude=euler_to_quaternion(angles),
+        rates=euler_to_body_rates(angles, log.state[:, ANGLE_RATES]),
+        commands=log.speeds,
+    )
+
+
+def identify(record: Record, start: Vehicle = START) -> Identification:
+    return identify_records([record], [[slice(0, len(record.t))]], start)
+
+
+@cache
+def of_the_eight() -> Identification:
+    return identify(record_of(flown()))
+
+
+def by_name(found: Identification) -> dict[str, Estimate]:
+    return {estimate.name: estimate for estimate in found.estimates}
+
+
+def truth(**others: float) -> dict[str, float]:
+    inertia = {f"inertia_{axis}": value for axis, value in zip("xyz", TRUE.inertia, strict=True)}
+    drag = {"body_drag": (TRUE.body_drag or (0.0,))[0]}
+    return {"delay": 0.0, "offset_x": 0.0, "offset_y": 0.0, **vars(TRUE), **inertia, **drag, **others}
+
+
+def wrong(found: Identification, **others: float) -> list[str]:
+    """Names of the parameters that pass their gates without holding the truth."""
+    true = truth(**others)
+    return [e.name for e in found.estimates if not e.refused and not e.low <= true[e.name] <= e.high]
+
+
+def test_rotors_lag_as_the_plant_s_do() -> None:
+    log = flown().log
+    rotors = lagging(log.control.speeds, 0.01, rise=0.03, fall=0.04, delay=0.0)
+    stride = (len(log.plant.t) - 1) // len(log.control.t)
+    settled = slice(100, len(log.control.t))  # they begin at another speed
+    assert rotors.speeds[settled] == pytest.approx(log.plant.speeds[::stride][settled], abs=1e-9)
+    middles = 0.5 * (log.plant.speeds[1:] + log.plant.speeds[:-1]).reshape(-1, stride, 4)
+    assert rotors.mean[100:] == pytest.approx(middles.mean(axis=1)[100:-1], rel=1e-3)
+    assert rotors.square[100:] == pytest.approx(np.square(middles).mean(axis=1)[100:-1], rel=1e-3)
+
+
+@pytest.mark.parametrize("delay", [0.004, 0.01, 0.013, -0.01])
+def test_a_delay_shifts_what_rotors_do(delay: float) -> None:
+    commands = 450.0 + 50.0 * np.random.default_rng(0).standard_normal((60, 4))
+    fine = np.repeat(commands, 10, axis=0)
+    shifted = fine[np.clip(np.arange(len(fine)) - round(1000.0 * delay), 0, len(fine) - 1)]
+    late = lagging(commands, 0.01, rise=0.03, fall=0.04, delay=delay)
+    assert late.speeds[30:-5] == pytest.approx(
+        lagging(shifted, 0.001, rise=0.03, fall=0.04, delay=0.0).speeds[::10][30:-5], rel=1e-4
+    )
+
+
+def test_a_polynomial_of_reflection_coefficients_is_stable_and_complete() -> None:
+    assert _polynomial(np.array([0.5, -0.3])) == pytest.approx([1.0, 0.5 * 0.7, -0.3])
+    for reflections in np.random.default_rng(0).uniform(-1.0, 1.0, (50, 4)):
+        assert np.abs(np.roots(_polynomial(reflections))).max() < 1.0
+
+
+def test_an_eight_with_yaw_steps_gives_all_but_the_body_s_drag() -> None:
+    found = of_the_eight()
+    assert not wrong(found)
+    assert [e.name for e in found.estimates if e.refused] == ["body_drag"]
+    known = by_name(found)
+    for name, most in {"thrust_coefficient": 0.01, "inertia_x": 0.02, "inertia_y": 0.03, "rotor_rise": 0.1}.items():
+        assert known[name].high / known[name].low - 1.0 < 2.0 * most
+    assert found.vehicle.inertia == (known["inertia_x"].value, known["inertia_y"].value, known["inertia_z"].value)
+    assert found.vehicle.body_drag is None
+    assert found.cross_check["inertia_x"] == pytest.approx(1.0, abs=0.05)
+    assert max(found.whiteness.values()) < 0.15
+
+
+def test_a_torque_that_the_loop_answers_biases_output_error_and_not_the_estimate() -> None:
+    found = identify(record_of(flown(torque=0.01)))
+    assert not wrong(found)
+    assert not by_name(found)["inertia_x"].refused
+    assert found.cross_check["inertia_x"] > 1.08
+
+
+def test_hover_refuses_yaw_and_drag_and_says_what_to_fly() -> None:
+    found = identify(record_of(flown(course="hover")))
+    assert not wrong(found)
+    known = by_name(found)
+    assert not known["thrust_coefficient"].refused
+    for name in ("inertia_z", "drag_to_thrust", "rotor_inertia", "rotor_drag"):
+        assert "not excited" in known[name].refused
+        assert known[name].advice
+    kept = found.vehicle
+    assert (kept.inertia[2], kept.rotor_inertia, kept.rotor_drag) == (START.inertia[2], START.rotor_inertia, None)
+
+
+@pytest.mark.parametrize("late", [1, -1])
+def test_commands_that_are_logged_late_or_early_are_seen_as_a_delay(late: int) -> None:
+    record = record_of(flown())
+    assert record.commands is not None
+    shifted = record.commands[np.clip(np.arange(len(record.t)) - late, 0, len(record.t) - 1)]
+    found = identify(replace(record, commands=shifted))
+    assert not wrong(found, delay=-0.01 * late)
+    assert by_name(found)["delay"].value == pytest.approx(-0.01 * late, abs=1e-3)
+
+
+def test_throttle_and_voltage_take_the_place_of_speeds() -> None:
+    record = record_of(flown())
+    assert record.commands is not None
+    voltage = np.linspace(16.0, 14.0, len(record.t))
+    share = np.square(record.commands / START.speed_max) / np.square(voltage / voltage.mean())[:, None]
+    throttle = (np.sqrt(0.3**2 + 4.0 * 0.7 * share) - 0.3) / (2.0 * 0.7)  # 0.3 u + 0.7 u^2
+    found = identify(replace(record, commands=None, throttle=throttle, voltage=voltage))
+    assert not wrong(found, throttle_curve=0.7, voltage_exponent=2.0)
+    assert found.voltage == pytest.approx(15.0)
+    assert by_name(found)["throttle_curve"].value == pytest.approx(0.7, abs=0.1)
+
+
+def test_measured_speeds_take_the_place_of_commands() -> None:
+    record = record_of(flown())
+    assert record.commands is not None
+    rotors = lagging(record.commands, 0.01, rise=0.03, fall=0.04, delay=0.0)
+    speeds = rotors.speeds + np.random.default_rng(0).standard_normal(rotors.speeds.shape)
+    alone = identify(replace(record, commands=None, speeds=speeds))
+    assert not wrong(alone)
+    assert "not their commands" in by_name(alone)["rotor_rise"].refused
+    both = identify(replace(record, speeds=0.97 * rotors.speeds))  # as of a battery that sags
+    scaled = {name: getattr(TRUE, name) / 0.97 for name in ("rotor_inertia", "rotor_drag")}
+    assert not wrong(both, thrust_coefficient=TRUE.thrust_coefficient / 0.97**2, **scaled)
+
+
+def test_two_logs_are_fitted_together_and_narrow_the_intervals() -> None:
+    whole = record_of(flown())
+    half = len(whole.t) // 2
+    spans = [slice(0, half), slice(half, len(whole.t))]
+    both = identify_records([whole], [spans], START)
+    first = identify_records([whole], [spans[:1]], START)
+    assert not wrong(both)
+    assert not wrong(first)
+    width = [by_name(found)["inertia_x"].high / by_name(found)["inertia_x"].low for found in (both, first)]
+    assert width[0] < width[1]
+    without = replace(whole, name="other", commands=None, speeds=whole.commands)
+    with pytest.raises(InputError, match="must have the same columns of rotors and battery; got log, other"):
+        identify_records([whole, without], [spans, spans], START)
+
+
+def test_noise_that_is_not_modelled_shuts_the_gate() -> None:
+    record = record_of(flown())
+    n = np.arange(len(record.t))
+    ringing = 0.5 * np.sin(2.0 * np.pi * 7.0 * record.period * n) * (1.0 + 0.5 * np.sin(0.05 * n))
+    rates = record.rates + lfilter([0.2], [1.0, -0.8], ringing)[:, None] * [1.0, 0.0, 0.0]
+    found = by_name(identify(replace(record, rates=rates)))
+    assert "not white" in found["inertia_x"].refused or "noise model" in found["inertia_x"].refused
+    assert not found["thrust_coefficient"].refused
