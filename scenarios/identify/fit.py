@@ -24,12 +24,11 @@ WIDEST: Final = 0.25
 WIDEST_DELAY: Final = 0.01  # the same of a delay [s]
 MOST_COLOUR: Final = 0.2  # largest autocorrelation of the innovations [-]
 MOST_PRIOR: Final = 0.25  # share of the information on a parameter that rules and start may give
-FLOOR, DRAG_FLOOR = 0.0015, 0.015
-"""Standard deviations, in logarithms, of what the prediction leaves out, such as fast changes of the wind."""
 WINDOW: Final = 0.5  # of the output-error method [s]
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
 _STEPS: Final = 6  # of the output-error method
 _YAW: Final = "yaw steps of 40 deg, one per second, for 10 s"
+_GUSTS: Final = 0.015  # of drag, by wind that changes faster than its knots
 _TURNS: Final = "a figure eight with yaw steps, 20 s"
 
 
@@ -39,6 +38,7 @@ class _Kind(NamedTuple):
     axes: tuple[str, ...]  # whose innovations must be white
     advice: str  # what to fly to learn it
     unit: str = ""  # where the vehicle file has none
+    floor: float = 0.0015  # standard deviation, in units of the search, of what the prediction leaves out
 
 
 _KINDS: Final = {
@@ -50,11 +50,11 @@ _KINDS: Final = {
     "rotor_rise": _Kind(("roll", "pitch", "yaw"), _YAW),
     "rotor_fall": _Kind(("roll", "pitch", "yaw"), _YAW),
     "rotor_inertia": _Kind(("yaw",), _YAW),
-    "rotor_drag": _Kind(("vx", "vy"), "a figure eight at 2 m/s or more, 20 s"),
-    "body_drag": _Kind(("vx", "vy"), "straight legs at the highest speed, there and back"),
-    "delay": _Kind(("roll", "pitch", "yaw"), _TURNS, "s"),
-    "offset_x": _Kind(("pitch",), "hover, 10 s", "m"),
-    "offset_y": _Kind(("roll",), "hover, 10 s", "m"),
+    "rotor_drag": _Kind(("vx", "vy"), "a figure eight at 2 m/s or more, 20 s", floor=_GUSTS),
+    "body_drag": _Kind(("vx", "vy"), "straight legs at the highest speed, there and back", floor=_GUSTS),
+    "delay": _Kind(("roll", "pitch", "yaw"), _TURNS, "s", floor=0.04),
+    "offset_x": _Kind(("pitch",), "hover, 10 s", "m", floor=0.1),
+    "offset_y": _Kind(("roll",), "hover, 10 s", "m", floor=0.1),
     "throttle_curve": _Kind(("vz",), "climbs and descents at full and little throttle", "-"),
     "voltage_exponent": _Kind(("vz",), "one flight from a full battery to an empty one", "-"),
 }
@@ -106,7 +106,6 @@ def part_of(record: Record, span: slice) -> Record:
     return replace(record, **cut)
 
 
-_DRAGS: Final = ("rotor_drag", "body_drag")
 _RELATIVE: Final = {*_KINDS} - {"delay", "offset_x", "offset_y", "throttle_curve", "voltage_exponent"}
 """Parameters whose interval is judged by its share of the value."""
 
@@ -136,8 +135,8 @@ class _Fit:
 
     def _half_width(self, shares: dict[int, float]) -> float:
         drift = sum(abs(share) * self.drift[i] for i, share in shares.items())
-        floor = DRAG_FLOOR if any(self.search.sought[i].name in _DRAGS for i in shares) else FLOOR
-        return self.quantile * math.hypot(*self._deviations(shares), floor) + float(drift)
+        floor = max(_KINDS[self.search.sought[i].name].floor for i in shares)
+        return self.quantile * math.hypot(max(self._deviations(shares)), floor) + 2.0 * float(drift)
 
     def result(self) -> Identification:
         """Every estimate, and the vehicle with those that are not refused."""
@@ -262,7 +261,7 @@ def _quantile(blocks: int) -> float:
 
 
 def _not_excited(half: float) -> str:
-    return f"not excited: the interval is +-{np.expm1(half):.0%}, allowed {np.expm1(WIDEST):.0%}"
+    return f"not excited: the interval is +-{np.expm1(min(half, 5.0)):.0%}, allowed {np.expm1(WIDEST):.0%}"
 
 
 def _colour(search: Search) -> dict[str, float]:

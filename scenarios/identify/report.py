@@ -119,6 +119,11 @@ class IdentifiedVehicle(Result):
         """Return what the checks noted, what to fly, and what a scenario has to be told."""
         return (
             *(f"check: {note}" for note in self.notes),
+            *(
+                f"check: the commands are logged {-1e3 * estimate.value:.0f} ms late, as a delay cannot be negative"
+                for estimate in self.identification.estimates
+                if estimate.name == "delay" and estimate.high < 0.0
+            ),
             *(f"to identify {names}, fly: {advice}" for advice, names in self.advice.items()),
             *(
                 f"a vehicle file has no field for it, a scenario has: {name} = {value}"
