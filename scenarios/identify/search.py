@@ -26,6 +26,7 @@ TURN_ON: Final = 0.5  # time [s] after a stretch begins until the rotors have fo
 KNOT: Final = 1.5  # time between two instants of the wind [s]
 _MOST_KNOTS: Final = 40
 BLOCK: Final = 3.0  # shortest part of a log that is left out in turn [s]
+FEWEST: Final = 6  # parts, shorter ones of a log of less than 18 s: of 2, Student's t makes intervals useless
 _MOST_BLOCKS: Final = 20
 _NOISE_AT_FIRST: Final = ((1.0, 0.0), (-1.5, 0.5))  # reflection coefficients of A and C, before tanh
 PLATE: Final = (0.87, 0.12)
@@ -233,11 +234,13 @@ class Search:
     def blocks(self) -> list[Normal]:
         """Normal equations of the log's parts, each of `BLOCK` or longer, without priors."""
         long = sum(len(part.rates) * part.record.period for part in self.parts)
-        fewest = 2 if len(self.parts) == 1 else 1  # left out in turn, so that others remain
         blocks = []
         for i, part in enumerate(self.parts):
             innovations, slopes = self._slopes(i)
-            count = max(fewest, round(len(innovations) * part.record.period / max(BLOCK, long / _MOST_BLOCKS)))
+            count = max(
+                -(-FEWEST // len(self.parts)),
+                round(len(innovations) * part.record.period / max(BLOCK, long / _MOST_BLOCKS)),
+            )
             for rows in np.array_split(np.arange(len(innovations)), count):
                 J = (slopes[rows] / self.sigma[:, None]).reshape(-1, len(self.x))
                 blocks.append(Normal(J.T @ J, J.T @ (innovations[rows] / self.sigma).ravel()))
