@@ -11,6 +11,7 @@ commands does not bias this estimate, as each e_k is predicted from commands and
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
@@ -232,15 +233,13 @@ class Search:
         return innovations, slopes
 
     def blocks(self) -> list[Normal]:
-        """Normal equations of the log's parts, each of `BLOCK` or longer, without priors."""
+        """Normal equations of the log's parts, each of `BLOCK` or longer but for `FEWEST`, without priors."""
         long = sum(len(part.rates) * part.record.period for part in self.parts)
         blocks = []
         for i, part in enumerate(self.parts):
             innovations, slopes = self._slopes(i)
-            count = max(
-                -(-FEWEST // len(self.parts)),
-                round(len(innovations) * part.record.period / max(BLOCK, long / _MOST_BLOCKS)),
-            )
+            seconds = len(innovations) * part.record.period
+            count = max(math.ceil(FEWEST / len(self.parts)), round(seconds / max(BLOCK, long / _MOST_BLOCKS)))
             for rows in np.array_split(np.arange(len(innovations)), count):
                 J = (slopes[rows] / self.sigma[:, None]).reshape(-1, len(self.x))
                 blocks.append(Normal(J.T @ J, J.T @ (innovations[rows] / self.sigma).ravel()))
