@@ -40,7 +40,6 @@ SEEDS: Final = 8  # flights of each controller on each vehicle
 DRAW: Final = 2026  # seed of the vehicles
 QUICK: Final = ((0, 2), 1)  # vehicles, flights of each controller
 EXCITATION: Final = 20.0  # [s] of the flight that is identified from
-SHORTEST: Final = 4.0  # [s] of a flight that can be identified from
 YAW: Final = 25.0  # [deg] of its yaw steps, there and back
 YAW_EVERY: Final = 2.0  # [s]
 LAG: Final = 0.03  # [s] a lag that one guesses without knowing better
@@ -209,6 +208,7 @@ def measure(quick: bool, workers: int | None, report: Progress) -> list[Record]:
 def draw(records: Sequence[Record], path: Path) -> None:
     """Draw each vehicle's errors from file to file, and how often flights failed."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullLocator
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(11.0, 4.6), layout="constrained")
     columns = np.arange(len(records))
@@ -219,14 +219,16 @@ def draw(records: Sequence[Record], path: Path) -> None:
     for y, lost in zip(drawn.T, losses.T, strict=True):
         left.plot(columns, y, "-o", color="C3" if lost.any() else "C0", alpha=0.6, markersize=4, linewidth=1.0)
         left.plot(columns[lost > 0], y[lost > 0], "x", color="C3", markersize=9)
-    left.plot([], [], "-o", color="C0", markersize=4, label="a vehicle, median of its flights")
-    left.plot([], [], "-x", color="C3", markersize=9, label="x: some flights lost; on the line above: half of them")
+    left.plot([], [], "-o", color="C0", markersize=4, label="a vehicle: median of its flights")
+    left.plot([], [], "-o", color="C3", markersize=4, label="one with lost flights, where marked x")
     left.axhline(top, color="C3", linewidth=0.8, linestyle=":")
     left.set_yscale("log")
-    left.yaxis.set_major_formatter("{x:g}")
-    left.yaxis.set_minor_formatter("{x:g}")
+    marks = [mark for mark in (1.0, 2.0, 5.0, 10.0, 20.0, 50.0) if mark < 0.8 * top]
+    left.set_yticks([*marks, top], [*(f"{mark:g}" for mark in marks), "lost in\nhalf or\nmore"])
+    left.yaxis.set_minor_locator(NullLocator())
+    left.set_ylim(0.4 * drawn.min(), 1.3 * top)
     left.set_title("RMS distance from the course [% of its length]", loc="left", fontsize=10)
-    left.legend(fontsize=8, loc="upper right")
+    left.legend(fontsize=8, loc="lower right")
     for i, event in enumerate(("violated", "lost")):
         share = np.array([100.0 * record[event] / record["flights"] for record in records])
         ends = 100.0 * np.array([[record[f"{event}_from"], record[f"{event}_to"]] for record in records]).T
@@ -238,6 +240,7 @@ def draw(records: Sequence[Record], path: Path) -> None:
     right.legend(fontsize=8)
     for axes in (left, right):
         axes.set_xticks(columns, [f"{record['file']} file" for record in records])
+        axes.set_xlim(-0.5, len(records) - 0.5)
         axes.grid(axis="y", alpha=0.3)
     figure.savefig(path, dpi=150)
     plt.close(figure)

@@ -23,6 +23,8 @@ WIDEST: Final = 0.25
 """Half-width of an interval, in logarithms, above which a log is said not to excite a parameter."""
 WIDEST_DELAY: Final = 0.01  # the same of a delay [s]
 MOST_COLOUR: Final = 0.2  # largest autocorrelation of the innovations [-]
+CHANCE: Final = 3.7
+"""The same times sqrt(N) that noise of N samples stays below in 99 %, at 8 lags of 6 axes: more than 0.2 if N < 342."""
 MOST_PRIOR: Final = 0.25  # share of the information on a parameter that rules and start may give
 WINDOW: Final = 0.5  # of the output-error method [s]
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
@@ -125,6 +127,7 @@ class _Fit:
         self.moved = richer.x[:count] - search.x[:count]
         self.drift = np.abs(noisier.x[:count] - search.x[:count])  # by the noise of measured speeds
         self.colour = _colour(search)
+        self.most_colour = max(MOST_COLOUR, CHANCE / min(map(len, search.innovations(search.x))) ** 0.5)
 
     def _deviations(self, shares: dict[int, float]) -> tuple[float, float]:
         """Standard deviations of a sum of shares of x: what the innovations explain, and by leaving out blocks."""
@@ -179,8 +182,9 @@ class _Fit:
         """Why a number that is searched for tells nothing, or nothing."""
         number, kind = self.search.sought[i], _KINDS[self.search.sought[i].name]
         loud = max(kind.axes, key=self.colour.__getitem__)
-        if self.colour[loud] > MOST_COLOUR:
-            return f"not white: innovations of {loud} correlate by {self.colour[loud]:.2f}, allowed {MOST_COLOUR:g}"
+        if self.colour[loud] > self.most_colour:
+            found = f"innovations of {loud} correlate by {self.colour[loud]:.2f}"
+            return f"not white: {found}, allowed {self.most_colour:.2g}"
         relative = half if number.scale is None else half * number.scale / abs(number.value(self.search.x[i]))
         if relative > WIDEST and number.name in _RELATIVE:
             return _not_excited(relative)
@@ -233,7 +237,7 @@ class _Fit:
         told, share = estimates["drag_to_thrust"], {"drag_to_thrust": 1.0, "thrust_coefficient": 1.0, "inertia_z": -1.0}
         sought = enumerate(self.search.sought)
         half = self._half_width({i: share[number.name] for i, number in sought if number.name in share})
-        if half > WIDEST or self.colour["yaw"] > MOST_COLOUR:
+        if half > WIDEST or self.colour["yaw"] > self.most_colour:
             return told, vehicle
         gain = told.value * estimates["thrust_coefficient"].value / estimates["inertia_z"].value
         tied = gain * vehicle.inertia[2] / vehicle.thrust_coefficient

@@ -27,7 +27,8 @@ TURN_ON: Final = 0.5  # time [s] after a stretch begins until the rotors have fo
 KNOT: Final = 1.5  # time between two instants of the wind [s]
 _MOST_KNOTS: Final = 40
 BLOCK: Final = 3.0  # shortest part of a log that is left out in turn [s]
-_FEWEST_BLOCKS, _MOST_BLOCKS = 4, 20
+FEWEST: Final = 6  # parts, shorter ones of a log of less than 18 s: of 2, Student's t makes intervals useless
+_MOST_BLOCKS: Final = 20
 _NOISE_AT_FIRST: Final = ((1.0, 0.0), (-1.5, 0.5))  # reflection coefficients of A and C, before tanh
 PLATE: Final = (0.87, 0.12)
 """Inertia_z over inertia_x + inertia_y, and its standard deviation in logarithms; of a plate it is 1."""
@@ -238,13 +239,13 @@ class Search:
         return innovations, slopes
 
     def blocks(self) -> list[Normal]:
-        """Normal equations of the log's parts, each of `BLOCK` or longer, without priors."""
+        """Normal equations of the log's parts, each of `BLOCK` or longer but for `FEWEST`, without priors."""
         long = sum(len(part.increments) * part.record.period for part in self.parts)
-        fewest = math.ceil(_FEWEST_BLOCKS / len(self.parts))
         blocks = []
         for i, part in enumerate(self.parts):
             innovations, slopes = self._slopes(i)
-            count = max(fewest, round(len(innovations) * part.record.period / max(BLOCK, long / _MOST_BLOCKS)))
+            seconds = len(innovations) * part.record.period
+            count = max(math.ceil(FEWEST / len(self.parts)), round(seconds / max(BLOCK, long / _MOST_BLOCKS)))
             for rows in np.array_split(np.arange(len(innovations)), count):
                 J = (slopes[rows] / self.sigma[:, None]).reshape(-1, len(self.x))
                 blocks.append(Normal(J.T @ J, J.T @ (innovations[rows] / self.sigma).ravel()))
