@@ -27,6 +27,7 @@ CHANCE: Final = 3.7
 """The same times sqrt(N) that noise of N samples stays below in 99 %, at 8 lags of 6 axes: more than 0.2 if N < 342."""
 MOST_PRIOR: Final = 0.25  # share of the information on a parameter that rules and start may give
 WINDOW: Final = 0.5  # of the output-error method [s]
+_NORMAL: Final = 1.96  # standard deviations on either side, of a normal distribution
 _LONGEST_LAG: Final = 0.2  # of the autocorrelation [s]
 _STEPS: Final = 6  # of the output-error method
 _YAW: Final = "yaw steps of 40 deg, one per second, for 10 s"
@@ -137,9 +138,12 @@ class _Fit:
         return float(np.sqrt(row @ self.cov @ row)), float(np.sqrt((len(each) - 1) * each.var()))
 
     def _half_width(self, shares: dict[int, float]) -> float:
+        """Half of the interval: noise, scatter of blocks, and what the prediction leaves out, one added to the other."""
         drift = sum(abs(share) * self.drift[i] for i, share in shares.items())
         floor = max(_KINDS[self.search.sought[i].name].floor for i in shares)
-        return self.quantile * math.hypot(max(self._deviations(shares)), floor) + 2.0 * float(drift)
+        explained, scatter = self._deviations(shares)
+        half = math.hypot(_NORMAL * explained, self.quantile * scatter, self.quantile * floor)
+        return half + 2.0 * float(drift)
 
     def result(self) -> Identification:
         """Every estimate, and the vehicle with those that are not refused."""
