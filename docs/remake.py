@@ -41,9 +41,12 @@ BENCHMARKS: Final = (
     "autopilots",
     "interfaces",
     "identification",
+    "intervals",
 )
 KEPT: Final = ("solvers", "mismatch", "speed", "interfaces", "identification")
 """Benchmarks whose figure and records are kept in docs/."""
+PRECISE: Final = ("thrust_coefficient", "inertia_x", "inertia_y")
+"""Parameters whose median error [%] the table of intervals shows."""
 CAMPAIGNS: Final = ("paper-robustness", "paper-robustness-robust", "paper-nominal")
 BATTERIES: Final = {
     "battery-none": ("none", ["battery", "--set", "controller.disturbance.largest_force=1e-6"]),
@@ -348,6 +351,26 @@ def identification(data: Any) -> str:
     return markdown((*head, "violated, 95 % interval", "lost, 95 % interval", "vehicles lost at least once"), rows)
 
 
+def intervals(data: Any) -> str:
+    """Of each condition, how often the interval of a parameter that passes its gates holds the truth."""
+    shown = {
+        "thrust_coefficient": "b",
+        **{f"inertia_{axis}": f"J{axis}" for axis in "xyz"},
+        "drag_to_thrust": "d / b",
+        "rotor_rise": "rise",
+        "rotor_fall": "fall",
+        "rotor_inertia": "Jr",
+        "rotor_drag": "rotor drag",
+        "delay": "delay",
+    }
+    rows: dict[str, dict[str, str]] = {}
+    for row in _records(data):
+        error = f" ({100.0 * row['median_error']:.2g})" if row["parameter"] in PRECISE and row["passed"] else ""
+        rows.setdefault(row["condition"], {})[row["parameter"]] = f"{row['inside']}/{row['passed']}{error}"
+    cells = [(name, *(of[parameter] for parameter in shown)) for name, of in rows.items()]
+    return markdown(("log", *shown.values()), cells)
+
+
 def _with_half(mean: float | None, half: float | None) -> str:
     """A mean error in centimetres, with half its interval."""
     if mean is None:
@@ -402,6 +425,7 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "solvers": solvers,
     "interfaces": interfaces,
     "identification": identification,
+    "intervals": intervals,
     **dict.fromkeys(("flight", "film", "campaign", "autopilots"), records),
 }
 

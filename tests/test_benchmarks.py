@@ -101,6 +101,12 @@ def test_the_identified_file_flies_as_the_true_one_does(tmp_path: Path) -> None:
     assert (tmp_path / "identification.png").is_file()
 
 
+def test_the_interval_of_a_hover_s_thrust_holds_the_truth(tmp_path: Path) -> None:
+    records = {record["parameter"]: record for record in quick("intervals", tmp_path)}
+    assert (records["thrust_coefficient"]["passed"], records["thrust_coefficient"]["inside"]) == (1, 1)
+    assert records["drag_to_thrust"]["passed"] == 0
+
+
 def test_wrong_input_is_one_message(tmp_path: Path) -> None:
     done = script("benchmarks/solvers.py", "--scenario", "hover-pid", "--json", tmp_path / "out.json")
     assert done.returncode == 2

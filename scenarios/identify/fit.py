@@ -138,7 +138,7 @@ class _Fit:
         return float(np.sqrt(row @ self.cov @ row)), float(np.sqrt((len(each) - 1) * each.var()))
 
     def _half_width(self, shares: dict[int, float]) -> float:
-        """Half of the interval: noise, scatter of blocks, and what the prediction leaves out, one added to the other."""
+        """Half of the interval: of noise, of the blocks' scatter, and of what the prediction leaves out, together."""
         drift = sum(abs(share) * self.drift[i] for i, share in shares.items())
         floor = max(_KINDS[self.search.sought[i].name].floor for i in shares)
         explained, scatter = self._deviations(shares)
