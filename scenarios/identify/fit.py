@@ -109,6 +109,8 @@ def part_of(record: Record, span: slice) -> Record:
     return replace(record, **cut)
 
 
+_WEAK: Final = "not excited"
+_NEARLY: Final = 2.0  # how much too wide an interval may be for more of the same flight to help
 _RELATIVE: Final = {*_KINDS} - {"delay", "offset_x", "offset_y", "throttle_curve", "voltage_exponent"}
 """Parameters whose interval is judged by its share of the value."""
 
@@ -178,9 +180,13 @@ class _Fit:
     def _estimate(self, i: int) -> Estimate:
         number, x = self.search.sought[i], self.search.x[i]
         half = self._half_width({i: 1.0})
-        return self._judged(
+        found = self._judged(
             number.name, number.value(x), number.value(x - half), number.value(x + half), self._weak(i, half)
         )
+        if not WIDEST < half < _NEARLY * WIDEST or not found.refused.startswith(_WEAK):
+            return found
+        flown = sum(part.record.period * len(part.increments) for part in self.search.parts)
+        return replace(found, advice=f"{found.advice}, or the same again, {flown * (half / WIDEST) ** 2:.0f} s in all")
 
     def _weak(self, i: int, half: float) -> str:
         """Why a number that is searched for tells nothing, or nothing."""
@@ -244,7 +250,7 @@ class _Fit:
         if half > WIDEST or self.colour["yaw"] > self.most_colour:
             return told, vehicle
         gain = told.value * estimates["thrust_coefficient"].value / estimates["inertia_z"].value
-        tied = gain * vehicle.inertia[2] / vehicle.thrust_coefficient
+        tied = float(f"{gain * vehicle.inertia[2] / vehicle.thrust_coefficient:.5g}")
         why = f"only the yaw acceleration that it gives is identified, +-{np.expm1(half):.1%}; "
         why += f"{tied:.4g} gives it with inertia_z as kept"
         return replace(told, refused=why, advice=_TURNS), replace(vehicle, drag_to_thrust=tied)
@@ -269,7 +275,7 @@ def _quantile(blocks: int) -> float:
 
 
 def _not_excited(half: float) -> str:
-    return f"not excited: the interval is +-{np.expm1(min(half, 5.0)):.0%}, allowed {np.expm1(WIDEST):.0%}"
+    return f"{_WEAK}: the interval is +-{np.expm1(min(half, 5.0)):.0%}, allowed {np.expm1(WIDEST):.0%}"
 
 
 def _colour(search: Search) -> dict[str, float]:

@@ -78,7 +78,7 @@ class IdentifiedVehicle(Result):
     def tables(self) -> tuple[Grid, Grid]:
         """Return the parameters, and the errors of the prediction."""
         known = self.identification
-        white = ", ".join(f"{axis} {format_number(value)}" for axis, value in known.whiteness.items())
+        white = ", ".join(f"{axis} {value:.2f}" for axis, value in known.whiteness.items())
         parameters = Grid(
             key="parameters",
             title="Parameters",
@@ -222,8 +222,7 @@ def _parameter(estimate: Estimate, known: Identification) -> tuple[Cell, ...]:
     start = ABSENT if estimate.start is None else f"{estimate.start:.4g}"
     value, ratio = f"{rounded(estimate.value, estimate):.7g}", known.cross_check.get(estimate.name)
     checked = ABSENT if ratio is None else f"{ratio:.3f}"
-    mark = Mark.WARN if estimate.refused else Mark.NONE
-    found = Cell(text=verdict(estimate, known.vehicle), mark=mark)
+    found = Cell(text=verdict(estimate, known.vehicle), mark=Mark.TEXT)
     return line(estimate.name, estimate.unit, start, value, interval(estimate), checked, found)
 
 
