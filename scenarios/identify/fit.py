@@ -56,6 +56,7 @@ _KINDS: Final = {
     "rotor_drag": _Kind(("vx", "vy"), "a figure eight at 2 m/s or more, 20 s", floor=_GUSTS),
     "body_drag": _Kind(("vx", "vy"), "straight legs at the highest speed, there and back", floor=_GUSTS),
     "delay": _Kind(("roll", "pitch", "yaw"), _TURNS, "s", floor=0.04),
+    "lateness": _Kind(("roll", "pitch", "yaw"), _TURNS, "s"),
     "offset_x": _Kind(("pitch",), "hover, 10 s", "m", floor=0.1),
     "offset_y": _Kind(("roll",), "hover, 10 s", "m", floor=0.1),
     "throttle_curve": _Kind(("vz",), "climbs and descents at full and little throttle", "-"),
@@ -111,7 +112,7 @@ def part_of(record: Record, span: slice) -> Record:
 
 _WEAK: Final = "not excited"
 _NEARLY: Final = 2.0  # how much too wide an interval may be for more of the same flight to help
-_RELATIVE: Final = {*_KINDS} - {"delay", "offset_x", "offset_y", "throttle_curve", "voltage_exponent"}
+_RELATIVE: Final = {*_KINDS} - {"delay", "lateness", "offset_x", "offset_y", "throttle_curve", "voltage_exponent"}
 """Parameters whose interval is judged by its share of the value."""
 
 
@@ -129,6 +130,8 @@ class _Fit:
         count = len(search.sought)
         self.moved = richer.x[:count] - search.x[:count]
         self.drift = np.abs(noisier.x[:count] - search.x[:count])  # by the noise of measured speeds
+        record = search.parts[0].record
+        self._alone = record.commands is None and record.throttle is None  # measured speeds, without commands
         self.colour = _colour(search)
         self.most_colour = max(MOST_COLOUR, CHANCE / min(map(len, search.innovations(search.x))) ** 0.5)
 
@@ -151,9 +154,15 @@ class _Fit:
         """Every estimate, and the vehicle with those that are not refused."""
         search, x = self.search, self.search.x
         sought = {number.name: i for i, number in enumerate(search.sought) if number.name in _KINDS}
-        estimates = {name: self._delay() if name == "delay" else self._estimate(i) for name, i in sought.items()}
+        late = self._delay()
+        estimates = {name: self._estimate(i) for name, i in sought.items() if name != "delay"} | {late.name: late}
         if "rotor_rise" not in estimates:
             estimates |= self._lags_as_stated()
+        inertia = [estimates[f"inertia_{axis}"] for axis in "xyz"]
+        used = [e.start if e.refused and e.start else e.value for e in inertia]
+        if not inertia[2].refused and not _is_body(used):
+            why = f"no body has it beside {used[0]:.4g} and {used[1]:.4g} about x and y"
+            estimates["inertia_z"] = replace(inertia[2], refused=why, advice=_TURNS)
         vehicle = self._assembled({name: e.value for name, e in estimates.items() if not e.refused})
         if estimates["inertia_z"].refused:
             estimates["drag_to_thrust"], vehicle = self._yaw_gain(estimates, vehicle)
@@ -166,7 +175,7 @@ class _Fit:
             estimates=tuple(estimates[name] for name in _KINDS if name in estimates),
             vehicle=vehicle,
             fitted=fitted,
-            delay=estimates["delay"].value,
+            delay=late.value,
             offset=(first.offset[0], first.offset[1]),
             wind=(float(first.wind[:, 0].mean()), float(first.wind[:, 1].mean())),
             throttle_curve=first.throttle_curve,
@@ -235,7 +244,8 @@ class _Fit:
         value = float(np.average(delays, weights=halves**-2.0))
         half = max(float(halves.min()), float(np.abs(delays - value).max()))
         refused = f"not excited: +-{1e3 * half:.0f} ms" if half > WIDEST_DELAY else ""
-        return self._judged("delay", value, value - half, value + half, refused)
+        name = "lateness" if self._alone else "delay"
+        return self._judged(name, value, value - half, value + half, refused)
 
     def _lags_as_stated(self) -> dict[str, Estimate]:
         """Rotor lag where speeds were measured and no commands."""
@@ -261,12 +271,17 @@ class _Fit:
             name: value for name, value in values.items() if name in VEHICLE_UNITS and name != "body_drag"
         }
         inertia = [values.get(f"inertia_{axis}", kept) for axis, kept in zip("xyz", self.vehicle.inertia, strict=True)]
-        if "inertia_z" not in values and not abs(inertia[0] - inertia[1]) < inertia[2] < inertia[0] + inertia[1]:
+        if "inertia_z" not in values and not _is_body(inertia):
             inertia[2] = PLATE[0] * (inertia[0] + inertia[1])
         if "body_drag" in values:
             ratio = np.array(self.vehicle.body_drag or LEVEL_PLATE)
             changes["body_drag"] = tuple((values["body_drag"] * ratio / ratio[0]).tolist())
         return replace(self.vehicle, inertia=tuple(inertia), **changes)
+
+
+def _is_body(inertia: Sequence[float]) -> bool:
+    """Whether none of three moments of inertia exceeds the sum of the others."""
+    return 2.0 * max(inertia) < sum(inertia)
 
 
 def _quantile(blocks: int) -> float:

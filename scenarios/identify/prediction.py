@@ -135,7 +135,7 @@ def _without_refused(known: Identification) -> Identification:
         0.0 if "offset_y" in refused else known.offset[1],
     )
     wind = (0.0, 0.0) if {"rotor_drag", "body_drag"} <= refused else known.wind
-    return replace(known, delay=0.0 if "delay" in refused else known.delay, offset=offset, wind=wind)
+    return replace(known, delay=0.0 if refused & {"delay", "lateness"} else known.delay, offset=offset, wind=wind)
 
 
 def _measured(record: Record) -> Array:

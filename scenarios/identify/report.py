@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import shlex
 from collections.abc import Sequence
@@ -179,6 +180,9 @@ def identify_logs(
               for name, path in (("file", out), ("page", page))}  # fmt: skip
     vehicle = load_vehicle(start)
     records, tested = ([read_record(path, poles=poles) for path in paths] for paths in (logs, test))
+    for one, other in itertools.combinations([*records, *tested], 2):
+        if np.array_equal(one.rates, other.rates):
+            raise InputError(f"{one.name} and {other.name} are the same flight: name it once")
     airborne = [spans(record, vehicle) for record in [*records, *tested]]
     notes = [
         note
