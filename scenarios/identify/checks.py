@@ -139,17 +139,17 @@ def _check_units(record: Record, parts: Sequence[slice], vehicle: Vehicle) -> It
         what = (
             f"{record.name}: {field} of {hover:.4g} rad/s carry the weight, {ratio:.3g} times the start's hover speed"
         )
-        if field == "commands" and (most := float(rows[np.isfinite(rows)].max())) > 1.02 * vehicle.speed_max:
-            raise InputError(
-                f"{record.name}: commands reach {most:.4g} rad/s, above the start's speed_max of {vehicle.speed_max:g} "
-                "rad/s: correct it, or the unit of the commands"
-            )
         start = f"of {vehicle.hover_speed:.4g} rad/s"
         if not 1.0 / FACTOR <= ratio <= FACTOR:
             cause = min(LIKELY, key=lambda pair: abs(np.log(max(ratio, 1e-9) / pair[0])))[1]
             raise InputError(
                 f"{what} {start}; at most a factor of {FACTOR:g} is allowed. Likely: {cause}. Correct the unit, the "
                 "poles, or the start's thrust_coefficient and mass"
+            )
+        if field == "commands" and (most := float(rows[np.isfinite(rows)].max())) > 1.02 * vehicle.speed_max:
+            raise InputError(
+                f"{record.name}: commands reach {most:.4g} rad/s, above the start's speed_max of {vehicle.speed_max:g} "
+                "rad/s: correct it, or the unit of the commands"
             )
         if not 1.0 / NOTED_FACTOR <= ratio <= NOTED_FACTOR:
             yield f"{what} {start}: check unit, poles and the start's thrust_coefficient"

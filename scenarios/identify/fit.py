@@ -111,6 +111,7 @@ def part_of(record: Record, span: slice) -> Record:
 
 
 _WEAK: Final = "not excited"
+_HOPELESS: Final = 1.1  # half-width above which its size is not told
 _NEARLY: Final = 2.0  # how much too wide an interval may be for more of the same flight to help
 _RELATIVE: Final = {*_KINDS} - {"delay", "lateness", "offset_x", "offset_y", "throttle_curve", "voltage_exponent"}
 """Parameters whose interval is judged by its share of the value."""
@@ -290,7 +291,8 @@ def _quantile(blocks: int) -> float:
 
 
 def _not_excited(half: float) -> str:
-    return f"{_WEAK}: the interval is +-{np.expm1(min(half, 5.0)):.0%}, allowed {np.expm1(WIDEST):.0%}"
+    width = f"+-{np.expm1(half):.0%}" if half < _HOPELESS else f"more than +-{np.expm1(_HOPELESS):.0%}"
+    return f"{_WEAK}: the interval is {width}, allowed {np.expm1(WIDEST):.0%}"
 
 
 def _colour(search: Search) -> dict[str, float]:

@@ -39,6 +39,7 @@ class Parameters:
     """(3,) centre of mass in the rotors' frame, x and y, and how far above it rotor drag acts [m]."""
     wind: Array = field(default_factory=lambda: np.zeros((2, 2)))
     """(W, 2) world x and y, linear between W instants from first sample to last [m/s]."""
+    inflow: float = 0.0  # thrust lost per rotor speed and air speed along the axis [N s^2/(m rad)]
     munk: float = 0.0  # mass of air that moves along body z less that along x and y [kg]
     yaw_trim: float = 0.0  # constant yaw torque that is not the rotors' [N m]
     throttle_curve: float = 1.0  # a of w^2 / w_max^2 = (1 - a) u + a u^2, u the throttle [-]
@@ -120,8 +121,8 @@ def turning(record: Record, vehicle: Vehicle, p: Parameters) -> Turning:
 def predicted(motion: Motion, rotors: Turning, vehicle: Vehicle, p: Parameters) -> Array:
     """(M, 6) increments of body rates and velocity in each period, as the parameters predict them.
 
-    J dw/dt = sum r_i x f_i - w x (J w + h e_z) - dh/dt e_z with h = -sum spin_i J_r w_i, f_i = b w_i^2 e_z -
-    rotor_drag w_i v_perp,i; m dv/dt = R (sum f_i + body drag) - m g e_z.
+    J dw/dt = sum r_i x f_i - w x (J w + h e_z) - dh/dt e_z with h = -sum spin_i J_r w_i, f_i = (b w_i^2 -
+    inflow w_i v_axial,i) e_z - rotor_drag w_i v_perp,i; m dv/dt = R (sum f_i + body drag) - m g e_z.
     """
     x, y, _ = vehicle.rotor_positions.T
     spin = np.array(vehicle.rotor_spins, float)
@@ -130,7 +131,8 @@ def predicted(motion: Motion, rotors: Turning, vehicle: Vehicle, p: Parameters) 
     wind = np.stack([*(np.interp(when, np.arange(len(p.wind)), w) for w in p.wind.T), np.zeros(len(when))], axis=1)
     air = np.einsum("kji,kj->ki", motion.turn, motion.velocity - wind)  # body axes
     roll, pitch, yaw = motion.rates.T
-    thrust = p.thrust_coefficient * rotors.square
+    axial = air[:, 2:] + roll[:, None] * y - pitch[:, None] * x
+    thrust = p.thrust_coefficient * rotors.square - p.inflow * rotors.mean * axial
     dragging = p.rotor_drag * rotors.mean
     side = -(dragging * (air[:, :1] - yaw[:, None] * y)), -(dragging * (air[:, 1:2] + yaw[:, None] * x))
     total = thrust.sum(axis=1)

@@ -69,7 +69,8 @@ def _sought(vehicle: Vehicle, parts: Sequence[Stretch]) -> list[Sought]:
         Sought("body_drag", area, area, 1.0),
         Sought("offset_x", 0.0, 0.01 * arm, 10.0),
         Sought("offset_y", 0.0, 0.01 * arm, 10.0),
-        Sought("drag_height", 0.0, 0.1 * arm, 2.0),
+        Sought("drag_height", 0.0, 0.1 * arm, 20.0),
+        Sought("inflow", 0.0, 0.02 * weight / (4.0 * vehicle.hover_speed), 5.0),
         Sought("munk", 0.0, 0.001 * vehicle.mass, 2.0),
         Sought("yaw_trim", 0.0, 0.01 * weight * vehicle.drag_to_thrust, 10.0),
     ]
