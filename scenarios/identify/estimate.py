@@ -29,7 +29,6 @@ class Identification:
 
     estimates: tuple[Estimate, ...]
     vehicle: Vehicle  # the start with what was identified in its place
-    fitted: Vehicle  # the same with every estimate in its place, refused ones too
     delay: float  # of the commands, or by which measured speeds are logged late [s]
     offset: tuple[float, float]  # x and y of the centre of mass in the rotors' frame [m]
     wind: tuple[float, float] = (0.0, 0.0)  # mean, world x and y, where drag shows it [m/s]

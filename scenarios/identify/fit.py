@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from scipy.stats import t as student
 
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import InputError
 from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.identify.estimate import Estimate, Identification
 from scenarios.identify.model import AXES, Stretch, stretch
@@ -167,15 +167,10 @@ class _Fit:
         vehicle = self._assembled({name: e.value for name, e in estimates.items() if not e.refused})
         if estimates["inertia_z"].refused:
             estimates["drag_to_thrust"], vehicle = self._yaw_gain(estimates, vehicle)
-        try:
-            fitted = self._assembled({name: estimate.value for name, estimate in estimates.items()})
-        except ParameterError:
-            fitted = vehicle
         first = search.parameters(x, 0)
         return Identification(
             estimates=tuple(estimates[name] for name in _KINDS if name in estimates),
             vehicle=vehicle,
-            fitted=fitted,
             delay=late.value,
             offset=(first.offset[0], first.offset[1]),
             wind=(float(first.wind[:, 0].mean()), float(first.wind[:, 1].mean())),

@@ -106,7 +106,7 @@ def turning(record: Record, vehicle: Vehicle, p: Parameters) -> Turning:
     if record.speeds is not None and record.commands is None:
         return measured(record.speeds, record.period, delay=p.delay)
     if record.commands is not None:
-        commands = np.clip(record.commands, vehicle.speed_min, vehicle.speed_max)
+        commands = record.commands
     else:
         assert record.throttle is not None
         share = np.clip(record.throttle, 0.0, 1.0)

@@ -117,11 +117,6 @@ class Search:
         winds = [[i for i, n in enumerate(self.sought) if n.name == "wind" and n.part == k] for k in range(len(parts))]
         self._winds = [np.reshape(wind, (-1, 2)) for wind in winds]  # (K, 2) where each stretch's wind is in `x`
 
-    def index(self, name: str, part: int | None = None) -> int | None:
-        """Where a number is in `x`, or None if it is not searched for."""
-        found = [i for i, number in enumerate(self.sought) if number.name == name and number.part == part]
-        return found[0] if found else None
-
     def parameters(self, x: Array, part: int) -> Parameters:
         """The prediction's parameters for a stretch."""
         own: dict[str, Any] = {
@@ -179,7 +174,8 @@ class Search:
 
     def _rules(self, x: Array) -> Iterator[tuple[list[tuple[int, float]], float, float]]:
         """Priors on several numbers at once: slopes by index, residual, standard deviation."""
-        jx, jy, jz = (i for i, number in enumerate(self.sought) if number.name.startswith("inertia"))
+        place = {number.name: i for i, number in enumerate(self.sought)}
+        jx, jy, jz = (place[f"inertia_{axis}"] for axis in "xyz")
         inertia = [self.sought[i].value(x[i]) for i in (jx, jy, jz)]
         flat = inertia[0] + inertia[1]
         yield (
@@ -187,8 +183,8 @@ class Search:
             np.log(inertia[2] / flat / PLATE[0]),
             PLATE[1],
         )
-        rise, fall = self.index("rotor_rise"), self.index("rotor_fall")
-        if rise is not None and fall is not None:
+        if "rotor_rise" in place:
+            rise, fall = place["rotor_rise"], place["rotor_fall"]
             ratio = self.sought[rise].value(x[rise]) / self.sought[fall].value(x[fall])
             yield [(rise, 1.0), (fall, -1.0)], float(np.log(ratio)), _LAG_RATIO
         for before, after in (

@@ -141,7 +141,7 @@ def test_what_a_gate_refuses_keeps_the_number_of_the_start_and_says_why(place: P
         estimate("inertia_z", 0.012, 0.0139, width=0.9, refused="no yaw excitation"),
         estimate("drag_to_thrust", 0.03, 0.016, width=2.0, refused="no yaw excitation"),
     )
-    identification = Identification(estimates=estimates, vehicle=new, fitted=new, delay=0.0, offset=(0.0, 0.0))
+    identification = Identification(estimates=estimates, vehicle=new, delay=0.0, offset=(0.0, 0.0))
     path = place / "refused.toml"
     path.write_text(vehicle_text(identification, place / "start.toml", ["a.csv", "b.csv"]), encoding="utf-8")
     written, sources, before = load_vehicle(path), vehicle_sources(path), vehicle_sources(place / "start.toml")
@@ -156,7 +156,7 @@ def test_what_a_gate_refuses_keeps_the_number_of_the_start_and_says_why(place: P
 def test_a_parameter_that_the_start_lacks_is_added(place: Path) -> None:
     start = replace(load_vehicle(vehicle_path("lopes2011")), rotor_rise=0.03)
     estimates = (estimate("rotor_rise", 0.03, None), estimate("rotor_fall", 0.9, None, refused="never slows down"))
-    identification = Identification(estimates=estimates, vehicle=start, fitted=start, delay=0.0, offset=(0.0, 0.0))
+    identification = Identification(estimates=estimates, vehicle=start, delay=0.0, offset=(0.0, 0.0))
     path = place / "added.toml"
     path.write_text(vehicle_text(identification, vehicle_path("lopes2011"), ["a.csv"]), encoding="utf-8")
     assert load_vehicle(path) == start
@@ -168,7 +168,7 @@ def test_a_refused_number_that_does_not_suit_the_rest_is_set_and_says_so(place: 
     estimates = (*(estimate(f"inertia_{axis}", 0.005, 0.009) for axis in "xy"),
                  estimate("inertia_z", 0.03, 0.0139, refused="no yaw excitation"))  # fmt: skip
     new = replace(start, inertia=(0.005, 0.005, 0.0087))
-    identification = Identification(estimates=estimates, vehicle=new, fitted=new, delay=0.0, offset=(0.0, 0.0))
+    identification = Identification(estimates=estimates, vehicle=new, delay=0.0, offset=(0.0, 0.0))
     path = place / "set.toml"
     path.write_text(vehicle_text(identification, place / "start.toml", ["a.csv"]), encoding="utf-8")
     assert load_vehicle(path).inertia == (0.005, 0.005, 0.0087)
@@ -196,7 +196,7 @@ def test_values_have_the_digits_of_their_intervals() -> None:
 def test_the_true_vehicle_predicts_and_thrust_alone_holds_the_rates(eight: Flight, place: Path) -> None:
     true, wrong = load_vehicle(vehicle_path(TRUE)), load_vehicle(place / "start.toml")
     record = read_record(place / "eight.csv")
-    identification = Identification(estimates=(), vehicle=true, fitted=true, delay=0.0, offset=(0.0, 0.0))
+    identification = Identification(estimates=(), vehicle=true, delay=0.0, offset=(0.0, 0.0))
     found = predict([record], [[slice(100, len(record.t))]], identification, wrong)
     noise = np.array([1e-3, 1e-2, 0.0, 1e-2]) * np.sqrt(8.0 / np.pi)  # mean norm of three normal numbers
     at_start, after = found.errors[IDENTIFIED][1], found.errors[IDENTIFIED][-1]
@@ -211,7 +211,7 @@ def test_the_true_vehicle_predicts_and_thrust_alone_holds_the_rates(eight: Fligh
 def test_the_prediction_knows_delay_offset_and_wind(place: Path) -> None:
     """In place of a flight with them: what they change in a prediction by the true vehicle."""
     true, record = load_vehicle(vehicle_path(TRUE)), read_record(place / "eight.csv")
-    known = Identification(estimates=(), vehicle=true, fitted=true, delay=0.0, offset=(0.0, 0.0))
+    known = Identification(estimates=(), vehicle=true, delay=0.0, offset=(0.0, 0.0))
 
     def end(**changes: object) -> np.ndarray:
         changed = replace(known, **changes)  # type: ignore[arg-type]

@@ -374,6 +374,7 @@ def test_poor_logs_are_notes(eight: Record, hummingbird: Vehicle) -> None:
     assert any("a rotor's commands are at a limit" in note for note in notes(clipped, hummingbird))
     fast = replace(eight, commands=1.5 * eight.commands)  # type: ignore[operator]
     assert any("1.49 times the start's hover speed" in note for note in notes(fast, hummingbird))
+    assert any("above the start's speed_max of 838 rad/s" in note for note in notes(fast, hummingbird))
 
 
 def test_ground_is_cut(tmp_path: Path) -> None:
