@@ -33,7 +33,7 @@ from scenarios.progress import Progress
 
 Table = dict[str, Any]
 VEHICLES: Final = 20
-FIRST_SEED: Final = 1000
+FIRST_SEED: Final = 5000
 DURATION: Final = 20.0  # [s]
 TRACKED: Final = {
     "position": {"rate": 100.0, "noise": 0.003},

@@ -18,13 +18,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from quadsim.state import Array
+from quadsim.state import Array, Indices
 from quadsim.vehicle import Vehicle
 from scenarios.identify.model import AXES, Parameters, Stretch, predicted, turning
 from scenarios.identify.rotors import Turning
 
 TURN_ON: Final = 0.5  # time [s] after a stretch begins until the rotors have forgotten the speeds assumed there
 KNOT: Final = 1.5  # time between two instants of the wind [s]
+LONGEST_FORCE: Final = 2.0
+"""Time [s] that an unknown force lasts: one that may last for ever would carry the weight in the thrust's place."""
+BALANCE: Final = 0.002
+"""Standard deviation of the mean lift over a log that is not the rotors' or drag, over the weight [-]."""
 _MOST_KNOTS: Final = 40
 BLOCK: Final = 3.0  # shortest part of a log that is left out in turn [s]
 FEWEST: Final = 6  # parts, shorter ones of a log of less than 18 s: of 2, Student's t makes intervals useless
@@ -109,6 +113,7 @@ class Search:
         noise = [*itertools.chain(*([*half, *[0.0] * (order - 2)] for half in _NOISE_AT_FIRST))] * len(AXES)
         self._starts = self._physical + len(noise)  # where what is wrong with the first samples is
         self.x = np.concatenate([np.zeros(self._physical), noise, np.zeros(len(AXES) * len(parts))])
+        self._fading = math.exp(-parts[0].record.period / LONGEST_FORCE)
         self._skip = [int(TURN_ON / part.record.period) for part in parts]
         self.sigma = np.ones(len(AXES))  # of the innovations [rad/s, m/s]
         deviations = [number.deviation for number in self.sought]
@@ -139,15 +144,16 @@ class Search:
         misfit = self.parts[part].increments - predicted(self.parts[part].motion, rotors, self.vehicle, parameters)
         return misfit[self._skip[part] :], rotors
 
-    def _polynomials(self, noise: Array) -> tuple[Array, Array]:
-        """A and C from their reflection coefficients."""
-        return _polynomial(np.tanh(noise[: self.order])), _polynomial(np.tanh(noise[self.order :]))
+    def _polynomials(self, noise: Array, axis: int) -> tuple[Array, Array]:
+        """A and C from their reflection coefficients; of a force, A forgets within `LONGEST_FORCE`."""
+        fading = self._fading ** np.arange(self.order + 1) if axis >= 3 else 1.0
+        return fading * _polynomial(np.tanh(noise[: self.order])), _polynomial(np.tanh(noise[self.order :]))
 
     def _filtered(self, misfit: Array, axis: int, noise: Array, start: float) -> Array:
         """(N,) innovations of one axis: e = A(z) / C(z) d, the first d less what is wrong with the first sample."""
         driven = misfit[:, axis].copy()
         driven[0] += start * self.sigma[axis]
-        filtered: Array = lfilter(*self._polynomials(noise), driven)
+        filtered: Array = lfilter(*self._polynomials(noise, axis), driven)
         return filtered
 
     def _innovations(self, misfit: Array, x: Array, part: int) -> Array:
@@ -194,8 +200,11 @@ class Search:
 
     def cost(self, x: Array) -> float:
         """Negative logarithm of the likelihood, each axis at its most likely variance, and of the priors."""
-        every = np.concatenate(self.innovations(x))
+        misfits = [self._misfit(x, i)[0] for i in range(len(self.parts))]
+        every = np.concatenate([self._innovations(misfit, x, i) for i, misfit in enumerate(misfits)])
+        lift = np.concatenate([self._lift(misfit[:, -1], i) for i, misfit in enumerate(misfits)])
         cost = self.prior(x)[0] + len(every) * float(np.log(np.sqrt((every**2).mean(axis=0))).sum())
+        cost += 0.5 * float(lift @ lift)
         return cost if np.isfinite(cost) else np.inf
 
     def misfits(self, x: Array, part: int) -> tuple[Array, Array]:
@@ -218,34 +227,49 @@ class Search:
                 slopes[:, :, i] = slope * np.interp(when, np.linspace(0.0, 1.0, len(wind)), share)[:, None]
         return misfit, slopes
 
-    def _slopes(self, part: int) -> tuple[Array, Array]:
-        """Innovations (N, 6) of a stretch and their slopes (N, 6, X)."""
+    def _rows(self, part: int) -> list[Indices]:
+        """The samples of each block of a stretch."""
+        long = sum(len(one.increments) * one.record.period for one in self.parts)
+        size = len(self.parts[part].increments) - self._skip[part]
+        seconds = size * self.parts[part].record.period
+        count = max(math.ceil(FEWEST / len(self.parts)), round(seconds / max(BLOCK, long / _MOST_BLOCKS)))
+        return np.array_split(np.arange(size), count)
+
+    def _lift(self, misfit: Array, part: int) -> Array:
+        """Mean misfit (N, ...) of vz in each block, over what is allowed of it: thrust has to carry the weight."""
+        rows = self._rows(part)
+        most = BALANCE * math.sqrt(len(rows) * len(self.parts))
+        return np.stack([misfit[of].mean(axis=0) for of in rows]) / (
+            most * self.vehicle.gravity * self.parts[part].record.period
+        )
+
+    def _slopes(self, part: int) -> tuple[Array, Array, Array, Array]:
+        """Innovations (N, 6) of a stretch and their slopes (N, 6, X); its blocks' lift (B,) and its slopes (B, X)."""
         x, physical, starts = self.x, self._physical, self._starts
         misfit, raw = self.misfits(x, part)
         innovations, size = self._innovations(misfit, x, part), 2 * self.order
         slopes = np.zeros((*innovations.shape, len(x)))
         for axis in range(len(AXES)):
             own, first = physical + size * axis, starts + len(AXES) * part + axis
-            top, bottom = self._polynomials(x[own : own + size])
+            top, bottom = self._polynomials(x[own : own + size], axis)
             slopes[:, axis, :physical] = lfilter(top, bottom, raw[:, axis], axis=0)
             for i in (*range(own, own + size), first):
                 moved = x.copy()
                 moved[i] += 1e-4
                 after = self._filtered(misfit, axis, moved[own : own + size], moved[first])
                 slopes[:, axis, i] = (after - innovations[:, axis]) / 1e-4
-        return innovations, slopes
+        lift = np.zeros((len(self._rows(part)), len(x)))
+        lift[:, :physical] = self._lift(raw[:, -1], part)
+        return innovations, slopes, self._lift(misfit[:, -1], part), lift
 
     def blocks(self) -> list[Normal]:
         """Normal equations of the log's parts, each of `BLOCK` or longer but for `FEWEST`, without priors."""
-        long = sum(len(part.increments) * part.record.period for part in self.parts)
         blocks = []
-        for i, part in enumerate(self.parts):
-            innovations, slopes = self._slopes(i)
-            seconds = len(innovations) * part.record.period
-            count = max(math.ceil(FEWEST / len(self.parts)), round(seconds / max(BLOCK, long / _MOST_BLOCKS)))
-            for rows in np.array_split(np.arange(len(innovations)), count):
-                J = (slopes[rows] / self.sigma[:, None]).reshape(-1, len(self.x))
-                blocks.append(Normal(J.T @ J, J.T @ (innovations[rows] / self.sigma).ravel()))
+        for i in range(len(self.parts)):
+            innovations, slopes, lift, lift_slopes = self._slopes(i)
+            for rows, mean, slope in zip(self._rows(i), lift, lift_slopes, strict=True):
+                J = np.vstack([(slopes[rows] / self.sigma[:, None]).reshape(-1, len(self.x)), slope])
+                blocks.append(Normal(J.T @ J, J.T @ np.append((innovations[rows] / self.sigma).ravel(), mean)))
         return blocks
 
     def run(self) -> None:
