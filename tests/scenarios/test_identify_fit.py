@@ -98,7 +98,7 @@ def by_name(found: Identification) -> dict[str, Estimate]:
 def truth(**others: float) -> dict[str, float]:
     inertia = {f"inertia_{axis}": value for axis, value in zip("xyz", TRUE.inertia, strict=True)}
     drag = {"body_drag": (TRUE.body_drag or (0.0,))[0]}
-    return {"delay": 0.0, "offset_x": 0.0, "offset_y": 0.0, **vars(TRUE), **inertia, **drag, **others}
+    return {"delay": 0.0, "lateness": 0.0, "offset_x": 0.0, "offset_y": 0.0, **vars(TRUE), **inertia, **drag, **others}
 
 
 def wrong(found: Identification, **others: float) -> list[str]:
