@@ -103,7 +103,7 @@ def measure(quick: bool, report: Progress) -> list[Record]:
                 "Betaflight_cm": round(errors[0], 3),
                 "built-in_cm": round(errors[1], 3),
                 "difference_cm": round(errors[0] - errors[1], 3),
-                "nearest_margin": f"{worst.limit.name}: {worst.deciding_margin:.2f} {worst.limit.unit}",
+                "nearest_margin": f"{worst.limit.name}: {worst.margin:.2f} {worst.limit.unit}",
                 "verdict": flight.outcome,
                 "second_run": "same bytes" if digest(flight) == digest(again) else "differs",
             }

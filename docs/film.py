@@ -105,7 +105,7 @@ class Plot:
             points = self._at(self._grid[:now], np.clip(curve[:now], self._low, self._high))
             canvas.line(points, fill=colour, width=2 * SHARP, joint="curve")
             for limit in (limit for limit in self._limits if limit.signal == name):
-                beyond = limit.holds_at(self._grid[:now]) & (limit.margin(curve[:now]) < -limit.tolerance)
+                beyond = limit.holds_at(self._grid[:now]) & limit.violated(limit.margin(curve[:now]))
                 for k in np.flatnonzero(beyond[1:]):
                     canvas.line(points[k : k + 2], fill=ink.RED, width=3 * SHARP)
             painter.text(GAP, self._top + 8 + 17 * j, name, size=12, colour=colour, anchor="lm")
@@ -115,7 +115,7 @@ class Plot:
 def draw_margin(painter: Painter, track: MarginTrack, i: int, width: float, top: float) -> None:
     """A row: a limit's name, its margin now as a bar, and its worst so far; red where violated."""
     limit, now, worst = track.limit, track.now[i], track.worst[i]
-    broken, once = (bool(margin < -max(limit.tolerance, 1e-6)) for margin in (now, worst))
+    broken, once = track.violated[i], track.violated_before[i]
     share = float(np.nan_to_num(np.clip(now / limit.half_band, 0.0, 1.0)))
     left, bar = 92, width - 92 - 130
     name = limit.name.replace("_", " ")

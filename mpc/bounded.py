@@ -251,8 +251,12 @@ class Polytope:
     lower: Annotated[tuple[Number, ...] | None, doc("[unit of the row] one per row; absent: no bound")] = None
     upper: Annotated[tuple[Number, ...] | None, doc("[unit of the row] one per row; absent: no bound")] = None
     soft: Annotated[Soft | None, doc("absent: hard")] = None
-    tolerance: Annotated[NonNegative, doc("[unit of the row] of the audit, at the physics rate")] = 0.0
-    tolerance_sampled: Annotated[NonNegative, doc("[unit of the row] of the audit, at the samples")] = 0.0
+    tolerance: Annotated[
+        NonNegative | None, doc("[unit of the row] of the audit, at the physics rate; absent: the default")
+    ] = None
+    tolerance_sampled: Annotated[
+        NonNegative | None, doc("[unit of the row] of the audit, at the samples; absent: in proportion to tolerance")
+    ] = None
     required: Annotated[bool, doc("false: reported only, without effect on the verdict")] = True
 
     def __post_init__(self) -> None:
@@ -274,7 +278,7 @@ class Polytope:
             for below, above in zip(self.lower, self.upper, strict=True):
                 if below >= above:
                     raise ValueError(f"lower must be below upper = {above}; got {below}")
-        if self.tolerance_sampled > self.tolerance:
+        if self.tolerance is not None and (self.tolerance_sampled or 0.0) > self.tolerance:
             rule = f"at most tolerance = {self.tolerance}"
             raise ParameterError("", "tolerance_sampled", self.tolerance_sampled, rule)
 

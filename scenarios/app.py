@@ -522,6 +522,7 @@ def compare(
     out: File | None = None,
     overwrite: Flag = False,
     markdown: Flag = False,
+    constraints: Target | None = None,
     progress: Watched = True,
 ) -> FlightComparison | PairedComparison | Document:
     """Compare flights, or two campaigns flight by flight: table, figures, HTML page.
@@ -531,6 +532,7 @@ def compare(
         out: directory for the page, its figures and its table.
         overwrite: replace an earlier output, if its summary.json lists every file in the directory.
         markdown: print the table as Markdown.
+        constraints: one of the targets, whose constraints and tolerances all are audited against, from their tables.
         progress: as in `fly`.
 
     Raises:
@@ -554,10 +556,12 @@ def compare(
     page = None if out is None else absolute(out)
     compared: FlightComparison | PairedComparison
     if any(isinstance(target, str | Path) and is_campaign(Path(target)) for target in targets):
-        compared = compare_campaigns([Path(str(target)) for target in targets], page, overwrite=overwrite)
+        compared = compare_campaigns(
+            [Path(str(target)) for target in targets], page, overwrite=overwrite, constraints=constraints
+        )
     else:
         with reporting(progress) as report:
-            compared = compare_flights(targets, page, report, overwrite=overwrite)
+            compared = compare_flights(targets, page, report, overwrite=overwrite, constraints=constraints)
     return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared
 
 

@@ -530,7 +530,7 @@ class Assembly:
             start = self.initial_state(self.motion)[None, list(POSITION)]
             for limit in limits:
                 clear = float(limit.shape.clearance(np.zeros(1), start)[0]) - limit.radius
-                if limit.start <= 0.0 and clear < -limit.tolerance:
+                if limit.start <= 0.0 and limit.violated(clear):
                     side = "inside" if isinstance(limit.shape, Region) else "clear of"
                     ball = f"the radius of {limit.radius:.3g} m of the ball that represents the vehicle"
                     raise ParameterError("initial", "position", start[0].tolist(), f"{side} {limit.name}, by {ball}")

@@ -18,7 +18,15 @@ import numpy as np
 from quadsim.controller import NOT_CONVERGED
 from quadsim.errors import MissingPackageError, OutputError, QuadsimError, UnknownNameError, printable
 from quadsim.flight import metrics, rundir
-from quadsim.flight.audit import SIGNALS, VERDICT_TEXT, Finding, margins_at, margins_sampled, worst_finding
+from quadsim.flight.audit import (
+    SIGNALS,
+    VERDICT_TEXT,
+    Finding,
+    flight_verdict,
+    margins_at,
+    margins_sampled,
+    worst_finding,
+)
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
@@ -42,9 +50,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from mpc.ocp import InfeasiblePeriod
+    from quadsim.flight.audit import FlightVerdict  # only here: Jedi completes no object with a property of a Literal
     from quadsim.report.figure import Figure
     from scenarios.assembly import Assembly
-    from scenarios.schema.scenario import Verdict  # only here: Jedi completes no object with a property of a Literal
 
 _LONGEST: Final = 500  # characters kept of why a product failed
 _log: Final = logging.getLogger("quadsim")
@@ -107,10 +115,7 @@ class Flight(Result):
 
     @property
     def satisfied(self) -> bool:
-        """Whether the flight was completed, without a crash or permanent fallback, and every required constraint held.
-
-        `quadsim.flight.metrics.unrecovered` defines permanent fallback.
-        """
+        """Whether the verdict is `satisfied`."""
         return self.outcome == "satisfied"
 
     def __repr__(self) -> str:
@@ -119,20 +124,14 @@ class Flight(Result):
         return f"{line}{f', {self.log.reason}' if self.log.reason else ''}{worst_margin(self.findings)}>"
 
     @property
-    def outcome(self) -> Verdict:
-        """The verdict in one word.
-
-        `aborted`: ended by Ctrl-C or an exception; `lost`: ended by anything else; `incomplete`: it ended before a
-        required constraint was reached, with no violation until then.
-        """
-        if self.log.aborted:
-            return "aborted"
-        if self.log.reason is not None:
-            return "lost"
-        verdicts = {finding.verdict for finding in self.findings if finding.limit.required}
-        if self.log.control.crashed or metrics.unrecovered(self.log.control) or "violated" in verdicts:
-            return "violated"
-        return "incomplete" if "incomplete" in verdicts else "satisfied"
+    def outcome(self) -> FlightVerdict:
+        """The verdict in one word, see `quadsim.flight.audit.flight_verdict`."""
+        return flight_verdict(
+            self.findings,
+            aborted=self.log.aborted,
+            lost=self.log.reason is not None,
+            failed=metrics.failure(self.log.control) is not None,
+        )
 
     @cached_property
     def diagnosis(self) -> Mapping[str, Any] | None:
@@ -362,7 +361,7 @@ class Flight(Result):
     @property
     def exit_status(self) -> int:
         """See `Result.exit_status`."""
-        return EXIT_DONE if self.outcome in ("satisfied", "incomplete") else EXIT_FAILED
+        return EXIT_DONE if self.outcome in ("satisfied", "incomplete", "unaudited") else EXIT_FAILED
 
     def shown(self) -> Shown:
         """See `Result.shown`."""
@@ -395,11 +394,12 @@ class Flight(Result):
 
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""
+        from quadsim.report.comparison import tolerance_text
         from quadsim.report.to_matplotlib import to_html
 
         rows = "".join(
-            f"<tr><td>{escape(entry.limit.name)}</td><td>{entry.deciding_margin:.4g} {escape(entry.limit.unit)}</td>"
-            f"<td>{entry.deciding[1]:g}</td><td>{VERDICT_TEXT[entry.verdict]}</td></tr>"
+            f"<tr><td>{escape(entry.limit.name)}</td><td>{entry.margin:.4g} {escape(entry.limit.unit)}</td>"
+            f"<td>{escape(tolerance_text(entry.limit))}</td><td>{VERDICT_TEXT[entry.verdict]}</td></tr>"
             for entry in self.findings
         )
         errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz" if self.time.size)
@@ -408,7 +408,7 @@ class Flight(Result):
         return (
             f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self.summary['duration']:g} s flown, "
             f"RMS error [m]: {errors or 'none'}</p>"
-            "<table><tr><th>constraint</th><th>deciding margin</th><th>tolerance</th><th>verdict</th></tr>"
+            "<table><tr><th>constraint</th><th>margin</th><th>tolerance</th><th>verdict</th></tr>"
             f"{rows}</table>{plot}"
         )
 
@@ -430,12 +430,14 @@ def to_pandas(table: pa.Table) -> Any:
 
 
 def worst_margin(findings: Iterable[Finding]) -> str:
-    """The worst margin of the required constraints, see `worst_finding`, as the second line of a repr."""
-    worst = worst_finding(finding for finding in findings if finding.limit.required)
+    """The worst margin, see `worst_finding`, as the second line of a repr."""
+    from quadsim.report.comparison import tolerance_text
+
+    worst = worst_finding(findings)
     if worst is None:
         return ""
-    margin, tolerance = worst.deciding
-    return f"\n worst margin: {worst.limit.name} {margin:.4g} {worst.limit.unit}, tolerance {tolerance:g}"
+    limit = worst.limit
+    return f"\n worst margin: {limit.name} {worst.margin:.4g} {limit.unit}, tolerance {tolerance_text(limit)}"
 
 
 def require_rendering() -> None:

@@ -10,9 +10,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from quadsim.errors import InputError
-from quadsim.flight import rundir
+from quadsim.errors import InputError, ParameterError
+from quadsim.flight import metrics, rundir
+from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
 from quadsim.outputs import reserving
+from quadsim.report.comparison import different_audits
 from quadsim.report.table import Row
 from scenarios.campaign.store import is_campaign as is_campaign
 from scenarios.campaign.store import stored_plan
@@ -43,6 +45,7 @@ class FlightComparison(Result):
 
     runs: tuple[rundir.Run, ...]  # the flights
     rows: list[Row]  # the table, a row per quantity
+    notes: tuple[str, ...]  # in what the audits differ, and whose constraints they were audited against
     names: tuple[str, ...]  # column names, one per flight
     page: Path | None  # `index.html`, if it was written
 
@@ -71,6 +74,7 @@ class FlightComparison(Result):
         """See `Result.shown`."""
         from scenarios import console
 
+        yield from self.notes
         lines = [
             (
                 (row.group if row.headline else row.label) + (f" [{row.unit}]" if row.unit else ""),
@@ -103,16 +107,20 @@ def compare_flights(
     progress: Progress = silent,
     *,
     overwrite: bool = False,
+    constraints: Target | None = None,
 ) -> FlightComparison:
     """Compare flights, and write the page to `out`; scenarios are flown and saved beside it, in `OUT-runs`.
 
+    With `constraints`, one of the targets, all are audited against its constraints.
+
     Raises:
-        InputError: a target is neither a flight nor a scenario; nothing was flown.
+        InputError: a target is neither a flight nor a scenario, or `constraints` is none of them; nothing was flown.
         OutputError: the directory cannot be written.
     """
     from quadsim.report.comparison import comparison_rows, run_names
     from quadsim.report.comparison_page import write_comparison
 
+    whose = None if constraints is None else _place_of(constraints, targets)
     for target in targets:
         _check(target)
     with contextlib.ExitStack() as stack:
@@ -121,9 +129,48 @@ def compare_flights(
             stack.enter_context(reserving(out, overwrite=overwrite))
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
         runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
+        names = run_names(runs)
+        if whose is None:
+            notes = _differences(runs, names)
+        else:
+            limits = runs[whose].limits
+            runs = tuple(audited_against(run, limits) for run in runs)
+            notes = (f"All are audited against the constraints of {names[whose]}, at the rate of their tables.",)
         progress("comparison", 0, 1)
-        page = None if out is None else write_comparison(runs, out, overwrite=overwrite)
-    return FlightComparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page)
+        page = None if out is None else write_comparison(runs, out, notes=notes, overwrite=overwrite)
+    return FlightComparison(runs=runs, rows=comparison_rows(runs), names=names, notes=notes, page=page)
+
+
+def _place_of(target: Target, targets: Sequence[Target]) -> int:
+    """Return the place of the target whose constraints are to be used."""
+    for i, each in enumerate(targets):
+        if each is target or (isinstance(target, str | Path) and str(each) == str(target)):
+            return i
+    rule = f"one of what is compared: {', '.join(map(str, targets))}"
+    raise ParameterError("", "--constraints", str(target), rule)
+
+
+def _differences(runs: Sequence[rundir.Run], names: Sequence[str]) -> tuple[str, ...]:
+    """Return a sentence if flights are audited against different constraints or tolerances."""
+    for run, name in zip(runs[1:], names[1:], strict=True):
+        if differences := limit_differences(runs[0].limits, run.limits):
+            return (different_audits(names[0], name, differences),)
+    return ()
+
+
+def audited_against(run: rundir.Run, limits: Sequence[Limit]) -> rundir.Run:
+    """Return a run that is audited again from its tables, against other constraints."""
+    findings = audit(run.log, limits)
+    failed = metrics.failure(run.log.control) is not None
+    verdict = flight_verdict(findings, aborted=run.log.aborted, lost=run.log.reason is not None, failed=failed)
+    again = {
+        "constraints": [rundir.limit_to_json(finding) for finding in findings],
+        "verdict": verdict,
+        "satisfied": verdict == "satisfied",
+        "expected": None,
+        "audit_notes": [],
+    }
+    return replace(run, summary={**run.summary, **again}, limits=tuple(finding.limit for finding in findings))
 
 
 def _check(target: Target) -> None:
@@ -156,14 +203,21 @@ def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool)
 
 
 def compare_campaigns(
-    directories: Sequence[Path], out: Path | None = None, *, overwrite: bool = False
+    directories: Sequence[Path],
+    out: Path | None = None,
+    *,
+    overwrite: bool = False,
+    constraints: Target | None = None,
 ) -> PairedComparison:
     """Compare two campaigns flight by flight, and write the report if a directory is given.
 
+    With `constraints`, one of the two, both are judged by its tolerances.
+
     Raises:
-        InputError: they are not two finished campaigns.
+        InputError: they are not two finished campaigns, or `constraints` is none of them or has other bounds.
         OutputError: the directory cannot be written.
     """
+    from scenarios.campaign.again import judged_by
     from scenarios.campaign.paired import compare_pairs
     from scenarios.campaign.plan import plan_differences
     from scenarios.campaign.store import FLIGHTS_FILE, read_flights
@@ -175,7 +229,16 @@ def compare_campaigns(
     names = (plans[0].spec.name, plans[1].spec.name)
     failures = (plans[0].spec.failure, plans[1].spec.failure)
     a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
-    comparison = compare_pairs(a, b, names, failures, plan_differences(*plans))
+    limits = [tuple(limit.with_tolerances() for limit in plan.limits) for plan in plans]
+    if constraints is not None:
+        whose = _place_of(constraints, directories)
+        a, b = (
+            judged_by(limits[whose], of, table, plan.failure)
+            for of, table, plan in zip(limits, (a, b), plans, strict=True)
+        )
+        limits = [limits[whose]] * 2
+    differences = limit_differences(*limits)
+    comparison = compare_pairs(a, b, names, failures, plan_differences(*plans), tuple(differences))
     if out is None:
         return comparison
     return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))

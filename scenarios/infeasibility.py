@@ -122,7 +122,7 @@ class _Case:
         if polytope is None:  # of an unknown kind
             return _Bound(name=f"{name}, row {side.row + 1},", side=which, entry=side.row)
         row = zip(polytope.of, polytope.rows[side.row], strict=True)
-        unit = sum_signal(tuple((of, factor) for of, factor in row if factor)).unit
+        unit = sum_signal({of: factor for of, factor in row if factor}).unit
         name, field = polytope.row_names[side.row], f"controller.polytopes.{polytope.name}.{which}"
         return _Bound(name=name, side=which, unit=unit, field=field, entry=side.row)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 from xml.etree import ElementTree
 
 from quadsim.errors import printable
-from quadsim.flight.rundir import constraint_verdict
+from quadsim.flight.audit import Finding
+from quadsim.flight.rundir import findings_of
 from quadsim.outputs import absolute, require_file, writing_file
 from quadsim.report.comparison import failure_sentences
 from quadsim.report.table import format_number
@@ -64,7 +65,10 @@ def write_junit(result: Reaudit | CampaignResult | Sequence[Reproduction], path:
         return write_cases(summary["campaign"], test_cases, Path(path))
     text = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
     whole = summary["status"] == "completed" and not summary["controller"].get("unrecovered")
-    cases = [("flight", whole, text), *map(_case, summary["constraints"])]
+    findings = findings_of(summary)
+    cases = [("flight", whole, text), *map(_case, findings)]
+    if not findings:
+        cases.append(("audit", False, "; ".join(summary["audit_notes"])))
     return write_cases(summary["scenario"], cases, Path(path))
 
 
@@ -87,14 +91,15 @@ def write_cases(suite: str, cases: Sequence[tuple[str, bool | None, str]], path:
     return path
 
 
-def _case(entry: Mapping[str, Any]) -> tuple[str, bool | None, str]:
+def _case(finding: Finding) -> tuple[str, bool | None, str]:
     """A constraint's name, whether its case passes (None where it was required and not reached), and its numbers."""
-    if constraint_verdict(entry) == "incomplete":
+    limit = finding.limit
+    if finding.verdict == "incomplete":
         text = "not reached: the flight has no value in the constraint's time window"
-        return entry["name"], None if entry["required"] else True, text
+        return limit.name, None if limit.required else True, text
     text = (
-        f"worst margin {format_number(entry['worst_margin'])} {entry['unit']} at t = {entry['worst_time']:.3f} s "
-        f"(tolerance {entry['tolerance']:g}), {format_number(entry['worst_margin_sampled'])} at the samples "
-        f"(tolerance {entry['tolerance_sampled']:g}); violated for {entry['time_violated']:.3f} s"
+        f"worst margin {format_number(finding.worst_margin)} {limit.unit} at t = {finding.worst_time:.3f} s "
+        f"(tolerance {limit.tolerances[0]:g}), {format_number(finding.worst_margin_sampled)} at the samples "
+        f"(tolerance {limit.tolerances[1]:g}); violated for {finding.time_violated:.3f} s"
     )
-    return entry["name"], bool(entry["satisfied"]) or not entry["required"], text
+    return limit.name, finding.satisfied or not limit.required, text

@@ -10,19 +10,19 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from mpc.bounded import Range
-from quadsim.flight.audit import Limit, SpaceLimit, SumLimit
+from mpc.handover import within
+from quadsim.controller import Controller
+from quadsim.flight.audit import MOTION, ROUNDING, SUM, UNAUDITED_ADVICE, Limit, SpaceLimit
 from quadsim.report.table import format_number
+from scenarios.law_bounds import law_limits
+from scenarios.plugin import PluginController
 
 if TYPE_CHECKING:
     from scenarios.assembly import Assembly
     from scenarios.schema.scenario import Scenario
-
-COMMANDED: Final = ("speed", "slew")
-SHARE, SHARE_SAMPLED, ROUNDING = 0.01, 0.002, 1e-6
-"""Default tolerances: shares of half the band, and for commands their rounding [rad/s]."""
 
 
 def audited(assembly: Assembly) -> tuple[Limit, ...]:
@@ -42,21 +42,38 @@ def with_bounds_stated(assembly: Assembly) -> Scenario:
     return scenario.altered(constraints=[*_stated(scenario, bounds), *_unnamed(scenario, bounds)])
 
 
+def with_law_bounds(assembly: Assembly, controller: Controller) -> Assembly:
+    """Return the assembly with the bounds of a user's controller as constraints of its scenario; see `law_limits`."""
+    adapted = within(controller, PluginController)
+    if adapted is None:
+        return assembly
+    scenario, named = assembly.scenario, _named(assembly.scenario)
+    limits = [
+        limit
+        for limit in law_limits(adapted.law, scenario.audited_names)
+        if limit.signal == SUM or limit.signal not in named
+    ]
+    return assembly.of(scenario.altered(constraints=[*scenario.constraints, *limits])) if limits else assembly
+
+
 def audit_notes(assembly: Assembly) -> list[str]:
     """Return notes on the audit: bounds without a constraint, and constraints that differ from the controller's."""
     scenario, vehicle, bounds = assembly.scenario, assembly.vehicle, assembly.bounds
+    audited = [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]
     unnamed = [limit.name for limit in _unnamed(scenario, bounds)]
     absent = [entry.name for entry in scenario.constraints if not (entry.has_bounds or entry.signal in bounds)]
     notes = []
     if unnamed:
+        notes.append(f"{', '.join(unnamed)}: audited as the controller bounds {'it' if len(unnamed) == 1 else 'them'}")
+    if not assembly.limits:
+        notes.append(UNAUDITED_ADVICE)
+    if any(limit.tolerance is None for limit in audited):
         notes.append(
-            f"{', '.join(unnamed)}: audited as the controller bounds {'it' if len(unnamed) == 1 else 'them'}; "
-            f"tolerance {100 * SHARE:g} % of half the band, {100 * SHARE_SAMPLED:g} % at the samples, "
-            f"{ROUNDING:g} rad/s for commands"
+            f"tolerances not stated are {100 * MOTION.plant:g} % of half the band, {100 * MOTION.sampled:g} % at the "
+            f"samples, {ROUNDING.plant:g} rad/s for commands"
         )
     if absent:
         notes.append(f"{', '.join(absent)}: not audited, the controller has no such bound and the entry states none")
-    audited = [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]
     changes = [(0.0, bounds)] + [(at, spec.audited(vehicle)) for at, spec in scenario.controller_changes]
     for limit in audited:
         for (at, now), (_, before) in zip(changes, [(0.0, {}), *changes], strict=False):
@@ -81,26 +98,21 @@ def _stated(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit]:
 
 def _unnamed(scenario: Scenario, bounds: Mapping[str, Range]) -> Iterator[Limit]:
     """Yield a limit for each controller bound without an entry."""
-    named = {
+    named = _named(scenario)
+    for signal, (lower, upper) in bounds.items():
+        if signal in named:
+            continue
+        name = f"controller.{signal}" if signal in scenario.audited_names else signal
+        yield Limit(name=name, signal=signal, lower=lower, upper=upper)
+
+
+def _named(scenario: Scenario) -> set[str]:
+    """Return the signals whose entry replaces the controller's bounds."""
+    return {
         entry.signal
         for entry in scenario.constraints
         if not entry.has_bounds or (entry.start <= 0.0 and math.isinf(entry.stop))
     }
-    for signal, (lower, upper) in bounds.items():
-        if signal in named:
-            continue
-        limit = Limit(
-            name=f"controller.{signal}" if signal in scenario.audited_names else signal,
-            signal=signal,
-            lower=lower,
-            upper=upper,
-        )
-        commanded = signal in COMMANDED
-        yield replace(
-            limit,
-            tolerance=ROUNDING if commanded else SHARE * limit.half_band,
-            tolerance_sampled=ROUNDING if commanded else SHARE_SAMPLED * limit.half_band,
-        )
 
 
 def _range(lower: float, upper: float) -> str:
@@ -135,9 +147,10 @@ def space_limits(assembly: Assembly) -> tuple[SpaceLimit, ...]:
 
 def _sum_limits(scenario: Scenario) -> tuple[Limit, ...]:
     return tuple(
-        SumLimit(
+        Limit(
             name=name,
-            terms=tuple((of, factor) for of, factor in zip(polytope.of, row, strict=True) if factor),
+            signal=SUM,
+            terms={of: factor for of, factor in zip(polytope.of, row, strict=True) if factor},
             lower=-math.inf if polytope.lower is None else polytope.lower[i],
             upper=math.inf if polytope.upper is None else polytope.upper[i],
             tolerance=polytope.tolerance,

@@ -133,10 +133,13 @@ class PluginController:
     """Adapts a law whose `step` returns four speeds or a `Command`, with optional `predict`, `reset` and `adopt`.
 
     The law receives copies; its commands are checked and copied.
+
+    Attributes:
+        law: the user's object.
     """
 
     def __init__(self, law: Any, horizon: int) -> None:
-        self._law, self.horizon = law, horizon
+        self.law, self.horizon = law, horizon
         self.name = printable(str(getattr(law, "name", type(law).__name__)))[:200]
         self.solver = printable(str(getattr(law, "solver", "")))[:200]
         self.commands = getattr(law, "commands", ROTORS)
@@ -152,7 +155,7 @@ class PluginController:
     def infeasible_period(self) -> object:
         """The first problem without an answer, an `mpc.InfeasiblePeriod`, if the law keeps one."""
         try:
-            return getattr(self._law, "infeasible_period", None)
+            return getattr(self.law, "infeasible_period", None)
         except Exception as error:  # the flight is complete and must not be lost
             logging.getLogger("quadsim").warning("no diagnosis: infeasible_period raised %s", reason_of(error))
             return None
@@ -160,20 +163,20 @@ class PluginController:
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`; raises InputError if the law's raises."""
         try:
-            getattr(self._law, "reset", np.copy)(speeds.copy())
+            getattr(self.law, "reset", np.copy)(speeds.copy())
         except (Exception, SystemExit) as error:
             raise InputError(f"controller: {self.name}.reset cannot be called: {reason_of(error)}") from error
 
     def adopt(self, previous: object) -> None:
         """See `quadsim.controller.Controller`."""
         law = within(previous, PluginController)  # perhaps with an autopilot
-        hand_over(self._law, previous if law is None else law._law)
+        hand_over(self.law, previous if law is None else law.law)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError if the answer is not a command."""
         acting = None if now.acting is None else now.acting.copy()
         named = state.copy().view(State)
-        answer: Any = self._law.step(replace(now, acting=acting), named, reference.copy())
+        answer: Any = self.law.step(replace(now, acting=acting), named, reference.copy())
         try:
             if not isinstance(answer, Command):
                 answer = Command(speeds=answer, plan=np.tile(_numbers(answer, (self._size,), "it"), (self.horizon, 1)))

@@ -20,11 +20,10 @@ import numpy as np
 from quadsim.controller import ROTORS
 from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import metrics, rundir
-from quadsim.flight.audit import Finding, audit
+from quadsim.flight.audit import Finding, FlightVerdict, audit, flight_verdict
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
-from quadsim.flight.rundir import constraint_verdict, limit_to_json
-from quadsim.report.comparison import verdict
+from quadsim.flight.rundir import finding_from_json, limit_to_json
 from quadsim.sim.effects.rotors import LagChange
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS
@@ -107,12 +106,10 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
     if others := _unlisted(directory, summary):
         shown = ", ".join(others[:MOST_REPORTED]) + (" ..." if len(others) > MOST_REPORTED else "")
         notes.append(f"not of this run: {printable(shown)}")
-    whole = summary["reason"] is None and log.control.t.size == scenario.periods and not log.control.crashed
-    whole = whole and not metrics.unrecovered(log.control)
     return Reaudit(
         summary=summary,
         findings=findings,
-        satisfied=whole and all(finding.satisfied for finding in findings if finding.limit.required),
+        satisfied=_verdict(log, findings) == "satisfied",
         rate=scenario.log_rate,
         notes=tuple(notes),
     )
@@ -236,18 +233,23 @@ def _differences(
     if names != expected:
         yield f"the constraints recorded are {', '.join(names) or 'none'}, and the scenario's {', '.join(expected)}"
         return
-    for entry, finding in zip(entries, findings, strict=True):
+    recorded = tuple(map(finding_from_json, entries))
+    for entry, written, finding in zip(entries, recorded, findings, strict=True):
         yield from (f"{finding.limit.name}: {what}" for what in _constraint_differences(entry, finding, scenario, log))
-        implied = constraint_verdict(entry)
-        if entry["satisfied"] != (implied == "satisfied") or entry.get("verdict", implied) != implied:
+        implied = written.verdict
+        if entry["satisfied"] != written.satisfied or entry.get("verdict", implied) != implied:
             yield f"{entry['name']}: satisfied is {entry['satisfied']}, and its worst margins say {implied}"
-    required = all(entry["satisfied"] for entry in entries if entry["required"])
-    satisfied = reason is None and required and not (log.control.crashed or metrics.unrecovered(log.control))
-    yield from _recorded("satisfied", summary["satisfied"], satisfied, "its audit and outcome make it")
-    outcome = verdict(summary)
-    yield from _recorded("verdict", summary.get("verdict", outcome), outcome, "its audit and outcome make it")
+    outcome = _verdict(log, recorded)
+    yield from _recorded("satisfied", summary["satisfied"], outcome == "satisfied", "its audit and outcome make it")
+    yield from _recorded("verdict", summary["verdict"], outcome, "its audit and outcome make it")
     if summary.get("as_expected") and outcome != scenario.expect:
         yield f"as_expected is recorded as True, and the flight is {outcome} where {scenario.expect} is expected"
+
+
+def _verdict(log: FlightLog, findings: Sequence[Finding]) -> FlightVerdict:
+    """Return the verdict on a flight with these findings."""
+    failed = metrics.failure(log.control) is not None
+    return flight_verdict(findings, aborted=log.aborted, lost=log.reason is not None, failed=failed)
 
 
 def _recorded(key: str, before: Any, again: Any, source: str, rounding: float = 0.0) -> Iterator[str]:
@@ -286,7 +288,7 @@ def _constraint_differences(
     if margin is not None:
         at_peak = None if entry[peak] is None else float(limit.margin(np.array([entry[peak]]))[0])
         yield from _recorded("worst_margin", margin, at_peak, f"by its {peak}", rounding)
-    beyond = margin is not None and margin < -entry["tolerance"]
+    beyond = margin is not None and limit.violated(margin)
     least, most = _time_beyond(finding, scenario, log)
     if (entry["time_violated"] > 0.0 and not beyond) or not least <= entry["time_violated"] <= most:
         yield f"time_violated is recorded as {entry['time_violated']}, and the tables give {again['time_violated']:.6g}"
@@ -302,7 +304,7 @@ def _time_beyond(finding: Finding, scenario: Scenario, log: FlightLog) -> tuple[
     if signal.plant is None or not log.control.t.size or scenario.plant_stride == 1:
         return seen - ROUNDING, seen + row + ROUNDING
     t = log.plant.t[:-1]  # the last row ends the flight, and lasts no time
-    beyond = limit.margin(signal.plant(log.plant))[:-1] < -limit.tolerance - ROUNDING_TILT
+    beyond = limit.excess(limit.margin(signal.plant(log.plant)))[:-1] > ROUNDING_TILT
     return max(0.0, (np.count_nonzero(limit.holds_at(t) & beyond) - 1) * scenario.plant.timestep), math.inf
 
 

@@ -25,6 +25,7 @@ from quadsim.state import Array
 from scenarios.assembly import Assembly
 from scenarios.flight import Flight
 from scenarios.flight_events import FlightEvents, Successor, prepared
+from scenarios.limits import with_law_bounds
 from scenarios.progress import Progress, silent
 from scenarios.schema.events import ControllerEvent, Event
 from scenarios.schema.scenario import LONGEST_FLIGHT, MOST_STEPS, Scenario
@@ -128,12 +129,14 @@ class Rollout:
         """
         assembly = scenario if isinstance(scenario, Assembly) else Assembly(scenario)
         assembly = assembly.of(prepared(assembly)) if live else assembly
-        self.vehicle, self.actual, self.limits = assembly.vehicle, assembly.actual, assembly.limits
-        self._started = scenario = assembly.scenario
+        scenario = assembly.scenario
         threadpool_limits(limits=1)  # the matrices are small, and results must not depend on the number of cores
         if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
             raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
         controller = assembly.controller() if law is None else law
+        assembly = with_law_bounds(assembly, controller)
+        self.vehicle, self.actual, self.limits = assembly.vehicle, assembly.actual, assembly.limits
+        self._started = scenario = assembly.scenario
         if assembly.user_autopilot is not None and not isinstance(controller, Piloted):
             rule = 'given with a controller that commands thrust and body rates, e.g. commands = "rates"'
             raise ParameterError("", "autopilot", type(assembly.user_autopilot).__name__, rule)
@@ -284,7 +287,7 @@ class Rollout:
             sample: the period; by default the last one.
         """
         margins = self.margins(sample)
-        beyond = {limit.name: -(margins[limit.name] + limit.tolerance) for limit in self.limits}
+        beyond = {limit.name: float(limit.excess(margins[limit.name])) for limit in self.limits}
         return {name: -math.inf if math.isnan(value) else value for name, value in beyond.items()}
 
     def flight(self) -> Flight:

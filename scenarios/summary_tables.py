@@ -11,14 +11,14 @@ from rich.table import Table
 from rich.text import Text
 
 from quadsim.controller import OPTIMAL, Phase, counts, law_name
-from quadsim.flight.audit import VERDICT_TEXT
-from quadsim.flight.rundir import constraint_verdict, deciding_margin
+from quadsim.flight.audit import VERDICT_TEXT, Finding
+from quadsim.flight.rundir import findings_of
 from quadsim.report.comparison import (
     crash,
     event_sentences,
     failure_sentences,
     required,
-    verdict,
+    tolerance_text,
     violated_by_fallback,
 )
 from scenarios import console
@@ -39,7 +39,7 @@ def summary_tables(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
     if summary["tracking"]:
         yield _tracking_table(summary["tracking"])
     if summary["constraints"]:
-        yield audit_table(summary["constraints"])
+        yield audit_table(findings_of(summary))
     yield from summary.get("audit_notes", ())
     if summary["tracking"]:
         yield from _controller_lines(summary)
@@ -58,66 +58,62 @@ def outcome_line(summary: Mapping[str, Any]) -> Text:
     if expected != "satisfied":
         remark = ", as the scenario expects" if as_expected else f"; the scenario expects: {expected}"
     colour = "green" if as_expected and (remark or summary["satisfied"]) else "red"
+    verdict = summary["verdict"]
     if summary["status"] != "completed":
-        return console.styled((f"{verdict(summary)}{remark}", colour), f": {summary['reason']}")
-    held = "every required constraint holds" if summary["constraints"] else "no constraint was audited"
-    phrase = held if summary["satisfied"] else _violations(summary["constraints"])
-    if verdict(summary) == "incomplete":
+        return console.styled((f"{verdict}{remark}", colour), f": {summary['reason']}")
+    if verdict in ("incomplete", "unaudited"):
         colour = "green" if remark and as_expected else "yellow"
-        return console.styled((f"incomplete, {required(summary).text}{remark}", colour))
+        what = required(summary).text if verdict == "incomplete" else "no constraint was audited"
+        return console.styled((f"{verdict}, {what}{remark}", colour))
+    phrase = "every required constraint holds" if summary["satisfied"] else _violations(findings_of(summary))
     if violated_by_fallback(summary):
         phrase = "but in permanent fallback"
     return console.styled((f"{crash(summary) or 'completed'}, {phrase}{remark}", colour))
 
 
-def _violations(constraints: Sequence[Mapping[str, Any]]) -> str:
+def _violations(findings: Sequence[Finding]) -> str:
     """Return the violated required constraints, with the largest violation of each and its time."""
     violated = []
-    for entry in constraints:
-        if entry["required"] and constraint_verdict(entry) == "violated":
-            margin, _ = deciding_margin(entry)
+    for finding in findings:
+        if finding.limit.required and finding.verdict == "violated":
+            margin, _ = finding.deciding
             by = ""
-            if margin is not None:
-                when = f"{entry['worst_time']:.2f} s" if margin == entry["worst_margin"] else "the samples"
-                by = f" by {_number(-margin)} {entry['unit']} at {when}"
-            violated.append(f"{entry['name']}{by}")
+            if math.isfinite(margin):
+                when = f"{finding.worst_time:.2f} s" if margin == finding.worst_margin else "the samples"
+                by = f" by {_number(-margin)} {finding.limit.unit} at {when}"
+            violated.append(f"{finding.limit.name}{by}")
     more = f" and {len(violated) - _NAMED} more" if len(violated) > _NAMED else ""
     return ": ".join(filter(None, ["a required constraint does not hold", ", ".join(violated[:_NAMED]) + more]))
 
 
-def audit_table(constraints: Sequence[Mapping[str, Any]]) -> Table:
-    """Return every constraint with its bounds, peaks, margin, tolerances and verdict."""
+def audit_table(findings: Sequence[Finding]) -> Table:
+    """Return every constraint with its bounds, peaks, smallest margin, tolerances and verdict."""
     caption = (
-        "margin: the decisive one, negative = beyond the bound (s: at the samples); within: the tolerance; "
+        "margin: the smallest, negative = beyond the bound; tolerance: at the physics rate and at the samples (s); "
         "beyond: time outside bound and tolerance [s]; -: no value"
     )
-    if any(not entry["required"] for entry in constraints):
+    if any(not finding.limit.required for finding in findings):
         caption += "; *: reported only, not required"
-    head = ("constraint", "bounds", "sampled", "plant", "margin", "beyond", "verdict")
-    lines = []
-    for entry in constraints:
-        margin, _ = deciding_margin(entry)
-        at_samples = "" if margin == entry["worst_margin"] else " s"
-        lines.append(
-            (
-                f"{entry['name']} [{entry['unit']}]",
-                _range(entry["lower"], entry["upper"]),
-                *(_number(entry[name]) for name in ("peak_sampled", "peak_plant")),
-                f"{_number(margin)}{at_samples}",
-                _number(entry["time_violated"]),
-                _verdict(entry),
-            )
+    head = ("constraint", "bounds", "sampled", "plant", "margin", "tolerance", "beyond", "verdict")
+    lines = [
+        (
+            f"{finding.limit.name} [{finding.limit.unit}]",
+            _range(finding.limit.lower, finding.limit.upper),
+            *(_number(peak) for peak in (finding.peak_sampled, finding.peak_plant)),
+            _number(finding.margin),
+            tolerance_text(finding.limit).replace(" at the samples", " s"),
+            _number(finding.time_violated),
+            _verdict(finding),
         )
+        for finding in findings
+    ]
     return console.table("audit at the physics rate", head, lines, caption=caption, left=("verdict",), spare=_SPARE)
 
 
-def _verdict(entry: Mapping[str, Any]) -> Text:
-    verdict = constraint_verdict(entry)
-    margin, tolerance = deciding_margin(entry)
-    if verdict == "violated":
-        return console.styled(("VIOLATED", "red") if entry["required"] else ("exceeded*", "yellow"))
-    within = f" (within {_number(tolerance)})" if margin is not None and margin < 0.0 else ""
-    return console.styled((f"{VERDICT_TEXT[verdict]}{within}", "green" if verdict == "satisfied" else "yellow"))
+def _verdict(finding: Finding) -> Text:
+    if finding.verdict == "violated":
+        return console.styled(("VIOLATED", "red") if finding.limit.required else ("exceeded*", "yellow"))
+    return console.styled((VERDICT_TEXT[finding.verdict], "green" if finding.verdict == "satisfied" else "yellow"))
 
 
 def _tracking_table(tracking: Mapping[str, Any]) -> Table:
@@ -177,13 +173,13 @@ def _effect_lines(summary: Mapping[str, Any]) -> Iterator[str]:
         yield f"RMS error of the measured state: {lengths} m; {angles} deg"
 
 
-def _number(value: float | None) -> str:
-    if value is None:
+def _number(value: float) -> str:
+    if math.isnan(value):
         return "-"
     return f"{value:.0f}" if 1e3 <= abs(value) < 1e5 else f"{value:.3g}".replace("e-0", "e-")
 
 
-def _range(lower: float | None, upper: float | None) -> str:
-    if lower is not None and upper is not None and lower == -upper:
+def _range(lower: float, upper: float) -> str:
+    if lower == -upper:
         return f"±{_number(upper)}"
-    return f"{_number(lower)}..{_number(upper)}"
+    return "..".join(_number(bound) if math.isfinite(bound) else "-" for bound in (lower, upper))

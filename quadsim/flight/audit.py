@@ -1,21 +1,23 @@
-"""The audit: signed margins of every limit, at the control samples and at the physics rate.
+"""The audit: signed margins of every limit, at the control samples and at the physics rate, and the verdicts.
 
 A QP bounds the samples of a linear model, but the vehicle must respect its limits between samples too.  The audit
-therefore reads the plant at the physics rate, with stated tolerances: the verdict is `margin >= -tolerance`.
+therefore reads the plant at the physics rate.  A margin is the signed distance to the nearer bound: positive inside,
+negative beyond it.  A limit is violated where the margin is below minus its tolerance.
 
-A margin is the signed distance to the nearer bound: positive inside, negative beyond it; see `docs/conventions.md`.
+Margins, tolerances, violations, the worst finding and the verdict on a flight are defined here and nowhere else;
+`docs/conventions.md` explains them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Final, Literal
 
 import numpy as np
 from annotated_types import doc
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number
@@ -39,8 +41,42 @@ from quadsim.vehicle import N_ROTORS
 
 Mask = NDArray[np.bool_]
 Verdict = Literal["satisfied", "violated", "incomplete"]
+"""On a constraint; `incomplete`: the flight has no value in its time window."""
 VERDICT_TEXT: Final[dict[str, str]] = {"satisfied": "holds", "violated": "violated", "incomplete": "not reached"}
 """Display text of the verdicts on a constraint."""
+FlightVerdict = Literal["satisfied", "violated", "lost", "aborted", "incomplete", "unaudited"]
+"""On a flight, see `flight_verdict`."""
+UNAUDITED_ADVICE: Final = (
+    "no constraint was audited: the controller has no bounds and the scenario no [[constraints]]; add an entry, for "
+    'example name = "tilt", signal = "tilt", upper = 30.0'
+)
+"""What to do about an unaudited flight."""
+COMMANDED: Final = ("speed", "slew")
+"""Signals that the controller sets itself."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tolerance:
+    """Default tolerances of a signal's limits, at the physics rate and at the control samples."""
+
+    plant: float
+    sampled: float
+    of_band: bool = True  # whether they are shares of half the band; otherwise they are in the signal's unit
+
+    def of(self, half_band: float) -> tuple[float, float]:
+        """Return both in the signal's unit."""
+        scale = half_band if self.of_band else 1.0
+        return self.plant * scale, self.sampled * scale
+
+
+MOTION: Final = Tolerance(plant=0.01, sampled=0.002)
+"""Of quantities that a controller bounds at its samples, and that overshoot between them."""
+AT_SAMPLES: Final = Tolerance(plant=0.01, sampled=0.01)
+"""Of quantities that exist only at the samples, and that no controller bounds."""
+ROUNDING: Final = Tolerance(plant=1e-6, sampled=1e-6, of_band=False)
+"""Of commands [rad/s]."""
+EXACT: Final = Tolerance(plant=0.0, sampled=0.0)
+"""Of clearances."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +87,7 @@ class Signal:
     sampled: Callable[[ControlLog], Array]  # log -> (K,) or (K, j) values at the control samples, in `unit`
     plant: Callable[[PlantLog], Array] | None
     """log -> (M,) or (M, j) values at the physics rate, or None for a quantity that exists only at samples."""
+    tolerance: Tolerance = MOTION  # default tolerances of its limits
 
     def finest(self, log: FlightLog) -> tuple[Array, Array]:
         """Return times [s] and values at the plant's rate, or at the control samples if the plant has none."""
@@ -66,12 +103,14 @@ def _state(i: int) -> Signal:
 
 def _error(j: int) -> Signal:
     unit, scale = shown_unit(STATE_UNITS[i := REFERENCE_STATES[j]])
-    return Signal(unit=unit, sampled=lambda log: scale * (log.truth[:, i] - log.reference[:, j]), plant=None)
+    return Signal(
+        unit=unit, sampled=lambda log: scale * (log.truth[:, i] - log.reference[:, j]), plant=None, tolerance=AT_SAMPLES
+    )
 
 
 def _estimate_error(i: int) -> Signal:
     unit, scale = shown_unit(STATE_UNITS[i])
-    return Signal(unit=unit, sampled=lambda log: scale * log.measured_error[:, i], plant=None)
+    return Signal(unit=unit, sampled=lambda log: scale * log.measured_error[:, i], plant=None, tolerance=AT_SAMPLES)
 
 
 def _body_rate(axis: int) -> Signal:
@@ -103,13 +142,18 @@ SIGNALS: Final[dict[str, Signal]] = {
         sampled=lambda log: _present(log.target[:, 0] if log.target is not None else None, log.t),
         plant=lambda log: _present(log.thrust, log.t),
     ),
-    "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds),
-    "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None),
+    "speed": Signal(unit="rad/s", sampled=lambda log: log.speeds, plant=lambda log: log.speeds, tolerance=ROUNDING),
+    "slew": Signal(unit="rad/s", sampled=lambda log: log.slews, plant=None, tolerance=ROUNDING),
 }
 
 
 def _rotor(i: int) -> Signal:
-    return Signal(unit="rad/s", sampled=lambda log: log.speeds[:, i], plant=lambda log: log.speeds[:, i])
+    return Signal(
+        unit="rad/s",
+        sampled=lambda log: log.speeds[:, i],
+        plant=lambda log: log.speeds[:, i],
+        tolerance=ROUNDING,
+    )
 
 
 TERMS: Final[dict[str, Signal]] = {
@@ -121,14 +165,15 @@ SUM: Final = "sum"  # the signal of a limit on a sum of terms
 CLEARANCE: Final = "clearance"  # the signal of a limit in space: clearance of the vehicle's bounding ball [m]
 
 
-def sum_signal(terms: tuple[tuple[str, float], ...]) -> Signal:
-    """Return the signal of a sum of terms, each a name in `TERMS` with its factor."""
-    signals = [(factor, TERMS[name]) for name, factor in terms]
+def sum_signal(terms: Mapping[str, float]) -> Signal:
+    """Return the signal of a sum of terms: names in `TERMS` with their factors."""
+    signals = [(factor, TERMS[name]) for name, factor in terms.items()]
     units = {signal.unit for _, signal in signals}
     return Signal(
         unit=units.pop() if len(units) == 1 else "-",
         sampled=lambda log: np.sum([factor * signal.sampled(log) for factor, signal in signals], axis=0),
         plant=lambda log: np.sum([factor * signal.plant(log) for factor, signal in signals if signal.plant], axis=0),
+        tolerance=ROUNDING if all(signal.tolerance is ROUNDING for _, signal in signals) else MOTION,
     )
 
 
@@ -142,14 +187,28 @@ class Limit:
 
     name: Annotated[str, doc("name in reports")] = field(metadata={"pattern": "^[A-Za-z0-9_.-]+$"})
     signal: Annotated[
-        str, doc("bounded quantity: " + ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items()))
-    ] = field(metadata={"json_schema_extra": {"enum": [*SIGNALS]}})
+        str,
+        doc(
+            "bounded quantity: " + ", ".join(f"{name} [{signal.unit}]" for name, signal in SIGNALS.items()) + ", or sum"
+        ),
+    ] = field(metadata={"json_schema_extra": {"enum": [*SIGNALS, SUM]}})
+    terms: Annotated[
+        dict[str, Number] | None,
+        doc(
+            'where signal = "sum": the factors of states and rotor speeds by name, for example {x = 1.0, vx = 0.5}, in '
+            "their units in limits"
+        ),
+    ] = None
     lower: Annotated[Number, doc("[unit of the signal] lower bound; both absent: the controller's")] = -math.inf
     upper: Annotated[Number, doc("[unit of the signal] upper bound; both absent: the controller's")] = math.inf
-    tolerance: Annotated[NonNegative, doc("[unit of the signal] violation accepted at the physics rate")] = 0.0
-    tolerance_sampled: Annotated[NonNegative, doc("[unit of the signal] violation accepted at the control samples")] = (
-        0.0
-    )
+    tolerance: Annotated[
+        NonNegative | None,
+        doc("[unit of the signal] violation accepted at the physics rate; absent: the signal's default"),
+    ] = None
+    tolerance_sampled: Annotated[
+        NonNegative | None,
+        doc("[unit of the signal] violation accepted at the control samples; absent: in proportion to tolerance"),
+    ] = None
     required: Annotated[bool, doc("false: reported only, without effect on the verdict")] = True
     start: Annotated[Number, doc("[s] start of the time window")] = 0.0
     stop: Annotated[Number, doc("[s] end of the time window; absent: the end of the flight")] = math.inf
@@ -159,20 +218,26 @@ class Limit:
         owner = f"constraints.{self.name}"
         if not self.lower < self.upper:
             raise ParameterError(owner, "lower", self.lower, f"below upper = {self.upper}")
-        if not 0.0 <= self.tolerance_sampled <= self.tolerance < math.inf:
+        if self.tolerance is not None and (self.tolerance_sampled or 0.0) > self.tolerance:
             rule = f"at most tolerance = {self.tolerance}"
             raise ParameterError(owner, "tolerance_sampled", self.tolerance_sampled, rule)
         if not self.start <= self.stop:
             raise ParameterError(owner, "stop", self.stop, f"at least start = {self.start}")
 
     def _check_signal(self) -> None:
-        if self.signal not in SIGNALS:
-            raise UnknownNameError("signal", self.signal, SIGNALS)
+        if (self.signal == SUM) != bool(self.terms):
+            rule = "the factors of a sum" if self.signal == SUM else f'absent where signal is not "{SUM}"'
+            raise ParameterError(f"constraints.{self.name}", "terms", self.terms, rule)
+        if self.signal not in (*SIGNALS, SUM):
+            raise UnknownNameError("signal", self.signal, [*SIGNALS, SUM])
+        for name in self.terms or ():
+            if name not in TERMS:
+                raise UnknownNameError("signal", name, TERMS)
 
     @property
     def source(self) -> Signal:
         """The bounded quantity."""
-        return SIGNALS[self.signal]
+        return sum_signal(self.terms) if self.terms else SIGNALS[self.signal]
 
     @property
     def unit(self) -> str:
@@ -191,6 +256,26 @@ class Limit:
             return 0.5 * (self.upper - self.lower)
         return abs(self.lower if math.isfinite(self.lower) else self.upper) or 1.0
 
+    @property
+    def tolerances(self) -> tuple[float, float]:
+        """Violations accepted at the physics rate and at the control samples, stated or by default.
+
+        If only `tolerance` is stated, the one at the samples is in the proportion of the defaults; if only that is
+        stated, `tolerance` is at least as large.
+        """
+        plant, sampled = self.source.tolerance.of(self.half_band)
+        if self.tolerance is None:
+            stated = self.tolerance_sampled
+            return (plant, sampled) if stated is None else (max(plant, stated), stated)
+        if self.tolerance_sampled is not None:
+            return self.tolerance, self.tolerance_sampled
+        return self.tolerance, self.tolerance * (sampled / plant if plant else 1.0)
+
+    def with_tolerances(self) -> Limit:
+        """Return the limit with both tolerances stated."""
+        plant, sampled = self.tolerances
+        return replace(self, tolerance=plant, tolerance_sampled=sampled)
+
     def holds_at(self, t: Array) -> Mask:
         """Return (K,) whether it applies at times (K,) [s]."""
         return (t >= self.start - 1e-9) & (t <= self.stop + 1e-9)
@@ -200,23 +285,18 @@ class Limit:
         margin = np.minimum(values - self.lower, self.upper - values)
         return margin if margin.ndim == 1 else margin.min(axis=1)
 
+    def excess(self, margin: ArrayLike, *, sampled: bool = False) -> Array:
+        """Return how far margins are beyond bound and tolerance, in the limit's unit: positive where it is violated.
 
-@dataclass(frozen=True, kw_only=True)
-class SumLimit(Limit):
-    """Bounds on a sum of signals."""
+        Args:
+            margin: signed margins, of any shape; NaN outside the time window, where the excess is NaN too.
+            sampled: whether they are at the control samples; otherwise they are at the physics rate.
+        """
+        return np.asarray(-self.tolerances[sampled] - np.asarray(margin, float))
 
-    signal: str = SUM
-    terms: tuple[tuple[str, float], ...]  # names in `TERMS` with their factors
-
-    def _check_signal(self) -> None:
-        for name, _ in self.terms:
-            if name not in TERMS:
-                raise UnknownNameError("signal", name, TERMS)
-
-    @property
-    def source(self) -> Signal:
-        """The bounded quantity."""
-        return sum_signal(self.terms)
+    def violated(self, margin: ArrayLike, *, sampled: bool = False) -> Mask:
+        """Return whether margins violate the limit; arguments as `excess`."""
+        return np.asarray(self.excess(margin, sampled=sampled) > 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,6 +318,7 @@ class SpaceLimit(Limit):
             unit="m",
             sampled=lambda log: self.shape.clearance(log.t, log.truth[:, POSITION]) - self.radius,
             plant=lambda log: self.shape.clearance(log.t, log.state[:, POSITION]) - self.radius,
+            tolerance=EXACT,
         )
 
 
@@ -271,31 +352,90 @@ class Finding:
         return self.verdict == "satisfied"
 
     @property
+    def margin(self) -> float:
+        """The smallest signed margin, at the samples or between them; NaN if there is none."""
+        if math.isnan(self.worst_margin):
+            return math.nan
+        return float(np.fmin(self.worst_margin, self.worst_margin_sampled))
+
+    @property
+    def share(self) -> float:
+        """`margin` as a share of half the band: 1 in its middle, 0 at a bound, negative beyond it."""
+        return self.margin / self.limit.half_band
+
+    @property
     def deciding(self) -> tuple[float, float]:
-        """The decisive signed margin, and its tolerance.
+        """The margin that decides the verdict, and its tolerance.
 
         It is taken at the physics rate, unless only the samples violate the limit.
         """
         sampled, margin = self.worst_margin_sampled, self.worst_margin
-        if sampled < -self.limit.tolerance_sampled and margin >= -self.limit.tolerance:
-            return sampled, self.limit.tolerance_sampled
-        return margin, self.limit.tolerance
-
-    @property
-    def deciding_margin(self) -> float:
-        """The first entry of `deciding`."""
-        return self.deciding[0]
+        tolerance, tolerance_sampled = self.limit.tolerances
+        if self.limit.violated(sampled, sampled=True) and margin >= -tolerance:
+            return sampled, tolerance_sampled
+        return margin, tolerance
 
 
 def worst_finding(findings: Iterable[Finding]) -> Finding | None:
-    """Return the finding whose margin, tolerance included, is the smallest share of half its band.
+    """Return the finding with the smallest margin as a share of half its band, ties by name; None if none counts.
 
-    Limits that were not reached do not count, and limits of the commands count once they are violated: a command at its
-    own bound is no near miss.  None if no finding counts.
+    Required limits count, or all if none is required.  Limits that were not reached do not count.  Limits of the
+    commands count only once they are violated: a command at its own bound is no near miss.
     """
-    reached = [finding for finding in findings if finding.verdict != "incomplete"]
-    counted = [each for each in reached if each.verdict == "violated" or each.limit.signal not in ("speed", "slew")]
-    return min(counted, key=lambda finding: sum(finding.deciding) / finding.limit.half_band, default=None)
+    findings = tuple(findings)
+    required = tuple(finding for finding in findings if finding.limit.required) or findings
+    reached = [finding for finding in required if math.isfinite(finding.margin)]
+    counted = [finding for finding in reached if finding.verdict == "violated" or finding.limit.signal not in COMMANDED]
+    return min(counted, key=lambda finding: (finding.share, finding.limit.name), default=None)
+
+
+def flight_verdict(findings: Sequence[Finding], *, aborted: bool, lost: bool, failed: bool) -> FlightVerdict:
+    """Return the verdict on a flight in one word.
+
+    Args:
+        findings: its audit.
+        aborted: whether the user or an exception ended it.
+        lost: whether anything else ended it early.
+        failed: whether it failed apart from its audit, see `quadsim.flight.metrics.failure`.
+
+    Returns:
+        `aborted` or `lost`, where it ended early; `violated`, where it failed or a required limit is violated;
+        `incomplete`, where it ended before a required limit was reached; `unaudited`, where it has no limit; otherwise
+        `satisfied`.
+    """
+    verdicts = {finding.verdict for finding in findings if finding.limit.required}
+    if aborted or lost:
+        return "aborted" if aborted else "lost"
+    if failed or "violated" in verdicts:
+        return "violated"
+    if "incomplete" in verdicts:
+        return "incomplete"
+    return "satisfied" if findings else "unaudited"
+
+
+def limit_differences(first: Sequence[Limit], second: Sequence[Limit]) -> list[str]:
+    """Return, by name, how the limits of two audits differ: absent ones, bounds, windows, tolerances and demands."""
+    a, b = ({limit.name: limit for limit in limits} for limits in (first, second))
+    lines = [f"{name} only in the {where}" for where, name in _alone(a, b)]
+    for name in (name for name in a if name in b):
+        pairs = [
+            (what, getattr(a[name], what), getattr(b[name], what))
+            for what in ("signal", "terms", "lower", "upper", "start", "stop", "tolerances", "required", "shape")
+            if hasattr(a[name], what) or hasattr(b[name], what)
+        ]
+        lines += [f"{name}: {what} {_plain(one)} and {_plain(other)}" for what, one, other in pairs if one != other]
+    return lines
+
+
+def _alone(a: Mapping[str, Limit], b: Mapping[str, Limit]) -> list[tuple[str, str]]:
+    return [("first", name) for name in a if name not in b] + [("second", name) for name in b if name not in a]
+
+
+def _plain(value: object) -> str:
+    """Return a part of a limit for a message: tolerances at the physics rate and at the samples."""
+    if isinstance(value, tuple):
+        return " / ".join(f"{number:.4g}" for number in value)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def margins_sampled(limit: Limit, log: FlightLog) -> Array:
@@ -315,7 +455,7 @@ def smallest_margins(log: FlightLog, limits: Sequence[Limit]) -> dict[str, float
 
 def audit(log: FlightLog, limits: Sequence[Limit]) -> tuple[Finding, ...]:
     """Audit a flight, its plant rows at the physics rate, against its limits: one finding per limit, in order."""
-    return tuple(_find(log, limit) for limit in limits)
+    return tuple(_find(log, limit.with_tolerances()) for limit in limits)
 
 
 def _find(log: FlightLog, limit: Limit) -> Finding:
@@ -324,7 +464,7 @@ def _find(log: FlightLog, limit: Limit) -> Finding:
     if t.size:  # a flight can end before its first period
         t, values = limit.source.finest(log)
         peak, margin, time = _worst(limit, t, values)
-    beyond = limit.holds_at(t) & (limit.margin(values) < -limit.tolerance)
+    beyond = limit.holds_at(t) & limit.violated(limit.margin(values))
     durations = np.diff(t, append=log.plant.t[-1:])  # a value lasts until the next, or until the flight's end
     return Finding(
         limit=limit,

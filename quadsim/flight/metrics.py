@@ -158,6 +158,13 @@ def unrecovered(log: ControlLog) -> int:
     return periods if periods and (not good.size or periods * period >= UNRECOVERED - 1e-9) else 0
 
 
+def failure(log: ControlLog) -> str | None:
+    """Return how a flight failed apart from its audit: `crash` or `permanent fallback`; None if it did not."""
+    if log.crashed:
+        return "crash"
+    return "permanent fallback" if unrecovered(log) else None
+
+
 def computation(log: ControlLog) -> dict[str, Any]:
     """Simulated times from measurement to command [ms], and the number of commands that came too late."""
     return {"delay_ms": percentiles(1e3 * log.delay), "missed": log.status.count(MISSED)}

@@ -12,7 +12,7 @@ from types import NoneType
 from typing import Any, Final
 
 from quadsim.errors import FileError, printable
-from quadsim.flight.audit import Finding, Limit, SpaceLimit, SumLimit, Verdict
+from quadsim.flight.audit import Finding, Limit, SpaceLimit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_log
 from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
@@ -24,7 +24,7 @@ NUMBER: Final = (int, float)
 MAYBE_NUMBER: Final = (int, float, NoneType)
 LARGEST_FILE: Final = 64_000_000  # largest file [bytes] that is read
 _FORM: Final = {
-    **dict.fromkeys(("scenario", "status"), str),
+    **dict.fromkeys(("scenario", "status", "verdict"), str),
     "reason": (str, NoneType),
     "satisfied": bool,
     "duration": NUMBER,
@@ -116,7 +116,7 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
     return {
         "name": limit.name,
         "signal": limit.signal,
-        **({"terms": dict(limit.terms)} if isinstance(limit, SumLimit) else {}),
+        **({"terms": dict(limit.terms)} if limit.terms else {}),
         **({"shape": shape_to_json(limit.shape)} if isinstance(limit, SpaceLimit) else {}),
         "unit": limit.unit,
         **{name: value if math.isfinite(value) else None for name, value in (stated | audited).items()},
@@ -128,13 +128,11 @@ def limit_to_json(finding: Finding) -> dict[str, Any]:
 def limit_from_json(entry: Mapping[str, Any]) -> Limit:
     """Return the limit that `limit_to_json` wrote."""
     absent = {"lower": -math.inf, "upper": math.inf, "stop": math.inf}
-    values = {field.name: entry[field.name] for field in fields(Limit)}
+    values = {field.name: entry[field.name] for field in fields(Limit) if field.name != "terms"}
     values |= {name: bound for name, bound in absent.items() if values[name] is None}
     if entry.get("shape"):
         return SpaceLimit(shape=shape_from_json(entry["shape"]), radius=float(entry["radius"]), **values)
-    if not entry.get("terms"):
-        return Limit(**values)
-    return SumLimit(terms=tuple((name, float(factor)) for name, factor in entry["terms"].items()), **values)
+    return Limit(terms={name: float(factor) for name, factor in entry.get("terms", {}).items()} or None, **values)
 
 
 def finding_from_json(entry: Mapping[str, Any]) -> Finding:
@@ -144,15 +142,9 @@ def finding_from_json(entry: Mapping[str, Any]) -> Finding:
     return Finding(limit=limit_from_json(entry), **values)
 
 
-def constraint_verdict(entry: Mapping[str, Any]) -> Verdict:
-    """Return the verdict on a constraint of a summary, from its margins."""
-    return finding_from_json(entry).verdict
-
-
-def deciding_margin(entry: Mapping[str, Any]) -> tuple[float | None, float]:
-    """Return the margin that decides this verdict, None if there is none, and its tolerance."""
-    margin, tolerance = finding_from_json(entry).deciding
-    return None if math.isnan(margin) else margin, tolerance
+def findings_of(summary: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """Return the audit of a summary."""
+    return tuple(map(finding_from_json, summary["constraints"]))
 
 
 SCENARIO_FILE: Final = "scenario.toml"

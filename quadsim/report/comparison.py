@@ -15,10 +15,10 @@ import numpy as np
 
 from quadsim.controller import Phase, law_name
 from quadsim.errors import printable
-from quadsim.flight.audit import VERDICT_TEXT, worst_finding
-from quadsim.flight.rundir import constraint_verdict, deciding_margin, finding_from_json
+from quadsim.flight.audit import VERDICT_TEXT, Finding, Limit, SpaceLimit, worst_finding
+from quadsim.flight.rundir import findings_of
 from quadsim.report.table import ABSENT, Cell, Mark, Row, format_number
-from quadsim.space import SHAPES, Obstacle
+from quadsim.space import Obstacle
 from quadsim.state import VELOCITY
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ Summary = Mapping[str, Any]
 GLANCE: Final = "At a glance"
 _EXCEEDED: Final = "exceeded, not required"
 _ROUNDING: Final = 1e-3  # share of its tolerance below which a margin is shown as 0
+_MOST_DIFFERENCES: Final = 4  # differences of two audits that a sentence names
 _MOST_EVENTS: Final = 12  # most events of a flight that are named
 _Line = tuple[str, str, Callable[[Summary], Cell]]  # a row's label, its unit, and the cell of a summary
 
@@ -55,6 +56,15 @@ def distinct_courses(runs: Sequence[Run]) -> list[Run]:
         if not any(np.array_equal(course, other.log.control.reference[: len(course)]) for other in chosen):
             chosen.append(run)
     return chosen
+
+
+def different_audits(first: str, second: str, differences: Sequence[str]) -> str:
+    """Return the sentence about two audits that differ, and what to do."""
+    shown = "; ".join(differences[:_MOST_DIFFERENCES]) + ("; ..." if len(differences) > _MOST_DIFFERENCES else "")
+    return (
+        f"Audited differently: {shown} (first: {first}, second: {second}). Compare their margins, not their verdicts, "
+        "or audit all against the same constraints with --constraints."
+    )
 
 
 def comparison_rows(runs: Sequence[Run]) -> list[Row]:
@@ -90,10 +100,10 @@ def outcome(summary: Summary) -> Cell:
     cell = verdict_cell(summary)
     if summary["status"] != "completed":
         cell = replace(cell, text=f"{cell.text}: {summary.get('reason')}")
-    elif verdict(summary) == "incomplete":
+    elif summary["verdict"] == "incomplete":
         cell = replace(cell, text=f"{cell.text}; {required(summary).text}")
-    free = [entry for entry in summary["constraints"] if not entry["required"]]
-    if exceeded := [entry["name"] for entry in free if constraint_verdict(entry) == "violated"]:
+    free = [finding for finding in findings_of(summary) if not finding.limit.required]
+    if exceeded := [finding.limit.name for finding in free if finding.verdict == "violated"]:
         mark = Mark.WARN if cell.mark is Mark.GOOD else cell.mark
         cell = Cell(text=f"{cell.text}; {_EXCEEDED}: {', '.join(exceeded)}", mark=mark)
     return cell
@@ -101,10 +111,10 @@ def outcome(summary: Summary) -> Cell:
 
 def _worst_constraint(summary: Summary) -> Cell:
     """Return the constraint that came closest to its bound, or went furthest beyond it, with its verdict."""
-    worst = worst_finding(map(finding_from_json, summary["constraints"]))
+    worst = worst_finding(findings_of(summary))
     if worst is None:
         return Cell()
-    cell = _verdict(next(entry for entry in summary["constraints"] if entry["name"] == worst.limit.name))
+    cell = _verdict(worst)
     return replace(cell, text=f"{worst.limit.name} {cell.text}")
 
 
@@ -128,24 +138,10 @@ def _step_time(summary: Summary) -> Cell:
     return Cell(text=text, mark=Mark.WARN if nested(summary, "controller", "deadline_misses") else Mark.NONE)
 
 
-def verdict(summary: Summary) -> str:
-    """The verdict on a flight in one word: satisfied, violated, lost, aborted or incomplete."""
-    if summary["status"] != "completed":
-        return "aborted" if summary.get("verdict") == "aborted" else "lost"
-    verdicts = _required_verdicts(summary)
-    crashed = nested(summary, "ground", "crashed") or crash(summary)
-    if crashed or summary["controller"].get("unrecovered") or "violated" in verdicts:
-        return "violated"
-    return "incomplete" if "incomplete" in verdicts else "satisfied"
-
-
 def violated_by_fallback(summary: Summary) -> bool:
     """Return whether a completed flight met its required constraints and is violated only by permanent fallback."""
-    return bool(summary["controller"].get("unrecovered")) and "violated" not in _required_verdicts(summary)
-
-
-def _required_verdicts(summary: Summary) -> set[str]:
-    return {constraint_verdict(entry) for entry in summary["constraints"] if entry["required"]}
+    violated = any(finding.limit.required and finding.verdict == "violated" for finding in findings_of(summary))
+    return bool(summary["controller"].get("unrecovered")) and not violated
 
 
 def fallback_sentence(periods: int) -> str:
@@ -157,9 +153,8 @@ def crash(summary: Summary) -> str | None:
     """Say that the vehicle crashed, and which obstacles it touched; None if it did not."""
     if Phase.CRASHED not in summary["controller"].get("statuses", ()):
         return None
-    shapes = [entry for entry in summary["constraints"] if entry.get("shape")]
-    violated = [entry for entry in shapes if constraint_verdict(entry) == "violated"]
-    touched = [entry["name"] for entry in violated if issubclass(SHAPES[entry["shape"]["type"]], Obstacle)]
+    violated = [finding.limit for finding in findings_of(summary) if finding.verdict == "violated"]
+    touched = [limit.name for limit in violated if isinstance(limit, SpaceLimit) and isinstance(limit.shape, Obstacle)]
     return f"crashed, touched {', '.join(touched)}" if touched else "crashed"
 
 
@@ -178,7 +173,7 @@ def event_sentences(events: Sequence[Summary]) -> list[str]:
 
 def verdict_cell(summary: Summary) -> Cell:
     """Return the verdict, and whether the scenario expects it; runs of older versions state no expectation."""
-    word, expected = verdict(summary), summary.get("expected")
+    word, expected = summary["verdict"], summary.get("expected")
     if expected is None:
         return Cell(text=word)
     if summary.get("as_expected"):
@@ -188,15 +183,18 @@ def verdict_cell(summary: Summary) -> Cell:
 
 def required(summary: Summary) -> Cell:
     """The verdict on the constraints that the scenario demands, naming those that do not hold."""
-    demanded = [entry for entry in summary["constraints"] if entry["required"]]
+    findings = findings_of(summary)
+    if not findings:
+        return Cell(text="none audited", mark=Mark.WARN)
+    demanded = [finding for finding in findings if finding.limit.required]
     failing = {
-        text: [entry["name"] for entry in demanded if constraint_verdict(entry) == verdict]
+        text: [finding.limit.name for finding in demanded if finding.verdict == verdict]
         for verdict, text in VERDICT_TEXT.items()
         if verdict != "satisfied"
     }
     if parts := [f"{text}: {', '.join(names)}" for text, names in failing.items() if names]:
         return Cell(text="; ".join(parts), mark=Mark.BAD if failing["violated"] else Mark.WARN)
-    return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none")
+    return Cell(text=f"all {len(demanded)} hold", mark=Mark.GOOD) if demanded else Cell(text="none required")
 
 
 def tracking_values(summaries: Sequence[Summary], measure: str, channel: str) -> tuple[str, list[float | None]]:
@@ -213,14 +211,23 @@ def _present_keys(summaries: Sequence[Summary], *path: str) -> list[str]:
     return list(dict.fromkeys(key for summary in summaries for key in nested(summary, *path) or {}))
 
 
-def _bounds(entry: Summary) -> str:
+def _bounds(finding: Finding) -> Cell:
     """Format the bounds of a constraint and its window, e.g. `-5 .. 5`, `at least -0.5` or `0 .. 1, from 59 s`."""
-    lower, upper = entry["lower"], entry["upper"]
-    bounds = f"{format_number(lower)} .. {format_number(upper)}"
-    if lower is None or upper is None:
-        bounds = f"at least {format_number(lower)}" if upper is None else f"at most {format_number(upper)}"
-    window = f", from {entry['start']:g} s" if entry["start"] or entry["stop"] is not None else ""
-    return bounds + window + ("" if entry["stop"] is None else f" to {entry['stop']:g} s")
+    limit = finding.limit
+    lower, upper = format_number(limit.lower), format_number(limit.upper)
+    bounds = f"{lower} .. {upper}"
+    if math.isinf(limit.lower) or math.isinf(limit.upper):
+        bounds = f"at least {lower}" if math.isinf(limit.upper) else f"at most {upper}"
+    window = f", from {limit.start:g} s" if limit.start or math.isfinite(limit.stop) else ""
+    return Cell(text=bounds + window + (f" to {limit.stop:g} s" if math.isfinite(limit.stop) else ""))
+
+
+def tolerance_text(limit: Limit) -> str:
+    """Return the tolerance, and the one at the control samples where it is another."""
+    plant, sampled = limit.tolerances
+    if limit.source.plant is None:
+        return f"{sampled:.3g}"
+    return f"{plant:.3g}" if plant == sampled else f"{plant:.3g}, {sampled:.3g} at the samples"
 
 
 def _tracking_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
@@ -264,10 +271,10 @@ def _best_smallest(
 
 
 def _constraint_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
-    audits = [{entry["name"]: entry for entry in summary["constraints"]} for summary in summaries]
+    audits = [{finding.limit.name: finding for finding in findings_of(summary)} for summary in summaries]
     for name in dict.fromkeys(name for audit in audits for name in audit):
         entries = [audit.get(name) for audit in audits]
-        own_unit = next(entry["unit"] for entry in entries if entry is not None)
+        own_unit = next(entry.limit.unit for entry in entries if entry is not None)
         for label, unit, cell in _CONSTRAINT:
             yield Row(
                 group=f"Constraint {name}",
@@ -278,41 +285,40 @@ def _constraint_rows(summaries: Sequence[Summary]) -> Iterator[Row]:
             )
 
 
-def _verdict(entry: Summary) -> Cell:
+def _verdict(finding: Finding) -> Cell:
     """Return the verdict on a constraint, the margin that decides and its tolerance.
 
     For example `holds (margin -0.0376 deg, tolerance 0.05)`.
     """
-    verdict = constraint_verdict(entry)
-    text = VERDICT_TEXT[verdict]
-    if verdict == "violated" and not entry["required"]:
+    text = VERDICT_TEXT[finding.verdict]
+    if finding.verdict == "violated" and not finding.limit.required:
         text = _EXCEEDED
-    if verdict != "incomplete":
-        margin, tolerance = deciding_margin(entry)
-        at_samples = " at the samples" if margin != entry["worst_margin"] else ""
-        shown = 0.0 if margin is not None and abs(margin) < _ROUNDING * tolerance else margin
-        text += f" (margin {format_number(shown)} {entry['unit']}{at_samples}, tolerance {tolerance:g})"
-    return Cell(text=text, mark=_verdict_mark(entry))
+    if finding.verdict != "incomplete":
+        margin, tolerance = finding.deciding
+        at_samples = " at the samples" if margin != finding.worst_margin else ""
+        shown = 0.0 if abs(margin) < _ROUNDING * tolerance else margin
+        text += f" (margin {format_number(shown)} {finding.limit.unit}{at_samples}, tolerance {tolerance:.3g})"
+    return Cell(text=text, mark=_verdict_mark(finding))
 
 
-def _verdict_mark(entry: Summary) -> Mark:
-    verdict = constraint_verdict(entry)
-    if verdict == "satisfied":
+def _verdict_mark(finding: Finding) -> Mark:
+    if finding.verdict == "satisfied":
         return Mark.GOOD
-    return Mark.BAD if verdict == "violated" and entry["required"] else Mark.WARN
+    return Mark.BAD if finding.verdict == "violated" and finding.limit.required else Mark.WARN
 
 
-def _margin(key: str, tolerance: str) -> Callable[[Summary], Cell]:
-    def cell(entry: Summary) -> Cell:
-        beyond = entry[key] is not None and entry[key] < -entry[tolerance]
-        return Cell(text=format_number(entry[key]), mark=_verdict_mark(entry) if beyond else Mark.NONE)
+def _margin(*, sampled: bool) -> Callable[[Finding], Cell]:
+    def cell(finding: Finding) -> Cell:
+        margin = finding.worst_margin_sampled if sampled else finding.worst_margin
+        violated = finding.limit.violated(margin, sampled=sampled)
+        return Cell(text=format_number(margin), mark=_verdict_mark(finding) if violated else Mark.NONE)
 
     return cell
 
 
-def _violation(entry: Summary) -> Cell:
-    seconds = entry["time_violated"]
-    return Cell(text=format_number(seconds), mark=_verdict_mark(entry) if seconds > 0.0 else Mark.NONE)
+def _violation(finding: Finding) -> Cell:
+    seconds = finding.time_violated
+    return Cell(text=format_number(seconds), mark=_verdict_mark(finding) if seconds > 0.0 else Mark.NONE)
 
 
 def _lowest_speed(summary: Summary) -> Cell:
@@ -455,13 +461,14 @@ _TIMES: Final[tuple[_Line, ...]] = (
     ("with all files", "s", _number("wall_s", "total")),
 )
 _OWN: Final = "own"  # stands for the constraint's own unit
-_CONSTRAINT: Final[tuple[_Line, ...]] = (
+_CONSTRAINT: Final[tuple[tuple[str, str, Callable[[Finding], Cell]], ...]] = (
     ("verdict", "", _verdict),
-    ("bounds", _OWN, lambda entry: Cell(text=_bounds(entry))),
-    ("peak at the samples", _OWN, _number("peak_sampled")),
-    ("peak at the physics rate", _OWN, _number("peak_plant")),
-    ("worst margin at the samples", _OWN, _margin("worst_margin_sampled", "tolerance_sampled")),
-    ("worst margin at the physics rate", _OWN, _margin("worst_margin", "tolerance")),
-    ("when", "s", _number("worst_time")),
+    ("bounds", _OWN, _bounds),
+    ("tolerance", _OWN, lambda finding: Cell(text=tolerance_text(finding.limit))),
+    ("peak at the samples", _OWN, lambda finding: Cell(text=format_number(finding.peak_sampled))),
+    ("peak at the physics rate", _OWN, lambda finding: Cell(text=format_number(finding.peak_plant))),
+    ("worst margin at the samples", _OWN, _margin(sampled=True)),
+    ("worst margin at the physics rate", _OWN, _margin(sampled=False)),
+    ("when", "s", lambda finding: Cell(text=format_number(finding.worst_time))),
     ("time violated", "s", _violation),
 )

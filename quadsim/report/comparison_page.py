@@ -45,8 +45,12 @@ _FILES: Final = {
 """What is copied of a run directory beside its video and figures, and how links name it."""
 
 
-def write_comparison(runs: Sequence[Run], directory: Path, *, overwrite: bool = False) -> Path:
+def write_comparison(
+    runs: Sequence[Run], directory: Path, *, notes: Sequence[str] = (), overwrite: bool = False
+) -> Path:
     """Write a comparison of runs, which appears complete or not at all; returns the page, `directory/index.html`.
+
+    `notes` are sentences at its top.
 
     The directory holds the page, the overlay `comparison.png`, the table `comparison.md`, and of each run its video
     `NAME.mp4` with its poster `NAME.jpg`, and a folder `NAME` of its other files; it can be moved or zipped as it is.
@@ -81,7 +85,7 @@ def write_comparison(runs: Sequence[Run], directory: Path, *, overwrite: bool = 
         plots = Section(title="Plots", plots=tuple(figures))
         title = " and ".join(names) if len(names) < 3 else f"{len(names)} runs: {', '.join(names)}"
         files = {"overlay of all runs (PNG)": OVERVIEW_FILE, "table (Markdown)": TABLE_FILE}
-        notes = (warning,) if courses > 1 else ()
+        notes = (*notes, *([warning] if courses > 1 else []))
         page = render_page("comparison", title, [plots], notes=notes, runs=views, rows=rows, files=files)
         (partial / PAGE_FILE).write_text(page, encoding="utf-8")
     return directory / PAGE_FILE

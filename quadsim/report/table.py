@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -94,8 +95,8 @@ def section(grid: Grid) -> str:
 
 
 def format_number(value: float | None) -> str:
-    """Four significant digits, or two where it takes an exponent; `-` for None."""
-    if value is None:
+    """Four significant digits, or two where it takes an exponent; `-` for None and NaN."""
+    if value is None or math.isnan(value):
         return ABSENT
     size = abs(value)
     if 1e4 <= size < 1e7:

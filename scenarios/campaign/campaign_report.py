@@ -19,7 +19,7 @@ from quadsim.report.to_matplotlib import write_pngs
 from quadsim.report.to_plotly import Plot, to_plot
 from quadsim.state import Array
 from scenarios.campaign.campaign_file import CampaignFile
-from scenarios.campaign.events import HARMLESS, INCOMPLETE, VERDICTS, parse_event
+from scenarios.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, parse_event
 from scenarios.campaign.rows import (
     DRAW,
     MARGIN,
@@ -43,7 +43,7 @@ _TITLES: Final = {
     "groups": "Failures over each varied parameter",
 }
 _MOST_LINES: Final = 8  # of a table on the console; the report has them all
-_MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN}
+_MARKS: Final = {HARMLESS: Mark.NONE, INCOMPLETE: Mark.WARN, UNAUDITED: Mark.WARN}
 _ENDS: Final = ("lower", "upper")
 _ALWAYS: Final = ("failure", "violation", "lost")  # events that are listed even where they never happened
 
@@ -83,8 +83,11 @@ def verdict_sentence(summary: Summary) -> str:
     if failure["flights"]:
         share, ends = _shares(failure)
         text += f": {share} ({100.0 * summary['confidence']:g} % interval: {ends})"
-    left_out = summary["flights"] - failure["flights"]
-    return text + (f"; {count_of(left_out, 'incomplete flight')} not counted" if left_out else "")
+    verdicts = summary["verdicts"]
+    for verdict in (INCOMPLETE, UNAUDITED):
+        if summary["flights"] > failure["flights"] and verdicts.get(verdict):
+            text += f"; {count_of(verdicts[verdict], f'{verdict} flight')} not counted"
+    return text
 
 
 def definition_sentence(summary: Summary, failure: Sequence[str]) -> str:
@@ -128,7 +131,8 @@ def event_table(summary: Summary) -> Grid:
     )
     note = (
         "Violation: a required constraint did not hold, or the flight was lost, raised an error or met a limit. Shares "
-        "of failure and violation leave out incomplete flights, which ended before a required constraint was reached. "
+        "of failure and violation leave out incomplete flights, which ended before a required constraint was reached, "
+        "and unaudited flights, which have no constraint. "
         "Intervals are Clopper-Pearson's, of independent draws; the last two "
         "columns are one-sided. Spread draws are more precise than that."
     )
@@ -177,7 +181,7 @@ def worst_table(summary: Summary, directory: str) -> Grid:
         for flight in worst
     )
     note = "Lost flights first, then errors, limits, violations and the rest; among these, failed ones first, then "
-    note += "the smaller worst margin, tolerance included, as a share of half the band."
+    note += "the smaller worst margin as a share of half the band."
     if worst:
         note += f" To fly one of them again: {replay_command(directory, worst[0]['flight'])}"
     return _grid("worst", ("flight", "verdict", "worst margin", "constraint", "flown [s]", "reason"), lines, note)
@@ -263,8 +267,8 @@ _FILES: Final = (
 )
 """Files that the page links to, if they exist."""
 _MARGINS: Final = (
-    "The worst margin is that of a flight's required constraints, tolerance included, as a share of half the "
-    "constraint's band: 1 in the middle, 0 (dashed) at the end of what is allowed, negative beyond. What is measured "
+    "The worst margin is that of a flight's required constraints, as a share of half the "
+    "constraint's band: 1 in the middle, 0 (dashed) at its bound, negative beyond. What is measured "
     "of a lost flight ends where it was aborted. Flights beyond an axis are in its end bars."
 )
 _POINTS: Final = "Triangles at the edges are flights beyond the axes; at the foot also those without a margin."

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 Flags = np.ndarray[Any, np.dtype[np.bool_]]
 HARMLESS: Final = "satisfied"
 INCOMPLETE: Final = "incomplete"  # of a flight that ended before it reached a required constraint: neither good nor bad
+UNAUDITED: Final = "unaudited"  # of a flight without any constraint: it shows no violation, and not that there is none
 
 
 class Verdict(NamedTuple):
@@ -38,6 +39,7 @@ class Verdict(NamedTuple):
 VERDICTS: Final = {
     HARMLESS: Verdict(0, LINES[0], "circle"),
     INCOMPLETE: Verdict(1, LINES[2], "cross"),
+    UNAUDITED: Verdict(1, LINES[0], "circle-open"),
     "violated": Verdict(2, LINES[1], "diamond"),
     "lost": Verdict(6, BOUND, "x"),
     ERROR: Verdict(5, REFERENCE, "square"),

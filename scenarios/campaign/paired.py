@@ -16,14 +16,20 @@ import pyarrow as pa
 
 from quadsim.errors import InputError
 from quadsim.outputs import to_json, writing
+from quadsim.report.comparison import different_audits
 from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line, section
-from scenarios.campaign.events import EVENT_NAMES, Flags, parse_event
+from scenarios.campaign.events import EVENT_NAMES, INCOMPLETE, UNAUDITED, Flags, parse_event
 from scenarios.campaign.rows import (
     DRAW,
+    MARGIN,
+    SAMPLED,
     SATISFIED,
+    TIME_VIOLATED,
+    VIOLATION,
     constraint_names,
     draw_names,
+    failure_of,
     flags,
     is_counted,
     numbers,
@@ -53,6 +59,7 @@ COMPARED: Final = (
     *("peak_tilt", "worst_margin", "total_variation", "fallback_periods"),
 )
 """Metrics that are compared, where both campaigns have them."""
+_BY_AUDIT: Final = (VIOLATION, INCOMPLETE, UNAUDITED)  # events that depend on it, by name
 Differences = tuple[tuple[str, Any, Any], ...]
 """Fields, with the value of the first and of the second; None where it is absent."""
 
@@ -105,12 +112,18 @@ class PairedComparison(Result):
     differences: Differences | None  # fields in which their scenarios and draws differ; None where not known
     events: tuple[EventComparison, ...]  # failure, then every other event with a name, then each constraint not held
     metrics: tuple[MetricComparison, ...]
+    audits: tuple[str, ...] = ()  # in what their constraints or tolerances differ
     page: Path | None = None  # of the report, where it was written
 
     @property
     def verdict(self) -> str:
-        """`better`, `worse` or `not distinguishable`: of the second campaign, by its failures at a level of 5 %."""
+        """The second campaign by its failures at a level of 5 %: `better`, `worse` or `not distinguishable`.
+
+        `not comparable` if the audits differ and failure depends on them.
+        """
         failure = self.events[0]
+        if failure.event != FAILURE.text:
+            return "not comparable"
         if failure.p >= ALPHA:
             return "not distinguishable"
         return "better" if failure.only_b < failure.only_a else "worse"
@@ -118,7 +131,10 @@ class PairedComparison(Result):
     @property
     def sentence(self) -> str:
         """Return the verdict with its numbers."""
-        (a, b), failure = self.names, self.events[0]
+        (a, b) = self.names
+        if self.verdict == "not comparable":
+            return different_audits(a, b, self.audits)
+        failure = self.events[0]
         phrase = f"{b} is {self.verdict} than {a}"
         if self.verdict == "not distinguishable":
             phrase = f"{b} and {a} are not distinguishable by their failures"
@@ -155,9 +171,12 @@ class PairedComparison(Result):
         """See `Result.shown`."""
         from scenarios import console
 
+        if self.audits:
+            yield different_audits(*self.names, self.audits)
         yield self.pairing
         yield from console.grids(self.difference_tables)
-        yield self.sentence
+        if self.verdict != "not comparable":
+            yield self.sentence
         yield from console.grids(self.tables)
         if self.page is not None:
             yield console.to_open(self.page)
@@ -214,6 +233,7 @@ def compare_pairs(
     names: tuple[str, str],
     failures: tuple[Sequence[str], Sequence[str]] | None = None,
     differences: Differences | None = None,
+    audits: Sequence[str] = (),
 ) -> PairedComparison:
     """Compare two campaigns, pairing their flights by number.
 
@@ -223,6 +243,8 @@ def compare_pairs(
         names: of the first and the second; where they are the same, the comparison distinguishes them as such.
         failures: the events that each counts as failure; None where they are known to be the same.
         differences: see `scenarios.campaign.plan.plan_differences`; None where not known.
+        audits: in what their constraints or tolerances differ: then margins are compared, and neither violations nor
+            failures that count them.
 
     Raises:
         InputError: they count other events as failure, or have other constraints; they have no flight in common; or a
@@ -263,7 +285,7 @@ def compare_pairs(
         shared_draws=shared_draws,
         own_draws=tuple(sorted(set(draws_a) ^ set(draws_b))),
         differences=differences,
-        events=_compare_events(a, b),
+        events=_compare_events(a, b, audited_alike=not audits),
         metrics=tuple(
             _compare_metric(a, b, name, completed)
             for name in COMPARED
@@ -281,21 +303,18 @@ def _require_same_questions(
             f"{names[0]!r} counts {', '.join(first)} as failure, and {names[1]!r} {', '.join(second)}: only "
             "campaigns with the same failure events can be compared; fly one of them again with the other's"
         )
-    for name, one, other in ((names[0], a, b), (names[1], b, a)):
-        if alone := sorted(set(constraint_names(one)) - set(constraint_names(other))):
-            raise InputError(
-                f"{name!r} alone has the constraints {', '.join(alone)}: only campaigns that are audited against the "
-                "same constraints can be compared"
-            )
 
 
-def _compare_events(a: pa.Table, b: pa.Table) -> tuple[EventComparison, ...]:
+def _compare_events(a: pa.Table, b: pa.Table, *, audited_alike: bool) -> tuple[EventComparison, ...]:
     """Every event with its test, corrected for all of them but those that no flight of a pair had alone.
 
-    These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).
+    These have a p-value of 1 whatever the others are, so that there is nothing to correct for (Tarone, 1990).  Events
+    that depend on the audit are left out unless both campaigns were audited alike.
     """
-    happened = {name: [parse_event(name).column(table) for table in (a, b)] for name in EVENT_NAMES}
-    for name in constraint_names(a):
+    left_out = () if audited_alike else (*_BY_AUDIT, *([FAILURE.text] if any(map(_by_audit, failure_of(a))) else []))
+    names = [name for name in EVENT_NAMES if name not in left_out]
+    happened = {name: [parse_event(name).column(table) for table in (a, b)] for name in names}
+    for name in constraint_names(a) if audited_alike else ():
         happened[f"{name} not held"] = [~flags(table, SATISFIED + name, absent=False) for table in (a, b)]
     alone = {event: (int((in_a & ~in_b).sum()), int((in_b & ~in_a).sum())) for event, (in_a, in_b) in happened.items()}
     p = {event: mcnemar(*counts) for event, counts in alone.items()}
@@ -314,6 +333,12 @@ def _compare_events(a: pa.Table, b: pa.Table) -> tuple[EventComparison, ...]:
         )
         for event, (in_a, in_b) in happened.items()
     )
+
+
+def _by_audit(event: str) -> bool:
+    """Return whether an event depends on what flights are audited against."""
+    column = parse_event(event).column_name
+    return event in _BY_AUDIT or column.startswith((MARGIN, SAMPLED, SATISFIED, TIME_VIOLATED, "worst_"))
 
 
 def _compare_metric(a: pa.Table, b: pa.Table, name: str, completed: Flags) -> MetricComparison:

@@ -14,12 +14,14 @@ from typing import Any, Final
 import pyarrow as pa
 
 from quadsim.errors import FileError, InputError, ParameterError, QuadsimError
+from quadsim.flight.audit import Limit
 from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import CampaignFile, Draws, Value, Varied
 from scenarios.campaign.events import Event, parse_event
 from scenarios.campaign.rows import DRAW, TIMES, Row, flown_row, make_schema
 from scenarios.catalogue import campaign_path, scenario_path
 from scenarios.flight import Flight
+from scenarios.limits import with_law_bounds
 from scenarios.loading import parse_scenario
 from scenarios.machine import processor_name
 from scenarios.many import ERROR, MEMORY, fly_many
@@ -65,7 +67,12 @@ class Plan:
     def schema(self) -> pa.Schema:
         """The columns of its results."""
         kinds = {entry.name: (column_type(entry), entry.unit) for entry in self.spec.vary}
-        return make_schema(kinds, Assembly(self.scenario).limits)
+        return make_schema(kinds, self.limits, [parse_event(text).text for text in self.spec.failure])
+
+    @cached_property
+    def limits(self) -> tuple[Limit, ...]:
+        """The limits of the audit; flights for which bounds are drawn have others."""
+        return Assembly(self.scenario).limits
 
     @property
     def flies_user_code(self) -> bool:
@@ -205,7 +212,7 @@ def load_plan(name: str, settings: Sequence[str] = (), *, flights: int | None = 
 def make_plan(scenario: Scenario, data: Mapping[str, Any]) -> Plan:
     """Return a campaign of a given scenario, with its other fields as in a file."""
     spec = parse_campaign({"name": scenario.name, **data, "scenario": scenario.name}, source="campaign")
-    plan = Plan(spec, Assembly(scenario).with_vehicle)
+    plan = Plan(spec, audited(Assembly(scenario)).with_vehicle)
     plan.check()
     return plan
 
@@ -234,7 +241,16 @@ def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ())
     except OSError as error:
         raise FileError(str(error.filename)[:100], f"cannot be read ({error.strerror})") from error
     Assembly(scenario).check()
-    return Assembly(scenario).with_vehicle
+    return audited(Assembly(scenario)).with_vehicle
+
+
+def audited(assembly: Assembly) -> Assembly:
+    """Return the assembly with the bounds of a user's controller as constraints: the table has a column for each."""
+    return (
+        with_law_bounds(assembly, assembly.controller())
+        if isinstance(assembly.scenario.controller, Plugin)
+        else assembly
+    )
 
 
 def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], ...]:

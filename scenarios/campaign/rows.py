@@ -17,18 +17,18 @@ import pyarrow as pa
 from quadsim.controller import ACCEPTED, NO_SOLVER, Phase
 from quadsim.errors import FileError
 from quadsim.flight import metrics
-from quadsim.flight.audit import Finding, Limit
+from quadsim.flight.audit import Finding, Limit, worst_finding
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
-from scenarios.campaign.events import HARMLESS, INCOMPLETE, VERDICTS, Event, Flags
+from scenarios.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, Event, Flags
 
 Row = dict[str, Any]  # one flight's values by column: numbers, texts, or None
 DRAW: Final = "draw."  # how the columns of drawn values begin
-MARGIN, TIME_VIOLATED, SATISFIED = "margin.", "time_violated.", "satisfied."
+VIOLATION: Final = "violation"  # the event
+MARGIN, SAMPLED, TIME_VIOLATED, SATISFIED = "margin.", "margin_sampled.", "time_violated.", "satisfied."
 """Prefixes of the columns of a constraint."""
 _MEASURES: Final = ("rmse", "max_error", "final_error", "overshoot")
-_COMMANDED: Final = ("speed", "slew")  # signals that the controller sets itself
 _FLOAT, _WHOLE = pa.float64(), pa.int64()
 
 
@@ -39,6 +39,7 @@ def _fields(kind: pa.DataType, unit: str, *names: str) -> list[pa.Field]:
 _HEAD: Final = [
     *_fields(pa.string(), "-", "status", "verdict", "reason"),
     *_fields(pa.bool_(), "-", "failed", "violated", "crashed"),
+    *_fields(pa.string(), "-", "failed_by"),
     *_fields(_FLOAT, "s", "duration"),
 ]
 _COMMANDS: Final = [
@@ -60,12 +61,20 @@ TIMES: Final = tuple(field.name for field in _TIMING)
 """Clock times of a flight and its machine, in a separate table."""
 Summary = Mapping[str, Any]
 Texts = np.ndarray[Any, np.dtype[np.object_]]
-_NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, TIME_VIOLATED, SATISFIED)
+_NO_METRIC: Final = ("flight", "seed", DRAW, MARGIN, SAMPLED, TIME_VIOLATED, SATISFIED)
 Rows = np.ndarray[Any, np.dtype[np.intp]]
 
 
-def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit]) -> pa.Schema:
-    """The columns of a campaign, clock times last; `draws` has type and unit of each varied parameter."""
+def make_schema(
+    draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[Limit], failure: Sequence[str] = (VIOLATION,)
+) -> pa.Schema:
+    """Return the columns of a campaign, clock times last.
+
+    Args:
+        draws: type and unit of each varied parameter.
+        limits: the limits of its audit.
+        failure: the events that count as failure, in their standard form.
+    """
     fields = _fields(_WHOLE, "-", "flight", "seed")
     for name, (kind, unit) in draws.items():
         fields += _fields(kind, unit, DRAW + name)
@@ -75,10 +84,10 @@ def make_schema(draws: Mapping[str, tuple[pa.DataType, str]], limits: Sequence[L
             fields += _fields(_FLOAT, unit, f"{measure}.{channel}")
     fields += _COMMANDS
     for limit in limits:
-        fields += _fields(_FLOAT, limit.unit, MARGIN + limit.name)
+        fields += _fields(_FLOAT, limit.unit, MARGIN + limit.name, SAMPLED + limit.name)
         fields += _fields(_FLOAT, "s", TIME_VIOLATED + limit.name)
         fields += _fields(pa.bool_(), "-", SATISFIED + limit.name)
-    return pa.schema([*fields, *_WORST, *_TIMING])
+    return pa.schema([*fields, *_WORST, *_TIMING], metadata={"failure": "; ".join(failure)})
 
 
 def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall_s: float, machine: str) -> Row:
@@ -87,37 +96,23 @@ def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall
         "status": log.status,
         "verdict": verdict,
         "reason": log.reason,
-        "violated": verdict not in (HARMLESS, INCOMPLETE),
-        "crashed": str(Phase.CRASHED) in log.control.phase,
+        "violated": verdict not in (HARMLESS, INCOMPLETE, UNAUDITED),
+        "failed_by": metrics.failure(log.control),
+        "crashed": log.control.crashed,
         "duration": round(float(log.plant.t[-1]), 9),
         "wall_s": wall_s,
         "machine": machine,
     }
     for finding in findings:
         name = finding.limit.name
-        row[MARGIN + name] = finding.worst_margin if math.isfinite(finding.worst_margin) else None
+        for column, margin in ((MARGIN, finding.worst_margin), (SAMPLED, finding.worst_margin_sampled)):
+            row[column + name] = margin if math.isfinite(margin) else None
         row[TIME_VIOLATED + name] = finding.time_violated
         unknown = finding.verdict == "incomplete" and verdict != "lost"  # a lost flight had to get there
         row[SATISFIED + name] = None if unknown else finding.satisfied
-    row["worst_margin"], row["worst_constraint"] = worst_margin(findings)
+    if (worst := worst_finding(findings)) is not None:
+        row["worst_margin"], row["worst_constraint"] = worst.share, worst.limit.name
     return row | (_numbers(log) if log.control.t.size else {})
-
-
-def worst_margin(findings: Iterable[Finding]) -> tuple[float | None, str | None]:
-    """The smallest margin of the required constraints, tolerance included, as a share of half its band, and whose.
-
-    At the physics rate or at the control samples, each with its own tolerance, whichever is smaller: it is negative
-    where a constraint that was reached did not hold.  1 is the middle of a band, 0 the end of what is allowed; of a
-    bound with one side alone, the share is of the bound's own magnitude.  A command at its own bound is no near miss:
-    constraints of `speed` and `slew` count once they are violated.  None where no such constraint was reached.
-    """
-    shares = [
-        (share, finding.limit.name)
-        for finding in findings
-        if finding.limit.required and math.isfinite(share := _share(finding))
-        if share < 0.0 or finding.limit.signal not in _COMMANDED
-    ]
-    return min(shares, default=(None, None))
 
 
 def make_table(rows: Iterable[Row], schema: pa.Schema) -> pa.Table:
@@ -175,14 +170,6 @@ def _numbers(log: FlightLog) -> Row:
     }
 
 
-def _share(finding: Finding) -> float:
-    """A margin, tolerance included, as a share of half its band."""
-    at_physics_rate = finding.worst_margin + finding.limit.tolerance
-    at_samples = finding.worst_margin_sampled + finding.limit.tolerance_sampled
-    nearest = np.fmin(at_physics_rate, at_samples) if math.isfinite(at_physics_rate) else at_physics_rate
-    return float(nearest) / finding.limit.half_band
-
-
 def numbers(table: pa.Table, name: str) -> Array:
     """(K,) a column of numbers or of truth values; NaN where a flight has none, or where there is no such column."""
     if name not in table.column_names:
@@ -206,14 +193,23 @@ def verdicts(table: pa.Table) -> dict[str, Flags]:
     return {verdict: np.asarray(texts(table, "verdict") == verdict, bool) for verdict in VERDICTS}
 
 
+def failure_of(table: pa.Table) -> list[str]:
+    """The events that count as failure of a flight, in their standard form."""
+    stated: bytes = (table.schema.metadata or {}).get(b"failure", VIOLATION.encode())
+    return stated.decode().split("; ")
+
+
 def is_counted(table: pa.Table, event: Event) -> Flags:
     """(K,) which flights count for an event's share: of failure and violation, those that show whether it happened.
 
-    An incomplete flight without it shows neither: it is left out, as it is no success.
+    A flight without it that is incomplete or unaudited shows neither: it is left out, as it is no success.  Unaudited
+    flights count for failure where violations do not.
     """
-    if event.text not in ("failure", "violation") or "verdict" not in table.column_names:
+    if event.text not in ("failure", VIOLATION) or "verdict" not in table.column_names:
         return np.ones(table.num_rows, bool)
-    return np.asarray((texts(table, "verdict") != INCOMPLETE) | event.column(table), bool)
+    violations = event.text == VIOLATION or VIOLATION in failure_of(table)
+    unknown = (INCOMPLETE, UNAUDITED) if violations else (INCOMPLETE,)
+    return np.asarray(~np.isin(texts(table, "verdict").astype(str), unknown) | event.column(table), bool)
 
 
 def draw_names(table: pa.Table) -> list[str]:

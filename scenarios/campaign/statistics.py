@@ -20,9 +20,19 @@ import scipy
 from numpy.typing import ArrayLike
 
 from quadsim.errors import InputError, ParameterError
+from quadsim.flight.audit import UNAUDITED_ADVICE
 from quadsim.report.table import ABSENT
 from quadsim.state import Array
-from scenarios.campaign.events import EVENT_NAMES, INCOMPLETE, OPERATIONS, VERDICTS, Event, Flags, parse_event
+from scenarios.campaign.events import (
+    EVENT_NAMES,
+    INCOMPLETE,
+    OPERATIONS,
+    UNAUDITED,
+    VERDICTS,
+    Event,
+    Flags,
+    parse_event,
+)
 from scenarios.campaign.rows import (
     DRAW,
     MARGIN,
@@ -244,7 +254,7 @@ def estimate(table: pa.Table) -> dict[str, Any]:
     `metrics`, over the flights that have each; `parameters`, how the outcome depends on each varied parameter;
     `worst`, the ten worst flights.
 
-    Incomplete flights are neither failures nor successes (`rows.is_counted`): the shares of failure and
+    Incomplete and unaudited flights are neither failures nor successes (`rows.is_counted`): the shares of failure and
     violation, and `parameters`, leave them out.
     """
     return {
@@ -442,6 +452,7 @@ class Judgement:
     bound: float  # one-sided, at the requirement's confidence: upper where the probability is to be small, else lower
     holds: bool
     least_flights: int  # that can support it, all of them in its favour
+    unaudited: int = 0  # flights that do not count because no constraint was audited
 
     @property
     def sentence(self) -> str:
@@ -453,6 +464,8 @@ class Judgement:
             f"{count_of(self.flights, 'flight')}{share}, so with {100.0 * required.confidence:g} % confidence at "
             f"{'most' if required.at_most else 'least'} {percent(self.bound, digits=3)}."
         )
+        if self.unaudited:
+            return f"{phrase} Of {count_of(self.unaudited, 'flight')}, {UNAUDITED_ADVICE}."
         if self.flights >= self.least_flights:
             return phrase
         least = count_of(self.least_flights, "flight")
@@ -493,18 +506,26 @@ def judge(table: pa.Table, requirement: Requirement) -> Judgement:
     """Judge a requirement by a campaign's flights, `flights.parquet`.
 
     It holds when the one-sided Clopper-Pearson bound at its confidence is on the required side; so it takes
-    flights enough, and no flights support nothing.  Incomplete flights do not count (`rows.is_counted`).
+    flights enough, and no flights support nothing.  Incomplete and unaudited flights do not count
+    (`rows.is_counted`).
 
     Raises:
         UnknownNameError: the table has no column that the event names.
         InputError: the event compares text with a number.
     """
-    happened = requirement.event.column(table)[is_counted(table, requirement.event)]
+    counted = is_counted(table, requirement.event)
+    happened = requirement.event.column(table)[counted]
     count, flights = int(happened.sum()), happened.size
     bound = _bound(requirement, count, flights)
     holds, least = flights > 0 and requirement.supported_by(bound), least_flights(requirement)
     return Judgement(
-        requirement=requirement, count=count, flights=flights, bound=bound, holds=holds, least_flights=least
+        requirement=requirement,
+        count=count,
+        flights=flights,
+        bound=bound,
+        holds=holds,
+        least_flights=least,
+        unaudited=int((verdicts(table)[UNAUDITED] & ~counted).sum()),
     )
 
 

@@ -17,7 +17,7 @@ from quadsim.errors import InputError, ParameterError, UnknownNameError
 from quadsim.report.figure import BOUND, Bound, Figure, Panel, Series, line_colour
 from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import CampaignFile, Grid
-from scenarios.campaign.plan import Plan, cell
+from scenarios.campaign.plan import Plan, audited, cell
 from scenarios.campaign.rows import DRAW, is_number, make_table, numbers
 from scenarios.flight import to_pandas
 from scenarios.progress import Progress, silent
@@ -132,7 +132,7 @@ def fly_sweep(
         spec = CampaignFile(name=scenario.name, scenario=scenario.name, flights=count, vary=[*entries])
     except ValueError as error:
         raise InputError(f"sweep: {error}") from error
-    plan = Plan(spec, Assembly(scenario).with_vehicle, one_seed=True)
+    plan = Plan(spec, audited(Assembly(scenario)).with_vehicle, one_seed=True)
     plan.check()
     progress("sweep", 0, count)
     rows = []

@@ -30,7 +30,7 @@ from mpc.export.targets import EMULATOR, TARGETS, Target
 from mpc.ocp import Problem
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, StepInputs, stopped
 from quadsim.errors import FlightError, MissingProgramError, QuadsimError
-from quadsim.flight.audit import Limit
+from quadsim.flight.audit import COMMANDED, Limit
 from quadsim.outputs import reserving
 from quadsim.state import N_STATES, Array
 from quadsim.vehicle import N_ROTORS
@@ -306,10 +306,10 @@ def _allowing(scenario: Scenario, spacing: float) -> Scenario:
     """The scenario with tolerances of at least `spacing` [rad/s] on speeds and their steps."""
 
     def widened(limit: Limit) -> Limit:
-        if limit.signal not in ("speed", "slew"):
+        if limit.signal not in COMMANDED:
             return limit
-        tolerances = {name: max(spacing, getattr(limit, name)) for name in ("tolerance", "tolerance_sampled")}
-        return replace(limit, **tolerances)
+        plant, sampled = (max(spacing, tolerance) for tolerance in limit.tolerances)
+        return replace(limit, tolerance=plant, tolerance_sampled=sampled)
 
     limits = [*map(widened, with_bounds_stated(Assembly(scenario)).constraints)]
     return scenario.altered(constraints=limits)

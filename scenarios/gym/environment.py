@@ -301,7 +301,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
     def _info(self, worst: Array, sampled: Array) -> dict[str, Any]:
         beyond = [
-            limit.required and (margin < -limit.tolerance or at_end < -limit.tolerance_sampled)
+            limit.required and bool(limit.violated(margin) or limit.violated(at_end, sampled=True))
             for limit, margin, at_end in zip(self.limits, worst.tolist(), sampled.tolist(), strict=True)
         ]
         loop, names = self.started.loop, self.constraint_names

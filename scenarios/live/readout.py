@@ -173,12 +173,7 @@ def _number(limit: Limit, margin: float) -> str:
         return ""
     decimals = max(0, 2 - math.floor(math.log10(limit.half_band)))
     text = f"{round(margin, decimals) + 0.0:+.{decimals}f}"
-    return f'<span class="bad" title="violated">{text}</span>' if is_violated(limit, margin) else text
-
-
-def is_violated(limit: Limit, margin: float) -> bool:
-    """Return whether the audit would call a margin a violation; a solver's rounding is none."""
-    return margin + limit.tolerance < -1e-9 * limit.half_band
+    return f'<span class="bad" title="violated">{text}</span>' if limit.violated(margin) else text
 
 
 def _mark(limit: Limit, margin: float, vehicle: int) -> str:
@@ -186,5 +181,5 @@ def _mark(limit: Limit, margin: float, vehicle: int) -> str:
     share, colour = min(max(1.0 - margin / limit.half_band, 0.0), _SHOWN) / _SHOWN, line_colour(vehicle)
     if vehicle:
         return f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{colour};z-index:1"></i>'
-    colour = BOUND if is_violated(limit, margin) else colour
+    colour = BOUND if limit.violated(margin) else colour
     return f'<i style="left:0;width:{100.0 * share:.1f}%;background:{colour}"></i>'

@@ -20,7 +20,7 @@ from pydantic import Field
 from quadsim.assets import read_toml
 from quadsim.errors import FlightError, InputError, ParameterError
 from quadsim.fields import Fraction, Vector
-from quadsim.flight.audit import Limit
+from quadsim.flight.audit import COMMANDED, Limit
 from quadsim.sim.effects.rotors import RotorLoss
 from quadsim.sim.physics import FlownPeriod
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
@@ -28,7 +28,7 @@ from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
 from scenarios.flight_events import Successor
-from scenarios.limits import COMMANDED, with_bounds_stated
+from scenarios.limits import with_bounds_stated
 from scenarios.progress import Progress, silent
 from scenarios.rollout import Rollout
 from scenarios.schema.controllers import AnyController

@@ -12,6 +12,7 @@ from quadsim.errors import FileError, ParameterError
 from scenarios.plugin import located
 from scenarios.schema.settings import note_changes, state_bounds
 
+_TOLERANCES: Final = ("tolerance", "tolerance_sampled")
 LARGEST_FILE: Final = 8_000_000
 """Size [bytes] of the largest file that is read; the longest possible scenario is smaller."""
 
@@ -107,7 +108,8 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Merge one table over another, field by field.
 
     A table of another `type` replaces the base's; entries of a list that have names are merged by name, new ones come
-    after them; every other value replaces the base's.
+    after them; every other value replaces the base's.  A base's tolerances belong to the base's bounds: they survive
+    only in an entry that states neither bounds nor tolerances.
     """
     merged = dict(copy.deepcopy(dict(base)))
     for key, value in over.items():
@@ -120,11 +122,20 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
             merged[key] = merge(before, value)
         elif isinstance(before, list) and _named(before) and _named(value):
             entries = {entry["name"]: entry for entry in before}
-            entries |= {entry["name"]: merge(entries.get(entry["name"], {}), entry) for entry in value}
+            entries |= {
+                entry["name"]: merge(_restated(entries.get(entry["name"], {}), entry), entry) for entry in value
+            }
             merged[key] = list(entries.values())
         else:
             merged[key] = copy.deepcopy(value)
     return merged
+
+
+def _restated(before: Mapping[str, Any], entry: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the base's entry, without its tolerances if the entry over it states bounds or tolerances."""
+    if not {"lower", "upper", *_TOLERANCES} & entry.keys():
+        return before
+    return {key: value for key, value in before.items() if key not in _TOLERANCES}
 
 
 def _read(path: Path) -> dict[str, Any]:

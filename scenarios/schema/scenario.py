@@ -16,7 +16,7 @@ from mpc.bounded import Polytope
 from mpc.indi import INDISettings
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Positive, Vector
-from quadsim.flight.audit import Limit
+from quadsim.flight.audit import FlightVerdict, Limit
 from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
@@ -153,7 +153,6 @@ MOST_STEPS: Final = 10_000_000
 """Physics steps, and planned steps (periods times horizon), that one flight may take: all are kept in memory."""
 
 
-Verdict = Literal["satisfied", "violated", "lost", "aborted", "incomplete"]
 BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate_z", "thrust", "speed", "slew")
 """Signals that controllers can bound."""
 
@@ -168,11 +167,12 @@ class Scenario:
     description: Annotated[str, doc("one line for `quadsim list`")]
     group: Annotated[Group, doc("where `quadsim list` shows it: " + ", ".join(get_args(Group)))] = "other"
     expect: Annotated[
-        Verdict,
+        FlightVerdict,
         doc(
             "expected verdict: satisfied (flown to its end, every required constraint satisfied), violated (one "
             "violated, the vehicle crashes, or the controller ends in permanent fallback), lost (the flight ends "
-            "early, by a criterion of [lost] or otherwise), incomplete (it ends before a constraint's window starts)"
+            "early, by a criterion of [lost] or otherwise), incomplete (it ends before a constraint's window starts), "
+            "unaudited (it has no constraint)"
         ),
     ] = "satisfied"
     duration: Annotated[

@@ -115,7 +115,7 @@ class TuningFile:
     guard: Annotated[
         str | None,
         doc(
-            'an event that counts instead of that of require in the search, e.g. "worst_margin < 0.02": few '
+            'an event that counts instead of that of require in the search, e.g. "worst_margin < 0.01": few '
             "flights see near misses before they see failures"
         ),
     ] = None

@@ -182,7 +182,8 @@ class Overlay:
         unit = height / (high - low)
         zero = top + height + unit * min(low, 0.0)
         for j, value in enumerate(values):
-            left, broken, shown = x + 50 * j, _breaks(limit, value), form.format(round(value, 1) + 0.0)
+            broken = _breaks(limit, value, sampled=limit is not None and limit.source.plant is None)
+            left, shown = x + 50 * j, form.format(round(value, 1) + 0.0)
             colour = ink.RED if broken else ink.WHITE
             painter.box(left, top, 34, height, ink.FAINT)
             painter.box(left, zero, 34, -unit * float(np.clip(value, low, high)), ink.RED if broken else ink.BLUE)
@@ -198,7 +199,7 @@ class Overlay:
         pitch = 18.5 if len(self._ranked) <= _MOST_MARGINS else 16.0
         for j, track in enumerate(shown):
             worst, row = track.worst[i], y + 22 + pitch * j
-            now_broken, once_broken = (margin < -track.limit.tolerance for margin in (track.now[i], worst))
+            now_broken, once_broken = track.violated[i], track.violated_before[i]
             painter.text(x, row, track.limit.name, size=14, colour=ink.RED if now_broken else ink.GREY)
             phrases = f"{round(worst, 2) + 0.0:+.2f} {track.limit.unit}"
             painter.text(x + 226, row, phrases, size=14, colour=ink.RED if once_broken else ink.WHITE, anchor="ra")
@@ -210,7 +211,7 @@ def margin_rows(ranked: Sequence[MarginTrack], i: int) -> tuple[list[MarginTrack
     """The limits that frame `i` shows, the first of those whose window has begun, and the text about the others."""
     begun = [track for track in ranked if not math.isnan(track.worst[i])]
     hidden = begun[_MOST_MARGINS:]
-    broken = sum(track.worst[i] < -track.limit.tolerance for track in hidden)
+    broken = sum(track.violated_before[i] for track in hidden)
     phrases = {"more": len(hidden), "of them violated": broken, "not begun": len(ranked) - len(begun)}
     parts = [f"{count} {what}" for what, count in phrases.items() if count]
     return begun[:_MOST_MARGINS], f"and {', '.join(parts)}" if parts else ""
@@ -220,8 +221,5 @@ def _bounds(limit: Limit | None) -> list[float]:
     return [] if limit is None else [bound for bound in (limit.lower, limit.upper) if math.isfinite(bound)]
 
 
-def _breaks(limit: Limit | None, value: float) -> bool:
-    if limit is None:
-        return False
-    tolerance = max(limit.tolerance, 1e-6)
-    return not limit.lower - tolerance <= value <= limit.upper + tolerance
+def _breaks(limit: Limit | None, value: float, *, sampled: bool = False) -> bool:
+    return limit is not None and bool(limit.violated(limit.margin(np.array([value]))[0], sampled=sampled))

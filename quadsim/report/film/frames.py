@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.errors import FileError
-from quadsim.flight.audit import Limit, margins_at, margins_sampled
+from quadsim.flight.audit import Limit, Mask, margins_at, margins_sampled
 from quadsim.flight.rundir import Run
 from quadsim.rotation import euler_to_quaternion
 from quadsim.state import EULER, POSITION, Array, tilt
@@ -44,16 +44,16 @@ class MarginTrack:
 
     limit: Limit  # the limit
     now: Array  # (F,) signed margin; NaN outside the limit's time window
-    worst: Array  # (F,) smallest margin so far, of the samples too where they violate it; NaN before the window
-    share: float
-    """The smallest of the whole flight, tolerance included, over half the limit's band: 1 in its middle, negative
-    where it is violated; infinite where the flight never reaches the window."""
+    worst: Array  # (F,) smallest margin so far, of the samples too; NaN before the limit's time window
+    violated: Mask  # (F,) whether it is violated
+    violated_before: Mask  # (F,) whether it is or has been violated
+    share: float  # smallest margin of the whole flight as a share of half the band; inf if it never applies
 
     @property
     def rank(self) -> tuple[bool, bool, float]:
         """Sorts the limits of a flight: required ones that are violated, others that are, then the nearest first."""
-        broken = self.share < 0.0
-        return not broken, broken and not self.limit.required, self.share
+        violated = bool(self.violated_before[-1:].any())
+        return not violated, violated and not self.limit.required, self.share
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,13 +138,20 @@ def _row_before(t: Array, times: Array) -> np.ndarray[Any, np.dtype[np.intp]]:
 def _track(run: Run, limit: Limit, times: Array) -> MarginTrack:
     t, values = limit.source.finest(run.log)
     margin = margins_at(limit, t, values)
-    if limit.source.plant is not None:  # a violating command does not show in saturated rotors
-        sampled = margins_sampled(limit, run.log)
-        broken = np.flatnonzero(sampled < -limit.tolerance_sampled)
-        np.fmin.at(margin, _row_before(t, run.log.control.t[broken]), sampled[broken])
-    row, worst = _row_before(t, times), np.fmin.accumulate(margin)
-    share = (float(worst[-1]) + limit.tolerance) / limit.half_band
-    return MarginTrack(limit=limit, now=margin[row], worst=worst[row], share=np.inf if np.isnan(share) else share)
+    violated, sampled = limit.violated(margin), margins_sampled(limit, run.log)
+    rows = _row_before(t, run.log.control.t)
+    np.fmin.at(margin, rows, sampled)  # a violating command does not show in saturated rotors
+    np.logical_or.at(violated, rows, limit.violated(sampled, sampled=True))
+    row, worst, violated_before = _row_before(t, times), np.fmin.accumulate(margin), np.logical_or.accumulate(violated)
+    share = float(worst[-1]) / limit.half_band
+    return MarginTrack(
+        limit=limit,
+        now=margin[row],
+        worst=worst[row],
+        violated=violated[row],
+        violated_before=violated_before[row],
+        share=np.inf if np.isnan(share) else share,
+    )
 
 
 def _smooth(t: Array, values: Array) -> Array:

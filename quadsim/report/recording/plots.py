@@ -117,8 +117,9 @@ def _send_limit(recording: rr.RecordingStream, limit: Limit, run: Run, colour: C
 
     names, entity = list(VERDICTS), f"verdicts/{limit.name}"
     band = limit.upper - limit.lower
-    near = max(limit.tolerance_sampled, _ACTIVE * band if math.isfinite(band) else 0.0)
-    verdicts = np.select([margins < -limit.tolerance_sampled, margins <= near, inside], [2, 1, 0], default=3)
+    near = max(limit.tolerances[1], _ACTIVE * band if math.isfinite(band) else 0.0)
+    violated = limit.violated(margins, sampled=True)
+    verdicts = np.select([violated, margins <= near, inside], [2, 1, 0], default=3)
     changes = np.flatnonzero(np.diff(verdicts, prepend=-1))
     style = rr.StateConfiguration(values=names, colors=list(VERDICTS.values()), visible=[True, True, True, False])
     recording.log(entity, style, static=True)

@@ -79,7 +79,7 @@ def test_it_is_found_beside_the_scenario_and_called_with_what_is_documented(writ
     vehicle = Assembly(load_scenario("hover")).vehicle
     np.testing.assert_array_equal(command.speeds, np.full(4, vehicle.hover_speed + 2.0))
     np.testing.assert_array_equal(command.plan, np.tile(command.speeds, (7, 1)))
-    assert law._law.received == (0.05, 7)
+    assert law.law.received == (0.05, 7)
     assert (law.name, law.solver, law.horizon) == ("Hover", "", 7)
 
 

@@ -1,0 +1,114 @@
+"""The bounds of a user's controller as limits of the audit, from its `problem`, `bounds` or `constraints`."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from mpc.constraints import Bounds, Constraint
+from mpc.ocp import Problem
+from quadsim.errors import InputError
+from quadsim.flight.audit import SUM, TERMS, Limit
+from quadsim.state import N_STATES, STATE_NAMES, STATE_UNITS, Array, shown_unit
+from quadsim.vehicle import N_ROTORS
+from scenarios.schema.problems import parse_table
+
+_SOURCES: Final = ("problem", "bounds", "constraints")
+_SPEEDS: Final = tuple(f"speed_{j + 1}" for j in range(N_ROTORS))
+_log: Final = logging.getLogger("quadsim")
+
+
+def law_limits(law: object, taken: Iterable[str] = ()) -> list[Limit]:
+    """Return what a user's controller says of its bounds, as limits with distinct names.
+
+    Args:
+        law: has none, one or more of `problem`, an `mpc.Problem`; `bounds`, an `mpc.Bounds` or pairs by signal, in the
+            units of the audit; `constraints`, a list of `mpc.Constraint` or of entries as in `[[constraints]]`.
+        taken: names that are not free.
+    """
+    names, limits = set(taken), dict[tuple[Any, ...], Limit]()
+    for source in _SOURCES:
+        try:
+            found = list(_limits(getattr(law, source, None), source))
+        except (ArithmeticError, AttributeError, InputError, LookupError, TypeError, ValueError) as error:
+            _log.warning("the controller's %s are not audited: %s", source, error)
+            continue
+        for limit in found:
+            key = (limit.signal, limit.lower, limit.upper, *(limit.terms or {}).items())
+            if key not in limits and limit.name not in names:
+                limits[key] = limit
+                names.add(limit.name)
+    return list(limits.values())
+
+
+def _limits(stated: Any, source: str) -> Iterator[Limit]:
+    """Yield the limits in one attribute of a controller; nothing where there is none."""
+    if isinstance(stated, Problem):
+        stated = stated.every_constraint
+    elif isinstance(stated, Bounds):
+        stated = stated.constraints
+    elif isinstance(stated, Mapping):
+        stated = [
+            {"name": name, "signal": name, "lower": lower, "upper": upper} for name, (lower, upper) in stated.items()
+        ]
+    if stated is None or callable(stated):
+        return
+    for entry in stated:
+        if isinstance(entry, Limit):
+            yield entry
+        elif isinstance(entry, Constraint):
+            yield from _rows(entry)
+        else:
+            finite = {
+                name: value for name, value in entry.items() if not (isinstance(value, float) and math.isinf(value))
+            }
+            yield parse_table(Limit, finite, f"the controller's {source}")
+
+
+def _rows(constraint: Constraint) -> Iterator[Limit]:
+    """Yield the rows of a constraint; rows that change from step to step, or are about other states, are left out."""
+    stacked = constraint.C is not None and constraint.C.ndim == 3
+    if constraint.lower.ndim != 1 or stacked:
+        _log.warning("%s is not audited: its rows change from step to step", constraint.name)
+        return
+    m = constraint.lower.size
+    C, D, E = (np.zeros((m, 0)) if matrix is None else matrix for matrix in (constraint.C, constraint.D, constraint.E))
+    if D.any() and not C.any() and not E.any() and (pair := _alike(D, constraint)) is not None:
+        yield Limit(name="speed", signal="speed", lower=pair[0], upper=pair[1])
+    elif E.any() and not C.any() and not D.any() and (pair := _alike(E, constraint)) is not None:
+        yield Limit(name="slew", signal="slew", lower=pair[0], upper=pair[1])
+    elif E.any() or (C.size and C.shape[1] < N_STATES) or C[:, N_STATES:].any():
+        _log.warning("%s is not audited: the audit knows the 12 states and rotor speeds", constraint.name)
+    else:
+        for i in range(m):
+            yield from _row(constraint, i, C[i], D[i])
+
+
+def _alike(matrix: Array, constraint: Constraint) -> tuple[float, float] | None:
+    """Return the bounds of rows that bound every rotor alike, None of others."""
+    lower, upper = constraint.lower, constraint.upper
+    if matrix.shape != (N_ROTORS, N_ROTORS) or (matrix != np.eye(N_ROTORS)).any():
+        return None
+    return (float(lower[0]), float(upper[0])) if (lower == lower[0]).all() and (upper == upper[0]).all() else None
+
+
+def _row(constraint: Constraint, i: int, C: Array, D: Array) -> Iterator[Limit]:
+    scale = [shown_unit(unit)[1] for unit in STATE_UNITS]
+    terms = {name: float(c / s) for name, c, s in zip(STATE_NAMES, C[:N_STATES], scale, strict=False) if c}
+    terms |= {name: float(d) for name, d in zip(_SPEEDS, D, strict=False) if d}
+    lower, upper = float(constraint.lower[i]), float(constraint.upper[i])
+    if not terms or (math.isinf(lower) and math.isinf(upper)):
+        return
+    if len(terms) == 1 and next(iter(terms)) in STATE_NAMES:
+        ((name, factor),) = terms.items()
+        lower, upper = sorted((lower / factor, upper / factor))
+        yield Limit(name=name, signal=name, lower=lower, upper=upper)
+    else:
+        yield Limit(name=f"{constraint.name}_{i + 1}", signal=SUM, terms=terms, lower=lower, upper=upper)
+
+
+assert set(_SPEEDS) < set(TERMS)
