@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from mpc.bounded import Range
 from mpc.handover import within
 from quadsim.controller import Controller
-from quadsim.flight.audit import MOTION, ROUNDING, SUM, UNAUDITED_ADVICE, Limit, SpaceLimit
+from quadsim.flight.audit import SUM, UNAUDITED_ADVICE, Limit, SpaceLimit
 from quadsim.report.table import format_number
 from scenarios.law_bounds import law_limits
 from scenarios.plugin import PluginController
@@ -67,11 +67,6 @@ def audit_notes(assembly: Assembly) -> list[str]:
         notes.append(f"{', '.join(unnamed)}: audited as the controller bounds {'it' if len(unnamed) == 1 else 'them'}")
     if not assembly.limits:
         notes.append(UNAUDITED_ADVICE)
-    if any(limit.tolerance is None for limit in audited):
-        notes.append(
-            f"tolerances not stated are {100 * MOTION.plant:g} % of half the band, {100 * MOTION.sampled:g} % at the "
-            f"samples, {ROUNDING.plant:g} rad/s for commands"
-        )
     if absent:
         notes.append(f"{', '.join(absent)}: not audited, the controller has no such bound and the entry states none")
     changes = [(0.0, bounds)] + [(at, spec.audited(vehicle)) for at, spec in scenario.controller_changes]

@@ -379,14 +379,13 @@ class Finding:
 def worst_finding(findings: Iterable[Finding]) -> Finding | None:
     """Return the finding with the smallest margin as a share of half its band, ties by name; None if none counts.
 
-    Required limits count, or all if none is required.  Limits that were not reached do not count.  Limits of the
-    commands count only once they are violated: a command at its own bound is no near miss.
+    Limits that were not reached do not count, and limits of the commands only once they are violated: a command at its
+    own bound is no near miss.  Of the others the required ones count, or all if none is required.
     """
-    findings = tuple(findings)
-    required = tuple(finding for finding in findings if finding.limit.required) or findings
-    reached = [finding for finding in required if math.isfinite(finding.margin)]
+    reached = [finding for finding in findings if math.isfinite(finding.margin)]
     counted = [finding for finding in reached if finding.verdict == "violated" or finding.limit.signal not in COMMANDED]
-    return min(counted, key=lambda finding: (finding.share, finding.limit.name), default=None)
+    required = [finding for finding in counted if finding.limit.required] or counted
+    return min(required, key=lambda finding: (finding.share, finding.limit.name), default=None)
 
 
 def flight_verdict(findings: Sequence[Finding], *, aborted: bool, lost: bool, failed: bool) -> FlightVerdict:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -28,9 +29,7 @@ def judged_by(limits: Sequence[Limit], own: Sequence[Limit], table: pa.Table, fa
         InputError: they differ in more than tolerances and demands; margins to other bounds are in no table.
     """
     theirs = {limit.name: limit for limit in limits}
-    like = [
-        Limit.with_tolerances(limit) if limit.name not in theirs else _alike(limit, theirs[limit.name]) for limit in own
-    ]
+    like = [_alike(limit, theirs.get(limit.name, limit)) for limit in own]
     if differences := limit_differences(limits, like):
         raise InputError(
             "a campaign's table has the margins to its own bounds alone, so it cannot be audited against others: "
@@ -40,7 +39,7 @@ def judged_by(limits: Sequence[Limit], own: Sequence[Limit], table: pa.Table, fa
     for limit in limits:
         margin, sampled = numbers(table, MARGIN + limit.name), numbers(table, SAMPLED + limit.name)
         unknown = np.array([value is None for value in table[SATISFIED + limit.name].to_pylist()], bool)
-        held = ~unknown & (margin >= -limit.tolerances[0]) & ~limit.violated(sampled, sampled=True)
+        held = ~unknown & np.isfinite(margin) & ~limit.violated(margin) & ~limit.violated(sampled, sampled=True)
         table = _put(table, SATISFIED + limit.name, pa.array(held.tolist(), mask=unknown))
         table = table.drop_columns([TIME_VIOLATED + limit.name])
         held_all &= held | unknown | (not limit.required)
@@ -58,8 +57,6 @@ def judged_by(limits: Sequence[Limit], own: Sequence[Limit], table: pa.Table, fa
 
 def _alike(limit: Limit, other: Limit) -> Limit:
     """Return a limit with the tolerances and demand of another."""
-    from dataclasses import replace
-
     tolerance, sampled = other.tolerances
     return replace(limit, tolerance=tolerance, tolerance_sampled=sampled, required=other.required)
 

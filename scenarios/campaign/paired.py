@@ -285,6 +285,7 @@ def compare_pairs(
         shared_draws=shared_draws,
         own_draws=tuple(sorted(set(draws_a) ^ set(draws_b))),
         differences=differences,
+        audits=tuple(audits),
         events=_compare_events(a, b, audited_alike=not audits),
         metrics=tuple(
             _compare_metric(a, b, name, completed)

@@ -199,6 +199,15 @@ def failure_of(table: pa.Table) -> list[str]:
     return stated.decode().split("; ")
 
 
+def unaudited(table: pa.Table) -> Flags:
+    """(K,) which flights had no constraint; none of a table without verdicts."""
+    return (
+        np.asarray(texts(table, "verdict") == UNAUDITED)
+        if "verdict" in table.column_names
+        else np.zeros(table.num_rows, bool)
+    )
+
+
 def is_counted(table: pa.Table, event: Event) -> Flags:
     """(K,) which flights count for an event's share: of failure and violation, those that show whether it happened.
 

@@ -27,7 +27,6 @@ from scenarios.campaign.events import (
     EVENT_NAMES,
     INCOMPLETE,
     OPERATIONS,
-    UNAUDITED,
     VERDICTS,
     Event,
     Flags,
@@ -46,6 +45,7 @@ from scenarios.campaign.rows import (
     metric_names,
     numbers,
     texts,
+    unaudited,
     unit_of,
     verdicts,
 )
@@ -525,7 +525,7 @@ def judge(table: pa.Table, requirement: Requirement) -> Judgement:
         bound=bound,
         holds=holds,
         least_flights=least,
-        unaudited=int((verdicts(table)[UNAUDITED] & ~counted).sum()),
+        unaudited=int((unaudited(table) & ~counted).sum()),
     )
 
 

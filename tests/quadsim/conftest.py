@@ -13,7 +13,7 @@ from scenarios.rollout import Rollout
 def aborted_run(short_run: Run) -> Run:
     """The short flight as if it had been lost at its end, under another name."""
     reason = "at t = 6.000 s: the plant's state is <not> finite & more"
-    summary = {**short_run.summary, "scenario": "lost", "status": "aborted", "reason": reason}
+    summary = {**short_run.summary, "scenario": "lost", "status": "aborted", "verdict": "lost", "reason": reason}
     return dataclasses.replace(short_run, summary=summary, log=dataclasses.replace(short_run.log, reason=reason))
 
 

@@ -14,6 +14,7 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from quadsim.errors import printable
+from quadsim.flight.rundir import findings_of
 from quadsim.report.table import Cell, Grid, Mark, Row, to_markdown
 from scenarios import console
 from scenarios.junit import write_cases
@@ -75,16 +76,17 @@ def test_sentences_break_at_spaces_and_paths_and_commands_stay_whole(short_run: 
     assert max(map(len, shown(summary_tables(short_run.summary), width))) <= width
 
 
-@pytest.mark.parametrize("width", [60, 80, 120])
+@pytest.mark.parametrize("width", [60, 80, 120, 160])
 def test_a_verdict_is_never_cut_and_names_the_tolerance_that_it_needs(short_run: Any, width: int) -> None:
     roll, *others = copy.deepcopy(short_run.summary["constraints"])
     roll |= {"name": "roll_of_the_" + "vehicle" * 5, "worst_margin": -0.04, "worst_margin_sampled": 0.0}
-    text = "\n".join(lines := shown([audit_table([roll, *others])], width))
-    assert "holds (within 0.05)" in text
+    table = audit_table(findings_of({"constraints": [roll, *others]}))
+    text = "\n".join(lines := shown([table], width))
+    assert "0.05, 0.01 s" in text
     assert "-0.04" in text
     assert text.count("not reached") == 4
     assert max(map(len, lines)) <= width
-    assert ("beyond verdict" in text) == (width == 120)
+    assert ("beyond verdict" in text) == (width == 160)
 
 
 @pytest.mark.parametrize("nasty", [*NASTY, "\x0b", "\uffff", "\ufffe"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ ENTRIES = [{"name": name, "signal": name, "lower": low, "upper": high} for name,
 
 
 def paper(**changes: Any) -> Scenario:
-    return quadsim.load("paper-constrained").replace({"duration": 6.0, "constraints": [], **changes})
+    return quadsim.load("paper-constrained").replace({"duration": 12.0, "constraints": [], **changes})
 
 
 def test_a_bound_has_the_same_verdict_whether_the_controller_or_an_entry_states_it() -> None:
@@ -194,9 +195,7 @@ class Bounded:
 def test_a_users_controller_is_audited_against_its_own_bounds(
     kind: str, expected: dict[str, Any], tmp_path: Path
 ) -> None:
-    flight = quadsim.fly(
-        quadsim.load("hover").replace(UNBOUNDED), controller=lambda vehicle: Bounded(vehicle, kind=kind)
-    )
+    flight = quadsim.fly(quadsim.load("hover").replace(UNBOUNDED), controller=partial(Bounded, kind=kind))
     limits = {finding.limit.name: (finding.limit.lower, finding.limit.upper) for finding in flight.audit}
     assert limits.keys() == expected.keys()
     for name, bounds in expected.items():
@@ -209,7 +208,7 @@ def test_a_users_controller_is_audited_against_its_own_bounds(
 def test_an_entry_of_the_scenario_takes_precedence_over_the_controllers_bounds() -> None:
     entry = {"name": "mine", "signal": "roll", "lower": -1.0, "upper": 1.0}
     scenario = quadsim.load("hover").replace({**UNBOUNDED, "constraints": [entry]})
-    flight = quadsim.fly(scenario, controller=lambda vehicle: Bounded(vehicle))
+    flight = quadsim.fly(scenario, controller=Bounded)
     assert [finding.limit.name for finding in flight.audit] == ["mine", "speed"]
 
 

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadsim.flight.rundir import Run
+from quadsim.flight.audit import flight_verdict
+from quadsim.flight.rundir import Run, findings_of
 from quadsim.report.comparison import (
     GLANCE,
     comparison_rows,
     distinct_courses,
     failure_sentences,
     run_names,
-    verdict,
     verdict_cell,
     violated_by_fallback,
 )
@@ -104,7 +104,7 @@ def test_constraints_carry_their_tolerances_and_what_is_required(short_run: Run,
     assert marks(rows, "worst margin at the physics rate", "Constraint roll")[:2] == [Mark.NONE, Mark.WARN]
     assert texts(rows, "time violated", "Constraint speed")[1] == "0.75"
     assert marks(rows, "deadline misses")[1] is Mark.BAD
-    assert texts(rows, "required constraints")[2] == "none"
+    assert texts(rows, "required constraints")[2] == "none audited"
 
 
 def test_five_rows_come_first_and_no_bound_is_exceeded_without_a_word(short_run: Run, worse_run: Run) -> None:
@@ -174,7 +174,16 @@ def test_a_verdict_is_compared_with_the_one_the_scenario_states(
 ) -> None:
     constraints = [with_margin(bare_run.summary["constraints"][0], margin)]
     as_expected = text.endswith("as expected")
-    run = having(bare_run, "a", status=status, constraints=constraints, expected=expected, as_expected=as_expected)
+    verdict = text.partition(" ")[0].strip(",")
+    run = having(
+        bare_run,
+        "a",
+        status=status,
+        verdict=verdict,
+        constraints=constraints,
+        expected=expected,
+        as_expected=as_expected,
+    )
     assert verdict_cell(run.summary) == Cell(text=text, mark=mark)
 
 
@@ -187,9 +196,11 @@ def test_a_verdict_minds_required_constraints_and_whether_they_were_reached(bare
         "incomplete": [held, unreached],
         "violated": [broken, unreached],
         "satisfied": [{**broken, "required": False}, {**unreached, "required": False}],
+        "unaudited": [],
     }
     for word, constraints in result.items():
-        assert verdict({**bare_run.summary, "constraints": constraints}) == word
+        findings = findings_of({"constraints": constraints})
+        assert flight_verdict(findings, aborted=False, lost=False, failed=False) == word
 
 
 def test_permanent_fallback_is_no_success_and_is_reported_with_its_reason(bare_run: Run) -> None:
@@ -199,7 +210,6 @@ def test_permanent_fallback_is_no_success_and_is_reported_with_its_reason(bare_r
     good = having(bare_run, "good", constraints=held)
     stuck = having(good, "stuck", controller=controller, diagnosis=result)
     crashed = having(good, "crashed", ground={"crashed": True})
-    assert [verdict(run.summary) for run in (good, stuck, crashed)] == ["satisfied", "violated", "violated"]
     assert violated_by_fallback(stuck.summary)
     assert not violated_by_fallback(crashed.summary)
     assert not violated_by_fallback(having(stuck, "both", constraints=broken).summary)

@@ -84,6 +84,7 @@ def test_the_text_gives_outcomes_reasons_and_numbers_and_nothing_is_fetched(page
 def test_hostile_names_are_text_and_other_courses_and_verdicts_are_pointed_out(short_run: Run, tmp_path: Path) -> None:
     control = dataclasses.replace(short_run.log.control, reference=short_run.log.control.reference + 1.0)
     summary = {**short_run.summary, "expected": "lost", "as_expected": False, "constraints": []}
+    summary["verdict"] = "satisfied"
     log = dataclasses.replace(short_run.log, control=control)
     other = dataclasses.replace(short_run, log=log, summary=summary)
     page = write_comparison([renamed(short_run, HOSTILE), other], tmp_path / "out")

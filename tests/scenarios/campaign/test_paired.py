@@ -119,14 +119,6 @@ def test_other_definitions_of_failure_are_refused(thousand: pa.Table, better: pa
         compare_pairs(thousand, better, NAMES, failures=(["violated"], ["rmse.z > 0.5", "lost"]))
 
 
-def test_other_constraints_are_refused(thousand: pa.Table, better: pa.Table) -> None:
-    names = [name.replace(".slew", ".tilt") for name in better.column_names]
-    with pytest.raises(InputError, match="'paper' alone has the constraints slew: only campaigns that are audited"):
-        compare_pairs(thousand, better.rename_columns(names), NAMES)
-    with pytest.raises(InputError, match="'robust' alone has the constraints slew"):
-        compare_pairs(thousand.drop_columns(["satisfied.slew"]), better, NAMES)
-
-
 def test_flights_of_other_numbers_are_refused(thousand: pa.Table) -> None:
     with pytest.raises(InputError, match="have no flight of one number"):
         compare_pairs(thousand.slice(0, 5), thousand.slice(5, 5), NAMES)

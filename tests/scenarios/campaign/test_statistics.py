@@ -213,7 +213,7 @@ def test_xi_of_what_is_not_there() -> None:
 
 
 MakeCampaign = Callable[..., pa.Table]
-NONE = ("incomplete", "died", "timeout", "memory")
+NONE = ("incomplete", "unaudited", "died", "timeout", "memory")
 
 
 def with_column(table: pa.Table, name: str, values: list[object]) -> pa.Table:
