@@ -5,18 +5,19 @@ from __future__ import annotations
 import contextlib
 import logging
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from quadsim.errors import InputError
+from quadsim.errors import InputError, ParameterError, printable
 from quadsim.flight import rundir
 from quadsim.outputs import reserving
 from quadsim.report.table import Row
 from scenarios.campaign.store import is_campaign as is_campaign
 from scenarios.campaign.store import stored_plan
-from scenarios.flight import Flight, worst_margin
+from scenarios.flight import Flight, require_rendering, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import reaudit
@@ -103,16 +104,24 @@ def compare_flights(
     progress: Progress = silent,
     *,
     overwrite: bool = False,
+    names: Sequence[str] = (),
+    products: Mapping[str, bool | None] = MappingProxyType({}),
 ) -> FlightComparison:
     """Compare flights, and write the page to `out`; scenarios are flown and saved beside it, in `OUT-runs`.
 
+    `names` are the columns'; `products` the options of `Flight.save` for what is saved.
+
     Raises:
-        InputError: a target is neither a flight nor a scenario; nothing was flown.
+        InputError: a target is neither a flight nor a scenario, or the names are wrong; nothing was flown.
         OutputError: the directory cannot be written.
+        RenderingUnavailableError: a video is requested but cannot be rendered; nothing was flown.
     """
     from quadsim.report.comparison import comparison_rows, run_names
     from quadsim.report.comparison_page import write_comparison
 
+    _check_names(names, len(targets))
+    if products.get("video"):
+        require_rendering()
     for target in targets:
         _check(target)
     with contextlib.ExitStack() as stack:
@@ -120,10 +129,21 @@ def compare_flights(
         if out is not None:
             stack.enter_context(reserving(out, overwrite=overwrite))
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
-        runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
+        saved = dict.fromkeys(("video", "recording", "figures"), False) if out is None else products
+        runs = tuple(_run_of(target, beside, progress, saved, pictures=out is not None) for target in targets)
+        if names:
+            runs = tuple(replace(run, label=name) for run, name in zip(runs, names, strict=True))
         progress("comparison", 0, 1)
         page = None if out is None else write_comparison(runs, out, overwrite=overwrite)
     return FlightComparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page)
+
+
+def _check_names(names: Sequence[str], count: int) -> None:
+    """Reject column names that do not tell the targets apart."""
+    plain = {name for name in names if isinstance(name, str) and name.strip() and printable(name) == name}
+    if names and (isinstance(names, str) or not len(names) == len(plain) == count):
+        shown = names if isinstance(names, str) else list(names)
+        raise ParameterError("", "names", shown, f"{count} different texts, one for each target")
 
 
 def _check(target: Target) -> None:
@@ -137,31 +157,30 @@ def _check(target: Target) -> None:
         load_scenario(str(target))
 
 
-def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool) -> rundir.Run:
+def _run_of(
+    target: Target, beside: Path, progress: Progress, products: Mapping[str, bool | None], *, pictures: bool
+) -> rundir.Run:
     """Return a target as a run; fly and save it beside the page if necessary."""
     if isinstance(target, Flight):
         if target.directory is not None or not pictures:
             return target.run
         with reserving(beside / target.scenario.name, free=True) as place:
-            return rundir.load_run(target.save(place, progress=progress))
+            return rundir.load_run(target.save(place, progress=progress, **products))
     if not isinstance(target, Scenario) and Path(target).is_dir():
         return rundir.load_run(Path(target))
     scenario = target if isinstance(target, Scenario) else load_scenario(str(target))
-    products = None if pictures else False
     with reserving(beside / scenario.name, free=True) as place:
         flight = Rollout(scenario).fly(progress)
-        return rundir.load_run(
-            flight.save(place, video=products, recording=products, figures=products, progress=progress)
-        )
+        return rundir.load_run(flight.save(place, progress=progress, **products))
 
 
 def compare_campaigns(
-    directories: Sequence[Path], out: Path | None = None, *, overwrite: bool = False
+    directories: Sequence[Path], out: Path | None = None, *, overwrite: bool = False, names: Sequence[str] = ()
 ) -> PairedComparison:
     """Compare two campaigns flight by flight, and write the report if a directory is given.
 
     Raises:
-        InputError: they are not two finished campaigns.
+        InputError: they are not two finished campaigns, or the names are wrong.
         OutputError: the directory cannot be written.
     """
     from scenarios.campaign.paired import compare_pairs
@@ -172,7 +191,8 @@ def compare_campaigns(
         raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")
     first, second = directories
     plans = (stored_plan(first), stored_plan(second))
-    names = (plans[0].spec.name, plans[1].spec.name)
+    _check_names(names, 2)
+    names = (names[0], names[1]) if names else (plans[0].spec.name, plans[1].spec.name)
     failures = (plans[0].spec.failure, plans[1].spec.failure)
     a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
     comparison = compare_pairs(a, b, names, failures, plan_differences(*plans))
