@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from quadsim.report.figure import line_colour
+from quadsim.palette import line_colour
 from scenarios.live import look
 from scenarios.live.page import Page
 from scenarios.live.serving import Pace
