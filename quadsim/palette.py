@@ -24,7 +24,7 @@ class Palette(NamedTuple):
     violated: str = "#dc2f38"  # whatever is beyond its bound, or failed: a bound's colour, as an area or a text
     satisfied: str = "#1b7fc4"  # whatever is within its bounds keeps the colour of what is flown
     warning: str = "#b39800"  # at a bound; beyond one that is not required; not reached
-    lost: str = "#ad3a9f"  # the vehicle
+    lost: str = "#ad3a95"  # the vehicle
     disturbance: str = "#56b4e9"  # wind, external forces, pulls
     obstacle: str = "#b85c48"
     axis_x: str = "#d95f5f"  # of the world, by the convention of 3-D viewers

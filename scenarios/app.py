@@ -566,12 +566,16 @@ def compare(
     if not targets:
         raise InputError("compare needs runs, scenarios, or two campaigns")
     page = None if out is None else absolute(out)
+    of_campaigns = any(isinstance(target, str | Path) and is_campaign(Path(target)) for target in targets)
+    products = {"video": video, "recording": recording, "figures": figures}
+    if (page is None or of_campaigns) and (asked := [name for name, wanted in products.items() if wanted]):
+        rule = "absent where campaigns are compared" if of_campaigns else "absent without --out: nothing is written"
+        raise ParameterError("", f"--{asked[0]}", True, rule)
     compared: FlightComparison | PairedComparison
-    if any(isinstance(target, str | Path) and is_campaign(Path(target)) for target in targets):
+    if of_campaigns:
         campaigns = [Path(str(target)) for target in targets]
         compared = compare_campaigns(campaigns, page, overwrite=overwrite, names=names)
     else:
-        products = {"video": video, "recording": recording, "figures": figures}
         with reporting(progress) as report:
             compared = compare_flights(targets, page, report, overwrite=overwrite, names=names, products=products)
     return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared

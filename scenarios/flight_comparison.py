@@ -165,13 +165,18 @@ def _run_of(
         if target.directory is not None or not pictures:
             return target.run
         with reserving(beside / target.scenario.name, free=True) as place:
-            return rundir.load_run(target.save(place, progress=progress, **products))
+            return _saved(target, place, progress, products)
     if not isinstance(target, Scenario) and Path(target).is_dir():
         return rundir.load_run(Path(target))
     scenario = target if isinstance(target, Scenario) else load_scenario(str(target))
     with reserving(beside / scenario.name, free=True) as place:
-        flight = Rollout(scenario).fly(progress)
-        return rundir.load_run(flight.save(place, progress=progress, **products))
+        return _saved(Rollout(scenario).fly(progress), place, progress, products)
+
+
+def _saved(flight: Flight, place: Path, progress: Progress, products: Mapping[str, bool | None]) -> rundir.Run:
+    video, recording, figures = (products.get(name) for name in ("video", "recording", "figures"))
+    flight.save(place, video=video, recording=recording, figures=figures, progress=progress)
+    return rundir.load_run(place)
 
 
 def compare_campaigns(

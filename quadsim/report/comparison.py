@@ -45,12 +45,12 @@ def run_names(runs: Sequence[Run]) -> tuple[str, ...]:
     Runs of one scenario add what tells them apart: their controllers' names, or else those of their directories; or
     they are numbered.
     """
-    parts = [(run.label or run.name,) for run in runs]
+    parts: list[tuple[str, ...]] = [(run.label or run.name,) for run in runs]
     laws = [law_name(printable(str(nested(run.summary, "controller", "name") or ABSENT))) for run in runs]
     for further in (laws, [printable(run.directory.name) for run in runs]):
         peers = {part: {more for more, other in zip(further, parts, strict=True) if other == part} for part in parts}
         parts = [(*part, more) if len(peers[part]) > 1 else part for part, more in zip(parts, further, strict=True)]
-    names = [f"{first} ({', '.join(rest)})" if rest else first for first, *rest in parts]
+    names = [part[0] + (f" ({', '.join(part[1:])})" if part[1:] else "") for part in parts]
     seen = Counter(names)
     return tuple(name if seen[name] == 1 else f"{name}, {names[: i + 1].count(name)}" for i, name in enumerate(names))
 

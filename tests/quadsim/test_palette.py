@@ -30,7 +30,6 @@ MATERIALS = {
     ("quadsim/report/to_plotly.py", "(210, 34, 46)"): "no colour: lengths in pixels",
     ("docs/gallery.py", "(160, 90, 8)"): "no colour: lengths in pixels",
     ("scenarios/live/look.py", "(128, 128, 3)"): "no colour: shape of an array",
-    ("docs/fly/fly.js", "#fff1dc"): "sunlight",
     ("docs/fly/fly.js", "#596b85"): "rotor disc, as in models/quadrotor.xml",
 }
 """Colours of things, which say nothing of a flight, and what they are."""

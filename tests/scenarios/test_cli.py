@@ -287,6 +287,10 @@ WRONG: dict[str, tuple[list[str], str]] = {
         ["compare", "hover", "gust", "--name", "mine", "--out", "page"],
         "names must be 2 different texts, one for each target; got ['mine']",
     ),
+    "a film of a comparison that writes nothing": (
+        ["compare", "hover", "gust", "--video"],
+        "--video must be absent without --out: nothing is written; got True",
+    ),
     "two flights to replay": (["replay", "gone", "--worst", "--flight", "3"], "--flight must be absent with --worst"),
     "one scenario of two": (["compare", "hover", "nope", "--out", "page"], "no scenario named 'nope'"),
     "a scenario without a name": (["scenario"], "scenario needs a name or a TOML file, or --schema (there are: "),
