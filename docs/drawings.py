@@ -7,9 +7,11 @@ from pathlib import Path
 from pkgutil import resolve_name
 
 from quadsim import load_vehicle
+from quadsim.palette import CYCLE
 
 ASSETS = Path(__file__).parent / "assets"
-INK, SOFT, FORWARD, TURN = "#6577d6", "#737ea6", "#d9534f", "#2e9b5f"
+INK, SOFT = "#6b7280", "#7c8596"
+FORWARD, TURN = CYCLE[2:4]
 STYLE = "font: 13px sans-serif; fill: " + SOFT
 
 

@@ -15,10 +15,11 @@ from PIL import Image, ImageDraw
 
 from quadsim.flight.audit import SIGNALS
 from quadsim.flight.rundir import Run
+from quadsim.palette import ON_DARK
 from quadsim.report.figure import bounds_of
 from quadsim.report.film import painter as ink
 from quadsim.report.film.frames import Footage, MarginTrack, Shot, make_footage
-from quadsim.report.film.painter import Colour, Painter
+from quadsim.report.film.painter import Painter
 from quadsim.report.film.video import rendering_backend
 from quadsim.state import Array
 
@@ -26,10 +27,9 @@ DOCS: Final = Path(__file__).resolve().parent
 SHARP: Final = 2  # pixels drawn for one that is shown, in each direction
 HEAD, PLOT, ROW, GAP, LABEL = 28, 90, 21, 8, 66  # [pixels]: title, plot, row of margins, gap, label left of both
 MOST_ROWS: Final = 4
-NEAR: Final = 0.1  # share of its band below which a margin is amber
-GROUND: Final[Colour] = (20, 24, 30)
-FIELD: Final[Colour] = (30, 35, 43)
-CURVES: Final = (ink.BLUE, ink.GREEN)
+NEAR: Final = 0.1  # share of its band below which a margin is in the colour of warnings
+GROUND, FIELD = "#14181e", "#1e232b"
+CURVES: Final = (ON_DARK.flown, ON_DARK.second)
 COLOURS: Final = 96
 
 
@@ -97,7 +97,7 @@ class Plot:
         canvas.rectangle((left, top, right, bottom), fill=FIELD)
         for bound, start, stop in ((0.0, *ends), *self._bounds):
             line = self._at(np.clip([start, stop], *ends), np.full(2, bound))
-            canvas.line(line, fill=ink.AMBER if bound else ink.FAINT, width=SHARP if bound else 1)
+            canvas.line(line, fill=ON_DARK.bound if bound else ink.FAINT, width=SHARP if bound else 1)
             if abs(bound) > 0.1 * self._high or not bound:
                 painter.text(self._left - 5, line[0][1] / SHARP, f"{bound:g}", size=12, colour=ink.GREY, anchor="rm")
         now = np.searchsorted(self._grid, self._times[i], side="right")
@@ -107,7 +107,7 @@ class Plot:
             for limit in (limit for limit in self._limits if limit.signal == name):
                 beyond = limit.holds_at(self._grid[:now]) & limit.violated(limit.margin(curve[:now]))
                 for k in np.flatnonzero(beyond[1:]):
-                    canvas.line(points[k : k + 2], fill=ink.RED, width=3 * SHARP)
+                    canvas.line(points[k : k + 2], fill=ON_DARK.violated, width=3 * SHARP)
             painter.text(GAP, self._top + 8 + 17 * j, name, size=12, colour=colour, anchor="lm")
         painter.text(GAP, self._top + PLOT - 8, "[deg]", size=12, colour=ink.GREY, anchor="lm")
 
@@ -119,12 +119,14 @@ def draw_margin(painter: Painter, track: MarginTrack, i: int, width: float, top:
     share = float(np.nan_to_num(np.clip(now / limit.half_band, 0.0, 1.0)))
     left, bar = 92, width - 92 - 130
     name = limit.name.replace("_", " ")
-    painter.text(GAP, top + ROW / 2, name, size=13, colour=ink.RED if once else ink.WHITE, anchor="lm")
-    painter.box(left, top + 5, bar, ROW - 10, ink.RED if broken else ink.FAINT)
-    painter.box(left, top + 5, bar * share, ROW - 10, ink.AMBER if share < NEAR else ink.GREEN)
+    painter.text(GAP, top + ROW / 2, name, size=13, colour=ON_DARK.violated if once else ink.WHITE, anchor="lm")
+    painter.box(left, top + 5, bar, ROW - 10, ON_DARK.violated if broken else ink.FAINT)
+    painter.box(left, top + 5, bar * share, ROW - 10, ON_DARK.warning if share < NEAR else ON_DARK.satisfied)
     if not np.isnan(worst):
         words = f"{round(float(worst), 2) + 0.0:+.2f} {limit.unit}"
-        painter.text(width - GAP, top + ROW / 2, words, size=13, colour=ink.RED if once else ink.GREY, anchor="rm")
+        painter.text(
+            width - GAP, top + ROW / 2, words, size=13, colour=ON_DARK.violated if once else ink.GREY, anchor="rm"
+        )
 
 
 def side_by_side(path: Path) -> None:

@@ -13,10 +13,11 @@ from typing import Any, Final
 import film
 import imageio
 import numpy as np
-from drawings import FORWARD, INK, SOFT, svg
+from drawings import svg
 
 from quadsim.errors import RenderingUnavailableError
 from quadsim.flight.rundir import Run
+from quadsim.palette import COLOUR
 from quadsim.report.film.frames import Shot, make_footage, thin
 from quadsim.state import Array
 
@@ -44,10 +45,10 @@ def thumbnail(name: str) -> None:
     scale = float((room / np.maximum(high - low, LEAST)).min())
     shown = [0.5 * np.array([WIDTH, HEIGHT]) + scale * (path - 0.5 * (low + high)) for path in paths]
     end = shown[1][-1]
-    colour = INK if flight.outcome == "satisfied" else FORWARD
+    colour = COLOUR.satisfied if flight.outcome == "satisfied" else COLOUR.violated
     parts = [
-        polyline(shown[0], f'stroke="{SOFT}" stroke-dasharray="3 2"'),
-        polyline(shown[1], f'stroke="{INK}" stroke-width="1.5"'),
+        polyline(shown[0], f'stroke="{COLOUR.reference}" stroke-dasharray="3 2"'),
+        polyline(shown[1], f'stroke="{COLOUR.flown}" stroke-width="1.5"'),
         f'<circle cx="{end[0]:.1f}" cy="{end[1]:.1f}" r="3.5" fill="{colour}"/>',
     ]
     (THUMBNAILS / f"{name}.svg").write_text(svg(WIDTH, HEIGHT, parts, arrows=False), encoding="utf-8")

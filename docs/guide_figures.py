@@ -17,14 +17,14 @@ import pandas as pd
 import quadsim
 import quadsim.gym
 from quadsim.flight.audit import SIGNALS
-from quadsim.report.figure import BOUND, LINES, OBSTACLE, REFERENCE, Area, Band, Bound, Figure, Panel, Series, outlines
+from quadsim.palette import COLOUR, CYCLE
+from quadsim.report.figure import Area, Band, Bound, Figure, Panel, Series, outlines
 from quadsim.sim.effects.battery import LIPO
 from quadsim.state import POSITION
 from scenarios.identify.page import trace_figure
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 FREE: Final[dict[str, Any]] = {"constraints": []}
-BLUE, ORANGE, GREEN, PURPLE = LINES[:4]
 UNTIL: Final = 16.0  # what is shown of the paper's step in x, which is at 10 s
 NEAR: Final = 1.2  # of a pillar, where half-spaces are drawn [m]
 SHOWN = (0.04, 0.08)  # of the errors of a tuning [m]; candidates that crash are beyond
@@ -86,7 +86,7 @@ def curves(
     signal = SIGNALS[name]
     assert signal.plant is not None
     lines = [
-        Series(x=flight.log.plant.t, y=signal.plant(flight.log.plant), colour=LINES[i], label=label)
+        Series(x=flight.log.plant.t, y=signal.plant(flight.log.plant), colour=CYCLE[i], label=label)
         for i, (label, flight) in enumerate(flights.items())
     ]
     limits = tuple(Bound(value=value) for value in bounds)
@@ -131,7 +131,7 @@ def linear() -> Figure:
     }
     t = start.time[k] + 0.05 * np.arange(problem.horizon + 1)
     pitch, speed = [], []
-    for colour, (label, plan) in zip((ORANGE, BLUE), plans.items(), strict=True):
+    for colour, (label, plan) in zip((CYCLE[1], COLOUR.predicted), plans.items(), strict=True):
         u, states = plan.reshape(-1, 4), [state]
         for command in u:
             states.append(problem.model.A @ states[-1] + problem.model.B @ (command - problem.model.u_bar))
@@ -157,7 +157,9 @@ def robust() -> Figure:
         names = {"constrained": "paper-constrained", "robust": "robust"}
         pairs.append({label: fly(name, {"duration": UNTIL, **FREE, **changes}) for label, name in names.items()})
     heavy, lagging = pairs
-    course = Series(x=np.array([3.0, UNTIL]), y=np.full(2, 10.0), colour=REFERENCE, label="reference", dashed=True)
+    course = Series(
+        x=np.array([3.0, UNTIL]), y=np.full(2, 10.0), colour=COLOUR.reference, label="reference", dashed=True
+    )
     height = curves("z", heavy, "20 % more mass than modelled", start=3.0)
     pitch = curves("pitch", lagging, "20 ms of unmodelled lag", bounds=(-5.0, 5.0), start=3.0)
     panels = (
@@ -185,12 +187,12 @@ def effects() -> Figure:
     gust = fly("gust", FREE).log.plant
     assert gust.wind is not None
     rotor = (
-        Series(x=lag.control.t, y=lag.control.speeds[:, 0], colour=REFERENCE, label="commanded", style="steps"),
-        Series(x=lag.plant.t, y=lag.plant.speeds[:, 0], colour=BLUE, label="actual"),
+        Series(x=lag.control.t, y=lag.control.speeds[:, 0], colour=COLOUR.reference, label="commanded", style="steps"),
+        Series(x=lag.plant.t, y=lag.plant.speeds[:, 0], colour=COLOUR.flown, label="actual"),
     )
     pushed = (
-        Series(x=gust.t, y=gust.wind[:, 0] / 10.0, colour=GREEN, label="wind [10 m/s]"),
-        Series(x=gust.t, y=gust.state[:, POSITION][:, 0], colour=ORANGE, label="position [m]"),
+        Series(x=gust.t, y=gust.wind[:, 0] / 10.0, colour=COLOUR.disturbance, label="wind [10 m/s]"),
+        Series(x=gust.t, y=gust.state[:, POSITION][:, 0], colour=COLOUR.flown, label="position [m]"),
     )
     panels = (
         Panel(title="rotor 1 with lag", y_label="speed [rad/s]", series=clipped(rotor, 0.9, 1.6), x_label="time [s]"),
@@ -211,8 +213,8 @@ def autopilot() -> Figure:
             unit=unit,
             series=clipped(
                 (
-                    Series(x=log.plant.t, y=flown, colour=BLUE, label="flown"),
-                    Series(x=log.control.t, y=demanded, colour=ORANGE, label="target", style="steps"),
+                    Series(x=log.plant.t, y=flown, colour=COLOUR.flown, label="flown"),
+                    Series(x=log.control.t, y=demanded, colour=COLOUR.reference, label="target", style="steps"),
                 ),
                 0.3,
                 1.3,
@@ -238,7 +240,7 @@ def battery() -> Figure:
     }
     flights = {label: fly("autopilot", {**changes, **observer}) for label, observer in observers.items()}
     missed = []
-    for colour, (label, flight) in zip((ORANGE, GREEN, BLUE), flights.items(), strict=True):
+    for colour, (label, flight) in zip((CYCLE[1], CYCLE[2], CYCLE[0]), flights.items(), strict=True):
         away = np.linalg.norm([flight.state[axis] - flight.reference[axis] for axis in "xyz"], axis=0)
         missed.append(Series(x=flight.time, y=100.0 * away, colour=colour, label=label))
     scaled = flights["thrust scale"]
@@ -246,8 +248,8 @@ def battery() -> Figure:
     assert log.battery is not None
     share = np.square(log.battery[:, 0] / (3 * LIPO[-1][1]))
     scale = (
-        Series(x=log.t, y=share, colour=REFERENCE, label="(V / V0)^2"),
-        Series(x=scaled.time, y=scaled.logged["thrust_scale"], colour=BLUE, label="estimate"),
+        Series(x=log.t, y=share, colour=COLOUR.measured, label="(V / V0)^2"),
+        Series(x=scaled.time, y=scaled.logged["thrust_scale"], colour=COLOUR.predicted, label="estimate"),
     )
     panels = (
         Panel(title="distance from the course [cm]", y_label="distance", series=tuple(missed)),
@@ -274,15 +276,17 @@ def space() -> Figure:
     for p in plan[np.linalg.norm(plan - centre, axis=1) < NEAR][::5]:
         n = (p - centre) / np.linalg.norm(p - centre)
         ends = centre + reach * n + np.array([[-0.6], [0.6]]) * np.array([-n[1], n[0]])
-        planes.append(Series(x=ends[:, 0], y=ends[:, 1], colour=BOUND, label="half-space", dashed=True, width=0.9))
+        planes.append(
+            Series(x=ends[:, 0], y=ends[:, 1], colour=COLOUR.bound, label="half-space", dashed=True, width=0.9)
+        )
     path, course = log.plant.state[:, POSITION], log.control.reference
     lines = (
-        Series(x=course[:, 0], y=course[:, 1], colour=REFERENCE, label="reference", dashed=True),
-        Series(x=path[:, 0], y=path[:, 1], colour=BLUE, label="flight"),
-        Series(x=plan[:, 0], y=plan[:, 1], colour=GREEN, label="plan", style="points", width=3.0),
+        Series(x=course[:, 0], y=course[:, 1], colour=COLOUR.reference, label="reference", dashed=True),
+        Series(x=path[:, 0], y=path[:, 1], colour=COLOUR.flown, label="flight"),
+        Series(x=plan[:, 0], y=plan[:, 1], colour=COLOUR.predicted, label="plan", style="points", width=3.0),
     )
     panel = Panel(title="from above", x_label="x [m]", y_label="y [m]", equal=True, height=1.6,
-                  areas=(Area(outline=outlines(pillar, 0.0)[0], colour=OBSTACLE, label="pillar"),),
+                  areas=(Area(outline=outlines(pillar, 0.0)[0], colour=COLOUR.obstacle, label="pillar"),),
                   series=(*planes, *clipped(lines, 2.0, 6.0)))  # fmt: skip
     return Figure(key="space", title="", panels=(panel,), columns=1)
 
@@ -302,18 +306,18 @@ def campaigns() -> Figure:
     points = tuple(
         Series(x=table["draw.mass"][which].to_numpy(), y=table["rmse.z"][which].to_numpy(), colour=colour, label=label,
                style="points", width=3.0)
-        for which, colour, label in ((~failed, BLUE, "flight"), (failed, ORANGE, "failed"))
+        for which, colour, label in ((~failed, COLOUR.satisfied, "flight"), (failed, COLOUR.violated, "failed"))
     )  # fmt: skip
     counts = np.arange(4, len(failed) + 1)
     shares = np.cumsum(failed)[counts - 1] / counts
     ends = [binomtest(int(np.cumsum(failed)[n - 1]), int(n)).proportion_ci() for n in counts]
     band = Band(x=1.0 * counts, low=np.array([end.low for end in ends]), high=np.array([end.high for end in ends]),
-                colour=BLUE, label="95 % interval")  # fmt: skip
+                colour=COLOUR.flown, label="95 % interval")  # fmt: skip
     panels = (
         Panel(title="each flight", y_label="RMS error of z [m]", x_label="mass [kg]", series=points,
               bounds=(Bound(value=0.05),)),
         Panel(title="share that failed", y_label="share", x_label="flights", bands=(band,), y_range=(0.0, 1.0),
-              series=(Series(x=1.0 * counts, y=shares, colour=BLUE, label="share"),)),
+              series=(Series(x=1.0 * counts, y=shares, colour=COLOUR.flown, label="share"),)),
     )  # fmt: skip
     return Figure(key="campaigns", title="", panels=panels)
 
@@ -322,7 +326,7 @@ def export() -> Figure:
     """How the work of the core varies over the paper's flight."""
     flight = fly("paper-constrained", {"controller.solver": "core", **FREE})
     t, iterations = flight.log.control.t, flight.log.control.iterations.astype(float)
-    work = Series(x=t, y=iterations, colour=ORANGE, style="steps")
+    work = Series(x=t, y=iterations, colour=CYCLE[1], style="steps")
     panels = (curves("x", {"": flight}), Panel(title="iterations of the core", whole=True, series=(work,)))
     return Figure(key="export", title="", panels=panels, columns=1, end=60.0)
 
@@ -338,9 +342,9 @@ def tuning() -> Figure:
         column.groupby(table["candidate"]).mean().to_numpy() for column in (error, table["search.horizon"])
     )
     numbers, best = 1.0 * np.arange(len(means)), np.minimum.accumulate(means)
-    each: dict[str, Any] = {"y": means, "colour": BLUE, "style": "points", "width": 3.5, "label": "candidate"}
-    start = Series(x=numbers[:1], y=means[:1], colour=ORANGE, style="points", width=6.0, label="start")
-    lowest = Series(x=numbers, y=best, colour=GREEN, style="steps", label="best so far")
+    each: dict[str, Any] = {"y": means, "colour": CYCLE[0], "style": "points", "width": 3.5, "label": "candidate"}
+    start = Series(x=numbers[:1], y=means[:1], colour=CYCLE[1], style="points", width=6.0, label="start")
+    lowest = Series(x=numbers, y=best, colour=CYCLE[2], style="steps", label="best so far")
     panels = (
         Panel(title="candidates", y_label="RMS error [m]", x_label="number", y_range=SHOWN,
               series=(Series(x=numbers, **each), lowest, start)),

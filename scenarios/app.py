@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     CampaignName: TypeAlias = ScenarioName
     Target: TypeAlias = Flight | ScenarioName
     Changes: TypeAlias = Mapping[Any, Any] | Sequence[str]
+    Names: TypeAlias = Sequence[str]
     Whole = int
     Flag = bool
     UserCode = object
@@ -85,6 +86,7 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
     CampaignName, PaperName = _one_of(campaign_names), _one_of(paper_names)
     TuningName = _one_of(tuning_names)
     Changes = Annotated[Sequence[str], Parameter(name="--set")]
+    Names = Annotated[Sequence[str], Parameter(name="--name")]
     Whole = Annotated[int, Parameter(converter=_whole)]
     Flag = Annotated[bool, Parameter(negative="")]
     UserCode = UserForces = UserReference = Fields = Draws = Watched = Flown = Annotated[Any, Parameter(parse=False)]
@@ -514,30 +516,42 @@ def check(
 @app.command(
     help_epilogue=_examples(
         "quadsim compare paper-unconstrained paper-constrained --out runs/comparison",
-        "quadsim compare runs/mine runs/other --markdown",
+        "quadsim compare runs/mine runs/other --name mine --name theirs --markdown",
     )
 )
 def compare(
     *targets: Target,
     out: File | None = None,
     overwrite: Flag = False,
+    names: Names = (),
     markdown: Flag = False,
     constraints: Target | None = None,
+    video: bool | None = None,
+    recording: bool | None = None,
+    figures: bool | None = None,
     progress: Watched = True,
 ) -> FlightComparison | PairedComparison | Document:
     """Compare flights, or two campaigns flight by flight: table, figures, HTML page.
+
+    With `out`, scenarios are flown into run directories below OUT-runs, beside the page.
 
     Args:
         targets: run directories, scenarios to fly, or the directories of two campaigns.
         out: directory for the page, its figures and its table.
         overwrite: replace an earlier output, if its summary.json lists every file in the directory.
+        names: name of a column, once for each target and in their order (default: scenario, and what tells its flights
+            apart).
         markdown: print the table as Markdown.
         constraints: one of the targets, whose constraints and tolerances all are audited against, from their tables.
+        video: film the scenarios that it flies (default: if possible).
+        recording: write their flight.rrd for the rerun viewer (default: if possible).
+        figures: plot them (default: if possible).
         progress: as in `fly`.
 
     Raises:
-        InputError: a target is neither a run, a scenario nor a campaign; nothing was flown.
+        InputError: a target is neither a run, a scenario nor a campaign, or the names are wrong; nothing was flown.
         OutputError: the page cannot be written.
+        RenderingUnavailableError: a video is requested but cannot be rendered; nothing was flown.
 
     Examples:
         >>> import quadsim
@@ -554,14 +568,19 @@ def compare(
     if not targets:
         raise InputError("compare needs runs, scenarios, or two campaigns")
     page = None if out is None else absolute(out)
+    of_campaigns = any(isinstance(target, str | Path) and is_campaign(Path(target)) for target in targets)
+    products = {"video": video, "recording": recording, "figures": figures}
+    if (page is None or of_campaigns) and (asked := [name for name, wanted in products.items() if wanted]):
+        rule = "absent where campaigns are compared" if of_campaigns else "absent without --out: nothing is written"
+        raise ParameterError("", f"--{asked[0]}", True, rule)
     compared: FlightComparison | PairedComparison
-    if any(isinstance(target, str | Path) and is_campaign(Path(target)) for target in targets):
-        compared = compare_campaigns(
-            [Path(str(target)) for target in targets], page, overwrite=overwrite, constraints=constraints
-        )
+    if of_campaigns:
+        campaigns = [Path(str(target)) for target in targets]
+        compared = compare_campaigns(campaigns, page, overwrite=overwrite, names=names, constraints=constraints)
     else:
+        options: dict[str, Any] = {"names": names, "products": products, "constraints": constraints}
         with reporting(progress) as report:
-            compared = compare_flights(targets, page, report, overwrite=overwrite, constraints=constraints)
+            compared = compare_flights(targets, page, report, overwrite=overwrite, **options)
     return Document(compared.to_markdown() + "\n", compared.to_json()) if markdown else compared
 
 

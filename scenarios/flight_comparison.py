@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import InputError, ParameterError, printable
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
 from quadsim.outputs import reserving
@@ -18,7 +19,7 @@ from quadsim.report.comparison import different_audits
 from quadsim.report.table import Row
 from scenarios.campaign.store import is_campaign as is_campaign
 from scenarios.campaign.store import stored_plan
-from scenarios.flight import Flight, worst_margin
+from scenarios.flight import Flight, require_rendering, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import reaudit
@@ -107,20 +108,28 @@ def compare_flights(
     progress: Progress = silent,
     *,
     overwrite: bool = False,
+    names: Sequence[str] = (),
+    products: Mapping[str, bool | None] = MappingProxyType({}),
     constraints: Target | None = None,
 ) -> FlightComparison:
     """Compare flights, and write the page to `out`; scenarios are flown and saved beside it, in `OUT-runs`.
 
-    With `constraints`, one of the targets, all are audited against its constraints.
+    `names` are the columns'; `products` the options of `Flight.save` for what is saved; with `constraints`, one of the
+    targets, all are audited against its constraints.
 
     Raises:
-        InputError: a target is neither a flight nor a scenario, or `constraints` is none of them; nothing was flown.
+        InputError: a target is neither a flight nor a scenario, `constraints` is none of them, or the names are wrong;
+            nothing was flown.
         OutputError: the directory cannot be written.
+        RenderingUnavailableError: a video is requested but cannot be rendered; nothing was flown.
     """
     from quadsim.report.comparison import comparison_rows, run_names
     from quadsim.report.comparison_page import write_comparison
 
     whose = None if constraints is None else _place_of(constraints, targets)
+    _check_names(names, len(targets))
+    if products.get("video"):
+        require_rendering()
     for target in targets:
         _check(target)
     with contextlib.ExitStack() as stack:
@@ -128,7 +137,10 @@ def compare_flights(
         if out is not None:
             stack.enter_context(reserving(out, overwrite=overwrite))
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
-        runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
+        saved = dict.fromkeys(("video", "recording", "figures"), False) if out is None else products
+        runs = tuple(_run_of(target, beside, progress, saved, pictures=out is not None) for target in targets)
+        if names:
+            runs = tuple(replace(run, label=name) for run, name in zip(runs, names, strict=True))
         names = run_names(runs)
         if whose is None:
             notes = _differences(runs, names)
@@ -153,7 +165,7 @@ def _place_of(target: Target, targets: Sequence[Target]) -> int:
 def _differences(runs: Sequence[rundir.Run], names: Sequence[str]) -> tuple[str, ...]:
     """Return a sentence if flights are audited against different constraints or tolerances."""
     for run, name in zip(runs[1:], names[1:], strict=True):
-        if differences := limit_differences(runs[0].limits, run.limits):
+        if differences := limit_differences(runs[0].limits, run.limits, demands=False):
             return (different_audits(names[0], name, differences),)
     return ()
 
@@ -173,6 +185,14 @@ def audited_against(run: rundir.Run, limits: Sequence[Limit]) -> rundir.Run:
     return replace(run, summary={**run.summary, **again}, limits=tuple(finding.limit for finding in findings))
 
 
+def _check_names(names: Sequence[str], count: int) -> None:
+    """Reject column names that do not tell the targets apart."""
+    plain = {name for name in names if isinstance(name, str) and name.strip() and printable(name) == name}
+    if names and (isinstance(names, str) or not len(names) == len(plain) == count):
+        shown = names if isinstance(names, str) else list(names)
+        raise ParameterError("", "names", shown, f"{count} different texts, one for each target")
+
+
 def _check(target: Target) -> None:
     """Reject targets that cannot be compared, before any flight."""
     if isinstance(target, Flight | Scenario):
@@ -184,22 +204,26 @@ def _check(target: Target) -> None:
         load_scenario(str(target))
 
 
-def _run_of(target: Target, beside: Path, progress: Progress, *, pictures: bool) -> rundir.Run:
+def _run_of(
+    target: Target, beside: Path, progress: Progress, products: Mapping[str, bool | None], *, pictures: bool
+) -> rundir.Run:
     """Return a target as a run; fly and save it beside the page if necessary."""
     if isinstance(target, Flight):
         if target.directory is not None or not pictures:
             return target.run
         with reserving(beside / target.scenario.name, free=True) as place:
-            return rundir.load_run(target.save(place, progress=progress))
+            return _saved(target, place, progress, products)
     if not isinstance(target, Scenario) and Path(target).is_dir():
         return rundir.load_run(Path(target))
     scenario = target if isinstance(target, Scenario) else load_scenario(str(target))
-    products = None if pictures else False
     with reserving(beside / scenario.name, free=True) as place:
-        flight = Rollout(scenario).fly(progress)
-        return rundir.load_run(
-            flight.save(place, video=products, recording=products, figures=products, progress=progress)
-        )
+        return _saved(Rollout(scenario).fly(progress), place, progress, products)
+
+
+def _saved(flight: Flight, place: Path, progress: Progress, products: Mapping[str, bool | None]) -> rundir.Run:
+    video, recording, figures = (products.get(name) for name in ("video", "recording", "figures"))
+    flight.save(place, video=video, recording=recording, figures=figures, progress=progress)
+    return rundir.load_run(place)
 
 
 def compare_campaigns(
@@ -207,6 +231,7 @@ def compare_campaigns(
     out: Path | None = None,
     *,
     overwrite: bool = False,
+    names: Sequence[str] = (),
     constraints: Target | None = None,
 ) -> PairedComparison:
     """Compare two campaigns flight by flight, and write the report if a directory is given.
@@ -214,7 +239,8 @@ def compare_campaigns(
     With `constraints`, one of the two, both are judged by its tolerances.
 
     Raises:
-        InputError: they are not two finished campaigns, or `constraints` is none of them or has other bounds.
+        InputError: they are not two finished campaigns, the names are wrong, or `constraints` is none of them or has
+            other bounds.
         OutputError: the directory cannot be written.
     """
     from scenarios.campaign.again import judged_by
@@ -226,7 +252,8 @@ def compare_campaigns(
         raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")
     first, second = directories
     plans = (stored_plan(first), stored_plan(second))
-    names = (plans[0].spec.name, plans[1].spec.name)
+    _check_names(names, 2)
+    names = (names[0], names[1]) if names else (plans[0].spec.name, plans[1].spec.name)
     failures = (plans[0].spec.failure, plans[1].spec.failure)
     a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
     limits = [tuple(limit.with_tolerances() for limit in plan.limits) for plan in plans]

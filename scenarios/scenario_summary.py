@@ -7,7 +7,8 @@ from html import escape
 import numpy as np
 
 from quadsim.errors import InputError
-from quadsim.report.figure import REFERENCE, Figure, Panel, Series
+from quadsim.palette import COLOUR
+from quadsim.report.figure import Figure, Panel, Series
 from quadsim.report.to_matplotlib import to_html
 from scenarios.loading import assemble
 from scenarios.schema.scenario import Scenario
@@ -38,7 +39,9 @@ def course_figure(scenario: Scenario) -> Figure:
     reference = assemble(scenario).reference(scenario.periods)
     t = scenario.control_period * np.arange(len(reference), dtype=np.float64)
     panels = tuple(
-        Panel(title=name, unit="m", series=(Series(x=t, y=column, colour=REFERENCE, label="reference, filtered"),))
+        Panel(
+            title=name, unit="m", series=(Series(x=t, y=column, colour=COLOUR.reference, label="reference, filtered"),)
+        )
         for name, column in zip("xyz", reference.T[:3], strict=True)
     )
     return Figure(key="course", title="", panels=panels, columns=1, end=scenario.duration)

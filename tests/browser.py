@@ -26,7 +26,10 @@ CLASHES = """plot => {
 
 @contextmanager
 def opened(page: Path, *, width: int = 1280, dark: bool = False) -> Iterator[Any]:
-    """A tab with the page and its drawn plots; its console must stay empty, and it may fetch nothing but files."""
+    """A tab with the page and its drawn plots.
+
+    The page must be no wider than its window, its console must stay empty, and it may fetch nothing but files.
+    """
     api = pytest.importorskip("playwright.sync_api", reason="no Playwright here: pip install playwright")
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if chromium is None:
@@ -42,6 +45,7 @@ def opened(page: Path, *, width: int = 1280, dark: bool = False) -> Iterator[Any
         tab.on("request", lambda request: requests.append(request.url))
         tab.goto(page.as_uri(), wait_until="commit")
         tab.wait_for_function("'drawn' in document.documentElement.dataset")
+        assert tab.evaluate("document.documentElement.scrollWidth") <= width, "the page is wider than its window"
         yield tab
         browser.close()
     assert [line for line in printed if not any(advice in line for advice in ADVICE)] == []

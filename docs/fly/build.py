@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from quadsim.assets import models_dir
+from quadsim.palette import css
 from scenarios.assembly import Assembly
 from scenarios.courses.steps import Steps
 from scenarios.export.exporter import c_controller
@@ -44,6 +45,7 @@ ESBUILD = [
     *("--bundle", "--minify", "--format=iife", "--log-level=error", "--loader:.gz=binary", "--loader:.xml=text"),
     *("--define:import.meta.url=document.baseURI", "--external:module", "--external:node:*", "--legal-comments=none"),
 ]
+PALETTE = "/* palette: docs/fly/build.py */"
 LEFT_OUT = '<p id="fly">This copy of the site was built without the page.</p>'
 LINK = '<p id="fly"><a class="md-button md-button--primary" href="fly/index.html">Fly it</a></p>'
 
@@ -127,7 +129,9 @@ def build(out: Path) -> str | None:
         (work / "node_modules").symlink_to(modules)
         out.mkdir(parents=True, exist_ok=True)
         subprocess.run([modules / ".bin/esbuild", work / "fly.js", *ESBUILD, f"--outfile={out / 'fly.js'}"], check=True)
-    shutil.copy(HERE / "index.html", out)
+    page = (HERE / "index.html").read_text(encoding="utf-8")
+    assert PALETTE in page, "docs/fly/index.html has no place for the palette"
+    (out / "index.html").write_text(page.replace(PALETTE, css()), encoding="utf-8")
     shutil.copy(modules / "three/LICENSE", out / "LICENSE-three.txt")
     for file in distribution("mujoco").files or ():
         if file.name in {"LICENSE", "LICENSES_THIRD_PARTY.md"}:

@@ -293,8 +293,8 @@ class Stage {
 
   /** Colours of the page's theme. */
   paint() {
-    const colours = { blue: [this.trail, this.drop, this.foot], red: [this.force, this.tip],
-      amber: [this.course, this.preview, this.ring, this.post], floor: [this.floor] };
+    const colours = { flown: [this.trail, this.drop, this.foot], disturbance: [this.force, this.tip],
+      reference: [this.course, this.preview, this.ring, this.post], floor: [this.floor] };
     for (const [name, parts] of Object.entries(colours)) for (const part of parts) part.material.color.set(theme(name));
     this.scene.fog.color.set(theme('horizon'));
     this.sky.intensity = 2 * theme('light');
@@ -323,10 +323,10 @@ class Stage {
     controls.update();
     const turn = 0.3 * Math.min(seconds, 0.05);
     this.blades.forEach((blade, i) => (blade.rotation.z += (i % 2 ? -turn : turn) * flight.acting[i]));
-    this.discs.forEach((disc, i) => { // red where a rotor or its step is at a bound
+    this.discs.forEach((disc, i) => { // where a rotor or its step is at a bound
       const [, most] = facts.speed, [down, up] = facts.slew, near = 0.01;
       const active = flight.acting[i] > most - near || flight.slew[i] > up - near || flight.slew[i] < down + near;
-      disc.material.color.lerp(new THREE.Color(active ? 0xe0402a : 0x596b85), 0.2);
+      disc.material.color.lerp(new THREE.Color(active ? theme('warning') : 0x596b85), 0.2);
     });
     this.sun.target.position.copy(vehicle.position);
     this.sun.position.copy(vehicle.position).add(new THREE.Vector3(4, -3, 18));
@@ -477,11 +477,11 @@ class Panel {
     pen.fillStyle = theme('zone');
     pen.fillRect(0, y(bound), width, y(-bound) - y(bound));
     pen.lineWidth = 1.6;
-    for (const [i, colour] of [[0, 'blue'], [1, 'pink']])
+    for (const [i, colour] of [[0, 'flown'], [1, 'second']])
       draw(colour, this.history.map((row, k) => [(width * (k + HISTORY - this.history.length)) / HISTORY, row[i]]));
     pen.lineWidth = 1;
     pen.setLineDash([4, 3]);
-    for (const sign of [-1, 1]) draw('red', [[0, sign * bound], [width, sign * bound]]);
+    for (const sign of [-1, 1]) draw('bound', [[0, sign * bound], [width, sign * bound]]);
     pen.setLineDash([]);
     pen.fillStyle = theme('dim');
     for (const [sign, baseline] of [['', 'bottom'], ['−', 'top']]) {

@@ -412,14 +412,20 @@ def flight_verdict(findings: Sequence[Finding], *, aborted: bool, lost: bool, fa
     return "satisfied" if findings else "unaudited"
 
 
-def limit_differences(first: Sequence[Limit], second: Sequence[Limit]) -> list[str]:
-    """Return, by name, how the limits of two audits differ: absent ones, bounds, windows, tolerances and demands."""
+_COMPARED: Final = ("signal", "terms", "lower", "upper", "start", "stop", "tolerances", "shape")
+
+
+def limit_differences(first: Sequence[Limit], second: Sequence[Limit], *, demands: bool = True) -> list[str]:
+    """Return, by name, how the limits of two audits differ: absent ones, bounds, windows and tolerances.
+
+    `demands`: also in which are required, on which the verdict on a flight depends.
+    """
     a, b = ({limit.name: limit for limit in limits} for limits in (first, second))
     lines = [f"{name} only in the {where}" for where, name in _alone(a, b)]
     for name in (name for name in a if name in b):
         pairs = [
             (what, getattr(a[name], what), getattr(b[name], what))
-            for what in ("signal", "terms", "lower", "upper", "start", "stop", "tolerances", "required", "shape")
+            for what in (*_COMPARED, *(["required"] if demands else []))
             if hasattr(a[name], what) or hasattr(b[name], what)
         ]
         lines += [f"{name}: {what} {_plain(one)} and {_plain(other)}" for what, one, other in pairs if one != other]

@@ -162,6 +162,7 @@ class Run:
     log: FlightLog  # the flight, its plant rows at the log rate
     vehicle: Vehicle  # the vehicle flown, with its actual parameters
     limits: tuple[Limit, ...]  # the constraints it was audited against
+    label: str | None = None  # its name in a comparison; None: see `quadsim.report.comparison.run_names`
 
     @property
     def name(self) -> str:

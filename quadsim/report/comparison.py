@@ -41,9 +41,17 @@ def nested(data: Any, *keys: str) -> Any:
 
 
 def run_names(runs: Sequence[Run]) -> tuple[str, ...]:
-    """A distinct name for each run: its scenario's, with its directory's where two share a scenario."""
-    scenarios = Counter(run.name for run in runs)
-    names = [run.name if scenarios[run.name] == 1 else f"{run.name} ({printable(run.directory.name)})" for run in runs]
+    """A distinct name for each run: its label, or else its scenario's name.
+
+    Runs of one scenario add what tells them apart: their controllers' names, or else those of their directories; or
+    they are numbered.
+    """
+    parts: list[tuple[str, ...]] = [(run.label or run.name,) for run in runs]
+    laws = [law_name(printable(str(nested(run.summary, "controller", "name") or ABSENT))) for run in runs]
+    for further in (laws, [printable(run.directory.name) for run in runs]):
+        peers = {part: {more for more, other in zip(further, parts, strict=True) if other == part} for part in parts}
+        parts = [(*part, more) if len(peers[part]) > 1 else part for part, more in zip(parts, further, strict=True)]
+    names = [part[0] + (f" ({', '.join(part[1:])})" if part[1:] else "") for part in parts]
     seen = Counter(names)
     return tuple(name if seen[name] == 1 else f"{name}, {names[: i + 1].count(name)}" for i, name in enumerate(names))
 

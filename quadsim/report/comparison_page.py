@@ -22,8 +22,9 @@ from quadsim.flight.rundir import (
     require_inside,
 )
 from quadsim.outputs import writing
+from quadsim.palette import line_colour
 from quadsim.report.comparison import comparison_rows, distinct_courses, mismatch, run_names
-from quadsim.report.figure import Scene, line_colour
+from quadsim.report.figure import Scene
 from quadsim.report.flight_figures import overview, page_figures
 from quadsim.report.page import PAGE_FILE, RunView, Section, render_page
 from quadsim.report.table import to_markdown

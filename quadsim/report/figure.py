@@ -1,8 +1,6 @@
-"""A figure as plain data: panels of curves, bounds, bands and areas, and their colours.
+"""A figure as plain data: panels of curves, bounds, bands and areas.
 
-`quadsim.report.to_matplotlib` draws it for files and notebooks, `quadsim.report.to_plotly` for pages.  Colours remain
-distinct for colour-blind readers: runs and rotors use Okabe and Ito's palette (2008), with its blue lightened for dark
-pages, and without its vermilion, which is too close to the red of the bounds.
+`quadsim.report.to_matplotlib` draws it for files and notebooks, `quadsim.report.to_plotly` for pages.
 """
 
 from __future__ import annotations
@@ -19,18 +17,9 @@ from quadsim.flight.rundir import Run
 from quadsim.space import AnyObstacle, Obstacle, Region, footprint
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
 
-LINES: Final = ("#1b7fc4", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#8c6d31")
-REFERENCE: Final = "#7a7f87"
-BOUND: Final = "#dc2f38"
-OBSTACLE: Final = "#b85c48"
 LEAST_SPANS: Final = {"m": 0.01, "deg": 0.1, "m/s": 0.01, "deg/s": 0.1, "rad/s": 1.0}
 """Span of an axis, by unit, below which only rounding would be visible."""
 _HALF_TURN: Final = 180.0
-
-
-def line_colour(i: int) -> str:
-    """Colour of the i-th run, or rotor, counted from 0; they repeat after six."""
-    return LINES[i % len(LINES)]
 
 
 def least_range(curves: Sequence[Array], unit: str) -> tuple[float, float] | None:

@@ -12,12 +12,10 @@ import numpy as np
 
 from quadsim.flight.audit import SIGNALS, SpaceLimit
 from quadsim.flight.rundir import Run
+from quadsim.palette import COLOUR, line_colour
 from quadsim.report.comparison import distinct_courses, run_names
 from quadsim.report.figure import (
-    BOUND,
     LEAST_SPANS,
-    OBSTACLE,
-    REFERENCE,
     Area,
     Band,
     Bound,
@@ -30,7 +28,6 @@ from quadsim.report.figure import (
     commanded_speeds,
     effect_curves,
     has_space,
-    line_colour,
     obstacles_in,
     outlines,
     reference_curve,
@@ -46,7 +43,12 @@ PAPER_FIGURES: Final = {
     "paper-constrained": ("figure4_", "figure5_"),
 }
 """Prefixes of the keys of the state and input figures, by scenario: their numbers in the paper."""
-_REFERENCE: Final[dict[str, Any]] = {"colour": REFERENCE, "label": "reference, filtered", "dashed": True, "width": 1.1}
+_REFERENCE: Final[dict[str, Any]] = {
+    "colour": COLOUR.reference,
+    "label": "reference, filtered",
+    "dashed": True,
+    "width": 1.1,
+}
 _NEAR: Final = 3.0  # clearance [m] below which a moving obstacle is drawn; upper limit of the curves
 _MOVES: Final = 0.1  # smallest span of a course [m] that counts as motion along an axis
 _EVERY: Final = 0.25  # time between drawings of it [s]
@@ -161,8 +163,8 @@ def targets(run: Run) -> list[Figure]:
     for i, name in enumerate(("thrust", "body_rate_x", "body_rate_y", "body_rate_z")):
         signal, scale = SIGNALS[name], 1.0 if i == 0 else math.degrees(1.0)
         curves = (
-            Series(x=plant.t, y=signal.finest(run.log)[1], colour=line_colour(0), label="flown"),
-            Series(x=run.log.control.t, y=scale * target[:, i], colour=line_colour(1), label="target", style="steps"),
+            Series(x=plant.t, y=signal.finest(run.log)[1], colour=COLOUR.flown, label="flown"),
+            Series(x=run.log.control.t, y=scale * target[:, i], colour=COLOUR.reference, label="target", style="steps"),
         )
         title = "collective thrust" if i == 0 else f"body rate about {name[-1]}"
         panels.append(Panel(title=title, unit=signal.unit, series=curves, bounds=_bounds([run], name), legend=True))
@@ -251,18 +253,18 @@ def _above(run: Run) -> Panel:
         for instant in np.arange(near[0], near[-1], _EVERY) if limit.shape.moves and near.size else [0.0]:
             for outline in outlines(limit.shape, instant):
                 opacity = 0.3 if limit.shape.moves else 0.55
-                areas.append(Area(outline=outline, colour=OBSTACLE, opacity=opacity, label="obstacle"))
+                areas.append(Area(outline=outline, colour=COLOUR.obstacle, opacity=opacity, label="obstacle"))
     regions = [
-        Series(x=edge[:, 0], y=edge[:, 1], colour=BOUND, label="region", dashed=True, width=0.9)
+        Series(x=edge[:, 0], y=edge[:, 1], colour=COLOUR.bound, label="region", dashed=True, width=0.9)
         for _, edges in region_edges(run)
         for edge in edges
     ]
     course, position = run.log.control.reference, run.log.plant.state[:, POSITION]
     lines = [
         Series(x=course[:, 0], y=course[:, 1], **_REFERENCE),
-        Series(x=position[:, 0], y=position[:, 1], colour=line_colour(0), label="flight"),
-        _point(position[0], "start", line_colour(0), width=9.0),
-        _point(position[-1], "end", line_colour(1), width=5.0, marker="square"),
+        Series(x=position[:, 0], y=position[:, 1], colour=COLOUR.flown, label="flight"),
+        _point(position[0], "start", COLOUR.flown, width=9.0),
+        _point(position[-1], "end", COLOUR.flown, width=5.0, marker="square"),
     ]
     return Panel(title="from above", x_label="x [m]", y_label="y [m]", equal=True, height=2.0, areas=tuple(areas),
                  series=(*regions, *lines))  # fmt: skip
@@ -283,9 +285,9 @@ def path(runs: Sequence[Run]) -> Scene:
                 solids.append((corners + obstacle.position, obstacle.name))
         for limit, edges in region_edges(next(run for run in runs if run.limits == limits)):
             lines = np.insert(edges, 2, np.nan, axis=1).reshape(-1, 3)
-            paths.append((lines, limit.name, BOUND, "", True))
+            paths.append((lines, limit.name, COLOUR.bound, "", True))
     for run in distinct_courses(runs):
-        paths.append((run.log.control.reference[:, :3], "reference", REFERENCE, "", True))
+        paths.append((run.log.control.reference[:, :3], "reference", COLOUR.reference, "", True))
     for i, label, run in _flown(runs):
         paths.append((run.log.plant.state[:, POSITION], label, line_colour(i), f"run{i}", False))
     return Scene(key="path", title="path in space", paths=tuple(paths), solids=tuple(solids))
@@ -301,7 +303,7 @@ def _signal(runs: Sequence[Run], name: str) -> Panel:
         sampled = signal.sampled(control)
         if len(runs) == 1 and name in STATE_NAMES and not control.measured_perfectly:
             t, values = break_at_wraps(control.t, signal.sampled(replace(control, truth=control.state)), signal.unit)
-            curves.append(Series(x=t, y=values, colour=line_colour(1), label="measured", width=0.7))
+            curves.append(Series(x=t, y=values, colour=COLOUR.measured, label="measured", width=0.7))
         if sampled.ndim == 1 and signal.plant is not None:
             curves.append(_of_run(i, label, *break_at_wraps(run.log.plant.t, signal.plant(run.log.plant), signal.unit)))
             continue
@@ -336,8 +338,8 @@ def _several(title: str, unit: str, t: Array, values: Array, names: Sequence[str
 
 def _acting(rotor: int, t: Array, commanded: Array, speeds: Array) -> Panel:
     """Plot commanded and actual speed of a rotor."""
-    command = Series(x=t, y=commanded[:, rotor], colour=REFERENCE, label="commanded", style="steps", width=1.0)
-    acting = Series(x=t, y=speeds[:, rotor], colour=line_colour(0), label="actual", width=1.0)
+    command = Series(x=t, y=commanded[:, rotor], colour=COLOUR.reference, label="commanded", style="steps", width=1.0)
+    acting = Series(x=t, y=speeds[:, rotor], colour=COLOUR.flown, label="actual", width=1.0)
     return Panel(title=f"rotor {rotor + 1}", unit="rad/s", series=(command, acting))
 
 

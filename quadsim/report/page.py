@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from quadsim.errors import printable
+from quadsim.palette import css
 from quadsim.report.table import Cell, Grid, Row
 from quadsim.report.to_plotly import Plot, plotly_script
 
@@ -64,7 +65,7 @@ def render_page(
     shown = [part for part in map(_without_empty, sections) if part.text or part.plots or part.tables or part.folded]
     return _environment().get_template("page.html.j2").render(
         kind=kind, title=title, sections=shown, verdict=verdict, notes=notes, runs=runs, groups=groups,
-        files=files or {}, plotly=plotly_script() if any(section.plots for section in shown) else "",
+        files=files or {}, palette=css(), plotly=plotly_script() if any(section.plots for section in shown) else "",
     )  # fmt: skip
 
 

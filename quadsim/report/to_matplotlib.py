@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from quadsim.errors import OutputError
-from quadsim.report.figure import BOUND, Bound, Figure, Panel, Series
+from quadsim.palette import COLOUR
+from quadsim.report.figure import Bound, Figure, Panel, Series
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -207,7 +208,7 @@ def _draw_series(axes: Axes, series: Series) -> Artist:
 
 
 def _draw_bound(axes: Axes, bound: Bound) -> Artist:
-    looks: Any = {"color": BOUND, "linestyle": "--", "linewidth": 1.1}
+    looks: Any = {"color": COLOUR.bound, "linestyle": "--", "linewidth": 1.1}
     if bound.vertical:
         return axes.axvline(bound.value, **looks)
     if not np.isfinite([bound.start, bound.stop]).all():

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from quadsim.report.figure import BOUND, OBSTACLE, Figure, Panel, Scene, Series
+from quadsim.palette import COLOUR
+from quadsim.report.figure import Figure, Panel, Scene, Series
 from quadsim.state import Array
 
 if TYPE_CHECKING:
@@ -109,7 +110,12 @@ def scene_to_plot(scene: Scene) -> Plot:
     canvas = Canvas()
     for points, name in scene.solids:
         x, y, z = points.T.astype(np.float32)
-        look: dict[str, Any] = {"color": OBSTACLE, "opacity": 0.6, "name": html.escape(name), "hoverinfo": "name"}
+        look: dict[str, Any] = {
+            "color": COLOUR.obstacle,
+            "opacity": 0.6,
+            "name": html.escape(name),
+            "hoverinfo": "name",
+        }
         canvas.add_trace(Mesh3d(x=x, y=y, z=z, alphahull=0, **look))
     for path, label, colour, group, dashed in scene.paths:
         x, y, z = path[:: max(1, len(path) // _MOST_POINTS)].T.astype(np.float32)
@@ -161,7 +167,7 @@ def _draw_panel(canvas: Canvas, panel: Panel, place: dict[str, int], points: int
         canvas.add_trace(Scatter(x=x, y=y, mode="lines", hoverinfo="skip", **look), **place)
     for series in panel.series:
         _draw_series(canvas, series, place, points)
-    line = {"color": BOUND, "width": 1.4, "dash": "dash"}
+    line = {"color": COLOUR.bound, "width": 1.4, "dash": "dash"}
     for bound in panel.bounds:
         if bound.vertical:
             canvas.add_vline(bound.value, line=line, **place)

@@ -10,6 +10,7 @@ import numpy as np
 
 from quadsim.assets import models_dir
 from quadsim.flight.phase import Outline
+from quadsim.palette import COLOUR, rgba
 from quadsim.rotation import euler_to_quaternion
 from quadsim.space import Obstacle
 from quadsim.state import Array
@@ -36,7 +37,6 @@ defaults."""
 _MEETS: Final = 1  # bit of contype and conaffinity for contact of floor and airframe
 _MEETS_OBSTACLES: Final = 2
 """Bit of contype and conaffinity for contact of obstacles and the vehicle's bounding ball."""
-OBSTACLE_COLOUR: Final = (0.72, 0.36, 0.28, 1.0)
 _RIM: Final = 32
 """Points on the rim of a rotor disc; they miss its lowest point by at most half a percent of its radius."""
 DRAG: Final = "drag"
@@ -188,7 +188,7 @@ def _add_obstacles(spec: mujoco.MjSpec, obstacles: Sequence[Obstacle], radius: f
         for solid in obstacle.solids:
             kind = getattr(mujoco.mjtGeom, f"mjGEOM_{solid.kind.upper()}")
             geom = body.add_geom(type=kind, size=list(solid.size), pos=solid.centre, quat=solid.quaternion)
-            geom.rgba = OBSTACLE_COLOUR
+            geom.rgba = rgba(COLOUR.obstacle)
             meeting.append((geom, _MEETS_OBSTACLES, 0))
     for geom, contype, conaffinity in meeting:
         geom.mass, geom.contype, geom.conaffinity = 0.0, contype, conaffinity

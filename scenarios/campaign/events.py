@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from quadsim.report.figure import BOUND, LINES, REFERENCE
+from quadsim.palette import COLOUR, CYCLE
 from scenarios.many import DIED, ERROR, MEMORY, TIMEOUT
 
 if TYPE_CHECKING:
@@ -37,15 +37,15 @@ class Verdict(NamedTuple):
 
 
 VERDICTS: Final = {
-    HARMLESS: Verdict(0, LINES[0], "circle"),
-    INCOMPLETE: Verdict(1, LINES[2], "cross"),
-    UNAUDITED: Verdict(1, LINES[0], "circle-open"),
-    "violated": Verdict(2, LINES[1], "diamond"),
-    "lost": Verdict(6, BOUND, "x"),
-    ERROR: Verdict(5, REFERENCE, "square"),
-    DIED: Verdict(5, LINES[3], "pentagon"),
-    TIMEOUT: Verdict(4, LINES[4], "triangle-up"),
-    MEMORY: Verdict(3, LINES[5], "triangle-down"),
+    HARMLESS: Verdict(0, COLOUR.satisfied, "circle"),
+    INCOMPLETE: Verdict(1, COLOUR.warning, "cross"),
+    UNAUDITED: Verdict(1, COLOUR.measured, "circle-open"),
+    "violated": Verdict(2, COLOUR.violated, "diamond"),
+    "lost": Verdict(6, COLOUR.lost, "x"),
+    ERROR: Verdict(5, COLOUR.measured, "square"),
+    DIED: Verdict(5, CYCLE[2], "pentagon"),
+    TIMEOUT: Verdict(4, CYCLE[3], "triangle-up"),
+    MEMORY: Verdict(3, CYCLE[4], "triangle-down"),
 }
 """In the order in which they are drawn and counted."""
 

@@ -14,7 +14,8 @@ import numpy as np
 import pyarrow as pa
 
 from quadsim.errors import InputError, ParameterError, UnknownNameError
-from quadsim.report.figure import BOUND, Bound, Figure, Panel, Series, line_colour
+from quadsim.palette import COLOUR
+from quadsim.report.figure import Bound, Figure, Panel, Series
 from scenarios.assembly import Assembly
 from scenarios.campaign.campaign_file import CampaignFile, Grid
 from scenarios.campaign.plan import Plan, audited, cell
@@ -101,8 +102,8 @@ class Sweep(Result):
         points = tuple(
             Series(x=x[chosen], y=y[chosen], colour=colour, label=label, style="points", width=5.0, marker=marker)
             for chosen, colour, label, marker in (
-                (satisfied, line_colour(0), "satisfied", "circle"),
-                (~satisfied, BOUND, "not satisfied", "x"),
+                (satisfied, COLOUR.satisfied, "satisfied", "circle"),
+                (~satisfied, COLOUR.violated, "not satisfied", "x"),
             )
             if chosen.any()
         )

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from quadsim.report.figure import LINES, REFERENCE, Figure, Panel, Series
+from quadsim.palette import COLOUR, CYCLE
+from quadsim.report.figure import Figure, Panel, Series
 from quadsim.report.page import Section, render_page
 from quadsim.report.to_plotly import to_plot
 from quadsim.state import shown_unit
@@ -17,7 +18,7 @@ from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, STAR
 if TYPE_CHECKING:
     from scenarios.identify.report import IdentifiedVehicle
 
-_COLOURS: Final = {IDENTIFIED: LINES[0], THRUST_ONLY: LINES[1], START: LINES[2]}
+_COLOURS: Final = dict(zip((IDENTIFIED, THRUST_ONLY, START), CYCLE, strict=False))
 _TRACED: Final = (
     *((f"v{axis}, world", "m/s") for axis in "xyz"),
     *((f"{axis} rate", "rad/s") for axis in ("roll", "pitch", "yaw")),
@@ -49,18 +50,27 @@ def interval_figure(estimates: Sequence[Estimate]) -> Figure:
     """Return each parameter's interval and start in percent of its value; those that a gate refuses are grey."""
     drawn = [estimate for estimate in estimates if estimate.in_file]
     series = []
-    for refused, colour, label in ((False, LINES[0], "95 % interval"), (True, REFERENCE, "refused by a gate")):
+    for refused, colour, label in (
+        (False, _COLOURS[IDENTIFIED], "95 % interval"),
+        (True, COLOUR.measured, "refused by a gate"),
+    ):
         at = [(i, e) for i, e in enumerate(drawn) if bool(e.refused) is refused]
         x = np.ravel([[i, i, np.nan] for i, _ in at])
         y = np.ravel([[_percent(e.low, e), _percent(e.high, e), np.nan] for _, e in at])
         series += [Series(x=x, y=y, colour=colour, label=label, width=5.0)] if at else []
     series += [
-        Series(x=np.arange(float(len(drawn))), y=np.zeros(len(drawn)), colour=LINES[0], style="points", width=4.0)
+        Series(
+            x=np.arange(float(len(drawn))),
+            y=np.zeros(len(drawn)),
+            colour=_COLOURS[IDENTIFIED],
+            style="points",
+            width=4.0,
+        )
     ]
     start = Series(
         x=np.arange(float(len(drawn))),
         y=np.array([np.nan if e.start is None else _percent(e.start, e) for e in drawn]),
-        colour=LINES[1],
+        colour=_COLOURS[START],
         label=START,
         style="points",
         marker="diamond",
@@ -98,7 +108,7 @@ def trace_figure(trace: Trace, models: Sequence[str] = (IDENTIFIED, THRUST_ONLY)
             for name in models
         )  # fmt: skip
         measured = Series(
-            x=t.ravel(), y=scale * trace.measured[..., i].ravel(), colour=REFERENCE, label="measured", width=2.4
+            x=t.ravel(), y=scale * trace.measured[..., i].ravel(), colour=COLOUR.measured, label="measured", width=2.4
         )
         panels.append(Panel(title=title, unit=unit, series=(measured, *reversed([*predicted]))))
     title = f"measured and predicted: {trace.log} from {trace.t[0, 0]:.4g} s on, a prediction every {t[0, -1]:.2g} s"

@@ -26,7 +26,8 @@ from viser import _messages
 
 from quadsim.controller import law_name
 from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.report.figure import LINES, least_range
+from quadsim.palette import CYCLE
+from quadsim.report.figure import least_range
 from quadsim.rotation import quaternion_to_euler
 from quadsim.sim.physics import FlownPeriod
 from scenarios.flight import Flight
@@ -201,7 +202,7 @@ class Page:
             self._plots = [
                 gui.add_uplot(
                     (np.array([0.0, 1.0]), *([np.zeros(2)] * len(names))),
-                    ({"label": "t [s]"}, *({"label": n, "stroke": c} for n, c in zip(names, LINES, strict=False))),
+                    ({"label": "t [s]"}, *({"label": n, "stroke": c} for n, c in zip(names, CYCLE, strict=False))),
                     scales=_TIME,
                     aspect=1.9,
                     title=title,

@@ -9,7 +9,7 @@ from typing import Final
 
 from quadsim.controller import OPTIMAL
 from quadsim.flight.audit import Limit
-from quadsim.report.figure import BOUND, line_colour
+from quadsim.palette import COLOUR, line_colour
 from scenarios.live.session import Frame
 
 NEAR: Final = 0.1  # share of a bound's half band within which the row is marked
@@ -37,15 +37,15 @@ STEER: Final = (
 STYLE: Final = f"""<style>
 .q{{font:12px/1.5 system-ui,sans-serif;padding:0 .8em}}.q b,.q .n{{font-variant-numeric:tabular-nums}}
 .q .line{{height:1.5em;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}}
-.chip{{display:inline-block;padding:0 .6em;border-radius:1em;color:#fff;background:#a85f00;font-weight:600}}
-.chip.flying{{background:#2f7d4f}}.chip.paused,.chip.ready{{background:#6b7280}}.chip.ended{{background:{BOUND}}}
+.chip{{display:inline-block;padding:0 .6em;border-radius:1em;color:#fff;background:#6b7280;font-weight:600}}
+.chip.flying{{background:{COLOUR.flown}}}.chip.ended{{background:{COLOUR.violated}}}
 .q table{{width:100%;border-collapse:collapse;table-layout:fixed}}.q tr{{height:1.6em}}
 .q td,.q th{{padding:0 4px 0 0;white-space:nowrap;overflow:hidden;text-overflow:ellipsis}}
 .q th{{text-align:left;font-weight:400;opacity:.7}}.q .n{{text-align:right}}
 .q .track{{position:relative;height:9px;background:#8884;border-radius:3px;overflow:hidden}}
 .q .track i{{position:absolute;top:0;bottom:0}}
-.q .bad{{color:{BOUND};font-weight:600}}.q .near{{font-weight:600}}.q .off{{opacity:.55}}
-.q .watch{{background:#a85f00;color:#fff;padding:.4em .7em;border-radius:4px;margin:.4em 0}}
+.q .bad{{color:{COLOUR.violated};font-weight:600}}.q .near{{font-weight:600}}.q .off{{opacity:.55}}
+.q .watch{{background:#6b7280;color:#fff;padding:.4em .7em;border-radius:4px;margin:.4em 0}}
 .q .why{{opacity:.75;padding-bottom:.5em}}
 .hints,.over{{position:fixed;left:16px;z-index:5;pointer-events:none;font:14px/1.4 system-ui,sans-serif}}
 .hints{{bottom:16px}}.over{{top:16px}}.hints .key{{font-size:12px}}
@@ -74,9 +74,9 @@ def says(text: str, mark: str = "") -> str:
 def hints(used: Collection[str], names: Sequence[str]) -> str:
     """Return the hints over the scene that have not been used, and the key to its colours."""
     left = "".join(f"<div>{text}</div>" for name, text in HINTS.items() if name not in used)
-    key = "blue: flown; green: predicted; arrows: thrusts; orange arm: front"
+    key = "; ".join(map(_named, ("flown", "predicted", "reference"))) + "; arrows: thrusts; orange arm: front"
     if len(names) > 1:
-        key = f"blue: {escape(names[0])}; orange: {escape(names[1])}; inputs act on both"
+        key = "; ".join(f"{_dot(i)}{escape(name)}" for i, name in enumerate(names)) + "; inputs act on both"
     return f'<div class="hints">{left}<div class="key">octahedron: set-point; {key}</div></div>'
 
 
@@ -120,6 +120,10 @@ def _dotted(texts: Sequence[str]) -> str:
     return " ".join(f"{_dot(i) if len(texts) > 1 else ''}<b>{text}</b>" for i, text in enumerate(texts))
 
 
+def _named(meaning: str) -> str:
+    return f'<span style="color:{getattr(COLOUR, meaning)}">●</span> {meaning}'
+
+
 def _dot(vehicle: int) -> str:
     return f'<span style="color:{line_colour(vehicle)}">●</span> '
 
@@ -160,7 +164,7 @@ class Constraints:
         if math.isnan(margins[0]):
             kind = "off"
             cells[0] = f"from {limit.start:g} s" if audited and frame.time < limit.start else "ended"
-        bound = f'<i style="left:{100.0 / _SHOWN:.1f}%;width:2px;background:{BOUND}"></i>'
+        bound = f'<i style="left:{100.0 / _SHOWN:.1f}%;width:2px;background:{COLOUR.bound}"></i>'
         numbers = "".join(f'<td class="n">{cell}</td>' for cell in cells)
         name = f"{escape(limit.name)} [{escape(limit.unit)}]"
         track = f'<div class="track">{marks}{bound}</div>'
@@ -181,5 +185,5 @@ def _mark(limit: Limit, margin: float, vehicle: int) -> str:
     share, colour = min(max(1.0 - margin / limit.half_band, 0.0), _SHOWN) / _SHOWN, line_colour(vehicle)
     if vehicle:
         return f'<i style="left:calc({100.0 * share:.1f}% - 2px);width:4px;background:{colour};z-index:1"></i>'
-    colour = BOUND if limit.violated(margin) else colour
+    colour = COLOUR.violated if limit.violated(margin) else colour
     return f'<i style="left:0;width:{100.0 * share:.1f}%;background:{colour}"></i>'

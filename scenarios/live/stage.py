@@ -19,8 +19,8 @@ from viser.infra._infra import WebsockMessageHandler
 
 from quadsim.controller import law_name
 from quadsim.flight.audit import SpaceLimit
-from quadsim.report.figure import BOUND, OBSTACLE, line_colour
-from quadsim.report.film import painter as ink
+from quadsim.palette import COLOUR, Rgb, line_colour, rgb
+from quadsim.report.film.frames import thin
 from quadsim.sim.airframe import FLOOR, compile_model
 from quadsim.space import Obstacle, Region
 from quadsim.state import Array
@@ -32,12 +32,12 @@ FLAT: Final = {"cast_shadow": False, "receive_shadow": False}
 FIELD: Final = math.radians(45.0)  # of view, as in films
 TRAIL: Final = 200  # points of the flown path that stay
 _EVERY: Final = 2  # periods from one to the next; every point is sent anew with each
-_COURSE: Final = 600  # points of the reference that are drawn
+_COURSE: Final = 3000  # segments of the reference that are drawn
+_BEND: Final = 0.03  # how far they may be from it, in arm lengths
 _SECONDS: Final = 180.0  # of the flight that a recording has at most
 _REST: Final = 5e-4  # [s] after each period that is recorded, for the thread that flies
 _ROOT: Final = "/flight"  # what moves as one in a recording
 _SHADOW: Final = (84, 92, 101)
-_REGION: Final = (242, 242, 140)
 _TINTED: Final = ("front", "disc", "disc_front")  # materials in a vehicle's colour where there are two
 
 
@@ -66,23 +66,24 @@ class Stage:
         self._drop = float(model.geom(FLOOR).pos[2])  # from a vehicle to the floor that it stands on [m]
         self._square = look.square_side(self.unit)
         self._floor = scene.add_glb(f"{_ROOT}/floor", look.floor(self._square))
-        target = ink.AMBER if alone else ink.WHITE
+        target = rgb(COLOUR.reference)
         self._ahead = self._line("reference", _course(session), target, 2.0)
         self._goal = self._line("goal", _octahedron(0.5 * self.unit), target, 2.5)
-        self._hand = self._line("hand", np.zeros((1, 2, 3)), _rgb(BOUND), 5.0)
-        self._thrusts: list[ink.Colour] = []  # colours
+        self._hand = self._line("hand", np.zeros((1, 2, 3)), rgb(COLOUR.disturbance), 5.0)
+        self._colours: list[Rgb] = []
         self._frames, self._arrows, self._horizons, self._paths, self._shadows = [], [], [], [], []
         for i, flight in enumerate(session.flights):
-            name, length, colour = f"vehicle{i}", flight.loop.controller.horizon, _rgb(line_colour(i))
+            name, length, colour = f"vehicle{i}", flight.loop.controller.horizon, rgb(line_colour(i))
             self._frames.append(scene.add_frame(f"{_ROOT}/{name}", show_axes=False))
-            for material, (*rgb, alpha), mesh in look.airframe(model):
-                tint = tuple(rgb) if alone or material not in _TINTED else colour
+            for material, (*paint, alpha), mesh in look.airframe(model):
+                tint = tuple(paint) if alone or material not in _TINTED else colour
                 self._add(f"{name}/{material}", mesh, tint, opacity=None if alpha == 1.0 else alpha)
-            thrust, arrows = ink.BLUE if alone else colour, np.zeros((len(self._rotors), 2, 3))
+            arrows = np.zeros((len(self._rotors), 2, 3))
             widths = {"shaft_radius": 0.04 * self.unit, "head_radius": 0.09 * self.unit, "head_length": 0.2 * self.unit}
-            self._thrusts.append(thrust)
-            self._arrows.append(scene.add_arrows(f"{_ROOT}/{name}/thrust", arrows, thrust, **widths))
-            self._horizons.append(self._line(f"horizon{i}", np.zeros((length, 2, 3)), ink.GREEN if alone else colour))
+            self._colours.append(colour)
+            self._arrows.append(scene.add_arrows(f"{_ROOT}/{name}/thrust", arrows, colour, **widths))
+            predicted = rgb(COLOUR.predicted) if alone else colour
+            self._horizons.append(self._line(f"horizon{i}", np.zeros((length, 2, 3)), predicted))
             self._paths.append(self._line(f"path{i}", np.zeros((TRAIL, 2, 3)), colour))
             shadow = self._add(f"shadow{i}", look.disc(0.9 * self.unit), _SHADOW)
             plumb = self._line(f"shadow{i}/plumb", np.array([[(0.0, 0.0, 0.0), (0.0, 0.0, 1.0)]]), _SHADOW, 1.0)
@@ -92,7 +93,7 @@ class Stage:
                 scene.add_label(f"{_ROOT}/{name}/label", title, position=top, anchor="bottom-center")
                 self._line(f"{name}/pole", np.array([[(0.0, 0.0, 0.0), top]]), colour, 1.5)
         self.mark = self._add("mark", look.disc(0.5 * self.unit), target, visible=False)
-        self.grab = self._add("vehicle0/grab", look.grip(1.3 * self.unit), ink.WHITE, opacity=0.001)
+        self.grab = self._add("vehicle0/grab", look.grip(1.3 * self.unit), _SHADOW, opacity=0.001)
         self._trails = [deque[Array](maxlen=TRAIL + 1) for _ in session.flights]
         self._shown = deque[Frame](maxlen=round(_SECONDS / session.period))
         self._moving: list[tuple[Obstacle, Any]] = []
@@ -102,10 +103,10 @@ class Stage:
         for limit in session.limits:
             match limit:
                 case SpaceLimit(shape=Region() as region):
-                    line = self._line(f"regions/{limit.name}", region.edges(low, high), _REGION, 1.5)
+                    line = self._line(f"regions/{limit.name}", region.edges(low, high), rgb(COLOUR.bound), 1.5)
                     self._regions.append((limit, line))
                 case SpaceLimit(shape=Obstacle() as body):
-                    handle = self._add(f"obstacles/{body.name}", look.obstacle(body), _rgb(OBSTACLE))
+                    handle = self._add(f"obstacles/{body.name}", look.obstacle(body), rgb(COLOUR.obstacle))
                     handle.position = body.position
                     if body.moves:
                         self._moving.append((body, handle))
@@ -120,7 +121,7 @@ class Stage:
                 continue
             thrusts = self._coefficient * frame.health * np.square(sample.rotors)
             lengths = self.unit * len(self._rotors) / self._weight * thrusts
-            sound = np.where(frame.health[:, None] == 1.0, self._thrusts[i], _rgb(BOUND))
+            sound = np.where(frame.health[:, None] == 1.0, self._colours[i], rgb(COLOUR.violated))
             self._arrows[i].colors = sound.astype(np.uint8)
             tips = self._rotors + np.outer(lengths, [0.0, 0.0, 1.0])
             self._arrows[i].points = np.stack([self._rotors, tips], axis=1).astype(np.float32)
@@ -191,18 +192,13 @@ class Stage:
             clock.sleep(_REST)
         return look.dressed(record.as_html(), title)
 
-    def _line(self, name: str, points: Array, colour: ink.Colour, thickness: float = 3.0) -> Any:
+    def _line(self, name: str, points: Array, colour: Rgb, thickness: float = 3.0) -> Any:
         style = {"thickness": thickness, "thickness_units": "screen"}
         return self._scene.add_line_segments(f"{_ROOT}/{name}", points.astype(np.float32), colour, **style)
 
     def _add(self, name: str, mesh: Any, colour: tuple[float, ...], **style: Any) -> Any:
         style = {"color": colour, "flat_shading": True, **FLAT, **style}
         return self._scene.add_mesh_simple(f"{_ROOT}/{name}", mesh.vertices, mesh.faces, **style)
-
-
-def _rgb(colour: str) -> ink.Colour:
-    red, green, blue = bytes.fromhex(colour[1:])
-    return red, green, blue
 
 
 def _octahedron(radius: float) -> Array:
@@ -220,7 +216,7 @@ def _segments(points: Array, count: int) -> Array:
 
 
 def _course(session: Session) -> Array:
-    """The reference over the scenario's whole time, thinned."""
-    periods = session.scenario.periods
-    rows = session.flights[0].loop.course.preview(0, periods)[:: max(1, periods // _COURSE), :3]
-    return _segments(np.asarray(rows), _COURSE + 1)
+    """The reference over the scenario's whole time, thinned where it is straight, and cut off where it is too long."""
+    course = np.asarray(session.flights[0].loop.course.preview(0, session.scenario.periods)[:, :3])
+    rows = course[thin(course, _BEND * session.flights[0].actual.arm_length)]
+    return _segments(rows[: _COURSE + 1], _COURSE)

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -331,6 +332,21 @@ def test_flights_are_compared(hover: Scenario, flight: Flight, tmp_path: Path) -
     page = quadsim.compare(saved, out=tmp_path / "page", progress=False).page
     assert page == tmp_path / "page" / "index.html"
     assert "hover" in page.read_text()
+
+
+def test_columns_of_a_comparison_have_the_names_that_they_are_given(hover: Scenario, flight: Flight) -> None:
+    def falls(now: Any, state: Any, reference: Any) -> list[float]:
+        return [0.0] * 4
+
+    own = quadsim.fly(hover, controller=falls, progress=False)
+    shipped = quadsim.fly(hover, progress=False)
+    assert quadsim.compare(shipped, own, progress=False).names == ("hover (constrained MPC)", "hover (falls)")
+    named = quadsim.compare(shipped, own, names=["theirs", "mine"], progress=False)
+    assert named.names == ("theirs", "mine")
+    assert "| theirs | mine |" in named.to_markdown()
+    for names in (["mine"], ["mine", "mine"], ["mine", " "], "me", ["mine", 3]):
+        with pytest.raises(ParameterError, match="names must be 2 different texts, one for each target; got"):
+            quadsim.compare(hover, flight, names=names, progress=False)
 
 
 def test_what_is_handed_out_names_itself_in_a_few_lines() -> None:

@@ -253,6 +253,21 @@ def test_check_writes_its_verdicts_as_junit(
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_compare_leaves_out_what_it_is_told_to_and_names_its_columns(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "short.toml").write_text('base = "hover"\nname = "short"\nduration = 0.2\nconstraints = []\n')
+    products = ["--no-video", "--no-recording", "--no-figures"]
+    arguments = ["compare", "short.toml", "short.toml", "--name", "A", "--name", "B", "--out", "page", *products]
+    assert main([*arguments, "--json"]) == EXIT_DONE
+    assert set(json.loads(capsys.readouterr().out)[0]["values"]) == {"A", "B"}
+    assert sorted(path.name for path in (here / "page-runs").iterdir()) == ["short", "short-2"]
+    kept = {path.name for path in (here / "page-runs" / "short").iterdir()}
+    assert {"summary.json", "flight.parquet"} <= kept
+    assert not kept & {"flight.mp4", "flight.rrd", "figures"}
+    assert ">A</h3>" in (here / "page" / "index.html").read_text()
+
+
 def test_compare_prints_markdown(hover_directory: Path, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["compare", str(hover_directory), "--out", "page", "--markdown"]) == EXIT_DONE
     assert capsys.readouterr().out.startswith("| ")
@@ -268,6 +283,14 @@ WRONG: dict[str, tuple[list[str], str]] = {
     "a number that is not whole": (["run", "hover", "--seed", "3.7"], "--seed: must be a whole number; got '3.7'"),
     "a word too many": (["list", "hover"], "Unused Tokens: ['hover']"),
     "nothing to compare": (["compare", "--out", "page"], "compare needs runs, scenarios, or two campaigns"),
+    "one name for two flights": (
+        ["compare", "hover", "gust", "--name", "mine", "--out", "page"],
+        "names must be 2 different texts, one for each target; got ['mine']",
+    ),
+    "a film of a comparison that writes nothing": (
+        ["compare", "hover", "gust", "--video"],
+        "--video must be absent without --out: nothing is written; got True",
+    ),
     "two flights to replay": (["replay", "gone", "--worst", "--flight", "3"], "--flight must be absent with --worst"),
     "one scenario of two": (["compare", "hover", "nope", "--out", "page"], "no scenario named 'nope'"),
     "a scenario without a name": (["scenario"], "scenario needs a name or a TOML file, or --schema (there are: "),

@@ -13,15 +13,20 @@ from PIL import Image
 from quadsim.controller import LAW, OPTIMAL, STOPPED, Phase, law_name
 from quadsim.flight.audit import Limit
 from quadsim.flight.rundir import Run
+from quadsim.palette import ON_DARK
 from quadsim.report.comparison import failure_sentences
 from quadsim.report.film import painter as ink
 from quadsim.report.film.frames import Footage, MarginTrack
-from quadsim.report.film.painter import Colour, Painter, Picture, shade, text_width
+from quadsim.report.film.painter import Painter, Picture, shade, text_width
 from quadsim.report.table import ABSENT
 from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, Array
 
 _STRIP: Final = 150  # height of the bottom strip, in design pixels of a 1280 x 720 frame
-_LEGEND: Final = (230, "reference", ink.AMBER), (150, "flown", ink.BLUE), (100, "predicted", ink.GREEN)
+_LEGEND: Final = (
+    (230, "reference", ON_DARK.reference),
+    (150, "flown", ON_DARK.flown),
+    (100, "predicted", ON_DARK.predicted),
+)
 """How far left of the right edge [design pixels] the colours of the paths are named."""
 _MOST_MARGINS: Final = 6
 
@@ -81,32 +86,32 @@ class Overlay:
         time = self._footage.times[i]
         return next((x for x in self._run.limits if x.signal == signal and x.start <= time <= x.stop), None)
 
-    def _headlines(self, i: int) -> list[tuple[str, float, Colour]]:
+    def _headlines(self, i: int) -> list[tuple[str, float, str]]:
         """Text, size and colour of the lines in the corner."""
         control, k = self._run.log.control, self._footage.period[i]
         time = self._footage.times[i]
-        lines: list[tuple[str, float, Colour]] = [(self._run.name, 21, ink.WHITE)]
+        lines: list[tuple[str, float, str]] = [(self._run.name, 21, ink.WHITE)]
         lines += [(self._subtitle, 14, ink.GREY), (f"t = {time:.2f} s", 20, ink.WHITE), self._answer(k)]
         for vectors, what, unit, colour in (
-            (self._footage.wind, "wind", "m/s", ink.CYAN),
-            (self._footage.force, "external force", "N", ink.VIOLET),
+            (self._footage.wind, "wind", "m/s", ON_DARK.disturbance),
+            (self._footage.force, "external force", "N", ON_DARK.disturbance),
         ):
             if vectors is not None:
                 lines.append((f"{what} {np.linalg.norm(vectors[i]):.2g} {unit}", 14, colour))
         happened = [event for event in self._run.summary.get("events", ()) if 0.0 <= time - event["time"] <= _SHOWN]
-        lines += [(event["text"][:_WIDEST], 15, ink.AMBER) for event in happened[-_MOST_EVENTS:]]
+        lines += [(event["text"][:_WIDEST], 15, ON_DARK.warning) for event in happened[-_MOST_EVENTS:]]
         reason = self._run.log.reason
         if reason is not None and time >= control.t[-1]:
-            lines.append((f"aborted {reason}"[:130], 15, ink.RED))
+            lines.append((f"aborted {reason}"[:130], 15, ON_DARK.violated))
         if time >= self._footage.times[-1] - _LAST:
             wrapped = [textwrap.wrap(sentence, _WIDEST) for sentence in failure_sentences(self._run.summary)]
             parts = [part for sentence in wrapped for part in sentence]
-            lines += [(part, 14, ink.AMBER) for part in parts[:_MOST_LINES]]
+            lines += [(part, 14, ON_DARK.warning) for part in parts[:_MOST_LINES]]
             if len(parts) > _MOST_LINES:
-                lines.append(("... all of it is in summary.json", 14, ink.AMBER))
+                lines.append(("... all of it is in summary.json", 14, ON_DARK.warning))
         return lines
 
-    def _answer(self, k: int) -> tuple[str, float, Colour]:
+    def _answer(self, k: int) -> tuple[str, float, str]:
         """Phase, where the flight has a ground, and what the controller answered in period k; red for a failure."""
         control = self._run.log.control
         status, phase, fallback = control.status[k], control.phase[k], control.fallback[k]
@@ -117,11 +122,11 @@ class Overlay:
         if control.iterations[k]:
             phrases += [f"{control.iterations[k]} iterations", f"{control.active[k]} active"]
         good = fallback == 0 and status in OPTIMAL | {Phase.LANDED}
-        return "  ·  ".join(phrases), 14, ink.GREEN if good else ink.RED
+        return "  ·  ".join(phrases), 14, ON_DARK.satisfied if good else ON_DARK.violated
 
     def _position(self, painter: Painter, x: float, y: float, i: int) -> None:
         painter.text(x + 118, y, "now", size=13, colour=ink.GREY, anchor="ra")
-        painter.text(x + 192, y, "reference", size=13, colour=ink.AMBER, anchor="ra")
+        painter.text(x + 192, y, "reference", size=13, colour=ON_DARK.reference, anchor="ra")
         painter.text(x + 262, y, "error", size=13, colour=ink.GREY, anchor="ra")
         reference = self._run.log.control.reference[self._footage.period[i]]
         values = (*self._footage.position[i], self._footage.euler[i, 2])
@@ -131,10 +136,12 @@ class Overlay:
             now, target, row = factor * values[j], factor * reference[j], y + 24 + 27 * j
             painter.text(x, row, f"{name} [{'deg' if angle else 'm'}]", colour=ink.GREY)
             unknown = angle and self._footage.tilt is not None and self._footage.tilt[i] > 0.5 * math.pi
-            columns = (118, now, ink.WHITE), (192, target, ink.AMBER), (262, now - target, ink.GREY)
+            columns = (118, now, ink.WHITE), (192, target, ON_DARK.reference), (262, now - target, ink.GREY)
             for right, value, colour in columns:
                 shown = f"{round(value, digits) + 0.0:+.{digits}f}"  # no "-0.00"
-                text = ABSENT if unknown and colour is not ink.AMBER else shown  # no value is bounded upside down
+                text = (
+                    ABSENT if unknown and colour is not ON_DARK.reference else shown
+                )  # no value is bounded upside down
                 painter.text(x + right, row, text, colour=colour, anchor="ra")
 
     def _attitude(self, painter: Painter, x: float, y: float, i: int) -> None:
@@ -148,13 +155,19 @@ class Overlay:
             span = 2.0 * max(map(abs, _bounds(limit)), default=15.0) if tilted is None else whole[name]
             broken, shown = _breaks(limit, value), f"{round(value, 2) + 0.0:+.2f}"
             painter.text(x, row, name, size=17)
-            painter.text(x + 262, row, shown, size=17, colour=ink.RED if broken else ink.WHITE, anchor="ra")
+            painter.text(x + 262, row, shown, size=17, colour=ON_DARK.violated if broken else ink.WHITE, anchor="ra")
             painter.box(x, row + 25, 262, 9, ink.FAINT)
             centre, unit = x + 131, 131 / span
-            painter.box(centre, row + 25, unit * float(np.clip(value, -span, span)), 9, ink.RED if broken else ink.BLUE)
+            painter.box(
+                centre,
+                row + 25,
+                unit * float(np.clip(value, -span, span)),
+                9,
+                ON_DARK.violated if broken else ON_DARK.flown,
+            )
             painter.box(centre - 0.5, row + 23, 1, 13, ink.GREY)
             for bound in _bounds(limit):
-                painter.box(centre + unit * bound - 1, row + 21, 2.5, 17, ink.RED if broken else ink.AMBER)
+                painter.box(centre + unit * bound - 1, row + 21, 2.5, 17, ink.WHITE if broken else ON_DARK.bound)
 
     def _speeds(self, painter: Painter, x: float, y: float, i: int) -> None:
         limit = self._limit("speed", i)
@@ -184,13 +197,15 @@ class Overlay:
         for j, value in enumerate(values):
             broken = _breaks(limit, value, sampled=limit is not None and limit.source.plant is None)
             left, shown = x + 50 * j, form.format(round(value, 1) + 0.0)
-            colour = ink.RED if broken else ink.WHITE
+            colour = ON_DARK.violated if broken else ink.WHITE
             painter.box(left, top, 34, height, ink.FAINT)
-            painter.box(left, zero, 34, -unit * float(np.clip(value, low, high)), ink.RED if broken else ink.BLUE)
+            painter.box(
+                left, zero, 34, -unit * float(np.clip(value, low, high)), ON_DARK.violated if broken else ON_DARK.flown
+            )
             painter.text(left + 17, top + height + 5, shown, size=13, colour=colour, anchor="ma")
         for bound in _bounds(limit):
             if bound != 0.0:
-                painter.box(x - 4, zero - unit * bound - 1, 192, 2, ink.AMBER)
+                painter.box(x - 4, zero - unit * bound - 1, 192, 2, ON_DARK.bound)
 
     def _margins(self, painter: Painter, x: float, y: float, i: int) -> None:
         painter.text(x, y, "limit", size=13, colour=ink.GREY)
@@ -200,10 +215,12 @@ class Overlay:
         for j, track in enumerate(shown):
             worst, row = track.worst[i], y + 22 + pitch * j
             now_broken, once_broken = track.violated[i], track.violated_before[i]
-            painter.text(x, row, track.limit.name, size=14, colour=ink.RED if now_broken else ink.GREY)
+            painter.text(x, row, track.limit.name, size=14, colour=ON_DARK.violated if now_broken else ink.GREY)
             phrases = f"{round(worst, 2) + 0.0:+.2f} {track.limit.unit}"
-            painter.text(x + 226, row, phrases, size=14, colour=ink.RED if once_broken else ink.WHITE, anchor="ra")
-        colour = ink.RED if "violated" in rest else ink.GREY
+            painter.text(
+                x + 226, row, phrases, size=14, colour=ON_DARK.violated if once_broken else ink.WHITE, anchor="ra"
+            )
+        colour = ON_DARK.violated if "violated" in rest else ink.GREY
         painter.text(x, y + 22 + pitch * len(shown), rest, size=14, colour=colour)
 
 

@@ -1,4 +1,4 @@
-"""Drawing primitives and colours of the captions.  Pillow alone."""
+"""Drawing primitives of the captions, and the ink that has no meaning.  Pillow alone."""
 
 from __future__ import annotations
 
@@ -9,17 +9,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 Picture = np.ndarray[Any, np.dtype[np.uint8]]
-Colour = tuple[int, int, int]
 
-WHITE: Final = (240, 243, 246)
-GREY: Final = (158, 168, 178)
-FAINT: Final = (74, 82, 92)
-RED: Final = (255, 84, 66)
-BLUE: Final = (72, 176, 255)
-AMBER: Final = (255, 184, 77)
-GREEN: Final = (120, 222, 150)
-CYAN: Final = (126, 232, 232)
-VIOLET: Final = (225, 120, 205)
+WHITE: Final = "#f0f3f6"
+GREY: Final = "#9ea8b2"
+FAINT: Final = "#4a525c"
 
 _TEXTS: Final = 2048
 """Texts that are cached as pictures, of each size of font: a film shows most of its words in every frame."""
@@ -32,14 +25,12 @@ class Painter:
     def __init__(self, image: Image.Image, scale: float) -> None:
         self._canvas, self._scale = ImageDraw.Draw(image), scale
 
-    def text(
-        self, x: float, y: float, text: str, *, size: float = 15, colour: Colour = WHITE, anchor: str = "la"
-    ) -> None:
+    def text(self, x: float, y: float, text: str, *, size: float = 15, colour: str = WHITE, anchor: str = "la") -> None:
         """Write at a place; `anchor` is Pillow's, `ra` for right-aligned."""
         font = _font(max(6, round(size * self._scale)))
         self._canvas.text((x * self._scale, y * self._scale), text, fill=colour, font=font, anchor=anchor)
 
-    def box(self, x: float, y: float, width: float, height: float, colour: Colour) -> None:
+    def box(self, x: float, y: float, width: float, height: float, colour: str) -> None:
         """Fill a rectangle; a negative width or height reaches to the left or up."""
         left, right = sorted((x * self._scale, (x + width) * self._scale))
         top, bottom = sorted((y * self._scale, (y + height) * self._scale))

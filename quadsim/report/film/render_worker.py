@@ -20,6 +20,7 @@ import numpy as np
 
 from quadsim.controller import Phase
 from quadsim.flight.rundir import Run, load_run
+from quadsim.palette import COLOUR, rgba
 from quadsim.report.figure import obstacles_in, region_edges
 from quadsim.report.film.camera import REQUEST
 from quadsim.report.film.captions import Overlay
@@ -43,12 +44,11 @@ PORTRAIT_SQUARE: Final = 0.1  # side of a portrait's floor squares [m]
 _DEEPEST_FLOOR: Final = 30.0  # the floor lies below the whole flight, but no deeper than this [m]
 _LONGEST_ARROW: Final = 2.5  # cap on a thrust arrow, in arrows at hover
 _MOST_GEOMS: Final = 2000
-_COURSE_COLOUR: Final = (1.0, 0.72, 0.25, 0.75)
-_TRAIL_COLOUR: Final = (0.12, 0.56, 1.0, 1.0)
-_HORIZON_COLOUR: Final = (0.35, 1.0, 0.55, 0.95)
-_THRUST_COLOUR: Final = (0.25, 0.70, 1.0, 0.85)
-_BROKEN_COLOUR: Final = (1.0, 0.2, 0.12, 0.95)
-_REGION_COLOUR: Final = (0.95, 0.95, 0.55, 0.5)
+_COURSE_COLOUR: Final = rgba(COLOUR.reference, 0.8)
+_HORIZON_COLOUR: Final = rgba(COLOUR.predicted)
+_THRUST_COLOUR: Final = rgba(COLOUR.flown, 0.85)
+_BROKEN_COLOUR: Final = rgba(COLOUR.violated)
+_REGION_COLOUR: Final = rgba(COLOUR.bound, 0.5)
 _SHADOW_COLOUR: Final = (0.05, 0.07, 0.10, 0.45)
 
 
@@ -149,7 +149,7 @@ class Stage:
         mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), np.array(colour, np.float32))
         mujoco.mjv_connector(geom, kind, width, start, stop)
         geom.category = mujoco.mjtCatBit.mjCAT_DECOR
-        geom.emission = 0.5
+        geom.emission = 0.25
         scene.ngeom += 1
 
     def _draw_path(self, points: Array, width: float, colour: tuple[float, float, float, float]) -> None:
@@ -162,7 +162,7 @@ class Stage:
         points = np.concatenate([self._footage.path[first:last], self._footage.position[i : i + 1]])
         for j, (start, stop) in enumerate(itertools.pairwise(points)):
             age = (now - times[first + j]) / TRAIL_SECONDS
-            colour = (*_TRAIL_COLOUR[:3], float(np.clip(1.0 - age, 0.0, 1.0)))
+            colour = rgba(COLOUR.flown, float(np.clip(1.0 - age, 0.0, 1.0)))
             self._connect(mujoco.mjtGeom.mjGEOM_CAPSULE, 0.030 * self._arm, start, stop, colour)
 
     def _draw_horizon(self, i: int) -> None:

@@ -15,13 +15,13 @@ from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
 from quadsim.flight.log import BODY_RATES, QUATERNION
 from quadsim.flight.metrics import unrecovered
 from quadsim.flight.rundir import Run
+from quadsim.palette import line_colour
 from quadsim.report.comparison import comparison_rows, fallback_sentence
 from quadsim.report.figure import (
     break_at_wraps,
     commanded_speeds,
     effect_curves,
     least_range,
-    line_colour,
     reference_curve,
 )
 from quadsim.report.recording.world import (
@@ -43,25 +43,29 @@ _ACTIVE: Final = 0.002  # A limit is active where its margin is below this fract
 
 
 def send_plots(recording: rr.RecordingStream, run: Run) -> rrb.Tabs:
-    """Send all signals over time, at the log rate where it exists between control samples; return their views."""
-    signals, events = _send_signals(recording, run), rrb.TextLogView(name="Events", origin="/events")
-    margins, effects = _send_limits(recording, run), _send_effects(recording, run)
-    times, *solver = _send_solver(recording, run)
-    lanes = [f"verdicts/{limit.name}" for limit in run.limits if limit.start == 0.0]
-    verdicts = rrb.StateTimelineView(name="Constraints on the whole flight", contents=lanes)
+    """Send all signals over time, at the log rate where it exists between control samples; return their views.
+
+    A view names only what was sent, and one without content is left out.
+    """
+    reached = [limit for limit in run.limits if _send_limit(recording, limit, run)]
+    signals, margins = _send_signals(recording, run, reached), _send_margins(recording, run, reached)
+    effects, events = _send_effects(recording, run), rrb.TextLogView(name="Events", origin="/events")
+    times, solver = _send_solver(recording, run)
+    lanes = [f"verdicts/{limit.name}" for limit in reached if limit.start == 0.0]
+    verdicts = [rrb.StateTimelineView(name="Constraints on the whole flight", contents=lanes)] if lanes else []
     return rrb.Tabs(
-        rrb.Grid(*signals[:FRONT_PANELS], verdicts, times, grid_columns=2, name="Flight"),
-        rrb.Grid(*signals[FRONT_PANELS:], grid_columns=2, name="More signals"),
+        rrb.Grid(*signals[:FRONT_PANELS], *verdicts, *times, grid_columns=2, name="Flight"),
+        *([rrb.Grid(*signals[FRONT_PANELS:], grid_columns=2, name="More signals")] if signals[FRONT_PANELS:] else []),
         rrb.Grid(*margins, *solver, events, grid_columns=2, name="Margins and solver"),
         *([rrb.Grid(*effects, grid_columns=2, name="Effects")] if effects else []),
     )
 
 
-def _send_signals(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
+def _send_signals(recording: rr.RecordingStream, run: Run, reached: Sequence[Limit]) -> list[rrb.TimeSeriesView]:
     """Every signal there is, and the reference; of flights that may turn upside down quaternion and body rates too."""
-    log, views = run.log, []
+    log, views = run.log, list[rrb.TimeSeriesView]()
     for title, names in panels(log).items():
-        contents, values = [], []
+        contents, values = list[str](), list[Array]()
         for colour, name in zip(SERIES, names, strict=False):
             unit = SIGNALS[name].unit
             t, curve = SIGNALS[name].finest(log)
@@ -70,50 +74,51 @@ def _send_signals(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSerie
                 labels = {f"rotor {i} [{unit}]": shade for i, shade in enumerate(SERIES, start=1)}
             else:
                 t, curve = break_at_wraps(t, curve, unit)
-            contents.append(f"signals/{name}")
+            contents += _send_curves(recording, f"signals/{name}", t, curve, labels, stepped=curve.ndim == 2)
             values.append(curve)
-            _send_curves(recording, contents[-1], t, curve, labels, stepped=curve.ndim == 2)
             if name in REFERENCE_NAMES:
-                contents.append(f"reference/{name}")
                 values.append(reference_curve(log.control, name))
-                _send_curves(recording, contents[-1], log.control.t, values[-1], {f"{name} ref [{unit}]": REFERENCE})
-        bounding = [limit for limit in run.limits if limit.signal in names]
+                labels = {f"{name} ref [{unit}]": REFERENCE}
+                contents += _send_curves(recording, f"reference/{name}", log.control.t, values[-1], labels)
+        bounding = [limit for limit in reached if limit.signal in names]
         values += [np.array([limit.lower, limit.upper]) for limit in bounding]
         contents += [f"limits/{limit.name}" for limit in bounding]
-        views.append(_view(title, contents, run, ends=least_range(values, SIGNALS[names[0]].unit)))
+        views += _view(title, contents, run, ends=least_range(values, SIGNALS[names[0]].unit))
     for name, vectors, columns in (
         ("quaternion", log.plant.attitude, QUATERNION),
         ("body_rates", log.plant.body_rates, BODY_RATES),
     ):
         if vectors is not None:
             labels = dict(zip((f"{column} [{unit}]" for column, unit in columns.items()), SERIES, strict=False))
-            _send_curves(recording, f"signals/{name}", log.plant.t, vectors, labels)
-            views.append(_view(name.replace("_", " ").capitalize(), [f"signals/{name}"], run))
+            contents = _send_curves(recording, f"signals/{name}", log.plant.t, vectors, labels)
+            views += _view(name.replace("_", " ").capitalize(), contents, run)
     return views
 
 
-def _send_limits(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
-    """Each limit's bounds over its time window, its margins, and what they say; margins of one unit in one plot."""
-    views = []
-    for unit in dict.fromkeys(limit.unit for limit in run.limits):
-        peers = [limit for limit in run.limits if limit.unit == unit]
-        for i, limit in enumerate(peers):
-            _send_limit(recording, limit, run, on_screen(line_colour(i)))
-        views.append(_view(f"Margins [{unit}]", [f"margins/{limit.name}" for limit in peers], run))
+def _send_margins(recording: rr.RecordingStream, run: Run, reached: Sequence[Limit]) -> list[rrb.TimeSeriesView]:
+    """The margins of limits at the samples; those of one unit in one plot."""
+    views = list[rrb.TimeSeriesView]()
+    for unit in dict.fromkeys(limit.unit for limit in reached):
+        contents = list[str]()
+        for i, limit in enumerate(limit for limit in reached if limit.unit == unit):
+            margins, labels = margins_sampled(limit, run.log), {f"{limit.name} [{unit}]": on_screen(line_colour(i))}
+            inside = np.isfinite(margins)
+            t, values = run.log.control.t[inside], margins[inside]
+            contents += _send_curves(recording, f"margins/{limit.name}", t, values, labels)
+        views += _view(f"Margins [{unit}]", contents, run)
     return views
 
 
-def _send_limit(recording: rr.RecordingStream, limit: Limit, run: Run, colour: Colour) -> None:
+def _send_limit(recording: rr.RecordingStream, limit: Limit, run: Run) -> bool:
+    """Send a limit's bounds over its time window and its verdicts; return whether the flight reached the window."""
     t, margins = run.log.control.t, margins_sampled(limit, run.log)
     inside = np.isfinite(margins)
     if not inside.any():
-        return
+        return False
     bounds = {sign: bound for sign, bound in (("≥", limit.lower), ("≤", limit.upper)) if math.isfinite(bound)}
     window = np.array([t[inside][0], min(limit.stop, run.end)])
     labels = {f"{limit.name} {sign} {bound:g} {limit.unit}": BOUND for sign, bound in bounds.items()}
     _send_curves(recording, f"limits/{limit.name}", window, np.tile([*bounds.values()], (2, 1)), labels)
-    labels = {f"{limit.name} [{limit.unit}]": colour}
-    _send_curves(recording, f"margins/{limit.name}", t[inside], margins[inside], labels)
 
     names, entity = list(VERDICTS), f"verdicts/{limit.name}"
     band = limit.upper - limit.lower
@@ -125,10 +130,12 @@ def _send_limit(recording: rr.RecordingStream, limit: Limit, run: Run, colour: C
     recording.log(entity, style, static=True)
     states = rr.StateChange.columns(state=[names[verdicts[k]] for k in changes])
     recording.send_columns(entity, [time_column(t[changes])], states)
+    return True
 
 
-def _send_solver(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
+def _send_solver(recording: rr.RecordingStream, run: Run) -> tuple[list[rrb.TimeSeriesView], list[rrb.TimeSeriesView]]:
     """Clock times, and what is known of the answers."""
+    sent = list[str]()
     control, timing = run.log.control, run.log.timing
     first, second = SERIES[:2]
     for name, values, label, colour in (
@@ -139,30 +146,34 @@ def _send_solver(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeries
         ("fallback", control.fallback, "fallback, 0 = none", first),
         ("slack", np.degrees(control.slack), "slack [deg]", second),
     ):
-        _send_curves(recording, f"solver/{name}", control.t, values, {label: colour})
+        sent += _send_curves(recording, f"solver/{name}", control.t, values, {label: colour})
     deadline = run.summary["controller"].get("deadline_ms")
     if deadline is not None:
         ends = run.log.plant.t[[0, -1]]
-        _send_curves(recording, "solver/deadline_ms", ends, np.full(2, deadline), {"deadline [ms]": BOUND})
-    return [
-        _view("Computation", ["solver/solve_ms", "solver/step_ms", "solver/deadline_ms"], run),
-        _view("Solver", ["solver/iterations", "solver/active"], run),
-        _view("Fallback and slack", ["solver/fallback", "solver/slack"], run),
-    ]
+        sent += _send_curves(recording, "solver/deadline_ms", ends, np.full(2, deadline), {"deadline [ms]": BOUND})
+    times, *answers = (
+        _view(title, [entity for entity in (f"solver/{name}" for name in names) if entity in sent], run)
+        for title, names in (
+            ("Computation", ("solve_ms", "step_ms", "deadline_ms")),
+            ("Solver", ("iterations", "active")),
+            ("Fallback and slack", ("fallback", "slack")),
+        )
+    )
+    return times, [view for views in answers for view in views]
 
 
 def _send_effects(recording: rr.RecordingStream, run: Run) -> list[rrb.TimeSeriesView]:
     """Send commands that rotors do not follow at once, external force, wind, and battery, where they exist."""
-    t, views = run.log.plant.t, []
+    t, views = run.log.plant.t, list[rrb.TimeSeriesView]()
     commanded = commanded_speeds(run.log)
     if commanded is not None:
         labels = {f"rotor {i}, commanded [rad/s]": REFERENCE for i in range(1, N_ROTORS + 1)}
-        _send_curves(recording, "effects/commanded", t, commanded, labels, stepped=True)
-        views.append(_view("Rotor speeds, commanded and acting", ["effects/commanded", "signals/speed"], run))
+        contents = _send_curves(recording, "effects/commanded", t, commanded, labels, stepped=True)
+        views += _view("Rotor speeds, commanded and acting", [*contents, "signals/speed"], run)
     for entry in effect_curves(run.log):
         labels = {f"{axis} [{entry.unit}]": colour for axis, colour in zip(entry.names, SERIES, strict=False)}
-        _send_curves(recording, f"effects/{entry.key}", t, entry.values, labels)
-        views.append(_view(f"{entry.title[0].upper()}{entry.title[1:]}", [f"effects/{entry.key}"], run))
+        contents = _send_curves(recording, f"effects/{entry.key}", t, entry.values, labels)
+        views += _view(f"{entry.title[0].upper()}{entry.title[1:]}", contents, run)
     return views
 
 
@@ -213,10 +224,14 @@ def _send_curves(
     labels: Mapping[str, Colour],
     *,
     stepped: bool = False,
-) -> None:
-    """One curve per column of `values` (len(t),) or (len(t), j), at times `t` [s]; nothing where there is no row."""
-    if not t.size:
-        return
+) -> list[str]:
+    """Send one curve per column of `values` (len(t),) or (len(t), j), at times `t` [s].
+
+    Returns:
+        The entity; nothing where no value is finite, and nothing was sent.
+    """
+    if not np.isfinite(values).any():
+        return []
     style = rr.SeriesLines(
         names=list(labels),
         colors=list(labels.values()),
@@ -226,17 +241,21 @@ def _send_curves(
     )
     recording.log(entity, style, static=True)
     recording.send_columns(entity, [time_column(t)], rr.Scalars.columns(scalars=np.asarray(values, float)))
+    return [entity]
 
 
 def _view(
     title: str, contents: Sequence[str], run: Run, *, ends: tuple[float, float] | None = None
-) -> rrb.TimeSeriesView:
-    """Curves over the whole flight, and the legend to their right; `ends` of the vertical axis."""
+) -> list[rrb.TimeSeriesView]:
+    """Curves over the whole flight, and the legend to their right; `ends` of the vertical axis; no view of nothing."""
+    if not contents:
+        return []
     first, last = (rr.TimeRangeBoundary.absolute(seconds=seconds) for seconds in (0.0, 1.4 * max(run.end, 1e-3)))
-    return rrb.TimeSeriesView(
+    view = rrb.TimeSeriesView(
         name=title,
         contents=list(contents),
         plot_legend=rrb.PlotLegend("RightTop"),
         axis_y=None if ends is None else rrb.ScalarAxis(range=ends),
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last)),
     )
+    return [view]

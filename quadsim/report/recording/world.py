@@ -14,7 +14,8 @@ from quadsim.controller import Phase
 from quadsim.flight.audit import SIGNALS
 from quadsim.flight.log import FlightLog
 from quadsim.flight.rundir import Run
-from quadsim.report.figure import line_colour, obstacles_in, region_edges
+from quadsim.palette import COLOUR, line_colour, on_dark, rgb
+from quadsim.report.figure import obstacles_in, region_edges
 from quadsim.rotation import euler_to_quaternion
 from quadsim.sim.airframe import DISC_NAMES, DRAWN_ARM, FLOOR, compile_model
 from quadsim.space import Solid
@@ -56,28 +57,21 @@ def panels(log: FlightLog) -> dict[str, tuple[str, ...]]:
     return dict(_ANY_ATTITUDE.get(title, (title, names)) for title, names in PANELS.items())
 
 
-def on_screen(colour: str) -> Colour:
-    """A colour made for paper, lightened: the viewer's background may be black or white."""
-    red, green, blue = (round(0.7 * int(colour[i : i + 2], 16) + 0.3 * 255) for i in (1, 3, 5))
-    return red, green, blue, 255
+def on_screen(colour: str, opacity: int = 255) -> Colour:
+    """A colour lightened: the viewer's background is black, or for some white."""
+    return *rgb(on_dark(colour)), opacity
 
 
 SERIES: Final = tuple(on_screen(line_colour(i)) for i in range(N_ROTORS))
-FLOWN: Final = (70, 160, 255, 255)
-WHOLE_PATH: Final = (70, 160, 255, 60)
-REFERENCE: Final = (165, 170, 178, 255)
-PREDICTED: Final = (255, 160, 40, 255)
-BOUND: Final = (255, 70, 70, 255)
-FORCE: Final = (225, 90, 200, 255)
-WIND: Final = (110, 220, 225, 255)
-OBSTACLE: Final = (184, 92, 72, 255)
-REGION: Final = (215, 205, 90, 255)
-AXES: Final = ((230, 90, 90, 255), (90, 200, 110, 255), (90, 140, 250, 255))
+REFERENCE: Final = on_screen(COLOUR.reference)
+BOUND: Final = on_screen(COLOUR.bound)
+DISTURBANCE: Final = on_screen(COLOUR.disturbance)
+AXES: Final = tuple(map(on_screen, (COLOUR.axis_x, COLOUR.axis_y, COLOUR.axis_z)))
 
 VERDICTS: Final = {
-    "holds": (46, 125, 80, 255),
-    "active": (214, 150, 30, 255),
-    "violated": (220, 50, 50, 255),
+    "holds": on_screen(COLOUR.satisfied),
+    "active": on_screen(COLOUR.warning),
+    "violated": on_screen(COLOUR.violated),
     "not in force": (0, 0, 0, 0),
 }
 
@@ -89,6 +83,7 @@ def time_column(t: Array) -> rr.TimeColumn:
 
 _FORCE_SCALE: Final = 5.0
 """How many times longer an external force is drawn than a thrust of its size: it would vanish inside the hull."""
+_DASH, _MOST_DASHES = 0.8, 500  # length of a dash of the reference, in arm lengths, and of dashes and gaps together
 _WIND_LENGTH: Final = 1.5  # how long a flight's strongest wind is drawn, in arm lengths
 
 
@@ -139,8 +134,9 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     )
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("world/axes", axes, static=True)
-    _log_lines(recording, "world/reference", REFERENCE, 1.2, _dashes(control.reference[:, :3]))
-    _log_lines(recording, "world/path", WHOLE_PATH, 1.0, [position])
+    dashes = _dashes(control.reference[:, :3], _DASH * run.vehicle.arm_length)
+    _log_lines(recording, "world/reference", REFERENCE, 1.2, dashes)
+    _log_lines(recording, "world/path", on_screen(COLOUR.flown, 60), 1.0, [position])
 
     # The body turns below an entity that only moves: views that start there follow the vehicle without tilting.
     thrusts = np.zeros((plant.t.size, N_ROTORS, 3))
@@ -154,24 +150,24 @@ def send_scene(recording: rr.RecordingStream, run: Run) -> None:
     if plant.wrench is not None and np.any(plant.wrench[:, :3]):
         vehicle = run.vehicle
         scale = _FORCE_SCALE * vehicle.arm_length / (vehicle.mass * vehicle.gravity / N_ROTORS)
-        _send_arrows(recording, run, "external_force", scale * plant.wrench[:, :3], FORCE, behind=0.0)
+        _send_arrows(recording, run, "external_force", scale * plant.wrench[:, :3], DISTURBANCE, behind=0.0)
     if plant.wind is not None and np.any(plant.wind):
         strongest = float(np.linalg.norm(plant.wind, axis=1).max())
         drawn = _WIND_LENGTH * run.vehicle.arm_length / strongest * plant.wind
-        _send_arrows(recording, run, "wind", drawn, WIND, behind=1.3)
+        _send_arrows(recording, run, "wind", drawn, DISTURBANCE, behind=1.3)
 
     if control.t.size:
         starts = np.searchsorted(plant.t, control.t - 1e-9)
         ends = np.append(starts[1:], plant.t.size - 1)
         pieces = [position[start : end + 1] for start, end in zip(starts, ends, strict=True)]
-        _log_lines(recording, "world/flown", FLOWN, 2.2)
+        _log_lines(recording, "world/flown", on_screen(COLOUR.flown), 2.2)
         recording.send_columns("world/flown", [time_column(plant.t[ends])], rr.LineStrips3D.columns(strips=pieces))
     if control.t.size and run.log.predicted is not None:
         horizons = np.concatenate([control.state[:, None, POSITION], run.log.predicted], axis=1)
         flying = np.array([phase == Phase.FLYING for phase in control.phase])
         # A prediction ignores the ground: below it, it would fall on.
         shown = [horizon if aloft else horizon[:0] for horizon, aloft in zip(horizons, flying, strict=True)]
-        _log_lines(recording, "world/horizon", PREDICTED, 2.5)
+        _log_lines(recording, "world/horizon", on_screen(COLOUR.predicted), 2.5)
         recording.send_columns("world/horizon", [time_column(control.t)], rr.LineStrips3D.columns(strips=shown))
 
 
@@ -180,7 +176,7 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
     for obstacle in obstacles_in(run.limits):
         entity = f"world/obstacles/{obstacle.name}"
         for i, solid in enumerate(obstacle.solids):
-            recording.log(f"{entity}/{i}", _part(solid, OBSTACLE), static=True)
+            recording.log(f"{entity}/{i}", _part(solid, on_screen(COLOUR.obstacle)), static=True)
         if obstacle.moves:
             t = run.log.plant.t
             moving = rr.Transform3D.columns(translation=obstacle.positions(t))
@@ -189,7 +185,7 @@ def send_space(recording: rr.RecordingStream, run: Run) -> None:
             recording.log(entity, rr.Transform3D(translation=obstacle.position), static=True)
     for limit, edges in region_edges(run):
         entity = f"world/regions/{limit.name}"
-        _log_lines(recording, entity, REGION, 1.2)
+        _log_lines(recording, entity, BOUND, 1.2)
         times = np.array([max(limit.start, 0.0), limit.stop])
         strips = rr.LineStrips3D.columns(strips=[*edges]).partition([len(edges), 0][: 1 + np.isfinite(limit.stop)])
         recording.send_columns(entity, [time_column(times[np.isfinite(times)])], strips)
@@ -257,14 +253,16 @@ def _log_lines(
     recording.log(entity, look, static=True)
 
 
-def _dashes(points: Array) -> list[Array]:
-    """A path (K, 3) [m] as dashes of 0.25 m, or longer where there would be very many."""
+def _dashes(points: Array, length: float) -> list[Array]:
+    """A path (K, 3) [m] as dashes of a length [m], or longer where there would be very many; each follows the path."""
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])[: len(points)]
     if not walked.size:
         return []
-    marks = np.arange(0.0, walked[-1], max(0.25, walked[-1] / 500.0))
-    ends = np.stack([np.interp(marks, walked, column) for column in points.T], axis=1)
-    return [ends[i : i + 2] for i in range(0, len(ends) - 1, 2)]
+    marks = np.arange(0.0, walked[-1], max(length, walked[-1] / _MOST_DASHES))
+    stations = np.union1d(marks, walked)
+    path = np.stack([np.interp(stations, walked, column) for column in points.T], axis=1)
+    ends = np.searchsorted(stations, marks)
+    return [path[start : end + 1] for start, end in zip(ends[::2], ends[1::2], strict=False)]
 
 
 def _vector_first(quaternion: Array) -> Array:

@@ -145,6 +145,18 @@ def test_runs_have_distinct_names_and_a_course_is_drawn_once(short_run: Run, abo
     assert run_names([short_run, aborted_run]) == ("paper-constrained", "lost")
     assert run_names([short_run, elsewhere])[1] == "paper-constrained (elsewhere)"
     assert len(set(run_names([short_run, short_run, elsewhere]))) == 3
+    controller = {**short_run.summary["controller"], "name": "MyLaw"}
+    own = having(short_run, "paper-constrained", controller=controller)
+    assert run_names([short_run, own]) == ("paper-constrained (constrained MPC)", "paper-constrained (MyLaw)")
+    own_elsewhere = dataclasses.replace(own, directory=Path("elsewhere"))
+    assert run_names([short_run, own, own_elsewhere, aborted_run]) == (
+        "paper-constrained (constrained MPC)",
+        "paper-constrained (MyLaw, paper-constrained)",
+        "paper-constrained (MyLaw, elsewhere)",
+        "lost",
+    )
+    assert run_names([own, own]) == ("paper-constrained, 1", "paper-constrained, 2")
+    assert run_names([dataclasses.replace(own, label="mine"), own]) == ("mine", "paper-constrained")
     control = dataclasses.replace(short_run.log.control, reference=short_run.log.control.reference + 1.0)
     other = dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, control=control))
     assert distinct_courses([empty_run, short_run, aborted_run, other]) == [short_run, other]

@@ -16,9 +16,9 @@ from support import small_log
 from quadsim.flight.audit import SIGNALS, Limit, SpaceLimit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.rundir import Run
+from quadsim.palette import COLOUR
 from quadsim.report import flight_figures
 from quadsim.report.figure import (
-    BOUND,
     LEAST_SPANS,
     Band,
     Bound,
@@ -173,7 +173,7 @@ def test_both_libraries_draw_the_same_numbers(x_label: str) -> None:
     assert drawn["layout"]["yaxis"]["range"] == [-3.0, 9.0]
     assert [trace["name"] for trace in drawn["data"] if "name" in trace] == [*styles, "bound"]
     (bound,) = (trace for trace in drawn["data"] if trace.get("name") == "bound")
-    assert (bound["x"], bound["y"], bound["line"]["color"]) == ([1.0, 2.0], [5.0, 5.0], BOUND)
+    assert (bound["x"], bound["y"], bound["line"]["color"]) == ([1.0, 2.0], [5.0, 5.0], COLOUR.bound)
 
 
 def test_thinning_keeps_ends_extremes_and_gaps() -> None:

@@ -138,6 +138,14 @@ def test_two_campaigns_are_compared_flight_by_flight(
         (["replay", "little.toml"], "is not a campaign"),
         (["compare", "{flown}/first", "--out", "pairs"], "compare takes two campaigns, each by itself, not 1"),
         (["compare", "{flown}/first", "hover", "--out", "pairs"], "hover: is not a campaign"),
+        (
+            ["compare", "{flown}/first", "{flown}/second", "--name", "A", "--name", "A"],
+            "names must be 2 different texts, one for each target; got ['A', 'A']",
+        ),
+        (
+            ["compare", "{flown}/first", "{flown}/second", "--figures"],
+            "--figures must be absent where campaigns are compared; got True",
+        ),
         (["replay", "{flown}/first", "--flight", "6"], "--flight must be one of the flights 0 to 5"),
     ],
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from quadsim.flight.audit import Limit
+from quadsim.palette import COLOUR
 from scenarios.live.readout import Constraints, hints, numbers
 from scenarios.live.session import Frame, Session
 from scenarios.loading import load_scenario
@@ -72,7 +73,10 @@ def test_bars_grow_towards_the_bound() -> None:
 def test_hints_that_were_followed_go() -> None:
     assert hints((), ["robust MPC"]).count("<b>") == 3
     assert "Drag the drone" not in hints({"pull"}, ["robust MPC"])
-    assert "blue: A; orange: B" in hints((), ["A", "B"])
+    assert re.findall('color:(#[0-9a-f]{6})">●</span> ([AB])', hints((), ["A", "B"])) == [
+        (COLOUR.flown, "A"),
+        (COLOUR.second, "B"),
+    ]
 
 
 def test_numbers_keep_their_height_and_name_a_broken_rotor() -> None:

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 import zstandard
 
-from quadsim.report.figure import line_colour
+from quadsim.palette import line_colour
 from scenarios.live import look
 from scenarios.live.page import Page
 from scenarios.live.serving import Pace
 from scenarios.live.session import Frame, Session
+from scenarios.live.stage import _course
 from scenarios.loading import load_scenario
 from tests.scenarios.live.test_page import PATIENCE, browser
 
@@ -133,3 +134,17 @@ def test_a_recording_plays_from_a_file_without_a_network_in_the_systems_theme(
     sky = tab.locator("canvas[data-engine]").evaluate("canvas => getComputedStyle(canvas).backgroundImage")
     assert "rgb(14, 22, 33)" in sky
     context.close()
+
+
+def test_the_reference_is_drawn_where_it_is_on_a_small_course() -> None:
+    circle = {"type": "circle", "radius": 0.2, "period": 1.5, "turns": 78.0}
+    scenario = load_scenario("hover", ["constraints=[]", "duration=120.0"]).replace({"reference": circle})
+    session = Session(scenario)
+    followed = session.flights[0].loop.course.preview(0, scenario.periods)[:, :3]
+    starts, ends = np.moveaxis(_course(session), 1, 0)
+    session.close()
+    chords = ends - starts
+    for point in followed[::7]:
+        along = np.einsum("ij,ij->i", point - starts, chords) / np.maximum(np.square(chords).sum(axis=1), 1e-12)
+        nearest = starts + np.clip(along, 0.0, 1.0)[:, None] * chords
+        assert np.linalg.norm(point - nearest, axis=1).min() < 0.01, "a chord, or a lap that is left out"

@@ -20,10 +20,10 @@ from support import NO_PRODUCTS
 from quadsim.errors import FileError, OutputError, RenderingUnavailableError
 from quadsim.flight.audit import Limit, audit
 from quadsim.flight.rundir import Run
+from quadsim.palette import ON_DARK, rgb
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
 from quadsim.report.film.frames import make_footage
-from quadsim.report.film.painter import RED
 from quadsim.report.film.video import render_gif, render_video, rendering_backend
 from quadsim.rotation import body_to_world
 from quadsim.state import EULER, INDEX, POSITION
@@ -200,7 +200,7 @@ def test_violated_limits_come_first_then_the_nearest_and_the_film_shows_how_many
         run = replace(short_run, limits=limits)
         overlay = Overlay(run, make_footage(run, np.array([6.0])), width=1280, height=720)
         picture = overlay.draw(np.full((720, 1280, 3), 128, np.uint8), 0)
-        return int(np.count_nonzero((picture == RED).all(axis=-1)))
+        return int(np.count_nonzero((picture == rgb(ON_DARK.violated)).all(axis=-1)))
 
     limits = (*wide, near, reported, low)
     tracks = make_footage(replace(short_run, limits=limits), np.array([6.0])).margins

@@ -122,6 +122,8 @@ def test_the_flown_path_grows_piece_by_piece_without_gaps(content: Content, shor
 def test_signals_are_the_audited_ones(content: Content, short_run: Run) -> None:
     log = short_run.log
     for name, signal in SIGNALS.items():
+        if name == "thrust":  # this flight has no target for it
+            continue
         of_plant = signal.plant is not None
         t = log.plant.t if of_plant else log.control.t
         expected = signal.plant(log.plant) if signal.plant is not None else signal.sampled(log.control)
@@ -176,6 +178,68 @@ def test_forces_torques_wind_battery_and_lagging_rotors_have_their_curves(
     np.testing.assert_allclose(gusts, longest * wind, atol=1e-6)
     blueprint = content.reader.stream(store=content.reader.blueprints()[0]).to_chunks()
     assert "Effects" in "".join(str(column) for chunk in blueprint for column in chunk.to_record_batch().columns)
+
+
+def named_by_the_layout(content: Content) -> list[list[str]]:
+    """The entities that each plot of the layout names."""
+    blueprint = content.reader.stream(store=content.reader.blueprints()[0]).to_chunks()
+    batches = [chunk.to_record_batch() for chunk in blueprint if chunk.entity_path.endswith("/ViewContents")]
+    queries = [row for batch in batches for row in batch.column("ViewContents:query").to_pylist()]
+    return [names for names in queries if not any("*" in name for name in names)]
+
+
+def has_values(content: Content, entity: str) -> bool:
+    """Whether an entity has a finite number, or a state."""
+    if entity not in content.entities:
+        return False
+    kind = "state" if entity.startswith("/verdicts") else "scalars"
+    values = [value for row in content.rows(entity, kind) for value in row]
+    return bool(values) and (kind == "state" or bool(np.isfinite(np.array(values, float)).any()))
+
+
+@pytest.mark.parametrize("case", ["as flown", "with a target", "by a law without limits", "of one period"])
+def test_a_plot_names_only_what_was_recorded_and_none_is_blank(
+    record: Callable[[Run], Content], short_run: Run, case: str
+) -> None:
+    log, limits = short_run.log, short_run.limits
+    assert any(limit.start > 6.0 for limit in limits), "one that this flight does not reach"
+    if case == "with a target":
+        target, thrust = np.full((log.control.t.size, 4), 39.0), np.full(log.plant.t.size, 40.0)
+        log = dataclasses.replace(
+            log,
+            control=dataclasses.replace(log.control, target=target),
+            plant=dataclasses.replace(log.plant, thrust=thrust),
+        )
+    if case == "by a law without limits":
+        nothing = np.full(log.control.t.size, math.nan)
+        log = dataclasses.replace(log, timing=dataclasses.replace(log.timing, solve_ms=nothing))
+        limits = ()
+    if case == "of one period":
+        limits = tuple(limit for limit in limits if limit.start > 0.0)
+    content = record(dataclasses.replace(short_run, log=log, limits=limits))
+    plots = named_by_the_layout(content)
+    assert len(plots) > 10
+    for names in plots:
+        assert names
+        assert [name for name in names if not has_values(content, f"/{name}")] == []
+    assert (["signals/thrust"] in plots) == (case == "with a target")
+
+
+def test_dashes_of_the_reference_lie_on_a_small_course(record: Callable[[Run], Content], short_run: Run) -> None:
+    angle, radius = np.linspace(0.0, 4.0 * math.pi, short_run.log.control.t.size), 0.2
+    reference = short_run.log.control.reference.copy()
+    reference[:, :3] = radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    control = dataclasses.replace(short_run.log.control, reference=reference)
+    content = record(dataclasses.replace(short_run, log=dataclasses.replace(short_run.log, control=control)))
+    dashes = [np.array(dash) for dash in content.rows("/world/reference", "strips")[0]]
+    assert len(dashes) > 3
+    for dash in dashes:
+        between = np.concatenate([dash, 0.5 * (dash[1:] + dash[:-1])])
+        sagitta = radius * (1.0 - math.cos(0.5 * (angle[1] - angle[0])))  # of the samples' own polygon
+        assert np.abs(np.hypot(*between.T[:2]) - radius).max() < 2.0 * sagitta
+    lengths = [np.linalg.norm(np.diff(dash, axis=0), axis=1).sum() for dash in dashes]
+    assert np.ptp(lengths) < 1e-3
+    assert sum(lengths) == pytest.approx(2.0 * math.pi * radius, rel=0.15), "half of the course is gaps"
 
 
 def rerun(*arguments: str) -> subprocess.CompletedProcess[str]:
