@@ -13,7 +13,6 @@ from annotated_types import Ge, Le, Len, doc
 from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
 from mpc.baselines.law import Baseline, FeedbackLaw
-from mpc.baselines.preview import wrapped
 from mpc.bounded import InputWeights, objective_of, require_states
 from mpc.heading import turn_horizontally
 from mpc.model import LinearModel, continuous_model, discretise, hover_model, lqr
@@ -22,7 +21,7 @@ from mpc.ocp import Objective
 from quadsim.controller import Command, Controller, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
-from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, STATE_NAMES, VELOCITY, Array, read_only
+from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, STATE_NAMES, VELOCITY, Array, read_only, wrapped
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 LARGEST_DEVIATIONS: Final = {
@@ -145,7 +144,7 @@ class LQR(FeedbackLaw):
         targets[:, REFERENCE_STATES] = poses
         targets[:, [*VELOCITY, INDEX["yaw_rate"]]] = rates
         yaw = float(state[INDEX["yaw"]])
-        targets[:, INDEX["yaw"]] += yaw + wrapped(value[3] - yaw) - value[3]
+        targets[:, INDEX["yaw"]] += yaw - wrapped(yaw - value[3]) - value[3]
         return targets
 
     def _limited(self, error: Array) -> Array:
