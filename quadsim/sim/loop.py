@@ -69,7 +69,7 @@ class ClosedLoop:
         k: control periods flown so far.
         period: length of one [s].
         controller: the controller in command; see `switch`.
-        course: the reference that is followed.
+        course: the reference that is followed; observations have its yaw on the turn of the measured one.
         answered: latest time at which a command has arrived so far [s].
         before: called with k at the start of a period, before any measurement; its changes act in that period.
         last: the last period; None before the first.
