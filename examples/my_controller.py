@@ -26,8 +26,13 @@ class MyController:
         a += self.stiffness * (reference[0, :3] - state[list(POSITION)] - self.period * velocity[0])
         a += 2.0 * np.sqrt(self.stiffness) * (velocity[0] - state[list(VELOCITY)])
         forward, left = a[0] * np.cos(yaw) + a[1] * np.sin(yaw), a[1] * np.cos(yaw) - a[0] * np.sin(yaw)
-        turn = (reference[0, 3] - yaw + np.pi) % (2.0 * np.pi) - np.pi
-        errors = np.array([np.clip(-left / g, -0.3, 0.3) - roll, np.clip(forward / g, -0.3, 0.3) - pitch, 0.1 * turn])
+        errors = np.array(
+            [
+                np.clip(-left / g, -0.3, 0.3) - roll,
+                np.clip(forward / g, -0.3, 0.3) - pitch,
+                0.1 * (reference[0, 3] - yaw),
+            ]
+        )
         up = (g + a[2]) / (np.cos(roll) * np.cos(pitch))
         wrench = self.inertia * [up, *(20.0 * errors - 8.0 * rates)]
         return np.sqrt(np.clip(self.to_squares @ wrench, 0.0, 500.0**2))

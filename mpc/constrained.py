@@ -19,7 +19,7 @@ from mpc.qp import KKT_EVERY
 from mpc.solvers import INVALID_DATA, Answer, Solver
 from quadsim.controller import GROUNDED, Command, Controller, StepInputs, stopped
 from quadsim.errors import PlanExhaustedError
-from quadsim.state import Array
+from quadsim.state import INDEX, Array, ReferenceTurns
 from quadsim.vehicle import Vehicle
 
 
@@ -55,6 +55,7 @@ class ConstrainedMPC:
         self._solver = solver
         self._obstacles = None if space is None else ObstacleQP(problem, self._solver, space)
         self._bounds, self._check = ActuatorBounds.of_problem(problem), AnswerCheck(problem, kkt_every)
+        self._turns = ReferenceTurns()
         self.reset(problem.model.u_bar)
 
     def reset(self, speeds: Array) -> None:
@@ -62,6 +63,7 @@ class ConstrainedMPC:
         self._before = np.array(speeds, float)
         self._plan: Array | None = None
         self._held = 0
+        self._turns.reset()
         self.infeasible_period: InfeasiblePeriod | None = None
         self._solver.reset()
         self._check.reset()
@@ -87,6 +89,7 @@ class ConstrainedMPC:
         if now.phase in GROUNDED:
             self._before, self._plan, self._held = self._bounds.reach(self._before)[0], None, 0
             return stopped(self._before.copy(), self.horizon, now.phase)
+        reference = self._turns.follow(reference, float(state[INDEX["yaw"]]))
         query = Query(state, self.problem.objective.desired(reference), self._before)
         problem = self.problem
         if self._obstacles is None:

@@ -77,7 +77,7 @@ def advance(model: LinearModel, state: Array, speeds: Array, trim: Trim) -> Arra
     return predict_in_heading_frame(anchored(model, trim), state[None], speeds[None, None], trim)[0, 0]
 
 
-def with_nearest_yaw(reference: Array, yaw: float, largest: float) -> Array:
+def with_limited_yaw(reference: Array, yaw: float, largest: float) -> Array:
     """The reference (N, 4) with a yaw that starts from the present one and has no jumps above `largest` [rad]."""
     yaws, steps = reference[:, 3], np.empty(len(reference))
     steps[0] = yaws[0] - yaw

@@ -18,7 +18,7 @@ from mpc.ocp import Problem
 from mpc.paper import prediction, rollout
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Controller, StepInputs, stopped
 from quadsim.errors import InputError
-from quadsim.state import Array
+from quadsim.state import INDEX, Array, ReferenceTurns
 from quadsim.vehicle import Vehicle
 
 
@@ -57,16 +57,18 @@ class UnconstrainedMPC:
         self.problem, self.horizon = problem, problem.horizon
         self.gains = sequence_gains(problem)
         self._offset = self.gains.L @ problem.model.u_bar
+        self._turns = ReferenceTurns()
 
     def reset(self, speeds: Array) -> None:
-        """No effect: the law is stateless."""
+        """Forget the turn of the heading, the law's only state."""
+        self._turns.reset()
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Evaluate Eq. (22), rotors off while landed; see `quadsim.controller.Controller.step`."""
         if now.phase in GROUNDED:
             return stopped(np.zeros(self.problem.model.nu), self.horizon, now.phase)
         started = clock.perf_counter()
-        desired = self.problem.objective.desired(reference)
+        desired = self.problem.objective.desired(self._turns.follow(reference, float(state[INDEX["yaw"]])))
         sequence = self.gains.K @ state + self.gains.G @ desired.ravel() + self._offset
         plan = sequence.reshape(self.horizon, -1)
         spent_s = clock.perf_counter() - started

@@ -249,7 +249,8 @@ class Controller(Protocol):
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the command for the period that starts now, from the measured state xi(k) (12,).
 
-        The reference (N, 4) is filtered x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}.
+        The reference (N, 4) is filtered x, y, z [m], yaw [rad] at t_{k+1} .. t_{k+N}; in a flight, the yaw is on the
+        turn of the measured one, as by `quadsim.state.ReferenceTurns`.
 
         Raises:
             FlightError: the controller cannot return a command.

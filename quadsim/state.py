@@ -1,15 +1,17 @@
-"""The 12-state of the paper: order, names and units.
+"""The 12-state of the paper: order, names and units; and the turns of its yaw.
 
 The state vector is xi = [x vx y vy z vz roll roll_rate pitch pitch_rate yaw yaw_rate] (Sec. 2.3), positions and
 velocities in the world frame (z up), attitude as Z-Y-X Euler angles (body_to_world = Rz(yaw) Ry(pitch) Rx(roll)),
 and **Euler-angle rates**, not body rates; `quadsim.rotation` converts between them.
+
+A yaw counts its turns, an error of it does not: it is `wrapped` to (-pi, pi].
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +90,74 @@ class State(np.ndarray[tuple[int], np.dtype[np.float64]]):
         return array[()] if return_scalar else array.view(np.ndarray)
 
 
+_Angle = TypeVar("_Angle", float, Array)
+TURN: Final = 2.0 * math.pi
+_TIE: Final = 1e-6  # [turns] this close to half a turn either way counts as half a turn forward
+KEPT: Final = math.radians(190.0)
+"""Distance from the vehicle's yaw up to which a reference keeps its turn [rad]; see `ReferenceTurns`."""
+
+
+def wrapped(angle: _Angle) -> _Angle:
+    """Wrap a difference of angles to (-pi, pi] [rad]."""
+    return math.pi - (math.pi - angle) % TURN % TURN  # the first remainder of a tiny negative number rounds to TURN
+
+
+def whole_turns(angle: _Angle, turn: float = TURN) -> _Angle:
+    """The whole turns n for which angle - n turn is in (-turn / 2, turn / 2], up to rounding."""
+    return -((0.5 + _TIE - angle / turn) // 1.0)
+
+
+def nearest_turn(angle: _Angle, to: float = 0.0, turn: float = TURN) -> _Angle:
+    """Change an angle by whole turns to the one nearest `to`."""
+    return angle - turn * whole_turns(angle - to, turn)
+
+
+def unwrapped(angles: Array, before: float) -> Array:
+    """Change angles (K,) by whole turns to those nearest the angle before each; themselves where they are already."""
+    steps = np.empty_like(angles)
+    steps[:1] = angles[:1] - before
+    np.subtract(angles[1:], angles[:-1], out=steps[1:])
+    turns = whole_turns(steps)
+    return angles - TURN * turns.cumsum() if np.count_nonzero(turns) else angles
+
+
+class ReferenceTurns:
+    """Changes the yaw of a reference by whole turns, to the turn of the vehicle's yaw.
+
+    A flight's first sample is at most half a turn from the vehicle, each later one at most half a turn from the one
+    before, within a preview and from period to period.  Only where the vehicle is more than `KEPT` from the reference
+    does this start from the vehicle again: half a turn away, noise does not decide anew in every period which way round
+    is the shorter.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Restart: the next reference is a flight's first."""
+        self._first = math.nan
+
+    def follow(self, reference: Array, yaw: float) -> Array:
+        """Return a period's reference (N, 4) on the turn of the vehicle's yaw [rad]; itself where it is already.
+
+        Call it once per period, one period apart.
+        """
+        yaws = reference[:, 3]
+        first, known = yaws.item(0), not math.isnan(self._first)
+        start = nearest_turn(first, self._first) if known else first
+        if not math.isfinite(start + yaw):
+            return reference
+        if not known or abs(yaw - start) > KEPT:
+            start += TURN * whole_turns(yaw - start)
+        self._first = start
+        followed = unwrapped(yaws, start)
+        if followed is yaws:
+            return reference
+        moved = reference.copy()
+        moved[:, 3] = followed
+        return moved
+
+
 class YawTurns:
     """Counts a yaw's whole turns, sample by sample.
 
@@ -103,7 +173,7 @@ class YawTurns:
         roll, pitch, yaw = euler.tolist()
         if math.isfinite(roll + pitch + yaw):
             upright = math.cos(roll) * math.cos(pitch) >= 0.0
-            yaw += 2.0 * math.pi * round(((self._upright if upright else self._last) - yaw) / (2.0 * math.pi))
+            yaw = nearest_turn(yaw, self._upright if upright else self._last)
             self._last = yaw
             self._upright = yaw if upright else self._upright
         return float(yaw)

@@ -231,7 +231,7 @@ def fly(
             and the torque in the body frame [N m]; or classes, called as MyForce(vehicle, rng=...), whose objects
             are such functions.
         reference: replaces the course and its filter; the scenario's constraints stay.  A function `f(t)` of time
-            [s] that returns x, y, z [m] and yaw [rad] (unwrapped).  It is called before the flight, for all control
+            [s] that returns x, y, z [m] and yaw [rad].  It is called before the flight, for all control
             instants up to the end of the last preview.  A run directory keeps these samples in `reference.csv`; its
             `scenario.toml` reproduces the flight bit for bit.
         autopilot: flies in place of the built-in autopilot, for a controller that commands thrust and body rates: an

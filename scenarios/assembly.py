@@ -38,7 +38,7 @@ from quadsim.sim.plant import Plant
 from quadsim.sim.rigid_body import check_free
 from quadsim.sim.sensing import AXES, FaultKind, Sensor, SensorFault, SensorName
 from quadsim.space import Corridor, Fence, Region
-from quadsim.state import POSITION, REFERENCE_NAMES, Array, make_state
+from quadsim.state import POSITION, REFERENCE_NAMES, Array, make_state, nearest_turn
 from quadsim.vehicle import (
     AUTOPILOT,
     N_ROTORS,
@@ -208,10 +208,15 @@ class Assembly:
             physics = np.array(
                 [0.0, *motion.position[0], *motion.attitude[0], *motion.velocity[0], *motion.body_rates[0]]
             )
-            return physics_to_state(physics[None], yaw=math.radians(initial.euler[2]))[0]
+            return physics_to_state(physics[None], yaw=self.initial_yaw)[0]
         x, y, z = initial.position
-        roll, pitch, yaw = np.radians(initial.euler)
-        return make_state(position=(x, y, z), euler=(roll, pitch, yaw))
+        roll, pitch, _ = np.radians(initial.euler)
+        return make_state(position=(x, y, z), euler=(roll, pitch, self.initial_yaw))
+
+    @property
+    def initial_yaw(self) -> float:
+        """The yaw at t = 0, within half a turn of 0 [rad]: a flight counts its turns from there."""
+        return math.radians(nearest_turn(self.scenario.initial.euler[2], turn=360.0))
 
     @property
     def initial_speeds(self) -> Array:
@@ -233,7 +238,7 @@ class Assembly:
     def initial_pose(self) -> Array:
         """(4,) x, y, z [m], yaw [rad] of the vehicle at t = 0."""
         initial = self.scenario.initial
-        return np.array([*initial.position, math.radians(initial.euler[2])])
+        return np.array([*initial.position, self.initial_yaw])
 
     def followed(self, course: Course | None = None) -> FollowedCourse:
         """Return the filtered reference row by row, with set-points in flight; `course` replaces the scenario's."""

@@ -25,7 +25,7 @@ from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import finding_from_json, limit_to_json
 from quadsim.sim.effects.rotors import LagChange
-from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array
+from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array, wrapped
 from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly
 from scenarios.courses.csv_course import Csv
@@ -178,7 +178,7 @@ def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
             return
     both = np.flatnonzero(np.arange(count) * steps % stride == 0)  # control periods that start with a row of the plant
     apart = control.truth[both] - plant.state[both * steps // stride]
-    apart[:, ANGLES] = (apart[:, ANGLES] + np.pi) % (2.0 * np.pi) - np.pi
+    apart[:, ANGLES] = wrapped(apart[:, ANGLES])
     yield from _where(
         np.abs(apart) > ROUNDING_TILT, STATE_NAMES, control.t[both], f"differs between {FLIGHT_FILE} and {PLANT_FILE}"
     )

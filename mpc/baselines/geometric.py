@@ -29,7 +29,7 @@ from mpc.baselines.attitude import (
 )
 from mpc.baselines.bandwidths import SEPARATION, YAW_SHARE, lag_to_allow_for, require_positive
 from mpc.baselines.law import FeedbackLaw, Tuned
-from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion, wrapped
+from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion
 from mpc.bounded import USUAL_TARGETS, Range, Seconds, TargetBounds, require_lags, require_space
 from mpc.disturbance import RampObserver, RampSettings
 from mpc.handover import within
@@ -41,7 +41,7 @@ from quadsim.controller import Command, Controller, Phase, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.rotation import multiply
-from quadsim.state import Array
+from quadsim.state import Array, wrapped
 from quadsim.vehicle import Vehicle
 
 Commands: TypeAlias = Literal["rotors", "rates", "attitude"]
@@ -359,7 +359,7 @@ def _heading(yaw: float, target: Target) -> Array:
     e_R vanishes at half a turn, where it should be largest.  If the heading error exceeds a quarter turn, the desired
     heading is a quarter turn away, at rest.
     """
-    turn = wrapped(target.yaw - yaw)
+    turn = -wrapped(yaw - target.yaw)
     near = abs(turn) <= 0.5 * math.pi
     heading = yaw + (turn if near else math.copysign(0.5 * math.pi, turn))
     rate, acceleration = (target.yaw_rate, target.yaw_acceleration) if near else (0.0, 0.0)

@@ -17,7 +17,7 @@ from mpc.model import LinearModel, hover_model
 from quadsim.controller import GROUNDED, Command, StepInputs, stopped
 from quadsim.errors import CommandError
 from quadsim.fields import NonNegative
-from quadsim.state import STATE_NAMES, Array
+from quadsim.state import INDEX, STATE_NAMES, Array, ReferenceTurns
 from quadsim.vehicle import Vehicle
 
 
@@ -38,11 +38,13 @@ class FeedbackLaw(ABC):
         self.model = hover_model(vehicle, period) if model is None else model
         self.horizon = horizon
         self._operator = differentiator(horizon, period)
+        self._turns = ReferenceTurns()
         self.reset(self.model.u_bar)
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s]."""
         self._before = np.array(speeds, float)
+        self._turns.reset()
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the law's command; on the ground the lowest speed, as fast as bounds allow; see `quadsim.controller`.
@@ -60,6 +62,7 @@ class FeedbackLaw(ABC):
             raise CommandError(f"no command from a measured state whose {names} is not finite", time=now.time)
         if not np.isfinite(reference).all():
             raise CommandError("no command from a reference that is not finite", time=now.time)
+        reference = self._turns.follow(reference, float(state[INDEX["yaw"]]))
         command = self._command(now, state, reference, before)
         self._before = command.speeds.copy()
         return command

@@ -13,7 +13,6 @@ from annotated_types import Ge, Le, Len, doc
 from mpc.allocation import allocate, make_allocation
 from mpc.answer import ActuatorBounds
 from mpc.baselines.law import Baseline, FeedbackLaw
-from mpc.baselines.preview import wrapped
 from mpc.bounded import InputWeights, objective_of, require_states
 from mpc.heading import turn_horizontally
 from mpc.model import LinearModel, continuous_model, discretise, hover_model, lqr
@@ -103,8 +102,7 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
 class LQR(FeedbackLaw):
     """u = u_bar - K (xi - xi_r), where the reference state xi_r has the reference's pose and velocity, upright.
 
-    Heading errors are wrapped.  Speeds beyond the bounds are limited as by `allocate`: thrust, roll and pitch torque
-    take precedence over yaw.
+    Speeds beyond the bounds are limited as by `allocate`: thrust, roll and pitch torque take precedence over yaw.
     """
 
     name: Final = "lqr"
@@ -118,7 +116,7 @@ class LQR(FeedbackLaw):
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """Return the bounded command, and a plan from the closed loop of the model."""
-        targets = self._targets(state, reference)
+        targets = self._targets(reference)
         xi = state
         if self.settings.heading_frame:
             turn = -float(state[INDEX["yaw"]])
@@ -136,16 +134,14 @@ class LQR(FeedbackLaw):
             xi = self.model.A @ xi + self.model.B @ (plan[i] - self.model.u_bar)
         return Command(speeds=plan[0].copy(), plan=plan)
 
-    def _targets(self, state: Array, reference: Array) -> Array:
-        """(N, 12) reference states at t_k .. t_{k+N-1}, with the yaw at t_k within half a turn of the measured one."""
+    def _targets(self, reference: Array) -> Array:
+        """(N, 12) reference states at t_k .. t_{k+N-1}."""
         (value, rate, acceleration), period = self._operator @ reference, self.settings.period
         poses = np.concatenate([value[None], reference[:-1]])
         rates = rate + period * np.arange(self.horizon)[:, None] * acceleration
         targets = np.zeros((self.horizon, N_STATES))
         targets[:, REFERENCE_STATES] = poses
         targets[:, [*VELOCITY, INDEX["yaw_rate"]]] = rates
-        yaw = float(state[INDEX["yaw"]])
-        targets[:, INDEX["yaw"]] += yaw + wrapped(value[3] - yaw) - value[3]
         return targets
 
     def _limited(self, error: Array) -> Array:

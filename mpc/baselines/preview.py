@@ -99,8 +99,3 @@ def target_of_motion(motion: Motion, yaw: Array, period: float) -> Target:
         yaw_acceleration=float(yaw[2]),
         heading=heading,
     )
-
-
-def wrapped(angle: float) -> float:
-    """Wrap an angle to [-pi, pi) [rad]."""
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi

@@ -71,7 +71,8 @@ class _Controller(ctypes.Structure):
 class _MPC(ctypes.Structure):
     _fields_ = [
         *(("controller", _AT), ("work", Work), ("wanted", _AT)),
-        *(*_arrays(before=4), ("age", _INT), ("known", _INT), *_arrays(rotors=4, ahead=12, estimate=6)),
+        *(*_arrays(before=4), ("age", _INT), ("headed", _INT), ("heading", _REAL), ("known", _INT)),
+        *_arrays(rotors=4, ahead=12, estimate=6),
         *_arrays(trim=4, lift=3, twist=3, effectiveness=16),
     ]
 

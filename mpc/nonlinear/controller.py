@@ -58,7 +58,19 @@ from quadsim.rotation import (
     multiply,
     quaternion_to_euler,
 )
-from quadsim.state import ANGLE_RATES, ANGLES, EULER, EULER_RATE, N_STATES, POSITIONS, VELOCITIES, Array
+from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
+    EULER,
+    EULER_RATE,
+    INDEX,
+    KEPT,
+    N_STATES,
+    POSITIONS,
+    VELOCITIES,
+    Array,
+    ReferenceTurns,
+)
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 LARGEST_CONDENSED: Final = 80
@@ -291,6 +303,8 @@ class NonlinearMPC:
         """Drop the plan, and assume no disturbance."""
         self._plan: tuple[Array, Array] | None = None
         self._quaternion: Array | None = None
+        self._side = 1.0
+        self._turns = ReferenceTurns()
         self._last: tuple[float, Array] | None = None  # time and state of the last period
         self._called_at = math.nan
         if self._observer is not None:
@@ -309,7 +323,7 @@ class NonlinearMPC:
             for name in ("_rotors", "_rotors_before") if same_space else ():
                 shares = getattr(law, name)
                 setattr(self, name, shares if alike else self._shares(law._speeds(shares)))
-            self._quaternion, self._called_at = law._quaternion, law._called_at
+            self._quaternion, self._side, self._called_at = law._quaternion, law._side, law._called_at
             if law._last is not None and same_space:
                 time, x = law._last
                 self._last = time, np.concatenate([x[:N_BODY], self._rotors])[: self._model.n]
@@ -345,12 +359,17 @@ class NonlinearMPC:
         if now.motion is not None:
             nodes = nodes_of_motion(now.motion, self._nodes, stride)
         else:
+            reference = self._turns.follow(reference, float(state[INDEX["yaw"]]))
             nodes = nodes_of_preview(reference, self._nodes, stride, self._period, self._hover)
         if self._quaternion is None:
             self._quaternion = nodes.states[0, Q]
         if measured[Q] @ self._quaternion < 0.0:
             measured[Q] *= -1.0
         self._quaternion = measured[Q].copy()
+        # q and -q are one attitude, a whole turn apart: of the nodes, the nearer one counts, as by `ReferenceTurns`.
+        if self._side * (measured[Q] @ nodes.states[0, Q]) < math.cos(0.5 * KEPT):
+            self._side = -self._side
+        nodes.states[:, Q] *= self._side
         if now.phase is Phase.FLYING:
             if self._observer is not None and last is not None:
                 self._learn(last, now.time, measured)

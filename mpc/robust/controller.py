@@ -24,7 +24,7 @@ from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE, CompletedInputs
 from mpc.handover import observed, within
-from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, with_nearest_yaw
+from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, with_limited_yaw
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
 from mpc.observer import DisturbanceObserver, thrust_axis
@@ -37,7 +37,7 @@ from mpc.robust.settings import RobustSettings as RobustSettings
 from mpc.solvers import INVALID_DATA, Answer, Solver
 from quadsim.controller import GROUNDED, Command, Phase, StepInputs, stopped
 from quadsim.errors import ParameterError
-from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, all_true
+from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, ReferenceTurns, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 _SAME_TIME: Final = 1e-6  # [s]
@@ -110,6 +110,7 @@ class RobustMPC:
         self._solver, self.solver = solver, solver.name
         self._obstacles = None if space is None else ObstacleQP(problem, self._solver, space)
         self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
+        self._turns = ReferenceTurns()
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
 
     def reset(self, speeds: Array) -> None:
@@ -119,6 +120,7 @@ class RobustMPC:
         self._rotors = self._acting.copy()
         self._ahead: Array | None = None
         self._called_at = self._measured = -math.inf
+        self._turns.reset()
         self.infeasible_period: InfeasiblePeriod | None = None
         self._check.reset()
         self._solver.reset()
@@ -200,12 +202,13 @@ class RobustMPC:
         self._yaw = float(x0[_YAW]) if self.settings.heading else 0.0  # rotation of the problem's axes
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, so its motion shows no disturbance
             self._ahead = x0
+        reference = self._turns.follow(reference, float(state[_YAW]))
         if self.settings.delay:  # the reference at the predicted instants, later by the delay
             later = np.concatenate([reference[1:], reference[-1:]])
             reference = reference + self.settings.delay / self._period * (later - reference)
         x0 = np.concatenate([x0, self._rotors])[: self._model.n]
         if self.settings.heading:
-            reference = with_nearest_yaw(reference, self._yaw, self.settings.largest_turn)
+            reference = with_limited_yaw(reference, self._yaw, self.settings.largest_turn)
             x0 = turn_horizontally(x0, -self._yaw)
             x0[_YAW] = 0.0
         u_s = self._balanced()

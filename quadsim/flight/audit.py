@@ -102,10 +102,8 @@ def _state(i: int) -> Signal:
 
 
 def _error(j: int) -> Signal:
-    unit, scale = shown_unit(STATE_UNITS[i := REFERENCE_STATES[j]])
-    return Signal(
-        unit=unit, sampled=lambda log: scale * (log.truth[:, i] - log.reference[:, j]), plant=None, tolerance=AT_SAMPLES
-    )
+    unit, scale = shown_unit(STATE_UNITS[REFERENCE_STATES[j]])
+    return Signal(unit=unit, sampled=lambda log: scale * log.tracking_error[:, j], plant=None, tolerance=AT_SAMPLES)
 
 
 def _estimate_error(i: int) -> Signal:

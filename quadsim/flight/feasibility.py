@@ -21,7 +21,19 @@ import numpy as np
 
 from quadsim.flight.audit import Mask
 from quadsim.rotation import euler_to_body_rates
-from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, POSITION, STATE_UNITS, VELOCITY, Array, shown_unit, tilt
+from quadsim.state import (
+    EULER,
+    EULER_RATE,
+    INDEX,
+    N_STATES,
+    POSITION,
+    STATE_UNITS,
+    VELOCITY,
+    Array,
+    shown_unit,
+    tilt,
+    wrapped,
+)
 from quadsim.vehicle import Vehicle
 
 STENCIL: Final = 2  # samples on either side that a torque depends on
@@ -49,7 +61,7 @@ class Feasibility:
     tilt: float  # largest [deg]
     velocity: float  # largest magnitude [m/s]
     acceleration: float  # largest magnitude [m/s^2]
-    yaw: float  # largest magnitude [deg]; a model linearised at zero yaw is valid near 0
+    yaw: float  # largest magnitude, wrapped to +-180 [deg]; a model linearised at zero yaw is valid near 0
     yaw_rate: float  # largest magnitude [deg/s]
     rotor_min: float  # lowest rotor speed [rad/s]; 0 where a rotor's thrust is negative
     rotor_max: float  # highest rotor speed [rad/s]
@@ -145,7 +157,7 @@ def assess(
         "tilt": math.degrees(float(tilt(needed.state).max())),
         "velocity": float(np.linalg.norm(needed.state[:, VELOCITY], axis=1).max()),
         "acceleration": float(np.linalg.norm(needed.acceleration, axis=1).max()),
-        "yaw": math.degrees(float(np.abs(needed.state[:, INDEX["yaw"]]).max())),
+        "yaw": math.degrees(float(np.abs(wrapped(needed.state[:, INDEX["yaw"]])).max())),
         "yaw_rate": math.degrees(float(np.abs(needed.state[:, INDEX["yaw_rate"]]).max())),
         "rotor_min": float(needed.speeds.min()),
         "rotor_max": float(needed.speeds.max()),

@@ -15,7 +15,18 @@ import numpy as np
 from quadsim.controller import Phase
 from quadsim.errors import ParameterError
 from quadsim.rotation import conjugate, euler_to_body_rates, euler_to_quaternion, multiply
-from quadsim.state import ANGLE_RATES, ANGLES, REFERENCE_NAMES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
+from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
+    INDEX,
+    REFERENCE_NAMES,
+    REFERENCE_STATES,
+    REFERENCE_UNITS,
+    STATE_NAMES,
+    STATE_UNITS,
+    Array,
+    wrapped,
+)
 from quadsim.vehicle import N_ROTORS
 
 RESIDUALS: Final = (
@@ -130,12 +141,20 @@ class ControlLog:
         return self.state is self.truth or bool(np.array_equal(self.state, self.truth))
 
     @property
+    def tracking_error(self) -> Array:
+        """(K, 4) true state less reference: x, y, z [m], yaw [rad] in (-pi, pi]."""
+        error = self.truth[:, REFERENCE_STATES] - self.reference
+        error[:, REFERENCE_NAMES.index("yaw")] = wrapped(error[:, REFERENCE_NAMES.index("yaw")])
+        return error
+
+    @property
     def measured_error(self) -> Array:
         """(K, 12) measured less true state; a logged attitude gives a rotation vector and body rates, body axes.
 
         Without one, it is the difference of Euler angles and of their rates.
         """
         error = self.state - self.truth
+        error[:, INDEX["yaw"]] = wrapped(error[:, INDEX["yaw"]])
         if self.attitude is not None and self.body_rates is not None:
             angles, rates = self.truth[:, ANGLES], self.truth[:, ANGLE_RATES]
             turn = multiply(conjugate(euler_to_quaternion(angles)), self.attitude)

@@ -13,7 +13,16 @@ import numpy as np
 from quadsim.controller import ACCEPTED, MISSED, NO_SOLVER, Phase
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, TimingLog
 from quadsim.flight.phase import AIRBORNE, Outline, clearance, takeoff_time, touchdown
-from quadsim.state import INDEX, REFERENCE_NAMES, REFERENCE_STATES, REFERENCE_UNITS, STATE_NAMES, STATE_UNITS, Array
+from quadsim.state import (
+    INDEX,
+    REFERENCE_NAMES,
+    REFERENCE_STATES,
+    REFERENCE_UNITS,
+    STATE_NAMES,
+    STATE_UNITS,
+    Array,
+    wrapped,
+)
 
 SETTLING_BAND: Final = 0.05  # half-width of the settling band, as a share of the step
 
@@ -42,7 +51,7 @@ def tracking(log: ControlLog) -> dict[str, Any]:
         `position_error`, of the distance from the reference: its mean, its root mean square, and the largest [m].
     """
     state = log.truth[:, REFERENCE_STATES]
-    error = state - log.reference
+    error = log.tracking_error
     distance = np.linalg.norm(error[:, :3], axis=1)
     lowest = np.minimum(log.reference.min(axis=0), state[0])
     highest = np.maximum(log.reference.max(axis=0), state[0])
@@ -80,7 +89,10 @@ def settling(t: Array, outputs: Array, steps: Sequence[CourseStep]) -> list[dict
     for step in steps:
         in_window = (t >= step.time - 1e-9) & (t <= step.until + 1e-9)
         error = outputs[in_window, REFERENCE_NAMES.index(step.channel)] - step.after
-        outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(step.after - step.before))
+        size = step.after - step.before
+        if step.channel == "yaw":
+            error, size = wrapped(error), wrapped(size)
+        outside = np.flatnonzero(np.abs(error) > SETTLING_BAND * abs(size))
         first = outside[-1] + 1 if outside.size else 0
         reached_end = t.size > 1 and t[-1] + period > step.until - 1e-9
         settled = round(float(t[in_window][first] - step.time), 9) if reached_end and first < error.size else None

@@ -21,7 +21,7 @@ from quadsim.motion import Motion
 from quadsim.sim.computation import Computation
 from quadsim.sim.physics import FlownPeriod, Observation, Segment, flight_log, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
-from quadsim.state import INDEX, REFERENCE_NAMES, Array
+from quadsim.state import INDEX, REFERENCE_NAMES, Array, ReferenceTurns
 from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class ClosedLoop:
         k: control periods flown so far.
         period: length of one [s].
         controller: the controller in command; see `switch`.
-        course: the reference that is followed.
+        course: the reference that is followed; observations have its yaw on the turn of the measured one.
         answered: latest time at which a command has arrived so far [s].
         before: called with k at the start of a period, before any measurement; its changes act in that period.
         last: the last period; None before the first.
@@ -130,6 +130,7 @@ class ClosedLoop:
         if ground is not None:
             ground.reset()
         self._plant, self._navigation, self._ground = plant, navigation, ground
+        self._turns = ReferenceTurns()
         self.course: Reference = Rows(values=reference) if isinstance(reference, np.ndarray) else reference
         self._steps, self._loss, self.quaternions = steps_per_period, loss, quaternions
         self._draws = rng if rng is not None else np.random.default_rng(0)
@@ -254,7 +255,9 @@ class ClosedLoop:
         truth = plant.state()
         state = truth.copy() if navigation is None else navigation.state()
         attitude, body_rates = plant.attitude if navigation is None else navigation.attitude
-        row, preview = self.course.row(k), self.course.preview(k, self.controller.horizon)
+        ahead = [self.course.row(k)[None], self.course.preview(k, self.controller.horizon)]
+        rows = self._turns.follow(np.concatenate(ahead), float(state[INDEX["yaw"]]))
+        row, preview = rows[0], rows[1:]
         phase = Phase.FLYING
         if self._ground is not None:
             since = self._start[None] if self.last is None else self.last.segment.physics

@@ -13,7 +13,7 @@ from quadsim.controller import FALLBACK, MISSED, Command, Phase, StepInputs
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, LoggedSignals, PlantLog, TimingLog, stacked
 from quadsim.rotation import body_to_euler_rates, quaternion_to_euler
 from quadsim.sim.sensing import whole
-from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, VELOCITIES, Array
+from quadsim.state import ANGLE_RATES, ANGLES, INDEX, N_STATES, POSITIONS, TURN, VELOCITIES, Array, whole_turns
 from quadsim.vehicle import N_ROTORS
 
 Integrator = Literal["mujoco", "rk4"]  # integrator of the physics steps: MuJoCo, or `quadsim.sim.rigid_body`
@@ -55,15 +55,15 @@ def physics_to_state(physics: Array, yaw: float = 0.0) -> Array:
     state[:, ANGLE_RATES] = body_to_euler_rates(euler, physics[:, 11:14])
     if len(euler) > 1:
         euler[:, 2] = np.unwrap(euler[:, 2])
-    turns = round((yaw - float(euler[0, 2])) / (2.0 * math.pi)) if len(euler) and math.isfinite(euler[0, 2]) else 0
-    euler[:, 2] += 2.0 * math.pi * turns
+    if len(euler) and math.isfinite(euler[0, 2]):
+        euler[:, 2] -= TURN * whole_turns(float(euler[0, 2]) - yaw)
     upright = np.cos(euler[:, 0]) * np.cos(euler[:, 1]) >= 0.0
     last = yaw
     for first in np.flatnonzero(np.diff(upright)) + 1:  # as `quadsim.state.YawTurns`
         if not upright[first]:
             last = float(euler[first - 1, 2])
         elif math.isfinite(euler[first, 2]):
-            euler[first:, 2] += 2.0 * math.pi * round((last - float(euler[first, 2])) / (2.0 * math.pi))
+            euler[first:, 2] -= TURN * whole_turns(float(euler[first, 2]) - last)
     state[:, ANGLES] = euler
     return state
 

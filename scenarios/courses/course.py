@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Annotated, Final
 
@@ -13,7 +13,7 @@ from annotated_types import Ge, Le, doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Number, Vector
-from quadsim.state import Array
+from quadsim.state import TURN, Array, nearest_turn, whole_turns
 
 EXACT: Final = (0.0, 0.0, 0.0, 0.0)
 MOST_POINTS: Final = 200  # points or turns of one course; a longer one is a table, `type = "csv"`
@@ -55,8 +55,12 @@ class Course:
 def begin(path: Path, *, start: float, initial: Array) -> Course:
     """Return the course that is `initial` (4,) until `start` [s], then follows the path and stays at its end.
 
-    A path that begins elsewhere makes the course jump at its start.
+    A path that begins elsewhere makes the course jump at its start, but by less than a turn.
     """
+    turned = np.array([0.0, 0.0, 0.0, TURN * whole_turns(path.pose(np.zeros(1)).item(3) - float(initial[3]))])
+    if turned.any():
+        given = path.pose
+        path = replace(path, pose=lambda t: given(t) - turned)
 
     def sample(t: Array) -> Array:
         since = t - start
@@ -124,10 +128,10 @@ class Point:
 
 
 def poses_of(points: Sequence[Point], initial: Array) -> Array:
-    """Return x, y, z [m], yaw [rad] of points (n, 4); a missing yaw is that of the point before."""
+    """Return x, y, z [m], yaw [rad] of points (n, 4), yaw on the turn nearest that of the point before, or that yaw."""
     poses, yaw = [], float(initial[3])
     for point in points:
-        yaw = yaw if point.yaw is None else math.radians(point.yaw)
+        yaw = yaw if point.yaw is None else nearest_turn(math.radians(point.yaw), yaw)
         poses.append([*point.position, yaw])
     return np.array(poses)
 

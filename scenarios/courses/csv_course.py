@@ -17,7 +17,7 @@ from annotated_types import doc
 from pydantic import StringConstraints
 
 from quadsim.errors import FileError
-from quadsim.state import Array
+from quadsim.state import Array, unwrapped
 from scenarios.courses.course import EXACT, Course, Path, Started, begin
 from scenarios.courses.legs import polyline
 
@@ -149,7 +149,7 @@ def parse_table(path: FilePath, content: bytes) -> Table:
         rule = f"must be above that of the row before = {rows[number - 2][0]}"
         raise FileError(path, f"row {number}, column t: {rule}; got {rows[number - 1][0]}")
     poses = numbers[:, 1:5].copy()
-    poses[:, 3] = np.unwrap(poses[:, 3])
+    poses[:, 3] = unwrapped(poses[:, 3], float(poses[0, 3]))
     velocities = numbers[:, 5:] if len(header) > len(POSE_HEADER) else None
     resolution = tuple(_resolution(row[column] for row in rows[1:]) for column in range(1, 5))
     digest = hashlib.sha256(content).hexdigest()

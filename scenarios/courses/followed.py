@@ -7,10 +7,11 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.state import REFERENCE_NAMES, Array
+from quadsim.state import REFERENCE_NAMES, Array, nearest_turn, unwrapped
 from scenarios.courses.course import Course
 from scenarios.courses.smoothing import smooth
 
+_YAW: Final = REFERENCE_NAMES.index("yaw")
 _BLOCK: Final = 256  # rows that the course is sampled for, and filtered, at a time
 
 
@@ -19,6 +20,8 @@ class FollowedCourse:
 
     A set-point is not known ahead: given at t_k, it takes the place of the samples from k+1 on, axis by axis, and the
     filter runs on from row k.  An axis keeps its set-point until it is given another one.
+
+    Each heading, of a sample or a set-point, is on the turn nearest the one before, and reached the shorter way round.
     """
 
     def __init__(self, course: Course, *, response_time: float, period: float) -> None:
@@ -49,13 +52,18 @@ class FollowedCourse:
         """Apply a set-point at t_k, by the names of its axes [m, rad]."""
         self._extend(k + 1)
         self._setpoint |= {REFERENCE_NAMES.index(name): value for name, value in values.items()}
+        if "yaw" in values:
+            self._setpoint[_YAW] = nearest_turn(values["yaw"], float(self._rows[k, _YAW]))
         self._rows = self._rows[: k + 1]
 
     def _extend(self, count: int) -> None:
         """Compute at least that many rows."""
         while len(self._samples) < count:
             t = self._period * np.arange(len(self._samples), len(self._samples) + _BLOCK, dtype=np.float64)
-            self._samples = np.concatenate([self._samples, self._course.sample(t)])
+            samples = self._course.sample(t)
+            before = self._samples[-1] if len(self._samples) else self._course.initial
+            samples[:, _YAW] = unwrapped(samples[:, _YAW], float(before[_YAW]))
+            self._samples = np.concatenate([self._samples, samples])
         if len(self._rows) >= count:
             return
         known = len(self._rows)

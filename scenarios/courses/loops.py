@@ -85,11 +85,10 @@ def fly_round(loop: Loop, *, turn_time: float, turns: float, ramp: float, yaw: f
     Yaw [rad] is held, or where it goes `along` the direction of travel, it starts near that.
     """
     rate, total = math.tau / turn_time, math.tau * turns
-    whole_turns = math.tau * round((yaw - loop.heading(np.zeros(1))[0]) / math.tau)
 
     def pose(t: Array) -> Array:
         theta = ramped(t, rate=rate, total=total, ramp=ramp)
-        headings = loop.heading(theta) + whole_turns if along else np.full(t.shape, yaw)
+        headings = loop.heading(theta) if along else np.full(t.shape, yaw)
         return np.column_stack([loop.position(theta), headings])
 
     return Path(pose=pose, duration=total / rate + ramp)

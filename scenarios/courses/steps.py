@@ -13,7 +13,7 @@ from annotated_types import MaxLen, doc
 
 from quadsim.errors import ParameterError
 from quadsim.fields import Number
-from quadsim.state import Array
+from quadsim.state import Array, nearest_turn
 from scenarios.courses.course import Course, Filtered
 
 
@@ -56,7 +56,7 @@ class Steps(Filtered):
 
     def channels(self, initial: Array) -> list[tuple[Sequence[Window], float]]:
         """Windows of x, y, z [m] and yaw [rad], each with the value outside them."""
-        yaw = [replace(window, value=math.radians(1.0) * window.value) for window in self.yaw]
+        yaw = [replace(window, value=math.radians(1.0) * nearest_turn(window.value, turn=360.0)) for window in self.yaw]
         x, y, z = initial[:3].tolist()
         return [(self.x, x), (self.y, y), (self.z, z), (yaw, 0.0)]
 

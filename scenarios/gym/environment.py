@@ -21,7 +21,7 @@ from quadsim.flight.audit import Limit
 from quadsim.flight.log import FlightLog
 from quadsim.report.film.camera import Camera
 from quadsim.sim.physics import Observation, one_period
-from quadsim.state import REFERENCE_STATES, Array
+from quadsim.state import REFERENCE_STATES, Array, wrapped
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.campaign.plan import Plan, make_plan, read_campaign
 from scenarios.catalogue import scenario_names, scenario_path
@@ -43,7 +43,7 @@ def nearness(state: Array, reference: Array, speeds: Array) -> float:
     It is never negative, so ending an episode early never pays.
     """
     error = state[list(REFERENCE_STATES)] - reference
-    return math.exp(-math.hypot(*error[:3].tolist()) - abs(math.remainder(float(error[3]), math.tau)))
+    return math.exp(-math.hypot(*error[:3].tolist()) - abs(wrapped(float(error[3]))))
 
 
 class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]

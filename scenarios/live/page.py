@@ -30,6 +30,7 @@ from quadsim.palette import CYCLE
 from quadsim.report.figure import least_range
 from quadsim.rotation import quaternion_to_euler
 from quadsim.sim.physics import FlownPeriod
+from quadsim.state import wrapped
 from scenarios.flight import Flight
 from scenarios.live import readout
 from scenarios.live.controls import ControllerTab, Steering, Widgets, disturb
@@ -346,7 +347,7 @@ def _values(sample: FlownPeriod) -> tuple[float, ...]:
     tilt = math.degrees(math.acos(np.clip(up.min(), -1.0, 1.0)))
     yaw = quaternion_to_euler(physics[-1:, 4:8])[0, 2] - observed.reference[3]
     error = observed.truth[[0, 2, 4]] - observed.reference[:3]
-    turned = math.degrees(math.remainder(yaw, 2.0 * math.pi))
+    turned = math.degrees(wrapped(float(yaw)))
     return (*error, tilt, turned, *sample.speeds, 1e3 * sample.step_s)
 
 

@@ -18,6 +18,8 @@ typedef quadsim_real real;
 
 enum { NU = QUADSIM_INPUTS };
 
+#define TURN R(6.283185307179586)
+
 /* ---- numbers ---------------------------------------------------------------------------------------------------- */
 
 static inline int is_finite(const real *numbers, int count)
@@ -43,6 +45,18 @@ static inline real clipped(real number, real lower, real upper)
 {
     const real least = number > lower ? number : lower;
     return least < upper ? least : upper;
+}
+
+/* Whole turns n for which angle - n turn is in (-1/2, 1/2] turn, up to rounding; 0 of an angle that is absurd. */
+static inline real whole_turns(real angle)
+{
+    const real turns = angle / TURN - R(0.500001);
+    int n;
+    if (!(magnitude(turns) < R(1e9))) {
+        return R(0.0);
+    }
+    n = (int)turns;
+    return (real)((real)n < turns ? n + 1 : n);
 }
 
 static inline real dot(const real *left, const real *right, int count)

@@ -74,6 +74,26 @@ static void want(const quadsim_controller *c, const real row[4], real *wanted)
     }
 }
 
+/* Turns to be taken off the reference's heading in the next period, so that it starts near a yaw: as it went on
+ * before, and from the yaw anew only where that is more than 190 deg away. */
+static real first_turns(quadsim_mpc *mpc, const real *reference, real yaw)
+{
+    real turns = mpc->headed ? whole_turns(reference[3] - mpc->heading) : R(0.0);
+    mpc->heading = reference[3] - TURN * turns;
+    if (!mpc->headed || magnitude(yaw - mpc->heading) > R(3.3161255787892263)) {
+        turns -= whole_turns(yaw - mpc->heading);
+        mpc->heading = reference[3] - TURN * turns;
+    }
+    mpc->headed = 1;
+    return turns;
+}
+
+/* The same of row i, of which row i - 1 had these turns. */
+static real next_turns(const real *reference, int i, real turns)
+{
+    return i == 0 ? turns : turns + whole_turns(reference[i * 4 + 3] - reference[i * 4 - 1]);
+}
+
 /* Level rest at a state's place and yaw. */
 static void rest_at(const real *state, real *rest)
 {
@@ -281,25 +301,30 @@ static void spin(real *rotors, const real *command, real decay)
     }
 }
 
-/* The reference's row at the instant that its prediction is for, the delay after it. */
-static void later_row(const quadsim_controller *c, const real *reference, int i, real row[4])
+/* The reference's row at the instant that its prediction is for, the delay after it; turns are those of row i. */
+static void later_row(const quadsim_controller *c, const real *reference, int i, real turns, real row[4])
 {
-    const real *now = reference + i * 4, *next = i < c->problem->horizon - 1 ? now + 4 : now;
+    const int last = i == c->problem->horizon - 1;
+    const real *now = reference + i * 4, *next = last ? now : now + 4;
+    const real heading = now[3] - TURN * turns;
+    const real ahead = last ? heading : next[3] - TURN * next_turns(reference, i + 1, turns);
     int j;
-    for (j = 0; j < 4; j++) {
+    for (j = 0; j < 3; j++) {
         row[j] = now[j] + c->robust->delayed_share * (next[j] - now[j]);
     }
+    row[3] = heading + c->robust->delayed_share * (ahead - heading);
 }
 
 /* wanted of the reference [N][4] as the prediction is given it: later by the delay, and where the model is turned by
  * the heading, yaw without jumps, seen from axes turned by it. */
-static void want_seen(quadsim_mpc *mpc, const real *reference, real yaw, real sine, real cosine)
+static void want_seen(quadsim_mpc *mpc, const real *reference, real turns, real yaw, real sine, real cosine)
 {
     const quadsim_controller *c = mpc->controller;
     real row[4], last = yaw, turned = yaw;
     int i;
     for (i = 0; i < c->problem->horizon; i++) {
-        later_row(c, reference, i, row);
+        turns = next_turns(reference, i, turns);
+        later_row(c, reference, i, turns, row);
         if (c->robust->heading) {
             const real x = row[0], y = row[1], step = row[3] - last;
             last = row[3];
@@ -343,7 +368,8 @@ static void find_rest(const quadsim_mpc *mpc, const real *state, real sine, real
 }
 
 /* The optimum from a state at the instant from which the command acts. */
-static enum quadsim_status solve_ahead(quadsim_mpc *mpc, const real *ahead, const real *reference, const real *acting)
+static enum quadsim_status solve_ahead(quadsim_mpc *mpc, const real *ahead, const real *reference, real turns,
+                                       const real *acting)
 {
     const quadsim_controller *c = mpc->controller;
     real state[MOST_STATES], rest[MOST_STATES], speeds[NU], sine = R(0.0), cosine = R(1.0);
@@ -359,7 +385,7 @@ static enum quadsim_status solve_ahead(quadsim_mpc *mpc, const real *ahead, cons
     put_modes(c, mpc->rotors, state);
     find_rest(mpc, state, sine, cosine, rest, speeds);
     want_rest(mpc, rest);
-    want_seen(mpc, reference, ahead[YAW], sine, cosine);
+    want_seen(mpc, reference, turns, ahead[YAW], sine, cosine);
     return optimise(mpc, state, rest, speeds, acting);
 }
 
@@ -386,7 +412,10 @@ static enum quadsim_status solve_robust(quadsim_mpc *mpc, const real *state, con
     }
     spin(mpc->rotors, acting, r->spun_delay);
     mpc->known = usable && is_finite(mpc->ahead, 12);
-    return mpc->known ? solve_ahead(mpc, mpc->ahead, reference, acting) : QUADSIM_BEFORE;
+    if (!mpc->known) {
+        return QUADSIM_BEFORE;
+    }
+    return solve_ahead(mpc, mpc->ahead, reference, first_turns(mpc, reference, state[YAW]), acting);
 }
 
 /* ---- the controllers --------------------------------------------------------------------------------------------- */
@@ -426,12 +455,15 @@ static int is_usable(const quadsim_controller *c, const real *state, const real 
 static enum quadsim_status solve_paper(quadsim_mpc *mpc, const real *state, const real *reference, const real *acting)
 {
     const quadsim_controller *c = mpc->controller;
-    real rest[MOST_STATES];
+    real rest[MOST_STATES], row[4], turns = first_turns(mpc, reference, state[YAW]);
     int i;
     rest_at(state, rest); /* hover is an equilibrium anywhere and at any yaw: here there is least to round */
     want_rest(mpc, rest);
     for (i = 0; i < c->problem->horizon; i++) {
-        want(c, reference + i * 4, mpc->wanted + i * c->problem->regulated);
+        turns = next_turns(reference, i, turns);
+        memcpy(row, reference + i * 4, sizeof(row));
+        row[3] -= TURN * turns;
+        want(c, row, mpc->wanted + i * c->problem->regulated);
     }
     return optimise(mpc, state, rest, c->hover, acting);
 }
@@ -460,7 +492,7 @@ void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
     memset(mpc->estimate, 0, sizeof(mpc->estimate));
     quadsim_work_reset(&mpc->work);
     mpc->age = -1;
-    mpc->known = 0;
+    mpc->known = mpc->headed = 0;
     if (mpc->controller->robust != NULL) {
         believe(mpc);
     }

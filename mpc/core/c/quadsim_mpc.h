@@ -4,7 +4,8 @@
  *
  * state [12]        x vx y vy z vz roll roll_rate pitch pitch_rate yaw yaw_rate
  *                   [m, m/s, rad, rad/s]: world axes with z up; Z-Y-X Euler angles, body to world, and their rates
- * reference [N][4]  x y z yaw [m, rad], where to be one period from now, two, ... N periods from now
+ * reference [N][4]  x y z yaw [m, rad], where to be one period from now, two, ... N periods from now; whole turns of
+ *                   yaw make no difference
  * acting [4]        command in force up to now, u(k-1) [rad/s]
  * command [4]       rotor speeds to hold for the period [rad/s], rotors in the vehicle file's order
  *
@@ -70,6 +71,8 @@ typedef struct quadsim_mpc {
     quadsim_real *wanted;           /* [N][n_r] y_d - C_r x_s */
     quadsim_real before[4];         /* the last command [rad/s] */
     int age;                        /* periods since the last optimum; negative: there is none yet */
+    int headed;                     /* whether a heading has been followed */
+    quadsim_real heading;           /* the reference's one period from now, on the turn that is followed [rad] */
     int known;                      /* robust: whether the state ahead is known */
     quadsim_real rotors[4];         /* robust: speeds at the instant from which the command acts [rad/s] */
     quadsim_real ahead[12];         /* the state there */

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
-from mpc.baselines.preview import differentiator, target_of, wrapped
+from mpc.baselines.preview import differentiator, target_of
 
 
 @pytest.mark.parametrize("samples", [3, 10, 25])
@@ -30,8 +28,3 @@ def test_a_jump_of_the_velocity_becomes_a_hump_of_its_area() -> None:
     assert accelerations.sum() * period == pytest.approx(6.0)
     assert accelerations.min() > -1e-9
     assert accelerations.max() < 0.25 * 6.0 / period
-
-
-@pytest.mark.parametrize(("angle", "expected"), [(3.5, 3.5 - 2.0 * math.pi), (-4.0, 2.0 * math.pi - 4.0), (1.0, 1.0)])
-def test_headings_wrap_to_the_short_way(angle: float, expected: float) -> None:
-    assert wrapped(angle) == pytest.approx(expected)

@@ -117,6 +117,7 @@ def test_tilt_is_the_angle_between_thrust_and_vertical(roll: float, pitch: float
 def test_errors_are_real_minus_reference_at_the_samples(axis: str, state: int, scale: float) -> None:
     log = small_log(3)
     errors = scale * (log.control.truth[:, state] - log.control.reference[:, {"x": 0, "yaw": 3}[axis]])
+    errors = errors if axis == "x" else -np.remainder(180.0 - errors, 360.0) + 180.0
     finding = find(log, Limit(name="error", signal=f"{axis}_error", upper=0.0))
     assert finding.peak_sampled == pytest.approx(errors.max())
     assert math.isnan(finding.peak_plant)  # it has no value there

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quadsim.state import Array
-from scenarios.courses.course import Path
+from scenarios.courses.course import Path, begin
 from scenarios.courses.loops import Loop, circle, figure_eight, fly_round, ramped
 
 CENTRE = np.array([1.0, -2.0, 3.0])
@@ -92,7 +92,9 @@ def test_two_turns_take_two_turn_times_and_a_ramp_and_end_where_they_began(ramp:
 @pytest.mark.parametrize(("given_yaw", "along"), [(0.4, False), (-7.0, False), (6.0, True), (-9.5, True)])
 def test_yaw_is_held_or_follows_the_path_from_the_nearest_turn(given_yaw: float, along: bool) -> None:
     loop = LOOPS["eight"]
-    yaw = flown(loop, yaw=given_yaw, along=along).pose(np.linspace(0.0, 22.0, 500))[:, 3]
+    path = flown(loop, yaw=given_yaw, along=along)
+    course = begin(path, start=0.0, initial=np.array([*CENTRE, given_yaw]))
+    yaw = course.sample(np.linspace(0.0, 22.0, 500))[:, 3]
     if not along:
         np.testing.assert_array_equal(yaw, given_yaw)
         return
