@@ -33,13 +33,18 @@ class Piloted:
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._slowest = np.full(4, vehicle.speed_min)
         self._target, self._fresh = self._hover, True  # the autopilot is reset before its first call
+        self._rates = np.zeros(3)  # body rates at which it starts then [rad/s]
         if hasattr(law, "predict"):
             self.predict = law.predict
 
     def reset(self, speeds: Array) -> None:
-        """Restart; the target before the first is hover."""
-        self._target, self._fresh = self._hover, True
+        """Restart, at rest unless `begin` follows; the target before the first is hover."""
+        self._target, self._fresh, self._rates = self._hover, True, np.zeros(3)
         self.inner.reset(self._hover.copy())
+
+    def begin(self, rates: Array) -> None:
+        """Let the autopilot start, after a reset, on a vehicle that turns at body rates (3,) [rad/s]."""
+        self._rates = rates.copy()
 
     def adopt(self, previous: object) -> None:
         """Take over the previous law, and its autopilot: a vehicle has one."""
@@ -52,7 +57,7 @@ class Piloted:
         """Return the law's target, to be flown by the autopilot; on the ground the rotors stop."""
         command: Command = self.inner.step(replace(now, acting=self._target), state, reference)
         if now.phase in GROUNDED:
-            self._target, self._fresh = self._hover, True
+            self._target, self._fresh, self._rates = self._hover, True, np.zeros(3)
             return stopped(self._slowest.copy(), self.horizon, now.phase)
         return replace(command, inner=self)
 
@@ -60,6 +65,8 @@ class Piloted:
         """See `quadsim.controller.InnerLoop`."""
         if self._fresh:
             self.autopilot.reset()
+            if hasattr(self.autopilot, "settle"):
+                self.autopilot.settle(self._rates, rotors)
         self._target, self._fresh = commanded, False
         return self.autopilot.speeds(time, commanded, rates, rotors, attitude)
 

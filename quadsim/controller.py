@@ -72,7 +72,8 @@ class StepInputs:
     Attributes:
         time: t_k [s].
         phase: phase relative to the ground.
-        acting: (4,) command in force at t_k, u(k-1) [rad/s]; None if it is the controller's last command.
+        acting: (4,) the command before, u(k-1) [rad/s], in force at t_k unless commands take longer than a period to
+            act; None if it is the controller's last command.
         attitude: (4,) measured quaternion wxyz, body to world, sign continuous from period to period; None: derive it
             from the state.
         body_rates: (3,) measured body rates [rad/s]; None: derive them from the state.
@@ -224,7 +225,8 @@ class Controller(Protocol):
     """A feedback law run once per control period.
 
     A controller that takes over in flight may have a method `adopt(previous)`, called after `reset`, which can copy
-    estimates and the plan from the previous controller.
+    estimates and the plan from the previous controller.  One with an autopilot may have a method `begin(rates)`, called
+    after `reset` with the body rates (3,) [rad/s] of that moment.
     """
 
     @property

@@ -24,7 +24,8 @@ from quadsim.controller import ROTORS
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
-from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance
+from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance, touching_speed
+from quadsim.rotation import body_to_euler_rates
 from quadsim.sim.airframe import outline
 from quadsim.sim.autopilot import Autopilot, AutopilotSettings, built_in_lags, identify_lags
 from quadsim.sim.computation import Computation, ComputationTime, Stall
@@ -38,7 +39,16 @@ from quadsim.sim.plant import Plant
 from quadsim.sim.rigid_body import check_free
 from quadsim.sim.sensing import AXES, FaultKind, Sensor, SensorFault, SensorName
 from quadsim.space import Corridor, Fence, Region
-from quadsim.state import POSITION, REFERENCE_NAMES, Array, make_state, nearest_turn
+from quadsim.state import (
+    ANGLE_RATES,
+    ANGLES,
+    POSITION,
+    REFERENCE_NAMES,
+    VELOCITIES,
+    Array,
+    make_state,
+    nearest_turn,
+)
 from quadsim.vehicle import (
     AUTOPILOT,
     N_ROTORS,
@@ -81,6 +91,7 @@ _UNITS: Final = {
     SensorName.RATES: math.radians(1.0),
 }
 """SI units per unit of the scenario file, by sensor."""
+_RESTING: Final = 1e-9  # vertical speed attributed to rounding [m/s]
 _OF_ALL_EVENTS: Final = ("vehicle", "autopilot", "user_autopilot", "inner_lag", "actual", "effects", "course")
 """Parts that do not depend on events, controller or duration."""
 
@@ -211,7 +222,11 @@ class Assembly:
             return physics_to_state(physics[None], yaw=self.initial_yaw)[0]
         x, y, z = initial.position
         roll, pitch, _ = np.radians(initial.euler)
-        return make_state(position=(x, y, z), euler=(roll, pitch, self.initial_yaw))
+        state = make_state(position=(x, y, z), euler=(roll, pitch, self.initial_yaw))
+        state[VELOCITIES] = initial.velocity
+        if any(initial.body_rates):
+            state[ANGLE_RATES] = body_to_euler_rates(state[ANGLES], np.radians(initial.body_rates))
+        return state
 
     @property
     def initial_yaw(self) -> float:
@@ -221,7 +236,10 @@ class Assembly:
     @property
     def initial_speeds(self) -> Array:
         """(4,) u(-1), and the rotor speeds at t = 0 [rad/s]."""
-        return np.full(N_ROTORS, 0.0 if self.scenario.initial.cold else self.vehicle.hover_speed)
+        initial = self.scenario.initial
+        if initial.rotor_speeds is not None:
+            return np.array(initial.rotor_speeds)
+        return np.full(N_ROTORS, 0.0 if initial.cold else self.vehicle.hover_speed)
 
     # --- course ------------------------------------------------------------------------------------------------------
 
@@ -516,7 +534,7 @@ class Assembly:
         Raises:
             InputError: the vehicle does not exist or cannot hover, an effect is impossible with it or with the
                 integrator, the course cannot be built or lacks the motion on which the flight starts, or the flight
-                starts below the floor, or in the air with rotors at rest.
+                starts below the floor, into it, in the air with `cold` rotors, or with rotors beyond their range.
         """
         scenario, load = self.scenario, self.effects.load or Load()
         mass_properties(self.actual, load, load.payloads)
@@ -528,6 +546,10 @@ class Assembly:
         if scenario.initial.on_reference and course.derivatives is None:
             rule = f"false where the course states positions alone, as one of type {scenario.reference.type} does"
             raise ParameterError("initial", "on_reference", True, rule)
+        speeds, fastest = self.initial_speeds, self.actual.speed_max
+        if scenario.initial.rotor_speeds is not None and speeds.max() > fastest:
+            rule = f"at most {fastest:g} rad/s each, the speed_max of {self.actual.name}"
+            raise ParameterError("initial", "rotor_speeds", speeds.tolist(), rule)
         ground = scenario.effects.ground
         if ground is not None and (ground.contact or ground.effect):
             self._check_floor()
@@ -542,7 +564,7 @@ class Assembly:
         return self
 
     def _check_floor(self) -> None:
-        """Reject a start below the floor, or one in the air with rotors at rest."""
+        """Reject a start below the floor or into it, or one in the air with rotors at rest."""
         initial, shape, state = self.scenario.initial, outline(self.actual), self.initial_state()[None, :]
         feet = float(clearance(state, shape.feet, shape.foot_radius, shape.floor)[0])
         hull = float(clearance(state, shape.hull, 0.0, shape.floor)[0])
@@ -554,6 +576,11 @@ class Assembly:
         if initial.cold and feet > AIRBORNE:
             rule = f"on the floor where initial.cold is true, or it would fall: its feet are {feet:.3g} m above it"
             raise ParameterError("initial", "position", position, rule)
+        sinking = -touching_speed(state, np.radians(initial.body_rates), shape)
+        if sinking > _RESTING and self.scenario.effects.ground is not None and self.scenario.effects.ground.contact:
+            name = "velocity" if initial.velocity[2] < 0.0 else "body_rates"
+            rule = f"such that no part on the floor moves into it: one does, at {sinking:.3g} m/s"
+            raise ParameterError("initial", name, list(getattr(initial, name)), rule)
 
 
 def stated_autopilot(path: Path, stated: AutopilotSettings | None = None) -> AutopilotSettings | None:

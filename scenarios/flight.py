@@ -41,6 +41,7 @@ from scenarios.feasibility_check import report
 from scenarios.flight_events import story
 from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
+from scenarios.mismatch import model_notes
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario
@@ -460,6 +461,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
     estimation = {} if log.control.measured_perfectly else {**metrics.estimation(log.control), "samples": samples}
     steps = flight.assembly.course_steps
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=steps)
+    notes = model_notes(flight.assembly) if flight.controller == scenario.controller.type else []
     return {
         "scenario": scenario.name,
         "description": scenario.description,
@@ -479,6 +481,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "tracking": numbers["tracking"],
         "constraints": [limit_to_json(finding) for finding in flight.findings],
         "audit_notes": audit_notes(flight.assembly),
+        **({"model_notes": notes} if notes else {}),
         "control": numbers["control"],
         "diagnosis": flight.diagnosis,
         "controller": {

@@ -16,14 +16,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from quadsim.controller import ROTORS
+from quadsim.controller import MISSED, ROTORS
 from quadsim.errors import FileError, InputError, printable
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Finding, FlightVerdict, audit, flight_verdict
-from quadsim.flight.log import FlightLog
+from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import finding_from_json, limit_to_json
+from quadsim.sim.computation import physics_steps
 from quadsim.sim.effects.rotors import LagChange
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array, wrapped
 from quadsim.vehicle import N_ROTORS
@@ -183,12 +185,11 @@ def _inconsistencies(scenario: Scenario, run: rundir.Run) -> Iterator[str]:
         np.abs(apart) > ROUNDING_TILT, STATE_NAMES, control.t[both], f"differs between {FLIGHT_FILE} and {PLANT_FILE}"
     )
     if _holds_commands(scenario):
-        k = np.minimum(np.arange(plant.t.size - 1) * stride // steps, max(count - 1, 0))  # the last row ends the flight
+        starts = np.arange(plant.t.size - 1) * stride  # the last row ends the flight
+        speeds, known = _in_force(scenario, control, starts)
         limits = (run.vehicle.speed_min, run.vehicle.speed_max) if scenario.plant.limit_speeds else (0.0, None)
-        applied = np.clip(control.speeds[k], *limits)
-        wrong = (np.abs(applied - plant.speeds[:-1]) > ROUNDING * np.maximum(1.0, applied)) & (control.delay[k] == 0.0)[
-            :, None
-        ]
+        applied = np.clip(speeds, *limits)
+        wrong = (np.abs(applied - plant.speeds[:-1]) > ROUNDING * np.maximum(1.0, applied)) & known[:, None]
         yield from _where(wrong, _TURNING, plant.t, f"of {PLANT_FILE} is not the speed that {FLIGHT_FILE} commands")
 
 
@@ -196,6 +197,27 @@ def _where(wrong: np.ndarray[Any, np.dtype[np.bool_]], columns: Sequence[str], t
     """Yield the columns with errors, each with the first time of one."""
     for i in np.flatnonzero(wrong.any(axis=0)).tolist():
         yield f"{columns[i]} at t = {t[np.argmax(wrong[:, i])]:g} s {what}"
+
+
+def _in_force(
+    scenario: Scenario, control: ControlLog, at: NDArray[np.int64]
+) -> tuple[Array, np.ndarray[Any, np.dtype[np.bool_]]]:
+    """Return the commands in force (M, 4) [rad/s] at physics steps (M,), and where the tables have them (M,).
+
+    They do not have the steps of a plan that bridge the time from when a command is due to when it arrives.
+    """
+    timestep, starts = scenario.plant.timestep, scenario.steps_per_period * np.arange(control.t.size)
+    due = starts + (0 if scenario.computation is None else physics_steps(scenario.computation.delay, timestep))
+    waits = [physics_steps(delay, timestep) for delay in control.delay.tolist()]
+    missed = [status == MISSED for status in control.status]  # their rows have what acts from when they were due
+    arrives = np.where(missed, due, starts + np.array(waits, dtype=np.int64))
+    assembly, laws = Assembly(scenario), [(0.0, scenario.controller), *scenario.controller_changes]
+    settings = [assembly.computation(spec) for _, spec in laws]
+    law = np.searchsorted([time for time, _ in laws], control.t + ROUNDING, side="right") - 1
+    planning = np.array([entry is not None and bool(entry.plan) for entry in settings])[law]
+    coming = np.searchsorted(arrives, at, side="right")
+    unknown_from = np.append(np.where(planning, due, math.inf), math.inf)
+    return np.vstack([control.speeds_before, control.speeds])[coming], at < unknown_from[coming]
 
 
 def _holds_commands(scenario: Scenario) -> bool:

@@ -41,6 +41,7 @@ def summary_tables(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
     if summary["constraints"]:
         yield audit_table(findings_of(summary))
     yield from summary.get("audit_notes", ())
+    yield from summary.get("model_notes", ())
     if summary["tracking"]:
         yield from _controller_lines(summary)
     yield from _effect_lines(summary)

@@ -53,11 +53,12 @@ def _arrays(**sizes: int) -> list[tuple[str, type]]:
 
 class _Robust(ctypes.Structure):
     _fields_ = [
-        *((name, _INT) for name in ("observes", "heading")),
-        *((name, _REAL) for name in ("gravity", "least_lift", "upright", "delay", "delayed_share", "rest_of_period")),
-        *((name, _REAL) for name in ("spun_delay", "spun_before", "largest_turn")),
+        *((name, _INT) for name in ("observes", "heading", "under_way")),
+        *((name, _REAL) for name in ("gravity", "least_lift", "upright", "period", "delay", "delayed_share")),
+        *((name, _REAL) for name in ("rest_of_period", "spun_period", "spun_delay", "spun_before", "largest_turn")),
         *_arrays(effectiveness=16, allocation=16, gyration=3, slope_inverse=16, modes=16, gain=6, largest=6),
-        *_arrays(decay_before=4 * SUBSTEPS, decay_delay=4 * SUBSTEPS, plausible_state=12, plausible_reference=4),
+        *_arrays(decay_before=4 * SUBSTEPS, decay_delay=4 * SUBSTEPS, decay_period=4 * SUBSTEPS),
+        *_arrays(plausible_state=12, plausible_reference=4),
     ]
 
 
@@ -70,9 +71,9 @@ class _Controller(ctypes.Structure):
 
 class _MPC(ctypes.Structure):
     _fields_ = [
-        *(("controller", _AT), ("work", Work), ("wanted", _AT)),
+        *(("controller", _AT), ("work", Work), ("wanted", _AT), ("sent", _AT)),
         *(*_arrays(before=4), ("age", _INT), ("headed", _INT), ("heading", _REAL), ("known", _INT)),
-        *_arrays(rotors=4, ahead=12, estimate=6),
+        *_arrays(rotors=4, ahead=12, turning=4, estimate=6),
         *_arrays(trim=4, lift=3, twist=3, effectiveness=16),
     ]
 

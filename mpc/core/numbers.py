@@ -15,7 +15,7 @@ from mpc.model import hover_model
 from mpc.nonlinear.model import SUBSTEPS, nonlinear_model
 from mpc.observer import UPRIGHT, DisturbanceObserver
 from mpc.ocp import Problem
-from mpc.robust.settings import RobustSettings
+from mpc.robust.settings import RobustSettings, split_delay
 from quadsim.state import REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -45,7 +45,7 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
     """Return the members of a `quadsim_robust`; `modes` (4, 4) as in `mpc.core.tables.Tables`."""
     settings, vehicle, period = law.settings, law.vehicle, law.problem.model.period
     assert settings is not None
-    lag, delay = settings.rotor_lag, settings.delay
+    lag, (whole, late) = settings.rotor_lag, split_delay(settings.delay, period)
     model = nonlinear_model(vehicle, period, rotor_lag=lag or None)
     observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
     instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
@@ -57,14 +57,17 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
     return {
         "observes": int(observer is not None),
         "heading": int(settings.heading),
+        "under_way": whole,
         "gravity": model.gravity,
         "least_lift": LEAST_LIFT,
         "upright": UPRIGHT,
-        "delay": delay,
-        "delayed_share": delay / period,
-        "rest_of_period": period - delay,
-        "spun_delay": float(decay(delay)),
-        "spun_before": float(decay(period - delay)),
+        "period": period,
+        "delay": late,
+        "delayed_share": late / period,
+        "rest_of_period": period - late,
+        "spun_period": float(decay(period)),
+        "spun_delay": float(decay(late)),
+        "spun_before": float(decay(period - late)),
         "largest_turn": settings.largest_turn,
         "effectiveness": np.asarray(model.effectiveness, float),
         "allocation": np.asarray(model.allocation, float),
@@ -73,8 +76,9 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
         "modes": modes,
         "gain": np.zeros(6) if observer is None else observer.gain,
         "largest": np.zeros(6) if observer is None else observer.largest,
-        "decay_before": decay(instants * (period - delay)),
-        "decay_delay": decay(instants * delay),
+        "decay_before": decay(instants * (period - late)),
+        "decay_delay": decay(instants * late),
+        "decay_period": decay(instants * period),
         "plausible_state": PLAUSIBLE,
         "plausible_reference": PLAUSIBLE[list(REFERENCE_STATES)],
     }

@@ -12,6 +12,7 @@ from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
 from mpc.core.solver import core_problem
 from mpc.core.tables import Tables, members
 from mpc.export.ctext import CText, Precision
+from mpc.robust.settings import split_delay
 from quadsim.vehicle import N_ROTORS
 
 CORE: Final = ("quadsim_core.h", "quadsim_core.c", "quadsim_math.h", "quadsim_mpc.h", "quadsim_mpc.c")
@@ -59,7 +60,9 @@ class CController:
         packed = 4 * room + 3 * rows  # bytes of integers
         widest = max(len(axis.B) for axis in self.tables.axes)
         work = N * (5 * N_ROTORS + widest) + 3 * rows + 6 * room + room * (room - 1) // 2
-        return work + packed // self.real_bytes + 1 + N * len(problem.objective.C_r)
+        settings, period = self.law.settings, self.law.problem.model.period
+        sent = 0 if settings is None else N_ROTORS * split_delay(settings.delay, period)[0]
+        return work + packed // self.real_bytes + 1 + N * len(problem.objective.C_r) + sent
 
     @property
     def real_bytes(self) -> int:

@@ -14,6 +14,7 @@ whatever the errors of A and B.
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 from typing import Final
 
@@ -32,7 +33,7 @@ from mpc.observer import ObserverSettings as ObserverSettings
 from mpc.obstacles import ObstacleQP, Space
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
-from mpc.robust.settings import LONGEST_SPAN
+from mpc.robust.settings import LONGEST_SPAN, split_delay
 from mpc.robust.settings import RobustSettings as RobustSettings
 from mpc.solvers import INVALID_DATA, Answer, Solver
 from quadsim.controller import GROUNDED, Command, Phase, StepInputs, stopped
@@ -59,8 +60,9 @@ def robust_problem(
 
     Objective, bounds and constraints refer to the paper's 12 states.
     """
-    if settings.delay > period:
-        raise ParameterError("controller", "delay", settings.delay, f"at most the control period of {period} s")
+    if settings.delay > horizon * period:
+        rule = f"at most the horizon of {horizon} periods, {horizon * period:g} s"
+        raise ParameterError("controller", "delay", settings.delay, rule)
     A, B = discretise(*continuous_model(vehicle, settings.rotor_lag), period)
     model = LinearModel(A=A, B=B, u_bar=hover_model(vehicle, period).u_bar, period=period)
     objective = replace(objective, C_r=_widened(objective.C_r, model.n), Q_d=settings.move_weight)
@@ -103,6 +105,8 @@ class RobustMPC:
     ) -> None:
         self.problem, self.settings, self.horizon = problem, settings, problem.horizon
         self._period = period = problem.model.period
+        whole, self._late = split_delay(settings.delay, period)
+        self._sent: deque[Array] = deque(maxlen=whole + 1)  # u(k-1-n) .. u(k-1): the command in force, and under way
         self._nominal = hover_model(vehicle, period)
         self._model = nonlinear_model(vehicle, period, rotor_lag=settings.rotor_lag or None)
         self._of_twist = np.ascontiguousarray(np.linalg.inv(slope(self._nominal))[:, 1:])
@@ -116,8 +120,9 @@ class RobustMPC:
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s], with rotors at that speed."""
         self._acting = np.array(speeds, float)
-        # Rotor speeds and state at the instant at which this period's command takes effect, `delay` after its start.
-        self._rotors = self._acting.copy()
+        self._sent.extend([self._acting] * (self._sent.maxlen or 1))
+        # Rotor speeds and state when the next command takes over in this period, and speeds when this period's does.
+        self._rotors = self._turning = self._acting.copy()
         self._ahead: Array | None = None
         self._called_at = self._measured = -math.inf
         self._turns.reset()
@@ -129,10 +134,11 @@ class RobustMPC:
         self._forget()
 
     def adopt(self, previous: object) -> None:
-        """Take over the rotor speeds and the disturbance of the previous law."""
+        """Take over the rotor speeds, the commands under way and the disturbance of the previous law."""
         law = within(previous, RobustMPC)
         if law is not None:
-            self._rotors = law._rotors.copy()
+            self._rotors, self._turning = law._rotors.copy(), law._turning.copy()
+            self._sent.extend(law._sent)
             self._called_at, self._measured = law._called_at, law._measured
             if self.settings.delay == law.settings.delay:
                 self._ahead = law._ahead
@@ -177,11 +183,16 @@ class RobustMPC:
         """
         if now.acting is not None:
             self._acting = np.array(now.acting, float)
-        rest = self._period - self.settings.delay
+        self._sent.append(self._acting)
+        in_force, *under_way = self._sent
+        rest = self._period - self._late
         ahead, before, called_at = self._ahead, self._rotors, self._called_at
-        rotors = spun(self._model, before, self._acting, rest)
-        self._rotors = spun(self._model, rotors, self._acting, self.settings.delay)
-        self._ahead, self._called_at = None, now.time
+        rotors = spun(self._model, before, in_force, rest)
+        self._rotors = spun(self._model, rotors, in_force, self._late)
+        turning = [self._rotors]
+        for command in under_way:
+            turning.append(spun(self._model, turning[-1], command, self._period))
+        self._ahead, self._called_at, self._turning = None, now.time, turning[-1]
         if now.phase in GROUNDED:
             self._acting, _ = self._actuators.reach(self._acting)
             self._forget()
@@ -192,21 +203,24 @@ class RobustMPC:
             self._measured = -math.inf
         span = self._span(now)
         if self._observer is not None and ahead is not None and span <= LONGEST_SPAN and now.phase is Phase.FLYING:
-            expected = self._after(rest, ahead, before)
+            expected = self._after(rest, ahead, before, in_force)
             if all_true(np.isfinite(expected)):
                 self._observer.update(state, expected)
                 self._update_trim()
-        x0 = self._after(self.settings.delay, state, rotors)
+        x0 = following = self._after(self._late, state, rotors, in_force)
+        for command, speeds in zip(under_way, turning, strict=False):
+            x0 = self._after(self._period, x0, speeds, command)
         if not all_true(np.isfinite(x0)):
             return refused(self._acting, self.horizon, INVALID_DATA)
         self._yaw = float(x0[_YAW]) if self.settings.heading else 0.0  # rotation of the problem's axes
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, so its motion shows no disturbance
-            self._ahead = x0
+            self._ahead = following
         reference = self._turns.follow(reference, float(state[_YAW]))
         if self.settings.delay:  # the reference at the predicted instants, later by the delay
+            reference = np.concatenate([reference[len(under_way) :], np.repeat(reference[-1:], len(under_way), axis=0)])
             later = np.concatenate([reference[1:], reference[-1:]])
-            reference = reference + self.settings.delay / self._period * (later - reference)
-        x0 = np.concatenate([x0, self._rotors])[: self._model.n]
+            reference = reference + self._late / self._period * (later - reference)
+        x0 = np.concatenate([x0, self._turning])[: self._model.n]
         if self.settings.heading:
             reference = with_limited_yaw(reference, self._yaw, self.settings.largest_turn)
             x0 = turn_horizontally(x0, -self._yaw)
@@ -255,18 +269,18 @@ class RobustMPC:
         span, self._measured = now.time - self._measured, now.time
         return span - _SAME_TIME
 
-    def _after(self, time: float, state: Array, rotors: Array) -> Array:
-        """Predict the state (12,) a time [s] after a state (12,) with rotor speeds (4,), under the command in force."""
+    def _after(self, time: float, state: Array, rotors: Array, command: Array) -> Array:
+        """Predict the state (12,) a time [s] after a state (12,) with rotor speeds (4,), under a command (4,)."""
         if time <= 1e-9:
             return state
         start = np.concatenate((state, rotors))[: self._model.n]
         acceleration = self._acceleration(thrust_axis(state.tolist()))
-        return advance_disturbed(self._model, start, self._acting, time, self._effectiveness, acceleration)[:N_STATES]
+        return advance_disturbed(self._model, start, command, time, self._effectiveness, acceleration)[:N_STATES]
 
     def _balanced(self) -> Array:
         """(4,) speeds at rest [rad/s] that also balance the torque caused by thrust, which the hover matrices omit."""
         thrust = self._model.effectiveness[0]
-        excess = np.dot(thrust, np.square(self._rotors) - np.square(self.trim.speeds))
+        excess = np.dot(thrust, np.square(self._turning) - np.square(self.trim.speeds))
         return np.asarray(self.trim.speeds - np.dot(self._of_twist, excess * self.trim.twist))
 
 

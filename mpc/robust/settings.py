@@ -49,7 +49,7 @@ class RobustSettings:
 
     penalty: Penalty | None = None  # penalty for violating an output bound; None for hard output bounds
     rotor_lag: float = 0.0  # rotor time constant in the prediction [s]; 0 for none
-    delay: float = 0.0  # delay from measurement to command that the prediction bridges [s]
+    delay: float = 0.0  # delay from measurement to command that the prediction bridges, see `split_delay` [s]
     observer: ObserverSettings | None = None  # settings of the disturbance observer; None for no offset-free tracking
     heading: bool = False
     """Whether the hover model is turned by the yaw.  The weights of x and y then apply forward and to the left; if they
@@ -62,6 +62,15 @@ class RobustSettings:
     terminal: bool = False  # whether the last state has the hover model's LQR weight
 
 
+def split_delay(delay: float, period: float) -> tuple[int, float]:
+    """Split a delay [s] into n whole periods and the rest, which is at most a period and zero only without delay.
+
+    At t_k the commands u(k-n) .. u(k-1) are under way, and u(k-1-n) is in force for that rest.
+    """
+    whole = max(math.ceil(delay / period - 1e-9) - 1, 0)
+    return whole, delay - whole * period
+
+
 @dataclass(frozen=True, kw_only=True)
 class Robust(Bounded):
     """The robust MPC: soft bounds, rotor lag, delay, disturbances, heading and more, each switched on separately."""
@@ -72,7 +81,10 @@ class Robust(Bounded):
         Lag,
         doc('[s] rotor time constant in the prediction, 0 for none; "vehicle": the rotor_rise of the vehicle'),
     ] = 0.0
-    delay: Annotated[Seconds, doc("[s] known delay from measurement to command, bridged by prediction")] = 0.0
+    delay: Annotated[
+        Seconds,
+        doc("[s] known delay from measurement to command, bridged by prediction; at most the horizon"),
+    ] = 0.0
     offset_free: ObserverSettings | None = None
     tightening: TighteningSettings | None = None
     heading: Annotated[bool, doc("whether the hover model is turned by the measured yaw")] = False

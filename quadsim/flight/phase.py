@@ -41,6 +41,20 @@ def clearance(states: Array, points: Array, radius: float, floor: float) -> Arra
     return lowest
 
 
+def touching_speed(state: Array, body_rates: Array, outline: Outline) -> float:
+    """Return the smallest vertical speed of the parts that touch the floor [m/s], negative into it; 0 if none does.
+
+    The state is (1, 12), body rates are (3,) [rad/s].
+    """
+    R = body_to_world(state[:, EULER])[0]
+    smallest = 0.0
+    for points, radius in ((outline.feet, outline.foot_radius), (outline.hull, 0.0)):
+        heights = state[0, INDEX["z"]] + points @ R[2] - radius - outline.floor
+        speeds = state[0, INDEX["vz"]] + np.cross(body_rates, points) @ R[2]
+        smallest = min(smallest, float(speeds[heights <= TOUCH].min(initial=0.0)))
+    return smallest
+
+
 def touchdown(t: Array, states: Array, clearances: Array) -> dict[str, float] | None:
     """Return the first touch after take-off; None if there is none.
 

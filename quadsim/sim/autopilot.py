@@ -163,8 +163,13 @@ class Autopilot:
 
     def reset(self) -> None:
         """Start anew: no integral, filters at rest, rotors at hover."""
-        self._filtered, self._slope, self._integral = np.zeros(3), np.zeros(3), np.zeros(3)
-        self._queue: deque[Array] = deque([self._hover] * self._delay)
+        self._integral = np.zeros(3)
+        self.settle(np.zeros(3), self._hover)
+
+    def settle(self, rates: Array, rotors: Array) -> None:
+        """Settle the filters at body rates (3,) [rad/s], and the commands under way at rotor speeds (4,) [rad/s]."""
+        self._filtered, self._slope = rates.copy(), np.zeros(3)
+        self._queue: deque[Array] = deque([rotors.copy()] * self._delay)
 
     def speeds(self, time: float, commanded: Array, rates: Array, rotors: Array, attitude: Array) -> Array:
         """Return the rotor speeds (4,) [rad/s] until the next call, for the target `commanded` (4,) or (8,)."""

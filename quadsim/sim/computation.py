@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -25,14 +26,24 @@ class Stall:
         return "the computer stalls"
 
 
+def physics_steps(time: float, timestep: float) -> int:
+    """Return the number of physics steps until a time after their start has passed, both [s]."""
+    return math.ceil(time / timestep - 1e-6)
+
+
 Seconds = Annotated[float, Ge(0.0), Le(100.0)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComputationTime:
-    """Time from measurement to command; a command later than the control period is dropped.  No clock is read."""
+    """Time from measurement to command; a command that misses its deadline is dropped.  No clock is read.
 
-    delay: Annotated[Seconds, doc("[s] fixed part")] = 0.0
+    The deadline is the end of the control period in which `delay` ends.
+    """
+
+    delay: Annotated[
+        Seconds, doc("[s] fixed part; longer than a control period: several commands are under way at a time")
+    ] = 0.0
     per_iteration: Annotated[Seconds, doc("[s] for each iteration of the solver")] = 0.0
     plan: Annotated[
         bool | None,
@@ -49,13 +60,20 @@ class Computation(ComputationTime):
     """Time from measurement to command, in simulated time.
 
     The sum of a fixed part, a part per solver iteration, an exponentially distributed part, like the wait for a busy
-    processor, and the remainder of a stall.  A command that arrives after the next period has started misses its
-    deadline and is dropped.  Until a command arrives, the previous one acts or, with `plan`, the next step of the last
-    plan that arrived in time: if commands are due `delay` after their measurement, the actuators' side has that plan
-    and continues it.
+    processor, and the remainder of a stall.  The deadline of a command is the end of the period in which the fixed part
+    ends, after n = `whole_periods`: for a `delay` up to a period, the start of the next one.  A later command is
+    dropped.  Until a command arrives, the previous one acts or, with `plan`, the next step of the last plan that
+    arrived in time: if commands are due `delay` after their measurement, the actuators' side has that plan and
+    continues it.
+
+    Commands arrive in their order.  With n > 0 the plant flies u(k-1-n), then u(k-n), in the period of u(k).
     """
 
     stalls: tuple[Stall, ...] = ()  # intervals without answers
+
+    def whole_periods(self, steps: int, timestep: float) -> int:
+        """Return n, the periods of `steps` physics steps [s] that each command spends under way before its own."""
+        return max(physics_steps(self.delay, timestep) - 1, 0) // steps
 
     def taken(self, time: float, command: Command, rng: np.random.Generator) -> float:
         """Return the time from the measurement at `time` [s] to the command [s]."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
-import math
 import time as clock
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -18,7 +18,7 @@ from quadsim.errors import FlightError, InputError, InterruptedFlightError, Lost
 from quadsim.flight.log import FlightLog, LoggedSignals
 from quadsim.flight.phase import check_loss
 from quadsim.motion import Motion
-from quadsim.sim.computation import Computation
+from quadsim.sim.computation import Computation, physics_steps
 from quadsim.sim.physics import FlownPeriod, Observation, Segment, flight_log, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, REFERENCE_NAMES, Array, ReferenceTurns
@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 
 _log: Final = logging.getLogger("quadsim")
 _HEIGHT: Final = REFERENCE_NAMES.index("z")
+
+
+Hold = tuple[InnerLoop | None, Array, int]
+"""A command (4,) or (8,) in force for a number of physics steps, and the inner loop that flies it."""
 
 
 class Reference(Protocol):
@@ -116,6 +120,7 @@ class ClosedLoop:
         """
         plant.reset(initial_state, initial_speeds)
         controller.reset(initial_speeds)
+        _begin(controller, plant)
         self.k, self.period = 0, steps_per_period * plant.timestep
         self.controller, self.computation, self.motion = controller, computation, motion
         self.answered = 0.0
@@ -137,8 +142,12 @@ class ClosedLoop:
         self._start = plant.physics
         self._initial_speeds = np.array(initial_speeds, float)
         self._lowest = float(initial_state[INDEX["z"]])
-        self._acting = self._initial_speeds  # the command in force: rotor speeds, or the target of an autopilot
+        self._acting = self._initial_speeds  # the command sent last: rotor speeds, or the target of an autopilot
         self._inner: InnerLoop | None = None  # flies it
+        # What acts in the coming periods: those that commands spend under way, and the one in which the next arrives.
+        self._under_way = 0 if computation is None else computation.whole_periods(steps_per_period, plant.timestep)
+        held: list[Hold] = [(self._inner, self._acting, steps_per_period)]
+        self._schedule: deque[list[Hold]] = deque([held] * self._under_way)
         self._speeds = self._initial_speeds  # the rotor speeds commanded last
         self._called: InnerLoop | None = None  # the inner loop called last, its answer, and the steps until its next
         self._answer, self._until_call = self._initial_speeds, 0
@@ -173,6 +182,7 @@ class ClosedLoop:
             raise InputError("a controller takes over before a period is observed, not after")
         with _ending_flight(self.time):
             controller.reset(self._speeds.copy())
+            _begin(controller, self._plant)
             adopt = getattr(controller, "adopt", None)
             if adopt is not None:
                 adopt(self.controller)
@@ -300,23 +310,25 @@ class ClosedLoop:
             step_s = clock.perf_counter() - started
         delay = 0.0 if computation is None else computation.taken(now.time, command, self._draws)
         self.answered = max(self.answered, now.time + delay)
-        wait = math.ceil(delay / plant.timestep - 1e-6)
+        # From the start of the period in which it arrives, this one where none spends a whole period under way.
+        wait = physics_steps(delay, plant.timestep) - self._under_way * steps
         missed = wait > steps  # one that comes just in time acts from the next period on
         due = min(wait, steps)
         if computation is not None and computation.plan:
-            due = min(due, math.ceil(computation.delay / plant.timestep - 1e-6))
+            due = min(due, physics_steps(computation.delay, plant.timestep) - self._under_way * steps)
         planned = self._plan[min(self._age + 1, len(self._plan) - 1)]  # its last row beyond its end
         inner = self._inner
-        holds = [(inner, self._acting, due), (inner, planned, min(wait, steps) - due)]
+        holds: list[Hold] = [(inner, self._acting, due), (inner, planned, min(wait, steps) - due)]
         if missed:
             self._age += 1
             acting = planned if holds[1][2] else self._acting
         else:
             acting, self._plan, self._age, self._inner = command.speeds, command.plan, 0, command.inner
             holds.append((self._inner, acting, steps - wait))
+        self._schedule.append(holds)
         before, on_ground = plant.physics, now.phase in (Phase.LANDED, Phase.ARMED)
         segments = []
-        for loop, row, count in holds:
+        for loop, row, count in self._schedule.popleft():
             for segment, speeds in self._hold(loop, row, count):
                 if self._navigation is not None:
                     held = np.broadcast_to(speeds, (len(segment.physics), N_ROTORS))
@@ -396,6 +408,13 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
         loop.interrupt()
     finally:
         gc.unfreeze()
+
+
+def _begin(controller: Controller, plant: Plant) -> None:
+    """Tell a controller with an autopilot how the vehicle turns now."""
+    begin = getattr(controller, "begin", None)
+    if begin is not None:
+        begin(plant.attitude[1])
 
 
 @contextlib.contextmanager

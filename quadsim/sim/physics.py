@@ -110,8 +110,10 @@ class FlownPeriod:
 
     observation: Observation  # the data at its start
     command: Command  # the controller's answer, or the command passed to `step`
-    speeds: Array  # (4,) rotor speeds commanded at its end, of an earlier command if `command` was missed [rad/s]
-    target: Array | None  # (4,) or (8,) the target in force at its end, for an autopilot; None without one
+    speeds: Array
+    """(4,) u(k), the rotor speeds of `command`, of an earlier one if it was missed, or of an autopilot at its end
+    [rad/s]."""
+    target: Array | None  # (4,) or (8,) the same as a target of an autopilot; None without one
     delay: float  # simulated time from the measurement to the command [s]
     missed: bool  # whether the command came too late
     step_s: float  # wall time of the controller's step [s]; 0 if the command was passed in

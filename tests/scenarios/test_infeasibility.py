@@ -106,6 +106,12 @@ CASES = {
         violated=("roll upper",),
         field="output_bounds.roll",
     ),
+    "commands under way": Case(
+        settings=("controller.type=robust", "controller.delay=0.12"),
+        state=TILTED,
+        violated=("roll upper",),
+        field="output_bounds.roll",
+    ),
 }
 
 

@@ -11,17 +11,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import quadsim
 from quadsim.errors import FileError
 from quadsim.flight import rundir
 from quadsim.flight.parquet import FLIGHT_FILE, PLANT_FILE, TIMING_FILE
 from scenarios.assembly import Assembly
 from scenarios.cli import main
 from scenarios.flight import Flight
-from scenarios.reaudit import reaudit
+from scenarios.reaudit import _in_force, reaudit
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -154,6 +156,37 @@ def test_tables_that_contradict_each_other_are_reported(
     put(runs / "good", name, column, change)
     with pytest.raises(FileError, match=message):
         reaudit(runs / "good")
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("slow-solver", {}),
+        ("slow-solver", {"computation.delay": 0.12}),
+        ("slow-solver", {"computation": {"delay": 0.06, "jitter": 0.03, "plan": False}}),
+        ("robust", {"computation": {"delay": 0.06, "jitter": 0.03}, "controller.delay": 0.06}),
+        ("stalled-solver", {"computation": {"delay": 0.06}}),
+    ],
+)
+def test_commands_are_followed_to_when_they_act(name: str, changes: dict[str, Any], tmp_path: Path) -> None:
+    """Late, missed, held, bridged by a plan: plant.parquet has what flight.parquet commands, when it acts."""
+    scenario = quadsim.load(name, {"log_rate": 1000.0, **changes}).replace({"duration": 2.5})
+    flight = quadsim.fly(scenario, progress=False)
+    flight.save(tmp_path / "run", video=False, recording=False, figures=False)
+    assert reaudit(tmp_path / "run").summary["scenario"] == name
+    control, plant = flight.log.control, flight.log.plant
+    speeds, known = _in_force(scenario, control, np.arange(plant.t.size - 1))
+    np.testing.assert_array_equal(speeds[known], plant.speeds[:-1][known])
+    assert 0.5 < known.mean() <= 1.0
+    assert known.all() == (name != "robust")  # whose plan goes on while a command is late
+    assert np.abs(np.repeat(control.speeds, 50, axis=0) - plant.speeds[:-1]).max() > 0.1
+
+    def early(w: Any) -> Any:
+        return np.append(w[1:], w[-1])
+
+    put(tmp_path / "run", PLANT_FILE, "w1", early)
+    with pytest.raises(FileError, match=r"w1 at t = [\d.]+ s of plant\.parquet is not the speed that flight"):
+        reaudit(tmp_path / "run")
 
 
 @pytest.mark.parametrize("name", [FLIGHT_FILE, PLANT_FILE, TIMING_FILE, rundir.SCENARIO_FILE, "horizon.parquet"])

@@ -320,11 +320,18 @@ static void later_row(const quadsim_controller *c, const real *reference, int i,
 static void want_seen(quadsim_mpc *mpc, const real *reference, real turns, real yaw, real sine, real cosine)
 {
     const quadsim_controller *c = mpc->controller;
+    const int end = c->problem->horizon - 1, under_way = c->robust->under_way;
     real row[4], last = yaw, turned = yaw;
     int i;
-    for (i = 0; i < c->problem->horizon; i++) {
+    for (i = 0; i < under_way && i <= end; i++) { /* rows that are past when the command acts */
         turns = next_turns(reference, i, turns);
-        later_row(c, reference, i, turns, row);
+    }
+    for (i = 0; i <= end; i++) {
+        const int at = i + under_way < end ? i + under_way : end;
+        if (i + under_way <= end) {
+            turns = next_turns(reference, at, turns);
+        }
+        later_row(c, reference, at, turns, row);
         if (c->robust->heading) {
             const real x = row[0], y = row[1], step = row[3] - last;
             last = row[3];
@@ -358,7 +365,7 @@ static void find_rest(const quadsim_mpc *mpc, const real *state, real sine, real
     rest[ROLL] = -angle_of(left, square_root(forward * forward + mpc->lift[2] * mpc->lift[2]));
     rest[PITCH] = angle_of(forward, mpc->lift[2]);
     for (j = 0; j < NU; j++) {
-        const real turning = mpc->rotors[j], resting = mpc->trim[j];
+        const real turning = mpc->turning[j], resting = mpc->trim[j];
         excess_thrust += r->effectiveness[j] * (turning * turning - resting * resting);
     }
     for (j = 0; j < NU; j++) {
@@ -382,11 +389,27 @@ static enum quadsim_status solve_ahead(quadsim_mpc *mpc, const real *ahead, cons
         state[VY] = cosine * ahead[VY] - sine * ahead[VX];
         state[YAW] = R(0.0);
     }
-    put_modes(c, mpc->rotors, state);
+    put_modes(c, mpc->turning, state);
     find_rest(mpc, state, sine, cosine, rest, speeds);
     want_rest(mpc, rest);
     want_seen(mpc, reference, turns, ahead[YAW], sine, cosine);
     return optimise(mpc, state, rest, speeds, acting);
+}
+
+/* The i-th of the commands that act one after the other until this period's does: in force, under way. */
+static const real *sent_command(const quadsim_mpc *mpc, int i, const real *acting)
+{
+    return i < mpc->controller->robust->under_way ? mpc->sent + i * NU : acting;
+}
+
+/* Take note of the last command sent. */
+static void note_sent(quadsim_mpc *mpc, const real *acting)
+{
+    const int n = mpc->controller->robust->under_way;
+    int i;
+    for (i = 0; i < n; i++) {
+        memcpy(mpc->sent + i * NU, sent_command(mpc, i + 1, acting), NU * sizeof(real));
+    }
 }
 
 /* The optimum of the robust controller, its prediction and its observer brought up to date. */
@@ -394,28 +417,40 @@ static enum quadsim_status solve_robust(quadsim_mpc *mpc, const real *state, con
                                         int usable)
 {
     const quadsim_robust *r = mpc->controller->robust;
-    real before[NU], expected[12];
+    const real *in_force = sent_command(mpc, 0, acting);
+    real before[NU], expected[12], ahead[12];
     const int known = mpc->known;
+    int i;
     memcpy(before, mpc->rotors, sizeof(before));
-    spin(mpc->rotors, acting, r->spun_before);
+    spin(mpc->rotors, in_force, r->spun_before);
     mpc->known = 0;
     if (usable && r->observes && known) {
         memcpy(expected, mpc->ahead, sizeof(expected));
-        advance(mpc, r->rest_of_period, r->decay_before, before, acting, expected);
+        advance(mpc, r->rest_of_period, r->decay_before, before, in_force, expected);
         if (is_finite(expected, 12)) {
             observe(mpc, state, expected);
         }
     }
     if (usable) {
         memcpy(mpc->ahead, state, sizeof(mpc->ahead));
-        advance(mpc, r->delay, r->decay_delay, mpc->rotors, acting, mpc->ahead);
+        advance(mpc, r->delay, r->decay_delay, mpc->rotors, in_force, mpc->ahead);
     }
-    spin(mpc->rotors, acting, r->spun_delay);
-    mpc->known = usable && is_finite(mpc->ahead, 12);
+    spin(mpc->rotors, in_force, r->spun_delay);
+    memcpy(ahead, mpc->ahead, sizeof(ahead));
+    memcpy(mpc->turning, mpc->rotors, sizeof(mpc->turning));
+    for (i = 1; i <= r->under_way; i++) {
+        const real *next = sent_command(mpc, i, acting);
+        if (usable) {
+            advance(mpc, r->period, r->decay_period, mpc->turning, next, ahead);
+        }
+        spin(mpc->turning, next, r->spun_period);
+    }
+    note_sent(mpc, acting);
+    mpc->known = usable && is_finite(ahead, 12);
     if (!mpc->known) {
         return QUADSIM_BEFORE;
     }
-    return solve_ahead(mpc, mpc->ahead, reference, first_turns(mpc, reference, state[YAW]), acting);
+    return solve_ahead(mpc, ahead, reference, first_turns(mpc, reference, state[YAW]), acting);
 }
 
 /* ---- the controllers --------------------------------------------------------------------------------------------- */
@@ -468,10 +503,16 @@ static enum quadsim_status solve_paper(quadsim_mpc *mpc, const real *state, cons
     return optimise(mpc, state, rest, c->hover, acting);
 }
 
+/* Numbers of the commands that are remembered. */
+static int sent_reals(const quadsim_controller *controller)
+{
+    return controller->robust == NULL ? 0 : controller->robust->under_way * NU;
+}
+
 long quadsim_mpc_reals(const quadsim_controller *controller)
 {
     const quadsim_problem *p = controller->problem;
-    return quadsim_work_reals(p) + p->horizon * p->regulated;
+    return quadsim_work_reals(p) + p->horizon * p->regulated + sent_reals(controller);
 }
 
 void quadsim_mpc_start(quadsim_mpc *mpc, const quadsim_controller *controller, real *memory)
@@ -480,15 +521,21 @@ void quadsim_mpc_start(quadsim_mpc *mpc, const quadsim_controller *controller, r
     memset(mpc, 0, sizeof(*mpc));
     mpc->controller = controller;
     mpc->wanted = memory;
-    quadsim_work_start(&mpc->work, p, memory + p->horizon * p->regulated);
+    mpc->sent = memory + p->horizon * p->regulated;
+    quadsim_work_start(&mpc->work, p, mpc->sent + sent_reals(controller));
     quadsim_mpc_reset(mpc, controller->hover);
 }
 
 void quadsim_mpc_reset(quadsim_mpc *mpc, const quadsim_real speeds[4])
 {
     const real *usable = is_finite(speeds, NU) ? speeds : mpc->controller->hover;
+    int i;
     memcpy(mpc->before, usable, sizeof(mpc->before));
     memcpy(mpc->rotors, usable, sizeof(mpc->rotors));
+    memcpy(mpc->turning, usable, sizeof(mpc->turning));
+    for (i = 0; i < sent_reals(mpc->controller); i++) {
+        mpc->sent[i] = usable[i % NU];
+    }
     memset(mpc->estimate, 0, sizeof(mpc->estimate));
     quadsim_work_reset(&mpc->work);
     mpc->age = -1;

@@ -6,7 +6,7 @@
  *                   [m, m/s, rad, rad/s]: world axes with z up; Z-Y-X Euler angles, body to world, and their rates
  * reference [N][4]  x y z yaw [m, rad], where to be one period from now, two, ... N periods from now; whole turns of
  *                   yaw make no difference
- * acting [4]        command in force up to now, u(k-1) [rad/s]
+ * acting [4]        the command before, u(k-1), in force up to now unless it is still under way [rad/s]
  * command [4]       rotor speeds to hold for the period [rad/s], rotors in the vehicle file's order
  *
  * A controller's numbers are a quadsim_controller, which is read only and may be shared.  All that a controller
@@ -27,10 +27,11 @@ enum { QUADSIM_SUBSTEPS = 2 }; /* Runge-Kutta steps of a prediction */
 typedef struct quadsim_robust {
     int observes;                                      /* whether disturbances are estimated */
     int heading;                                       /* whether the model is turned by the yaw */
+    int under_way;                                     /* whole periods that a command takes to act, before delay */
     quadsim_real gravity;                              /* [m/s^2] */
     quadsim_real least_lift, upright;                  /* least shares of weight, and of thrust along z */
-    quadsim_real delay, delayed_share, rest_of_period; /* [s], share of the period, [s] */
-    quadsim_real spun_delay, spun_before;              /* shares of rotor speeds left after delay and rest_of_period */
+    quadsim_real period, delay, delayed_share, rest_of_period; /* [s], [s], share of the period, [s] */
+    quadsim_real spun_period, spun_delay, spun_before; /* shares of rotor speeds left after these and rest_of_period */
     quadsim_real largest_turn;                         /* of the reference's yaw in a period [rad] */
     quadsim_real effectiveness[16];                    /* from squared speeds to U/m and I^-1 tau */
     quadsim_real allocation[16];                       /* its inverse */
@@ -39,7 +40,8 @@ typedef struct quadsim_robust {
     quadsim_real modes[16];         /* from rotor speeds to the states that stand for them where they lag */
     quadsim_real gain[6], largest[6];                                  /* of the observer; of its estimate */
     quadsim_real decay_before[QUADSIM_SUBSTEPS * 4];                   /* shares left at instants of rest_of_period */
-    quadsim_real decay_delay[QUADSIM_SUBSTEPS * 4];                    /* and of delay */
+    quadsim_real decay_delay[QUADSIM_SUBSTEPS * 4];                    /* of delay */
+    quadsim_real decay_period[QUADSIM_SUBSTEPS * 4];                   /* and of a period */
     quadsim_real plausible_state[12], plausible_reference[4];          /* most that is taken for a measurement */
 } quadsim_robust;
 
@@ -69,13 +71,15 @@ typedef struct quadsim_mpc {
     const quadsim_controller *controller;
     quadsim_work work;
     quadsim_real *wanted;           /* [N][n_r] y_d - C_r x_s */
+    quadsim_real *sent;             /* robust: [under_way][4] the commands before the last, oldest first [rad/s] */
     quadsim_real before[4];         /* the last command [rad/s] */
     int age;                        /* periods since the last optimum; negative: there is none yet */
     int headed;                     /* whether a heading has been followed */
     quadsim_real heading;           /* the reference's one period from now, on the turn that is followed [rad] */
     int known;                      /* robust: whether the state ahead is known */
-    quadsim_real rotors[4];         /* robust: speeds at the instant from which the command acts [rad/s] */
+    quadsim_real rotors[4];         /* robust: speeds when the next command takes over in this period [rad/s] */
     quadsim_real ahead[12];         /* the state there */
+    quadsim_real turning[4];        /* speeds at the instant from which the command acts [rad/s] */
     quadsim_real estimate[6];       /* disturbance: world x, y, along thrust [m/s^2], body [rad/s^2] */
     quadsim_real trim[4];           /* rotor speeds at rest against it [rad/s] */
     quadsim_real lift[3];           /* along which thrust points there, world axes */

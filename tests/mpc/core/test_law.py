@@ -12,6 +12,7 @@ import quadsim
 from mpc.core import library
 from mpc.core.law import CompiledMPC
 from mpc.core.numbers import robust_numbers
+from mpc.export.source import CController
 from quadsim.controller import CORE, FALLBACK, GAIN, Command, Phase, StepInputs
 from quadsim.errors import ExportError, MissingCoreError
 from quadsim.state import INDEX, N_STATES, Array
@@ -39,6 +40,22 @@ def test_a_compiled_flight_is_the_flight(name: str) -> None:
     assert np.abs(c.log.control.speeds - python.log.control.speeds).max() <= 1e-5
     assert c.log.control.active.sum() == pytest.approx(python.log.control.active.sum(), rel=0.05)
     assert c.log.control.slack == pytest.approx(python.log.control.slack, abs=1e-6)
+
+
+@pytest.mark.parametrize("delay", [0.06, 0.12])
+def test_a_compiled_law_predicts_through_the_commands_under_way(delay: float) -> None:
+    """The vehicle is heavier than its model and its rotors lag, so the observer learns through the delay too."""
+    late = {"computation.delay": delay, "controller.delay": delay, "duration": 8.0}
+    scenario = quadsim.load("robust-lag50", late).replace({"actual.mass": 4.4})
+    python, c = (
+        quadsim.fly(scenario.replace(law), progress=False) for law in ({"controller.solver": "core"}, COMPILED)
+    )
+    assert c.summary["controller"]["statuses"] == python.summary["controller"]["statuses"]
+    assert np.abs(c.log.control.speeds - python.log.control.speeds).max() <= 1e-5
+    assert np.ptp(c.log.control.speeds) > 5.0
+    law = exported_law(scenario)
+    mpc = CompiledMPC(law)
+    assert mpc._memory.size == CController(law=law, asked=mpc._shared.problem.struct.room - 1).reals
 
 
 def test_without_an_optimum_it_answers_as_on_the_target() -> None:

@@ -58,20 +58,21 @@ def flown(
     controller: RobustMPC, plant: NonlinearModel, state: Array, reference: Array, periods: int
 ) -> Iterator[tuple[Array, Array]]:
     """States (12,) at the samples and the commands given there; the plant's commands act the stated delay later."""
-    delay = controller.settings.delay
-    acting = np.full(4, controller._nominal.u_bar)
-    controller.reset(acting)
-    x = np.concatenate([state, acting])[: plant.n]
+    hover = np.full(4, controller._nominal.u_bar)
+    controller.reset(hover)
+    x = np.concatenate([state, hover])[: plant.n]
+    whole, late = divmod(controller.settings.delay, PERIOD)
+    sent = [hover] * (1 + round(whole))
     for k in range(periods):
         command = controller.step(
-            StepInputs(time=k * PERIOD, acting=acting), x[:12], reference[k + 1 : k + 1 + controller.horizon]
+            StepInputs(time=k * PERIOD, acting=sent[-1]), x[:12], reference[k + 1 : k + 1 + controller.horizon]
         )
         assert command.status in ACCEPTED
         yield x[:12].copy(), command.speeds
-        for duration, speeds in ((delay, acting), (PERIOD - delay, command.speeds)):
+        sent.append(command.speeds)
+        for duration, speeds in ((late, sent.pop(0)), (PERIOD - late, sent[0])):
             if duration > 0.0:
                 x = advance(replace(plant, period=duration), x, speeds)
-        acting = command.speeds
 
 
 def believing(controller: RobustMPC, estimate: Array) -> None:
@@ -116,9 +117,10 @@ def test_a_period_without_an_active_constraint_has_its_status(vehicle: Vehicle, 
 # Lag
 
 
-def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle) -> None:
+@pytest.mark.parametrize("delay", [0.02, 0.12])
+def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle, delay: float) -> None:
     """Through commands in flight, one that is refused, and rotors that are stopped; to the instant the delay later."""
-    lag, delay = 0.03, 0.02
+    lag = 0.03
     controller, rotors = robust(vehicle, rotor_lag=lag, delay=delay), RotorDynamics(rise=lag, fall=lag)
     speeds, before = np.full(4, 150.0), np.full(4, 150.0)
     controller.reset(speeds)
@@ -130,7 +132,7 @@ def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle) -> None:
         # Since the last call's end, `before` has acted to the end of its period, as has `acting` since its beginning.
         controller.step(StepInputs(acting=acting, phase=phase), state, HOLD)
         speeds = rotors.respond(speeds, acting, np.array([PERIOD]))[0][0]
-        np.testing.assert_allclose(controller._rotors, speeds, atol=1e-9)
+        np.testing.assert_allclose(controller._turning, speeds, atol=1e-9)
         before = acting
     assert np.abs(speeds - before).max() > 0.1
 
@@ -174,10 +176,11 @@ def test_constant_forces_torques_and_mass_leave_no_steady_error(vehicle: Vehicle
     assert np.abs(end[[0, 2, 4]]).max() > 0.05
 
 
-def test_stated_mismatch_is_not_attributed_to_a_disturbance(vehicle: Vehicle) -> None:
+@pytest.mark.parametrize("delay", [0.02, 0.1, 0.12])
+def test_stated_mismatch_is_not_attributed_to_a_disturbance(vehicle: Vehicle, delay: float) -> None:
     """Lag, delay and tilt are all in what the observer expects."""
     plant = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
-    controller = robust(vehicle, **EVERYTHING)
+    controller = robust(vehicle, **{**EVERYTHING, "delay": delay})
     start = moving((0.3, -0.2, 0.1), euler=(0.05, -0.03, 2.0))
     moved = [state for state, _ in flown(controller, plant, start, np.zeros((80, 4)), 20)]
     np.testing.assert_allclose(controller.disturbance, 0.0, atol=1e-4)
@@ -340,24 +343,27 @@ def test_far_from_its_yaw_the_vehicle_is_commanded_a_part_of_the_turn_at_once(ve
 # Delay
 
 
-@pytest.mark.parametrize("delay", [0.02, PERIOD])
+@pytest.mark.parametrize("delay", [0.02, PERIOD, 0.06, 0.12])
 @pytest.mark.parametrize("rotor_lag", [0.0, 0.03])
 def test_a_delay_is_answered_from_where_the_vehicle_will_be(vehicle: Vehicle, delay: float, rotor_lag: float) -> None:
-    """As by a controller without delay called at that instant."""
+    """As by a controller without delay called at that instant, after the commands under way."""
     model = nonlinear_model(vehicle, PERIOD, rotor_lag=rotor_lag or None)
     state = moving((0.5, 0.0, 0.2), position=(0.3, -0.2, 0.1), euler=(0.02, -0.03, 0.4))
     before, acting = np.full(4, vehicle.hover_speed), vehicle.hover_speed + np.array([1.0, -2.0, 3.0, -1.0])
     late = robust(vehicle, delay=delay, rotor_lag=rotor_lag, heading=True)
     late.reset(before)
     # A ramp, so that the instants of the reference count as well.
-    ramp = 0.05 * np.arange(51.0)[:, None] * np.array([1.0, 0.5, 0.2, 0.1])
-    command = late.step(StepInputs(acting=acting), state, ramp[:50])
-    rotors = acting + (before - acting) * math.exp(-(PERIOD - delay) / rotor_lag) if rotor_lag else acting
-    there = advance(replace(model, period=delay), np.concatenate([state, rotors])[: model.n], acting)
+    ramp = np.arange(50.0)[:, None] * 0.05 * np.array([1.0, 0.5, 0.2, 0.1])
+    command = late.step(StepInputs(acting=acting), state, ramp)
+    whole = math.ceil(delay / PERIOD - 1e-9) - 1
+    rest, commands = delay - whole * PERIOD, [*[before] * whole, acting]
+    rotors = commands[0] + (before - commands[0]) * math.exp(-(PERIOD - rest) / rotor_lag) if rotor_lag else acting
+    there = np.concatenate([state, rotors])[: model.n]
+    for duration, speeds in zip([rest, *[PERIOD] * whole], commands, strict=True):
+        there = advance(replace(model, period=duration), there, speeds)
     prompt = robust(vehicle, rotor_lag=rotor_lag, heading=True)
     prompt.reset(before)
-    shifted = ramp[:50] + delay / PERIOD * np.diff(ramp, axis=0)
-    shifted[-1] = ramp[49]
+    shifted = np.minimum(np.arange(50.0) + delay / PERIOD, 49.0)[:, None] * 0.05 * np.array([1.0, 0.5, 0.2, 0.1])
     np.testing.assert_allclose(
         command.speeds, prompt.step(StepInputs(acting=acting), there[:12], shifted).speeds, atol=1e-3
     )

@@ -119,22 +119,26 @@ def errors(vehicle: Vehicle, w: Array, *, rotor_lag: float, delay: float, subste
     step = PERIOD / substeps
     late = round(delay / step)
     A_d, inputs = discretise(A, np.hstack([B, E]), step)
-    A_late, B_late = discretise(A, B, delay)
-    e, acting, coming = np.zeros((len(A), w.shape[2])), np.zeros((4, w.shape[2])), np.zeros((4, w.shape[2]))
+    ideal = np.split(inputs, [4], axis=1)[0]
+    e, acting = np.zeros((len(A), w.shape[2])), np.zeros((4, w.shape[2]))
+    under_way = [acting] * (late // substeps)
     outputs = np.empty((len(w), 2, w.shape[2]))
     for i, pushed in enumerate(w):
+        if (i - late) % substeps == 0 and under_way:
+            acting = under_way.pop(0)
         if i % substeps == 0:
-            if late == substeps:
-                acting = coming
-            coming = -K @ (A_late @ e + B_late @ acting)
-        if i % substeps == late:
-            acting = coming
+            predicted, coming = e, [acting, *under_way]
+            for j in range(late):
+                predicted = A_d @ predicted + ideal @ coming[(j + i - late) // substeps - (i - late) // substeps]
+            under_way.append(-K @ predicted)
+            if late == 0:
+                acting = under_way.pop(0)
         e = A_d @ e + inputs @ np.concatenate([acting, pushed])
         outputs[i] = C @ e
     return outputs
 
 
-@pytest.mark.parametrize(("rotor_lag", "delay"), [(0.0, 0.0), (0.05, 0.0), (0.0, 0.02), (0.05, 0.05)])
+@pytest.mark.parametrize(("rotor_lag", "delay"), [(0.0, 0.0), (0.05, 0.0), (0.0, 0.02), (0.05, 0.05), (0.05, 0.12)])
 def test_margins_equal_the_worst_disturbances_effect(vehicle: Vehicle, rotor_lag: float, delay: float) -> None:
     largest, substeps, periods, about_x = np.repeat([0.5, 0.3], 3), 50, 10, 3
     settings = TighteningSettings(acceleration=0.5, angular_acceleration=0.3, turning=0.0)

@@ -123,16 +123,45 @@ def test_a_late_command_leaves_the_plan_going_on(vehicle: Vehicle, speeds: Array
     np.testing.assert_array_equal(log.control.speeds[2:5], [speeds[1] + 1.0, speeds[1] + 2.0, speeds[4]])
 
 
-def test_a_command_just_in_time_acts_a_period_later(vehicle: Vehicle, speeds: Array) -> None:
+@pytest.mark.parametrize("delay", [0.0, 0.031, PERIOD, 0.0505, 0.12, 3 * PERIOD])
+def test_commands_act_shifted_by_the_delay(vehicle: Vehicle, speeds: Array, delay: float) -> None:
+    """As from a queue of (arrival, command), in which several may wait; each u(k) keeps its own row of the log."""
     controller = Scripted(speeds)
     with Plant(vehicle) as plant:
-        log = fly_scripted(plant, controller, computation=Computation(delay=PERIOD))
-        hover = plant.hover_speeds
-    assert MISSED not in log.control.status
-    acting = np.concatenate([hover[None], speeds[:-1]])
-    np.testing.assert_array_equal(log.plant.speeds[:-1], np.repeat(acting, STEPS, axis=0))
-    np.testing.assert_array_equal([moment.acting for moment in controller.moments], acting)
+        log = fly_scripted(plant, controller, computation=Computation(delay=delay))
+        acting = plant.hover_speeds
+    queue = [(STEPS * k + int(np.ceil(1e3 * delay - 1e-6)), command) for k, command in enumerate(speeds)]
+    for step, turning in enumerate(log.plant.speeds[:-1]):
+        while queue and queue[0][0] <= step:
+            acting = queue.pop(0)[1]
+        np.testing.assert_array_equal(turning, acting)
     np.testing.assert_array_equal(log.control.speeds, speeds)
+    before = [vehicle.hover_speed * np.ones(4), *speeds[:-1]]
+    np.testing.assert_array_equal([moment.acting for moment in controller.moments], before)
+    assert computation(log.control)["missed"] == 0
+
+
+@pytest.mark.parametrize("plan", [False, True])
+def test_a_deadline_follows_the_commands_under_way(vehicle: Vehicle, speeds: Array, plan: bool) -> None:
+    """Due after 120 ms and dropped after 150: period 3 misses by its iterations, and the last plan goes on."""
+
+    class Planner(Scripted):
+        def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
+            command = super().step(now, state, reference)
+            slow = {2: 2, 3: 4}.get(command.iterations, 0)
+            return Command(speeds=command.speeds, plan=command.speeds + np.arange(4.0)[:, None], iterations=slow)
+
+    late = Computation(delay=0.12, per_iteration=0.01, plan=plan)
+    with Plant(vehicle) as plant:
+        log = fly_scripted(plant, Planner(speeds, horizon=4), computation=late)
+    assert [status == MISSED for status in log.control.status] == [k == 3 for k in range(8)]
+    acting = log.plant.speeds[:-1].reshape(-1, STEPS, 4)
+    held, later = (speeds[1], speeds[1] + 1.0) if plan else (speeds[1], speeds[1])
+    np.testing.assert_array_equal(acting[4], np.repeat([held, later, speeds[2]], [20, 20, 10], axis=0))
+    missed = speeds[2] + 1.0 if plan else speeds[2]
+    np.testing.assert_array_equal(acting[5], np.repeat([speeds[2], missed], [20, 30], axis=0))
+    np.testing.assert_array_equal(acting[6], np.repeat([missed, speeds[4]], [20, 30], axis=0))
+    np.testing.assert_array_equal(log.control.speeds[2:5], [speeds[2], missed, speeds[4]])
 
 
 def test_iterations_cost_simulated_time(vehicle: Vehicle, speeds: Array) -> None:

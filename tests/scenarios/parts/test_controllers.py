@@ -258,7 +258,10 @@ NO_LAG = (
     ("controller", "message"),
     [
         ({**ROBUST, "rotor_lag": "vehicle"}, NO_LAG),
-        ({**ROBUST, "delay": 0.06}, "controller.delay must be at most the control period of 0.05 s; got 0.06"),
+        (
+            {**ROBUST, "delay": 2.6, "horizon": 50},
+            "controller.delay must be at most the horizon of 50 periods, 2.5 s; got 2.6",
+        ),
         ({**ROBUST, "output_bounds": {"vx": [-0.2, 0.2]}, "tightening": {}}, NARROW),
         (
             {"type": "nonlinear", "node": 0.07},

@@ -1,0 +1,37 @@
+"""What a controller's model lacks of the plant that it flies, where the scenario states both."""
+
+from __future__ import annotations
+
+from mpc.bounded import Weighted, resolved_lag
+from mpc.model import SHORTEST_LAG
+from mpc.nonlinear.settings import Nonlinear
+from mpc.robust.settings import Robust
+from quadsim.controller import ROTORS
+from quadsim.sim.effects.rotors import RotorDynamics
+from scenarios.assembly import Assembly
+from scenarios.schema.controllers import AnyController
+
+
+def model_notes(assembly: Assembly) -> list[str]:
+    """Return a line if the plant's rotors lag and a predictive controller of the scenario predicts none."""
+    scenario, rotors = assembly.scenario, assembly.effects.rotors or RotorDynamics()
+    lag = rotors.rise or rotors.fall or 0.0
+    laws = [scenario.controller, *(spec for _, spec in scenario.controller_changes)]
+    ideal = [spec for spec in laws if _predicts_ideal_rotors(spec, assembly)]
+    if lag < SHORTEST_LAG or not ideal:
+        return []
+    remedy = [] if isinstance(ideal[0], Robust | Nonlinear) else ['controller.type = "robust" or "nonlinear"']
+    if assembly.vehicle.rotor_rise is None:
+        remedy.append(f"vehicle.rotor_rise = {lag:g}")
+    remedy.append('controller.rotor_lag = "vehicle"')
+    return [
+        f"the rotors lag by {1e3 * lag:.4g} ms, and {ideal[0].type} predicts none; to predict it: {', '.join(remedy)}"
+    ]
+
+
+def _predicts_ideal_rotors(spec: AnyController, assembly: Assembly) -> bool:
+    if isinstance(spec, Robust):
+        return resolved_lag(spec.rotor_lag, assembly.vehicle) == 0.0
+    if isinstance(spec, Nonlinear):  # an autopilot's lags include that of its rotors
+        return spec.commands == ROTORS and resolved_lag(spec.rotor_lag, assembly.vehicle) == 0.0
+    return isinstance(spec, Weighted)
