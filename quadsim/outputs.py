@@ -13,6 +13,7 @@ import fcntl
 import hashlib
 import itertools
 import json
+import logging
 import os
 import shutil
 import tempfile
@@ -21,11 +22,12 @@ from pathlib import Path
 from stat import S_IMODE, S_ISDIR, S_ISREG
 from typing import Any, Final
 
-from quadsim.errors import OutputError, printable
+from quadsim.errors import OutputError, failure, printable
 
 SUMMARY_FILE: Final = "summary.json"
 LOCK_FILE: Final = ".lock"  # in a directory that grows
 _FREE_BYTES_NEEDED: Final = 16 * 1024 * 1024
+_log: Final = logging.getLogger("quadsim")
 
 
 def absolute(path: Path | str) -> Path:
@@ -143,6 +145,15 @@ def amend(directory: Path, changes: Mapping[str, Any]) -> None:
     summary["files"] = dict(sorted(summary.pop("files", {}).items()))
     with writing_file(path, overwrite=True) as new:
         new.write_text(to_json(summary), encoding="utf-8")
+
+
+@contextlib.contextmanager
+def optional(name: str) -> Iterator[None]:
+    """Make what decorates a result that is there already, such as a figure: a failure is a line, nothing more."""
+    try:
+        yield
+    except Exception as error:
+        _log.warning("%s %s", name, failure(error))
 
 
 def require_file(path: Path | str, *, overwrite: bool = False) -> Path:

@@ -20,7 +20,7 @@ from scenarios.flight import Flight, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import reaudit
-from scenarios.results import Result, Shown
+from scenarios.results import Result, Shown, after
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
@@ -122,8 +122,11 @@ def compare_flights(
         beside = Path(scratch) if out is None else out.parent / f"{out.name}-runs"
         runs = tuple(_run_of(target, beside, progress, pictures=out is not None) for target in targets)
         progress("comparison", 0, 1)
-        page = None if out is None else write_comparison(runs, out, overwrite=overwrite)
-    return FlightComparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=page)
+        comparison = FlightComparison(runs=runs, rows=comparison_rows(runs), names=run_names(runs), page=None)
+        if out is None:
+            return comparison
+        with after(comparison, out):
+            return replace(comparison, page=write_comparison(runs, out, overwrite=overwrite))
 
 
 def _check(target: Target) -> None:
@@ -178,4 +181,5 @@ def compare_campaigns(
     comparison = compare_pairs(a, b, names, failures, plan_differences(*plans))
     if out is None:
         return comparison
-    return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))
+    with after(comparison, out):
+        return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))

@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.outputs import Growing, growing
+from quadsim.outputs import Growing, growing, optional
 from quadsim.report.figure import Figure
 from scenarios.campaign import store as records
 from scenarios.campaign.campaign_report import overview, write_report
@@ -160,8 +160,10 @@ def fly_campaign(
         def write(place: Path) -> None:
             write_report(place, table, summary, spec, campaign=directory)
 
-        put_report(files, REPORT_FILES, write if report else None)
         files.finish(summary)
+        with optional("the report"):
+            put_report(files, REPORT_FILES, write if report else None)
+        files.finish(summary)  # now with the report among its files
     return CampaignResult(directory=directory, manifest=manifest, table=table, summary=summary)
 
 

@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from quadsim.errors import InputError, OutputError
 from quadsim.flight.rundir import read_json
-from quadsim.outputs import SUMMARY_FILE, growing, to_json
+from quadsim.outputs import SUMMARY_FILE, growing, optional, to_json
 from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from quadsim.report.to_plotly import Plot, embed
@@ -136,11 +136,14 @@ def fly_tuning(
                 tables[0], tables[1], ("start", "best"), differences=plan_differences(*campaigns.values())
             )
             if report:
-                comparison.write_report(files.path / "comparison", overwrite=True)
+                with optional("the comparison"):
+                    comparison.write_report(files.path / "comparison", overwrite=True)
         summary = _summary(plan, search, answer, front, tables)
         write = partial(write_page, study=search.study, summary=summary)
-        put_report(files, [PAGE_FILE], write if report else None)
         files.finish(summary)
+        with optional("the report"):
+            put_report(files, [PAGE_FILE], write if report else None)
+        files.finish(summary)  # now with the report among its files
     return TuningResult(directory=files.path, best=best, table=table, summary=summary, comparison=comparison)
 
 
