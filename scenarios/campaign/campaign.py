@@ -131,7 +131,8 @@ def fly_campaign(
     if records.is_campaign(directory) and not (resume or overwrite):
         raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
     records.code_digest()  # kept: a process that dies before its manifest is there could not be resumed
-    with growing(directory, records.MANIFEST_FILE, overwrite=overwrite) as files:
+    first = (records.CAMPAIGN_FILE, records.SCENARIO_FILE)
+    with growing(directory, records.MANIFEST_FILE, overwrite=overwrite, first=first) as files:
         if records.is_campaign(directory):
             records.require_same(plan, directory)
         progress = _Progress(plan, files, until_width=until_width, watch=watch)
