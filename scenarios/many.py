@@ -34,8 +34,14 @@ Fly = Callable[[Any], Row]
 ERROR, TIMEOUT, MEMORY, DIED = "error", "timeout", "memory", "died"
 """Verdicts of flights without a row: an exception, a timeout, too much memory, or a dead process."""
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_PRELOAD: Final = ("scenarios.campaign.plan", "mpc.constrained", "mpc.robust.controller", "mpc.unconstrained")
-"""Preloaded by the server that workers are forked from."""
+_PRELOAD: Final = (
+    "quadsim",
+    "scenarios.campaign.plan",
+    "mpc.constrained",
+    "mpc.robust.controller",
+    "mpc.unconstrained",
+)
+"""Preloaded by the server that workers are forked from; by the first, the others are found, whatever has their names."""
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
 _START_S: Final = 60.0  # longest start of a worker, or of the first one of a cluster; not counted as flight time
