@@ -18,6 +18,7 @@ from quadsim.border import numbers_of
 from quadsim.controller import Command, Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import audit, smallest_margins
+from quadsim.input_limits import MOST_STEPS
 from quadsim.sim.effects import Force
 from quadsim.sim.loop import ClosedLoop, Reference, complete
 from quadsim.sim.navigation import Navigation
@@ -29,7 +30,7 @@ from scenarios.flight import Flight
 from scenarios.flight_events import FlightEvents, Successor, prepared
 from scenarios.progress import Progress, silent
 from scenarios.schema.events import ControllerEvent, Event
-from scenarios.schema.scenario import LONGEST_FLIGHT, MOST_STEPS, Scenario
+from scenarios.schema.scenario import LONGEST_FLIGHT, Scenario
 
 
 def closed_loop(

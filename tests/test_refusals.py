@@ -199,8 +199,9 @@ def test_every_command_reports_it_once_and_writes_nothing(
 @pytest.mark.parametrize(
     ("limit", "most", "expected"),
     [
-        ("scenarios.schema.bases.LARGEST_FILE", 20, "@x.toml: must be of 20 or fewer bytes; got 30"),
-        ("scenarios.courses.csv_course.LARGEST_FILE", 30, "@x.csv: must be of 30 or fewer bytes; got 48"),
+        ("quadsim.assets.LARGEST_TOML", 20, "@x.toml: must be of 20 or fewer bytes; got 30"),
+        ("scenarios.courses.csv_course.LARGEST_CSV", 30, "@x.csv: must be of 30 or fewer bytes; got 48"),
+        ("quadsim.assets.MOST_ASSIGNMENTS", 1, "@x.toml: must assign at most 1 values; it has 2 equals signs"),
         ("scenarios.courses.csv_course.MOST_ROWS", 1, "@x.csv: must have 1 or fewer rows below its header"),
     ],
 )

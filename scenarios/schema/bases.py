@@ -5,15 +5,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from quadsim.assets import DEEPEST, read_toml
 from quadsim.errors import FileError, ParameterError
 from scenarios.plugin import located
 from scenarios.schema.settings import note_changes, state_bounds
-
-LARGEST_FILE: Final = 8_000_000
-"""Size [bytes] of the largest file that is read; the longest possible scenario is smaller."""
 
 
 def locate_files(data: dict[str, Any], directory: Path) -> None:
@@ -128,10 +125,7 @@ def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return a file's tables; refuse a file that is too large."""
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
+    """Return a file's tables."""
     data = read_toml(path)
     if isinstance(data.get("controller"), str):  # its name alone, which a table over it, or a setting, adds to
         data["controller"] = {"type": data["controller"]}
