@@ -41,7 +41,7 @@ _PRELOAD: Final = (
     "mpc.robust.controller",
     "mpc.unconstrained",
 )
-"""Preloaded by the server that workers are forked from; by the first, the others are found, whatever has their names."""
+"""Preloaded by the server that workers are forked from; the first one finds the others by their place."""
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
 _START_S: Final = 60.0  # longest start of a worker, or of the first one of a cluster; not counted as flight time

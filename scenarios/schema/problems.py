@@ -212,8 +212,18 @@ def parse_table(kind: type[Table], data: Mapping[str, Any], source: str, *, file
     try:
         table: Table = adapter(cast(Any, kind)).validate_json(json.dumps(data, default=lambda _: math.inf))
     except ValidationError as error:
-        raise ScenarioError(source, describe_all(error, data, kind, file=file)) from error
+        lines = [*_not_unicode(data)] or describe_all(error, data, kind, file=file)
+        raise ScenarioError(source, lines) from error
     return table
+
+
+def _not_unicode(data: Any, names: tuple[str, ...] = ()) -> Iterator[str]:
+    """Yield a line about each text that no file of ours can hold, such as the path of a folder that is not UTF-8."""
+    if isinstance(data, Mapping | list):
+        for name, entry in data.items() if isinstance(data, Mapping) else enumerate(data):
+            yield from _not_unicode(entry, (*names, str(name)))
+    elif isinstance(data, str) and any("\ud800" <= character <= "\udfff" for character in data):
+        yield f"{'.'.join(names)} must be UTF-8, as every path and text; got {shown(data)}; rename it"
 
 
 @functools.cache
