@@ -23,6 +23,7 @@ from mpc.solvers import ALIASES, CORE_OR_PIQP, SOLVERS, Solver, find_solver, mak
 from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ExportError, MissingCoreError, ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number, Pair, Positive, Weight
+from quadsim.input_limits import MOST_ENTRIES
 from quadsim.state import (
     EULER,
     EULER_RATE,
@@ -49,7 +50,6 @@ IN_DEGREES: Final = frozenset(
 TERMS: Final = (*STATE_NAMES, *(f"speed_{i + 1}" for i in range(N_ROTORS)))
 """The quantities that the rows of a polytope may combine."""
 LARGEST_HORIZON: Final = 1000
-MOST_ENTRIES: Final = 1000  # most entries in a list of tables
 USUAL_TILT: Final = 10.0
 """Default limit of the fallback's tilt [deg], for a controller without a bound on tilt."""
 LEAST_THRUST, MOST_THRUST = 0.5, 0.9

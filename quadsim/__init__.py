@@ -11,6 +11,9 @@ Public names are in `__all__` and imported on first use (PEP 562), so `import qu
 from __future__ import annotations
 
 import importlib
+import sys
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -52,6 +55,38 @@ if TYPE_CHECKING:
     from scenarios.schema.scenario import Scenario as Scenario
 
 __version__ = "0.1.0"
+
+_FOLDER = Path(__file__).resolve().parents[1]
+_OWN = ("mpc", "scenarios")
+
+
+class _OwnPackages:
+    """Finds `mpc` and `scenarios` beside this package, whatever else has these names on the path."""
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        """See `importlib.abc.MetaPathFinder`."""
+        return PathFinder.find_spec(name, [str(_FOLDER)]) if name in _OWN else None
+
+
+def _require_own_packages() -> None:
+    """Find the packages by their place from now on.
+
+    Raises:
+        ImportError: another module of such a name has been imported already.
+    """
+    for name in _OWN:
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if name in sys.modules and Path(file or "").resolve() != _FOLDER / name / "__init__.py":
+            raise ImportError(
+                f"quadsim has a package {name!r}, and {file or 'another one'} was imported under that name before: "
+                "rename that file, or import quadsim first and do without it"
+            )
+    if not any(getattr(finder, "__name__", "") == _OwnPackages.__name__ for finder in sys.meta_path):
+        sys.meta_path.insert(0, _OwnPackages)
+
+
+_require_own_packages()
 
 _MODULES = {
     "quadsim.controller": "Command StepInputs",

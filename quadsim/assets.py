@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from quadsim.errors import FileError, InputError, UnknownNameError
+from quadsim.input_limits import LARGEST_TOML, MOST_ASSIGNMENTS, MOST_ENTRIES
 
 DEEPEST: Final = 20  # deepest nesting of tables and lists; a scenario has a third of it
 _KEY: Final = r"""(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')"""
@@ -55,10 +56,17 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file's tables.
 
     Raises:
-        FileError: it is missing, unreadable or not TOML.
+        FileError: it is missing, unreadable, too large or not TOML.
     """
     try:
-        return parse_toml(path.read_text(encoding="utf-8-sig"))
+        if (size := path.stat().st_size) > LARGEST_TOML:
+            raise FileError(path, f"must be of {LARGEST_TOML} or fewer bytes; got {size}")
+        text = path.read_text(encoding="utf-8-sig")
+        if (count := text.count("=")) > MOST_ASSIGNMENTS:  # before tomllib takes its time
+            raise FileError(path, f"must assign at most {MOST_ASSIGNMENTS} values; it has {count} equals signs")
+        return parse_toml(text)
+    except FileError:
+        raise
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(path, f"cannot be read ({error})") from error
     except InputError as error:
@@ -71,7 +79,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     """Parse the tables of a TOML text.
 
     Raises:
-        InputError: they are nested too deep.
+        InputError: they are nested too deep, or one is too large.
         ValueError: it is not TOML.
     """
     deeper = InputError(f"must nest tables and lists at most {DEEPEST} deep")
@@ -83,7 +91,18 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise deeper from None
     if _is_deeper(data, DEEPEST):
         raise deeper
+    _require_small(data)
     return data
+
+
+def _require_small(table: Any, name: str = "") -> None:
+    """Refuse tables with more keys than any has."""
+    if isinstance(table, dict) and len(table) > MOST_ENTRIES:
+        raise InputError(f"{name or 'the file'} must have {MOST_ENTRIES} or fewer keys; got {len(table)}")
+    entries = table.items() if isinstance(table, dict) else enumerate(table)
+    for key, entry in entries:
+        if isinstance(entry, dict | list):
+            _require_small(entry, f"{name}.{key}".removeprefix("."))
 
 
 def _is_deeper(value: Any, levels: int) -> bool:

@@ -269,6 +269,8 @@ class Controller(Protocol):
 
 def check_command(speeds: Array) -> str | None:
     """Return why rotor speeds are not a valid command, or None."""
+    if np.iscomplexobj(speeds):
+        return f"the command has complex numbers: {np.asarray(speeds).tolist()}"
     if np.shape(speeds) != (4,):
         return f"the command has shape {np.shape(speeds)}, not (4,)"
     if np.abs(speeds).max() <= LARGEST_SPEED:  # False for NaN

@@ -7,15 +7,18 @@ flight: it ends the flight, is recorded as its reason, and gives exit status 1.
 from __future__ import annotations
 
 import difflib
+import os
 import traceback
 import unicodedata
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from types import TracebackType
 from typing import Final
 
 _TRACEBACK_LINES: Final = 20  # lines kept of the traceback that ended a flight
 _LONGEST: Final = 500  # characters kept of its message
 _LONGEST_LIST: Final = 150  # characters of a list of names
+OUR_FOLDERS: Final = tuple(f"{Path(__file__).parents[1] / name}{os.sep}" for name in ("quadsim", "mpc", "scenarios"))
 _HIDDEN: Final = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
 """Unicode categories that control a terminal or are invisible: controls, formats such as direction, surrogates."""
 
@@ -187,10 +190,11 @@ class PlanExhaustedError(FlightError):
 
 
 class RaisedError(FlightError):
-    """The controller or a force raised an exception, or exited; `traceback` has its last lines."""
+    """The controller or a force raised an exception, or exited; `traceback` has its last lines, from the user's on."""
 
     def __init__(self, what: str, error: BaseException, *, time: float) -> None:
-        lines = "".join(traceback.format_exception(error)).splitlines()
+        start = _of_user(error.__traceback__)
+        lines = "".join(traceback.format_exception(type(error), error, start)).splitlines()
         text = "".join(traceback.format_exception_only(error)).split("\n")[0]
         super().__init__(f"{what} raised {text}"[:_LONGEST], time=time)
         self.traceback = tuple(printable(line)[:_LONGEST] for line in lines[-_TRACEBACK_LINES:])
@@ -201,6 +205,30 @@ class InterruptedFlightError(FlightError):
 
     def __init__(self, *, time: float) -> None:
         super().__init__("interrupted (Ctrl-C)", time=time)
+
+
+def failure(error: BaseException) -> str:
+    """Return why something was not made, in one line: `failed: ValueError: no`."""
+    text = str(error) if isinstance(error, QuadsimError) else described(error)
+    text = error.problem if isinstance(error, OutputError) else text  # its path is that of what was to be made
+    return f"failed: {printable(' '.join(text.split()))}"[:_LONGEST]
+
+
+def described(error: BaseException) -> str:
+    """Return an exception in one printable line, whatever its own `__str__` does."""
+    try:
+        text = f"{type(error).__name__}: {error}"
+    except Exception:
+        text = f"{type(error).__name__}, whose text cannot be read"
+    return printable(" ".join(text.split()))
+
+
+def _of_user(frames: TracebackType | None) -> TracebackType | None:
+    """Return a traceback from the first frame on that is not in our code; the whole of it where all are."""
+    first = frames
+    while first is not None and first.tb_frame.f_code.co_filename.startswith(OUR_FOLDERS):
+        first = first.tb_next
+    return frames if first is None else first
 
 
 def _restore(kind: type[QuadsimError], arguments: tuple[object, ...], values: dict[str, object]) -> QuadsimError:

@@ -26,3 +26,10 @@ class Motion:
         """Return the motion from sample k on, as views; beyond the end, its last sample."""
         first = min(k, len(self) - 1)
         return Motion(**{name: samples[first:] for name, samples in vars(self).items()})
+
+    def read_only(self) -> Motion:
+        """Return it as views that user code cannot write to."""
+        views = {name: samples.view() for name, samples in vars(self).items()}
+        for view in views.values():
+            view.flags.writeable = False
+        return Motion(**views)

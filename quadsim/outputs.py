@@ -3,7 +3,7 @@
 An existing output directory that is not empty is refused.  A new one is built beside its place and renamed into it;
 `files` in its `summary.json` has the SHA-256 of every other file.  Overwriting unlinks, by name, the regular files on
 that list, and refuses a directory that holds anything else.  A directory that grows in place, such as a campaign's, is
-locked.
+locked.  What a killed process of ours leaves, a lock or a half-written folder under a private name, is in nobody's way.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ import fcntl
 import hashlib
 import itertools
 import json
+import logging
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,11 +23,14 @@ from pathlib import Path
 from stat import S_IMODE, S_ISDIR, S_ISREG
 from typing import Any, Final
 
-from quadsim.errors import OutputError, printable
+from quadsim.errors import OutputError, failure, printable
 
 SUMMARY_FILE: Final = "summary.json"
 LOCK_FILE: Final = ".lock"  # in a directory that grows
+_LOCK_MARK: Final = b"quadsim\n"  # its content
+_PARTIAL: Final = re.compile(r"\.quadsim-[a-z0-9_]{8}\.partial")  # folders as `_beside` names them
 _FREE_BYTES_NEEDED: Final = 16 * 1024 * 1024
+_log: Final = logging.getLogger("quadsim")
 
 
 def absolute(path: Path | str) -> Path:
@@ -61,15 +66,18 @@ def file_hashes(directory: Path) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def reserving(path: Path | str, *, overwrite: bool = False, free: bool = False) -> Iterator[Path]:
+def reserving(
+    path: Path | str, *, overwrite: bool = False, free: bool = False, first: Sequence[str] = ()
+) -> Iterator[Path]:
     """Create an output directory before its contents are computed; it is removed if the block leaves it empty.
 
-    `overwrite` allows an earlier output there; `free` takes the next free name instead: NAME, NAME-2, ...
+    `overwrite` allows an earlier output there; `free` takes the next free name instead: NAME, NAME-2, ...; `first` as
+    in `growing`.
 
     Raises:
         OutputError: it cannot be made, or holds something that must not be replaced.
     """
-    first = target = absolute(path)
+    asked = target = absolute(path)
     made: list[Path] = []
     try:
         with _errors(target):
@@ -83,8 +91,8 @@ def reserving(path: Path | str, *, overwrite: bool = False, free: bool = False) 
                     made.insert(0, target)
                 if not free or target in made:
                     break
-                target = first.with_name(f"{first.name}-{i}")
-            _require_replaceable(target, overwrite=overwrite)
+                target = asked.with_name(f"{asked.name}-{i}")
+            _require_replaceable(target, overwrite=overwrite, first=first)
             if shutil.disk_usage(target).free < _FREE_BYTES_NEEDED:
                 raise OutputError(target, "the disk is full")
         yield target
@@ -102,9 +110,9 @@ def writing(path: Path | str, *, overwrite: bool = False) -> Iterator[Path]:
         OutputError: see `reserving`; if `path` has been taken meanwhile, the result stays beside it.
     """
     with reserving(path, overwrite=overwrite) as target, _beside(target) as work:
-        work.chmod(S_IMODE(target.stat().st_mode))
         yield work
         amend(work, {"files": file_hashes(work)})
+        work.chmod(S_IMODE(target.stat().st_mode))  # not before: it may allow nothing
         try:
             _require_replaceable(target, overwrite=overwrite)
             _clear(target)
@@ -143,6 +151,15 @@ def amend(directory: Path, changes: Mapping[str, Any]) -> None:
     summary["files"] = dict(sorted(summary.pop("files", {}).items()))
     with writing_file(path, overwrite=True) as new:
         new.write_text(to_json(summary), encoding="utf-8")
+
+
+@contextlib.contextmanager
+def optional(name: str) -> Iterator[None]:
+    """Make what decorates a result that is there already, such as a figure: a failure is a line, nothing more."""
+    try:
+        yield
+    except Exception as error:
+        _log.warning("%s %s", name, failure(error))
 
 
 def require_file(path: Path | str, *, overwrite: bool = False) -> Path:
@@ -197,34 +214,50 @@ class Growing:
 
 
 @contextlib.contextmanager
-def growing(path: Path | str, mark: str, *, overwrite: bool = False) -> Iterator[Growing]:
+def growing(path: Path | str, mark: str, *, overwrite: bool = False, first: Sequence[str] = ()) -> Iterator[Growing]:
     """A directory that grows in place, written by one process at a time: a new one, or one with a file `mark`.
+
+    `first` names the files that are written before `mark`: a process that was killed then leaves these alone.
 
     Raises:
         OutputError: it cannot be written, holds something else, or another process writes there.
     """
     directory = absolute(path)
     goes_on = (directory / mark).is_file() and not overwrite
-    with contextlib.nullcontext() if goes_on else reserving(directory, overwrite=overwrite), _locked(directory):
+    place = contextlib.nullcontext() if goes_on else reserving(directory, overwrite=overwrite, first=first)
+    with place, _locked(directory, mark=True):
         if odd := [name for name, mode in _below(directory).items() if not (S_ISREG(mode) or S_ISDIR(mode))]:
             raise OutputError(directory, f"{_few(odd)}: links are refused; move them away first")
+        _clear_partial(directory)
         if not goes_on:
             _clear(directory, keep=LOCK_FILE)
         try:
             yield Growing(directory)
         finally:
-            if list(_below(directory)) == [LOCK_FILE]:
-                (directory / LOCK_FILE).unlink()
+            with contextlib.suppress(OSError):  # the directory may be gone
+                if list(_below(directory)) == [LOCK_FILE]:
+                    (directory / LOCK_FILE).unlink()
 
 
-def _require_replaceable(target: Path, *, overwrite: bool) -> None:
-    """Refuse a directory that is not empty, unless its summary lists all its files and it may be overwritten."""
+def _require_replaceable(target: Path, *, overwrite: bool, first: Sequence[str] = ()) -> None:
+    """Refuse a directory that is not empty, unless its summary lists all its files and it may be overwritten.
+
+    One in which another process writes is refused; one that a process of ours has only begun to fill is as good as
+    empty: it has our lock, and perhaps files in `first`.
+    """
     if not target.is_dir():
         raise OutputError(target, "a file is already there; choose another --out")
     with contextlib.suppress(FileNotFoundError):  # the current directory may be gone
         if target.samefile(Path.cwd()):
             raise OutputError(target, "it is the current directory; name one to be made")
-    there, listed = _below(target), _listed(target)
+    with _errors(target):
+        there, listed = _below(target), _listed(target)
+    if S_ISREG(there.get(LOCK_FILE, 0)):
+        with _locked(target):
+            content = (target / LOCK_FILE).read_bytes()[: len(_LOCK_MARK) + 1]
+        left = {LOCK_FILE, *(first if content == _LOCK_MARK else ())}
+        if content in (b"", _LOCK_MARK) and {*there} <= left and all(map(S_ISREG, there.values())):
+            return
     if there and not overwrite:
         raise OutputError(target, f"it is not empty ({_few([*there])}); choose another --out, or add --overwrite")
     if there and listed is None:
@@ -234,12 +267,11 @@ def _require_replaceable(target: Path, *, overwrite: bool) -> None:
     others = [n for n, mode in there.items() if n not in (files if S_ISREG(mode) else folders if S_ISDIR(mode) else ())]
     if others:
         raise OutputError(target, f"its {SUMMARY_FILE} does not list {_few(others)}; move that away first")
-    with _locked(target) if LOCK_FILE in there else contextlib.nullcontext():
-        pass
 
 
 def _clear(target: Path, keep: str = "") -> None:
     """Unlink the listed files of a directory and its lock, remove its folders, and unlink its summary last."""
+    _clear_partial(target)
     files = {*(_listed(target) or ()), LOCK_FILE} - {keep}
     for name, mode in reversed(_below(target).items()):
         if S_ISDIR(mode):
@@ -247,6 +279,20 @@ def _clear(target: Path, keep: str = "") -> None:
         elif name in files:
             (target / name).unlink()
     (target / SUMMARY_FILE).unlink(missing_ok=True)
+
+
+def _clear_partial(directory: Path) -> None:
+    """Remove the half-written folders of killed processes, made here under private names."""
+    for path in directory.iterdir():
+        if _PARTIAL.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
+            _remove(path)
+
+
+def _remove(partial: Path) -> None:
+    """Remove a folder that `_beside` made, whatever its permissions."""
+    with contextlib.suppress(OSError):
+        partial.chmod(0o700)
+    shutil.rmtree(partial, ignore_errors=True)
 
 
 def _listed(directory: Path) -> dict[str, str] | None:
@@ -258,9 +304,23 @@ def _listed(directory: Path) -> dict[str, str] | None:
 
 
 def _below(directory: Path) -> dict[str, int]:
-    """Return the modes of everything below a directory by relative path, parents first; links are not followed."""
-    paths = (Path(folder, name) for folder, inner, files in os.walk(directory) for name in sorted((*inner, *files)))
-    return {path.relative_to(directory).as_posix(): path.lstat().st_mode for path in paths}
+    """Return the modes of everything below a directory by relative path, parents first; links are not followed.
+
+    Half-written folders of killed processes are left out.
+
+    Raises:
+        OSError: a folder cannot be read.
+    """
+
+    def fail(error: OSError) -> None:
+        raise error
+
+    modes = {}
+    for folder, inner, files in os.walk(directory, onerror=fail):
+        inner[:] = [name for name in inner if not _PARTIAL.fullmatch(name)]
+        for path in (Path(folder, name) for name in sorted((*inner, *files))):
+            modes[path.relative_to(directory).as_posix()] = path.lstat().st_mode
+    return modes
 
 
 def _few(names: Sequence[str]) -> str:
@@ -279,12 +339,12 @@ def _beside(target: Path) -> Iterator[Path]:
                 raise
             raise OutputError(target / error.path.relative_to(work), error.problem) from error
         finally:
-            shutil.rmtree(work, ignore_errors=True)  # made here, under a private name
+            _remove(work)
 
 
 @contextlib.contextmanager
-def _locked(directory: Path) -> Iterator[None]:
-    """Lock a directory for this process."""
+def _locked(directory: Path, *, mark: bool = False) -> Iterator[None]:
+    """Lock a directory for this process; `mark` says in the lock whose it is."""
     with _errors(directory / LOCK_FILE):
         handle = os.open(directory / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
     try:
@@ -292,6 +352,9 @@ def _locked(directory: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise OutputError(directory, "another process is writing there") from error
+        if mark and os.fstat(handle).st_size == 0:
+            with _errors(directory / LOCK_FILE):
+                os.write(handle, _LOCK_MARK)
         yield
     finally:
         os.close(handle)

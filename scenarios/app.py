@@ -488,6 +488,7 @@ def check(
     from scenarios.campaign.store import is_campaign
     from scenarios.junit import junit_file, write_junit
     from scenarios.progress import reporting
+    from scenarios.results import after
     from scenarios.rollout import Rollout
 
     file = None if junit is None else junit_file(junit)
@@ -509,7 +510,8 @@ def check(
             flight = Rollout(assembly).fly(report)
         audited = reaudit.Reaudit(summary=dict(flight.summary), findings=flight.findings, satisfied=flight.satisfied)
     if file is not None:
-        write_junit(audited, file)
+        with after(audited, file):
+            write_junit(audited, file)
     return audited
 
 
@@ -865,6 +867,7 @@ def campaign(
     from scenarios.campaign.plan import load_plan, make_plan
     from scenarios.campaign.statistics import judge, parse_requirement
     from scenarios.junit import junit_file, write_junit
+    from scenarios.results import after
     from scenarios.schema.scenario import Scenario
     from scenarios.user_code import importable
 
@@ -889,7 +892,8 @@ def campaign(
         result = fly_campaign(plan, workers=workers, cluster=cluster, report=report, until_width=until_width, **options)
     result = replace(result, judgements=tuple(judge(result.table, requirement) for requirement in requirements))
     if file is not None:
-        write_junit(result, file)
+        with after(result, file):
+            write_junit(result, file)
     return result
 
 
@@ -1059,13 +1063,15 @@ def reproduce(
     from scenarios.junit import junit_file, write_junit
     from scenarios.papers.reproduction import Reproductions, load_paper, reproduce_paper
     from scenarios.progress import reporting
+    from scenarios.results import after
 
     file = None if junit is None else junit_file(junit)
     papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
     with reporting(progress) as report:
         reproductions = Reproductions(reproduce_paper(spec, report) for spec in papers)
     if file is not None:
-        write_junit(reproductions, file)
+        with after(reproductions, file):
+            write_junit(reproductions, file)
     return reproductions
 
 
@@ -1311,13 +1317,11 @@ def vehicle_report(
         raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
     loaded = load_vehicle(name)
     against = None if scenario is None else loading.load_scenario(scenario)
-    if out is not None:
-        if Path(out).suffix != ".png":
-            raise ParameterError("", "--out", str(out), "a file ending in .png")
-        render_portrait(loaded, Path(out), overwrite=overwrite)
+    if out is not None and Path(out).suffix != ".png":
+        raise ParameterError("", "--out", str(out), "a file ending in .png")
     path = vehicle_path(str(name))
     autopilot = (stated_autopilot(path) or AutopilotSettings()).resolved(loaded)
-    return vehicle_report.VehicleReport(
+    report = vehicle_report.VehicleReport(
         vehicle=loaded,
         sources=vehicle_sources(path),
         autopilot=autopilot,
@@ -1325,8 +1329,12 @@ def vehicle_report(
         figures=vehicle_report.make_sheet(loaded),
         scenario=None if against is None else against.name,
         shortfalls=None if against is None else shortfalls.shortfalls(against, loaded),
-        picture=None if out is None else Path(out),
     )
+    if out is None:
+        return report
+    with results.after(report, Path(out)):
+        render_portrait(loaded, Path(out), overwrite=overwrite)
+    return replace(report, picture=Path(out))
 
 
 def load_vehicle(name: VehicleName) -> Vehicle:

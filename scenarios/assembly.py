@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import itemgetter
@@ -20,8 +21,9 @@ from mpc.nonlinear.settings import Nonlinear
 from mpc.piloted import Piloted
 from mpc.solvers import CORE_OR_PIQP
 from quadsim.assets import vehicle_path
+from quadsim.border import user_code
 from quadsim.controller import ROTORS
-from quadsim.errors import InputError, ParameterError
+from quadsim.errors import InputError, ParameterError, QuadsimError
 from quadsim.fields import filled
 from quadsim.flight.metrics import CourseStep
 from quadsim.flight.phase import AIRBORNE, TOUCH, PhaseMonitor, clearance, touching_speed
@@ -62,7 +64,7 @@ from scenarios.courses.course import Course
 from scenarios.courses.followed import FollowedCourse
 from scenarios.courses.steps import Steps, switches
 from scenarios.limits import audited, space_limits
-from scenarios.plugin import import_plugin, make_force
+from scenarios.plugin import import_plugin, make_force, reason_of
 from scenarios.schema.events import Event, SensorFaultEvent, SetpointEvent
 from scenarios.schema.problems import parse_table
 from scenarios.schema.writing import plain
@@ -341,15 +343,21 @@ class Assembly:
         """
         if (getattr(law, "commands", ROTORS) if commands is None else commands) == ROTORS:
             return law
-        return Piloted(law, self.user_autopilot or Autopilot(self.vehicle, self.autopilot), self.vehicle)
+        with self._calling_autopilot():
+            return Piloted(law, self.user_autopilot or Autopilot(self.vehicle, self.autopilot), self.vehicle)
 
     @cached_property
     def inner_lag(self) -> tuple[float, ...]:
         """(4,) first-order lags of thrust and body rates [s], by a step on the autopilot."""
         timestep = self.scenario.plant.timestep
         if self.user_autopilot is not None:
-            return identify_lags(self.vehicle, self.user_autopilot, timestep=timestep)
+            with self._calling_autopilot():
+                return identify_lags(self.vehicle, self.user_autopilot, timestep=timestep)
         return built_in_lags(self.vehicle, self.autopilot or AutopilotSettings(), timestep)
+
+    def _calling_autopilot(self) -> AbstractContextManager[None]:
+        what = f"autopilot: {type(self.user_autopilot).__name__} cannot be used"
+        return user_code(lambda error: InputError(f"{what}: {reason_of(error)}"), passing=(QuadsimError,))
 
     @property
     def autopilot_flown(self) -> dict[str, Any]:

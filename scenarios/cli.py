@@ -18,6 +18,7 @@ from typing import Annotated, Any, Final
 
 from cyclopts import CycloptsError, Parameter
 
+from quadsim.border import printing_to_stderr
 from quadsim.errors import QuadsimError, printable
 from scenarios.app import app
 from scenarios.results import EXIT_FAILED, EXIT_WRONG_INPUT, Document, Result
@@ -83,7 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 command, bound, json = parsed
                 judged = "flown" in bound.arguments
                 try:
-                    status = _show(command(*bound.args, **bound.kwargs), json, judged=judged)
+                    with printing_to_stderr() if json else contextlib.nullcontext():
+                        result = command(*bound.args, **bound.kwargs)
+                    status = _show(result, json, judged=judged)
                 except QuadsimError as error:  # a failure may carry a partial result
                     _show(error.result, json, judged=judged)
                     raise

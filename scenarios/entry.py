@@ -43,7 +43,10 @@ def main() -> int:
             sys.stdout.reconfigure(errors="backslashreplace")  # a terminal may lack characters
         from scenarios.cli import main as run
 
-        return run()
+        status = run()
+        if "--json" in sys.argv:
+            os.dup2(2, 1)  # user code may print at exit too
+        return status
     except (KeyboardInterrupt, ImportError, SystemError):  # a compiled module may turn the first into others
         if not stopped:
             raise

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from quadsim.controller import NOT_CONVERGED
-from quadsim.errors import MissingPackageError, OutputError, QuadsimError, UnknownNameError, printable
+from quadsim.errors import MissingPackageError, OutputError, UnknownNameError, failure
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import (
     SIGNALS,
@@ -43,7 +43,7 @@ from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
 from scenarios.mismatch import model_notes
 from scenarios.progress import Progress, silent
-from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
+from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown, plot_html
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import leaves
 
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
     from quadsim.report.figure import Figure
     from scenarios.assembly import Assembly
 
-_LONGEST: Final = 500  # characters kept of why a product failed
 _log: Final = logging.getLogger("quadsim")
 
 
@@ -396,7 +395,6 @@ class Flight(Result):
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""
         from quadsim.report.comparison import tolerance_text
-        from quadsim.report.to_matplotlib import to_html
 
         rows = "".join(
             f"<tr><td>{escape(entry.limit.name)}</td><td>{entry.margin:.4g} {escape(entry.limit.unit)}</td>"
@@ -404,13 +402,11 @@ class Flight(Result):
             for entry in self.findings
         )
         errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz" if self.time.size)
-        figure = self.small_plot()
-        plot = "" if figure is None else to_html(figure)
         return (
             f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self.summary['duration']:g} s flown, "
             f"RMS error [m]: {errors or 'none'}</p>"
             "<table><tr><th>constraint</th><th>margin</th><th>tolerance</th><th>verdict</th></tr>"
-            f"{rows}</table>{plot}"
+            f"{rows}</table>{plot_html(self.small_plot())}"
         )
 
     @property
@@ -523,9 +519,7 @@ def _add_products(
         except KeyboardInterrupt:
             interrupted, problem = True, "interrupted (Ctrl-C)"
         except Exception as error:
-            what = str(error) if isinstance(error, QuadsimError) else f"{type(error).__name__}: {error}"
-            what = error.problem if isinstance(error, OutputError) else what  # its path is the product's
-            problem = f"failed: {' '.join(printable(what).split())}"[:_LONGEST]
+            problem = failure(error)
             if demanded:
                 failed[name] = problem
         else:

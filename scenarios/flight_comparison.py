@@ -23,7 +23,7 @@ from scenarios.flight import Flight, require_rendering, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
 from scenarios.reaudit import reaudit
-from scenarios.results import Result, Shown
+from scenarios.results import Result, Shown, after
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
@@ -149,8 +149,11 @@ def compare_flights(
             runs = tuple(audited_against(run, limits) for run in runs)
             notes = (f"All are audited against the constraints of {names[whose]}, at the rate of their tables.",)
         progress("comparison", 0, 1)
-        page = None if out is None else write_comparison(runs, out, notes=notes, overwrite=overwrite)
-    return FlightComparison(runs=runs, rows=comparison_rows(runs), names=names, notes=notes, page=page)
+        comparison = FlightComparison(runs=runs, rows=comparison_rows(runs), names=names, notes=notes, page=None)
+        if out is None:
+            return comparison
+        with after(comparison, out):
+            return replace(comparison, page=write_comparison(runs, out, notes=notes, overwrite=overwrite))
 
 
 def _place_of(target: Target, targets: Sequence[Target]) -> int:
@@ -268,4 +271,5 @@ def compare_campaigns(
     comparison = compare_pairs(a, b, names, failures, plan_differences(*plans), tuple(differences))
     if out is None:
         return comparison
-    return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))
+    with after(comparison, out):
+        return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))

@@ -25,7 +25,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-from quadsim.errors import MissingPackageError, ParameterError, QuadsimError, printable
+from quadsim.errors import MissingPackageError, ParameterError, QuadsimError, described
 from scenarios.machine import usable_cores, versions
 
 Row = dict[str, Any]
@@ -34,8 +34,14 @@ Fly = Callable[[Any], Row]
 ERROR, TIMEOUT, MEMORY, DIED = "error", "timeout", "memory", "died"
 """Verdicts of flights without a row: an exception, a timeout, too much memory, or a dead process."""
 _ONE_THREAD: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_PRELOAD: Final = ("scenarios.campaign.plan", "mpc.constrained", "mpc.robust.controller", "mpc.unconstrained")
-"""Preloaded by the server that workers are forked from."""
+_PRELOAD: Final = (
+    "quadsim",
+    "scenarios.campaign.plan",
+    "mpc.constrained",
+    "mpc.robust.controller",
+    "mpc.unconstrained",
+)
+"""Preloaded by the server that workers are forked from; the first one finds the others by their place."""
 _STARTING: Final = threading.Lock()  # a Dask worker may have several threads
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss|ucx)://\S+:\d+")
 _START_S: Final = 60.0  # longest start of a worker, or of the first one of a cluster; not counted as flight time
@@ -87,11 +93,6 @@ def count_workers(workers: int | None, cluster: str | None) -> int:
         return workers or usable_cores()
     with _client(cluster) as client:
         return _threads(client)
-
-
-def describe(error: BaseException) -> str:
-    """An exception in one printable line."""
-    return printable(" ".join(f"{type(error).__name__}: {error}".split()))
 
 
 def _require(workers: int | None, cluster: str | None) -> None:
@@ -233,9 +234,9 @@ def _row(fly: Fly, flight: Any, memory: float) -> bytes:
     try:
         return pickle.dumps(fly(flight))
     except MemoryError as error:
-        return pickle.dumps({"verdict": MEMORY, "reason": f"{describe(error)} (it may take {memory:g} MB)"})
+        return pickle.dumps({"verdict": MEMORY, "reason": f"{described(error)} (it may take {memory:g} MB)"})
     except BaseException as error:  # a user's controller may call exit, too
-        return pickle.dumps({"verdict": ERROR, "reason": describe(error)})
+        return pickle.dumps({"verdict": ERROR, "reason": described(error)})
 
 
 def _limit_memory(megabytes: float) -> None:
@@ -270,12 +271,12 @@ def _on_cluster(address: str, flights: Iterable[Any], fly: bytes, timeout: float
             try:
                 row = future.result()
             except distributed.KilledWorker as error:  # several Dask workers died with the flight
-                row = {"verdict": DIED, "reason": describe(error)}
+                row = {"verdict": DIED, "reason": described(error)}
             except distributed.CancelledError as error:
                 raise ClusterError(f"the scheduler at {address} is gone; continue with --resume") from error
             except Exception as error:
                 rule = "every worker, and the scheduler, needs the quadsim, and the packages, that are here"
-                raise ClusterError(f"{address}: a worker cannot fly ({describe(error)}); {rule}") from error
+                raise ClusterError(f"{address}: a worker cannot fly ({described(error)}); {rule}") from error
             place = places.pop(future.key)
             submit()
             yield place, row
@@ -306,7 +307,7 @@ def _client(address: str) -> Iterator[Any]:
     try:
         client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError, ImportError) as error:
-        raise ClusterError(f"the scheduler at {address} does not answer ({describe(error)})") from error
+        raise ClusterError(f"the scheduler at {address} does not answer ({described(error)})") from error
     with client:
         try:
             client.wait_for_workers(1, timeout=_START_S)

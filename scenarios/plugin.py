@@ -14,9 +14,10 @@ import re
 import sys
 import sysconfig
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, Any, Final
@@ -27,10 +28,21 @@ from annotated_types import doc
 from mpc.bounded import ControllerTable, Horizon
 from mpc.handover import hand_over, within
 from mpc.obstacles import Shape
+from quadsim import border
+from quadsim.border import numbers_of, user_code
 from quadsim.controller import ROTORS, SQP, TARGET_SIZES, Command, Controller, StepInputs
-from quadsim.errors import CommandError, InputError, ParameterError, UnknownNameError, printable
+from quadsim.errors import (
+    OUR_FOLDERS,
+    CommandError,
+    InputError,
+    ParameterError,
+    UnknownNameError,
+    described,
+    printable,
+)
 from quadsim.fields import is_plain
 from quadsim.flight.log import RESIDUALS
+from quadsim.outputs import digest_of
 from quadsim.sim.effects import Force
 from quadsim.state import Array, State
 from quadsim.vehicle import N_ROTORS, Vehicle
@@ -45,6 +57,7 @@ _STEP: Final = (
 _WHOLE: Final = ("iterations", "active", "fallback")  # parts of a Command
 _REAL: Final = ("slack", *RESIDUALS, "solve_s")
 _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
+_log: Final = logging.getLogger("quadsim")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,14 +152,15 @@ class PluginController:
     """
 
     def __init__(self, law: Any, horizon: int) -> None:
-        self.law, self.horizon = law, horizon
-        self.name = printable(str(getattr(law, "name", type(law).__name__)))[:200]
-        self.solver = printable(str(getattr(law, "solver", "")))[:200]
-        self.commands = getattr(law, "commands", ROTORS)
+        self.law, self.horizon, kind = law, horizon, type(law).__name__
+        with user_code(lambda error: InputError(f"controller: {kind} cannot be used: {reason_of(error)}")):
+            self.name = printable(str(getattr(law, "name", kind)))[:200]
+            self.solver = printable(str(getattr(law, "solver", "")))[:200]
+            self.commands, predicts = getattr(law, "commands", ROTORS), hasattr(law, "predict")
         if not isinstance(self.commands, str) or self.commands not in TARGET_SIZES:
             raise ParameterError("controller", f"{self.name}.commands", self.commands, f"one of {[*TARGET_SIZES]}")
         self._size = TARGET_SIZES[self.commands]
-        if hasattr(law, "predict"):
+        if predicts:
             self.predict = lambda states, plans: _numbers(
                 law.predict(states.copy(), plans.copy()), (*plans.shape[:2], states.shape[1]), f"{self.name}.predict"
             )
@@ -155,17 +169,17 @@ class PluginController:
     def infeasible_period(self) -> object:
         """The first problem without an answer, an `mpc.InfeasiblePeriod`, if the law keeps one."""
         try:
-            return getattr(self.law, "infeasible_period", None)
-        except Exception as error:  # the flight is complete and must not be lost
-            logging.getLogger("quadsim").warning("no diagnosis: infeasible_period raised %s", reason_of(error))
+            with user_code(lambda error: InputError(reason_of(error))):
+                return getattr(self.law, "infeasible_period", None)
+        except InputError as error:  # the flight is complete and must not be lost
+            _log.warning("no diagnosis: infeasible_period raised %s", error)
             return None
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`; raises InputError if the law's raises."""
-        try:
+        what = f"controller: {self.name}.reset cannot be called"
+        with user_code(lambda error: InputError(f"{what}: {reason_of(error)}")):
             getattr(self.law, "reset", np.copy)(speeds.copy())
-        except (Exception, SystemExit) as error:
-            raise InputError(f"controller: {self.name}.reset cannot be called: {reason_of(error)}") from error
 
     def adopt(self, previous: object) -> None:
         """See `quadsim.controller.Controller`."""
@@ -174,14 +188,18 @@ class PluginController:
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError if the answer is not a command."""
-        acting = None if now.acting is None else now.acting.copy()
+        acting, attitude, rates = (
+            None if rows is None else rows.copy() for rows in (now.acting, now.attitude, now.body_rates)
+        )
+        motion = None if now.motion is None else now.motion.read_only()
+        given = replace(now, acting=acting, attitude=attitude, body_rates=rates, motion=motion)
         named = state.copy().view(State)
-        answer: Any = self.law.step(replace(now, acting=acting), named, reference.copy())
+        answer: Any = self.law.step(given, named, reference.copy())
         try:
             if not isinstance(answer, Command):
                 answer = Command(speeds=answer, plan=np.tile(_numbers(answer, (self._size,), "it"), (self.horizon, 1)))
             parts: dict[str, Any] = {name: operator.index(getattr(answer, name)) for name in _WHOLE}
-            parts |= {name: float(getattr(answer, name)) for name in _REAL}
+            parts |= {name: float(numbers_of(getattr(answer, name))) for name in _REAL}
             parts |= {name: printable(getattr(answer, name))[:200] for name in ("status", "answered_by")}
             parts["sqp"] = None if answer.sqp is None else SQP(*map(float, answer.sqp))
             parts["speeds"] = _numbers(answer.speeds, (self._size,), "its speeds")
@@ -202,7 +220,7 @@ class PluginController:
 
 
 def _numbers(numbers: Any, shape: tuple[int, ...], name: str) -> Array:
-    array = np.array(numbers, float)
+    array = numbers_of(numbers)
     if array.shape != shape:
         raise InputError(f"{name} must have shape {shape}; got {array.shape}")
     return array
@@ -221,7 +239,9 @@ def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginC
                 given = f"the {what} {code.__qualname__}{inspect.signature(code)}"
                 raise InputError(f"controller must be {_STEP}; got {given}: {error}") from error
             law = SimpleNamespace(step=functools.partial(code, **spec.settings), name=code.__name__)
-    if not callable(getattr(law, "step", None)):
+    with user_code(lambda error: InputError(f"{_table(spec)}: {spec.type} cannot be used: {reason_of(error)}")):
+        step = getattr(law, "step", None)
+    if not callable(step):
         raise ParameterError("controller", "type", f"{spec.type} ({law!r:.100})", _STEP)
     return PluginController(law, spec.horizon)
 
@@ -240,13 +260,10 @@ def make_force(force: Any, spec: PluginForce, vehicle: Vehicle, rng: np.random.G
 
 def _call(call: Any, spec: Plugin | PluginForce, arguments: dict[str, Any], **given: Any) -> Any:
     """Call with these arguments and the settings; an exception becomes a message about them."""
-    try:
+    called = ", ".join([*arguments, *given, *spec.settings])
+    what = f"{_table(spec)}: {spec.type} cannot be called with {called}"
+    with user_code(lambda error: InputError(f"{what}: {reason_of(error)}"), passing=(InputError,)):
         return call(*arguments.values(), **given, **spec.settings)
-    except InputError:
-        raise
-    except (Exception, SystemExit) as error:
-        called = ", ".join([*arguments, *given, *spec.settings])
-        raise InputError(f"{_table(spec)}: {spec.type} cannot be called with {called}: {reason_of(error)}") from error
 
 
 def import_plugin(spec: Plugin | PluginForce) -> Any:
@@ -256,18 +273,9 @@ def import_plugin(spec: Plugin | PluginForce) -> Any:
         InputError: it does not exist, or its module cannot be imported.
     """
     place = spec.type if ":" in spec.type else metadata.entry_points(group=ENTRY_POINTS)[spec.type].value
-    (module, _, attribute), path = place.partition(":"), list(sys.path)
+    module, _, attribute = place.partition(":")
     folders, top = [*filter(None, [spec.folder]), str(Path.cwd())], module.partition(".")[0]
-    try:
-        sys.path += folders  # last, so that installed modules take precedence
-        importlib.invalidate_caches()
-        imported = importlib.import_module(module)
-    except (Exception, SystemExit) as error:
-        absent = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
-        where = f"; it is looked for among what is installed, and in {', '.join(folders)}" if absent else ""
-        raise InputError(f"{_table(spec)}.type: {module} cannot be imported: {reason_of(error)}{where}") from error
-    finally:
-        sys.path[:] = path
+    imported: Any = _import(module, folders, _table(spec))
     file = getattr(sys.modules[top], "__file__", None) or "Python"
     files = [Path(folder, name) for folder in folders for name in (f"{top}.py", f"{top}/__init__.py")]
     hidden_file = next(filter(Path.is_file, files), None)
@@ -275,13 +283,61 @@ def import_plugin(spec: Plugin | PluginForce) -> Any:
         raise InputError(
             f"{_table(spec)}.type: {hidden_file} is hidden by another module {top}, from {file}; rename it"
         )
-    logging.getLogger("quadsim").info("imported %s from %s", module, getattr(imported, "__file__", None) or file)
+    _log.info("imported %s from %s", module, getattr(imported, "__file__", None) or file)
     for part in attribute.split("."):
         if not hasattr(imported, part):
             names = [name for name, value in vars(imported).items() if callable(value) and not name.startswith("_")]
             raise UnknownNameError(f"{_table(spec)}.type in {getattr(imported, '__name__', module)}", part, names)
         imported = getattr(imported, part)
     return imported
+
+
+_imported: Final[dict[str, str]] = {}
+"""Digests of the files that user modules were imported from here, with those that they imported."""
+
+
+def _import(module: str, folders: Sequence[str], table: str) -> Any:
+    """Import a user's module by its content: if a file has changed, or it is another one now, all are imported anew.
+
+    Raises:
+        InputError: it cannot be imported.
+    """
+    path, top, writes = list(sys.path), module.partition(".")[0], sys.dont_write_bytecode
+    search = [*path, *folders]  # last, so that installed modules take precedence
+    importlib.invalidate_caches()
+    if getattr(sys.modules.get(top), "__file__", None) in _imported:
+        spec = PathFinder.find_spec(top, search)
+        changed = [file for file, digest in _digests(_imported).items() if digest != _imported[file]]
+        changed += [spec.origin] if spec is not None and spec.origin and spec.origin not in _imported else []
+        if changed:
+            _log.warning("%s has changed: %s is imported again", ", ".join(changed), module)
+            for name in [name for name, held in sys.modules.items() if getattr(held, "__file__", None) in _imported]:
+                del sys.modules[name]
+            _imported.clear()
+    before = {*sys.modules}
+    try:
+        sys.path[:] = search
+        sys.dont_write_bytecode = True  # a cached file would stand for the next edit of the same second and size
+        with user_code(lambda error: _no_module(module, folders, table, error)):
+            return importlib.import_module(module)
+    finally:
+        sys.path[:], sys.dont_write_bytecode = path, writes
+        new = [name for name in sys.modules if name not in before or name.partition(".")[0] == top]
+        files = {getattr(sys.modules[name], "__file__", None) or "" for name in new}
+        installed = (*_INSTALLED, *OUR_FOLDERS)
+        users = [file for file in files - {*_imported} if file.endswith(".py") and not file.startswith(installed)]
+        _imported.update(_digests(users))
+
+
+def _digests(files: Iterable[str]) -> dict[str, str]:
+    """Return the digest of each file; of one that is gone, an empty text."""
+    return {file: digest_of(Path(file)) if Path(file).is_file() else "" for file in files}
+
+
+def _no_module(module: str, folders: Sequence[str], table: str, error: BaseException) -> InputError:
+    absent = isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
+    where = f"; it is looked for among what is installed, and in {', '.join(folders)}" if absent else ""
+    return InputError(f"{table}.type: {module} cannot be imported: {reason_of(error)}{where}")
 
 
 def refer_to(law: object, horizon: int = 1) -> Plugin:
@@ -319,6 +375,7 @@ def _table(spec: Plugin | PluginForce) -> str:
 
 def reason_of(error: BaseException) -> str:
     """Format an exception in one line, with the user's line that raised it."""
-    last, text = traceback.extract_tb(error.__traceback__)[-1], " ".join(f"{type(error).__name__}: {error}".split())
-    ours = last.filename in (__file__, inspect.__file__, importlib.__file__) or "<frozen" in last.filename
+    last, text = traceback.extract_tb(error.__traceback__)[-1], described(error)
+    ours = last.filename in (__file__, border.__file__, inspect.__file__, importlib.__file__)
+    ours = ours or "<frozen" in last.filename
     return text if ours or isinstance(error, SyntaxError) else f"{text} ({last.filename}, line {last.lineno})"

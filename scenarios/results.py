@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
+
+from quadsim.errors import OutputError, QuadsimError, failure
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -62,11 +66,37 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Return its tables and its plot for a notebook."""
-        from quadsim.report.to_matplotlib import to_html
         from scenarios import console
 
-        plot = self.small_plot()
-        return console.to_html([*self.shown(), *self.outputs()]) + ("" if plot is None else to_html(plot))
+        return console.to_html([*self.shown(), *self.outputs()]) + plot_html(self.small_plot())
+
+
+def plot_html(figure: Figure | None) -> str:
+    """Return a plot for a notebook, or a line where it cannot be drawn."""
+    from quadsim.report.to_matplotlib import to_html
+
+    try:
+        return "" if figure is None else to_html(figure)
+    except Exception as error:
+        return f"<p>the plot {escape(failure(error))}</p>"
+
+
+@contextlib.contextmanager
+def after(result: Result, output: Path) -> Iterator[None]:
+    """Write an output that the user asked for, once its result is there: an error carries the result, shown first.
+
+    Raises:
+        OutputError: whatever failed, if it was none of ours.
+    """
+    try:
+        yield
+    except QuadsimError as error:
+        error.result = result
+        raise
+    except Exception as error:
+        problem = OutputError(output, failure(error))
+        problem.result = result
+        raise problem from error
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,18 @@ import math
 import os
 import time as clock
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mpc.piloted import Piloted
+from quadsim.border import numbers_of
 from quadsim.controller import Command, Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import audit, smallest_margins
+from quadsim.input_limits import MOST_STEPS
 from quadsim.sim.effects import Force
 from quadsim.sim.loop import ClosedLoop, Reference, complete
 from quadsim.sim.navigation import Navigation
@@ -28,7 +31,7 @@ from scenarios.flight_events import FlightEvents, Successor, prepared
 from scenarios.limits import with_law_bounds
 from scenarios.progress import Progress, silent
 from scenarios.schema.events import ControllerEvent, Event
-from scenarios.schema.scenario import LONGEST_FLIGHT, MOST_STEPS, Scenario
+from scenarios.schema.scenario import LONGEST_FLIGHT, Scenario
 
 
 def closed_loop(
@@ -212,8 +215,10 @@ class Rollout:
         most = MOST_STEPS // max(self._started.steps_per_period, self._longest)
         if self.k >= min(most, math.floor(LONGEST_FLIGHT / period + 1e-6)):
             raise InputError(f"a flight has at most {self.k} control periods of {period} s")
-        if command is not None and not isinstance(command, Command):
-            speeds = np.asarray(command, float)
+        if isinstance(command, Command):
+            command = replace(command, speeds=np.array(command.speeds), plan=np.array(command.plan))
+        elif command is not None:
+            speeds = numbers_of(command)
             command = Command(speeds=speeds, plan=np.tile(speeds, (self.loop.controller.horizon, 1)))
         started = clock.perf_counter()
         try:

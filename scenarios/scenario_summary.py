@@ -9,8 +9,8 @@ import numpy as np
 from quadsim.errors import InputError
 from quadsim.palette import COLOUR
 from quadsim.report.figure import Figure, Panel, Series
-from quadsim.report.to_matplotlib import to_html
 from scenarios.loading import assemble
+from scenarios.results import plot_html
 from scenarios.schema.scenario import Scenario
 
 
@@ -29,9 +29,10 @@ def scenario_html(scenario: Scenario) -> str:
     table = "".join(f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in rows.items() if text)
     head = f"<p><b>{escape(scenario.name)}</b>: {escape(scenario.description)}</p><table>{table}</table>"
     try:
-        return head + to_html(course_figure(scenario))
+        figure = course_figure(scenario)
     except InputError as error:
         return f"{head}<p>{escape(str(error))}</p>"
+    return head + plot_html(figure)
 
 
 def course_figure(scenario: Scenario) -> Figure:

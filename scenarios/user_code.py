@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from quadsim.border import numbers_of, user_code
 from quadsim.controller import AutopilotLoop, Controller
 from quadsim.errors import InputError, ParameterError
 from quadsim.sim.effects import Force
@@ -65,10 +66,8 @@ def following(assembly: Assembly, reference: object) -> Assembly:
 
 
 def _pose(reference: Callable[[float], Any], time: float) -> Array:
-    try:
-        pose = np.array(answer := reference(time), float)
-    except (Exception, SystemExit) as error:
-        raise InputError(f"reference: f({time:g}) cannot be used: {reason_of(error)}") from error
+    with user_code(lambda error: InputError(f"reference: f({time:g}) cannot be used: {reason_of(error)}")):
+        pose = numbers_of(answer := reference(time))
     if pose.shape != (4,) or not (np.abs(pose) <= LARGEST).all():
         rule = f"four numbers within +-{LARGEST:g}: x, y, z [m], yaw [rad]"
         raise InputError(f"reference: f({time:g}) must be {rule}; got {answer!r:.200}")

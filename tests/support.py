@@ -16,6 +16,7 @@ from mpc.model import LinearModel
 from mpc.nonlinear.model import NonlinearModel, advance
 from mpc.ocp import Equilibrium, Objective, Problem, Query
 from quadsim.controller import Controller
+from quadsim.errors import described
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
 from quadsim.sim.loop import complete
 from quadsim.sim.navigation import Navigation
@@ -42,7 +43,7 @@ def fly_here(patch: pytest.MonkeyPatch) -> None:
             try:
                 yield place, fly(flight)
             except Exception as error:
-                yield place, {"verdict": many.ERROR, "reason": many.describe(error)}
+                yield place, {"verdict": many.ERROR, "reason": described(error)}
 
     for user in ("scenarios.many", "scenarios.campaign.plan"):
         patch.setattr(f"{user}.fly_many", fly_many)

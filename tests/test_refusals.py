@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import tomllib
 from collections.abc import Callable, Iterator
@@ -199,8 +200,9 @@ def test_every_command_reports_it_once_and_writes_nothing(
 @pytest.mark.parametrize(
     ("limit", "most", "expected"),
     [
-        ("scenarios.schema.bases.LARGEST_FILE", 20, "@x.toml: must be of 20 or fewer bytes; got 30"),
-        ("scenarios.courses.csv_course.LARGEST_FILE", 30, "@x.csv: must be of 30 or fewer bytes; got 48"),
+        ("quadsim.assets.LARGEST_TOML", 20, "@x.toml: must be of 20 or fewer bytes; got 30"),
+        ("scenarios.courses.csv_course.LARGEST_CSV", 30, "@x.csv: must be of 30 or fewer bytes; got 48"),
+        ("quadsim.assets.MOST_ASSIGNMENTS", 1, "@x.toml: must assign at most 1 values; it has 2 equals signs"),
         ("scenarios.courses.csv_course.MOST_ROWS", 1, "@x.csv: must have 1 or fewer rows below its header"),
     ],
 )
@@ -215,6 +217,16 @@ def test_a_file_that_is_too_large_is_not_read(
     load(path, text)
     monkeypatch.setattr(limit, most)
     assert matches(refusal(lambda: load(path, text)), expected)
+
+
+def test_a_folder_that_is_not_utf_8_is_named(tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
+    folder.mkdir()
+    (folder / "own.py").write_text("def law(now, state, reference):\n    return [190.0] * 4\n")
+    (folder / "own.toml").write_text('base = "hover"\nname = "own"\ncontroller = "own:law"\n')
+    message = refusal(lambda: load_scenario(str(folder / "own.toml")))
+    assert message.startswith("own.toml: controller.folder must be UTF-8, as every path and text; got '")
+    assert message.endswith("/caf\\udce9'; rename it")
 
 
 def test_all_problems_are_named_at_once_but_for_those_beyond_twenty() -> None:

@@ -12,7 +12,6 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 
 from mpc.bounded import (
-    MOST_ENTRIES,
     USUAL_FALLBACK,
     USUAL_TARGETS,
     Avoidance,
@@ -49,6 +48,7 @@ from mpc.solvers import CORE_OR_PIQP, SOLVERS
 from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Positive, Weight
+from quadsim.input_limits import MOST_ENTRIES
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
 

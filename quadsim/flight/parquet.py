@@ -37,6 +37,7 @@ from quadsim.flight.log import (
     PlantLog,
     TimingLog,
 )
+from quadsim.input_limits import LARGEST_TABLE, LARGEST_TEXTS, MOST_COLUMNS, MOST_ROWS
 from quadsim.vehicle import N_ROTORS
 
 FLIGHT_FILE: Final = "flight.parquet"
@@ -125,15 +126,46 @@ def read_parquet(path: Path) -> pa.Table:
     process (https://github.com/apache/arrow/issues/34314).
 
     Raises:
-        FileError: it is missing, not a file, or damaged.
+        FileError: it is missing, not a file, damaged, or too large.
     """
     if not path.is_file():  # reading a pipe would block
         raise FileError(path, "is not a readable Parquet file (missing, or not a file)")
     try:
         with path.open("rb") as file:  # Arrow takes no path that is not Unicode
-            return pq.ParquetFile(file, pre_buffer=False).read(use_threads=False)
+            return _read_bounded(path, pq.ParquetFile(file, pre_buffer=False))
+    except FileError:
+        raise
     except (OSError, ValueError, pa.ArrowException) as error:
         raise FileError(path, f"is not a readable Parquet file ({error})") from error
+
+
+def _read_bounded(path: Path, file: pq.ParquetFile) -> pa.Table:
+    """Read a table that fits in memory: a few bytes of a file may stand for any number of equal values.
+
+    Numbers are counted before they are read. Texts that occur once in the file may occur in each row, so batches are
+    so small that even then each fits.
+    """
+    known = file.metadata
+    rows, columns = known.num_rows, known.num_columns
+    if rows > MOST_ROWS or columns > MOST_COLUMNS:
+        raise FileError(path, f"must have at most {MOST_ROWS} rows and {MOST_COLUMNS} columns; got {rows}, {columns}")
+    groups = [known.row_group(i) for i in range(known.num_row_groups)]
+    chunks = [group.column(i) for group in groups for i in range(columns)]
+    numbers = 8 * sum(chunk.num_values for chunk in chunks)
+    texts = sum(chunk.total_uncompressed_size for chunk in chunks if chunk.physical_type.endswith("BYTE_ARRAY"))
+    most, batches = numbers + LARGEST_TEXTS, []
+    if numbers <= LARGEST_TABLE and rows * texts <= LARGEST_TEXTS:
+        return file.read(use_threads=False)
+    if numbers <= LARGEST_TABLE:
+        for batch in file.iter_batches(max(1, LARGEST_TEXTS // 16 // max(1, texts)), use_threads=False):
+            batches.append(batch)
+            most -= batch.nbytes
+            if most < 0:
+                break
+        else:
+            return pa.Table.from_batches(batches, file.schema_arrow)
+    largest = f"{LARGEST_TABLE} bytes of numbers and {LARGEST_TEXTS} of texts"
+    raise FileError(path, f"must be of at most {largest} in memory; it has more")
 
 
 def _fields(table: pa.Table, fields: Fields) -> dict[str, Any]:

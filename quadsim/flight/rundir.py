@@ -15,6 +15,7 @@ from quadsim.errors import FileError, printable
 from quadsim.flight.audit import Finding, Limit, SpaceLimit
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import read_log
+from quadsim.input_limits import LARGEST_JSON
 from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.outputs import file_hashes
 from quadsim.space import shape_from_json, shape_to_json
@@ -22,7 +23,6 @@ from quadsim.vehicle import Vehicle
 
 NUMBER: Final = (int, float)
 MAYBE_NUMBER: Final = (int, float, NoneType)
-LARGEST_FILE: Final = 64_000_000  # largest file [bytes] that is read
 _FORM: Final = {
     **dict.fromkeys(("scenario", "status", "verdict"), str),
     "reason": (str, NoneType),
@@ -50,8 +50,8 @@ def read_json(path: Path, form: Mapping[str, Any], what: str) -> dict[str, Any]:
         FileError: it cannot be read, is not JSON, or an entry is missing or of another type.
     """
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise FileError(path, f"is not {what}: it has more than {LARGEST_FILE} bytes")
+        if path.stat().st_size > LARGEST_JSON:
+            raise FileError(path, f"is not {what}: it has more than {LARGEST_JSON} bytes")
         table = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
     except (OSError, RecursionError, ValueError) as error:
         if isinstance(error, FileError):

@@ -21,7 +21,7 @@ from quadsim.flight.rundir import (
     Run,
     require_inside,
 )
-from quadsim.outputs import writing
+from quadsim.outputs import optional, writing
 from quadsim.palette import line_colour
 from quadsim.report.comparison import comparison_rows, distinct_courses, mismatch, run_names
 from quadsim.report.figure import Scene
@@ -71,8 +71,9 @@ def write_comparison(
             raise OutputError(directory, f"it holds the run {run.directory}, which must stay; choose another --out")
     names, rows = run_names(runs), comparison_rows(runs)
     with writing(directory, overwrite=overwrite) as partial:
-        write_pngs([overview(runs)], partial)
         (partial / TABLE_FILE).write_text(to_markdown(rows, names), encoding="utf-8")
+        with optional(OVERVIEW_FILE):
+            write_pngs([overview(runs)], partial)
         views = [
             _place(run, name, folder, line_colour(i), partial)
             for i, (run, name, folder) in enumerate(zip(runs, names, _folder_names(names), strict=True))
@@ -86,6 +87,7 @@ def write_comparison(
         plots = Section(title="Plots", plots=tuple(figures))
         title = " and ".join(names) if len(names) < 3 else f"{len(names)} runs: {', '.join(names)}"
         files = {"overlay of all runs (PNG)": OVERVIEW_FILE, "table (Markdown)": TABLE_FILE}
+        files = {label: name for label, name in files.items() if (partial / name).exists()}
         notes = (*notes, *([warning] if courses > 1 else []))
         page = render_page("comparison", title, [plots], notes=notes, runs=views, rows=rows, files=files)
         (partial / PAGE_FILE).write_text(page, encoding="utf-8")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
+import logging
 import re
 import textwrap
 from base64 import b64encode
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -43,6 +45,7 @@ STYLE: Final[dict[RcKeyType, Any]] = {
     "ytick.color": "#5b6067",
     "ytick.labelcolor": "#1c1e21",
 }
+"""What is drawn unlike matplotlib's defaults; texts are literal, `$` included."""
 _WIDTH, _ROW, _HEAD = 9.6, 1.95, 0.7  # of a figure, of a row of panels and of what stands above and below them [in]
 _LARGEST_SVG, _NOTEBOOK_DPI = 40_000, 55
 _LABEL: Final = 26  # characters beside a vertical axis
@@ -64,8 +67,9 @@ def write_pngs(figures: Iterable[Figure], directory: Path) -> list[Path]:
         directory.mkdir(parents=True, exist_ok=True)
         for figure in figures:
             paths.append(directory / f"{figure.key}.png")
+            png = to_png(figure)
             with paths[-1].open("xb") as file:
-                file.write(to_png(figure))
+                file.write(png)
     except OSError as error:
         raise OutputError(directory, error.strerror or str(error)) from error
     return paths
@@ -73,20 +77,16 @@ def write_pngs(figures: Iterable[Figure], directory: Path) -> list[Path]:
 
 def to_png(figure: Figure, dpi: float | None = None) -> bytes:
     """The figure as a PNG of so many pixels per inch, `DPI` unless told."""
-    import matplotlib
-
     png = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
+    with _style():
         draw(figure).savefig(png, format="png", dpi=dpi or DPI)
     return png.getvalue()
 
 
 def to_html(figure: Figure) -> str:
     """The figure for a notebook: SVG, or PNG where its curves make that large."""
-    import matplotlib
-
     svg = io.StringIO()
-    with matplotlib.rc_context({**STYLE, "svg.fonttype": "none", "svg.hashsalt": figure.key}):
+    with _style({"svg.fonttype": "none", "svg.hashsalt": figure.key}):
         nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
         draw(figure).savefig(svg, format="svg", metadata=nothing, dpi=72)
     text = svg.getvalue()
@@ -99,10 +99,24 @@ def to_html(figure: Figure) -> str:
 
 def draw(figure: Figure, *, interactive: bool = False) -> Canvas:
     """The figure as matplotlib's, which notebooks and `pyplot.show` show where it is interactive."""
-    import matplotlib
-
-    with matplotlib.rc_context(STYLE):
+    with _style():
         return _draw(figure, interactive=interactive)
+
+
+@contextlib.contextmanager
+def _style(more: dict[RcKeyType, Any] | None = None) -> Iterator[None]:
+    """Matplotlib's defaults with `STYLE`, whatever the user's matplotlibrc says, and without its notices."""
+    notices = logging.getLogger("matplotlib")
+    level = notices.level
+    notices.setLevel(logging.ERROR)  # as on a home directory that it cannot write
+    try:
+        import matplotlib.style
+
+        styles: list[Any] = ["default", STYLE, more or {}]
+        with matplotlib.style.context(styles):
+            yield
+    finally:
+        notices.setLevel(level)
 
 
 def _draw(figure: Figure, *, interactive: bool) -> Canvas:

@@ -8,13 +8,15 @@ import logging
 import time as clock
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
+from quadsim.border import user_code
 from quadsim.controller import Command, Controller, InnerLoop, Phase, StepInputs
-from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError
+from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError, described
 from quadsim.flight.log import FlightLog, LoggedSignals
 from quadsim.flight.phase import check_loss
 from quadsim.motion import Motion
@@ -294,11 +296,12 @@ class ClosedLoop:
             return None
         states = np.stack([sample.observation.state for sample in samples])
         try:
-            positions: Array = predict(states, np.stack([sample.command.plan for sample in samples]))[:, :, [0, 2, 4]]
-        except (Exception, SystemExit) as error:  # after the flight, which is not to be lost by it
-            _log.warning("no predictions are kept: predict raised %s: %s", type(error).__name__, error)
+            with user_code(lambda error: InputError(described(error))):
+                positions: Array = predict(states, np.stack([sample.command.plan for sample in samples]))
+                return positions[:, :, [0, 2, 4]]
+        except InputError as error:  # after the flight, which is not to be lost by it
+            _log.warning("no predictions are kept: predict raised %s", error)
             return None
-        return positions
 
     def _fly(self, observed: Observation, command: Command | None) -> FlownPeriod:
         plant, computation, steps, now = self._plant, self.computation, self._steps, observed.moment
@@ -368,7 +371,7 @@ class ClosedLoop:
             if self._called is not inner or self._until_call == 0:
                 attitude, rates = plant.attitude if measured is None else measured.sensed()
                 with _ending_flight(plant.time):
-                    self._answer = inner.speeds(plant.time, row, rates, plant.speeds, attitude)
+                    self._answer = np.array(inner.speeds(plant.time, row.copy(), rates, plant.speeds, attitude))
                 self._called, self._until_call = inner, stride
             count = min(self._until_call, steps)
             self._until_call, steps = self._until_call - count, steps - count
@@ -417,15 +420,9 @@ def _begin(controller: Controller, plant: Plant) -> None:
         begin(plant.attitude[1])
 
 
-@contextlib.contextmanager
-def _ending_flight(time: float) -> Iterator[None]:
+def _ending_flight(time: float) -> AbstractContextManager[None]:
     """Make whatever a controller's code raises the flight's end, not its loss."""
-    try:
-        yield
-    except FlightError:
-        raise
-    except (Exception, SystemExit) as error:
-        raise RaisedError("the controller", error, time=time) from error
+    return user_code(lambda error: RaisedError("the controller", error, time=time), passing=(FlightError,))
 
 
 def _joined(parts: list[Array | None]) -> np.ndarray[Any, np.dtype[np.float32]] | None:

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from mujoco.rollout import Rollout
 
+from quadsim.border import numbers_of, user_code
 from quadsim.controller import check_command
 from quadsim.errors import CommandError, DivergenceError, ForceError, ParameterError, RaisedError
 from quadsim.rotation import euler_to_body_rates, euler_to_quaternion
@@ -394,10 +395,8 @@ class Plant:
         state, total = physics_to_state(physics[None])[0], np.zeros(6)
         for force in self._own:
             name = getattr(force, "__name__", type(force).__name__)
-            try:
-                wrench = np.asarray(force(time, state.copy()), float)
-            except (Exception, SystemExit) as error:
-                raise RaisedError(f"the force {name}", error, time=time) from error
+            with user_code(lambda error, name=name: RaisedError(f"the force {name}", error, time=time)):  # type: ignore[misc]
+                wrench = numbers_of(force(time, state.copy()))
             if wrench.shape != (6,) or not np.all(np.isfinite(wrench)):
                 shown = f"{wrench.tolist()!r:.80}"
                 raise ForceError(f"the force {name} must give six finite numbers [N, N m]; got {shown}", time=time)

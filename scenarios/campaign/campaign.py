@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from quadsim.errors import InputError, OutputError, ParameterError
-from quadsim.outputs import Growing, growing
+from quadsim.outputs import Growing, growing, optional
 from quadsim.report.figure import Figure
 from scenarios.campaign import store as records
 from scenarios.campaign.campaign_report import overview, write_report
@@ -131,7 +131,8 @@ def fly_campaign(
     if records.is_campaign(directory) and not (resume or overwrite):
         raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
     records.code_digest()  # kept: a process that dies before its manifest is there could not be resumed
-    with growing(directory, records.MANIFEST_FILE, overwrite=overwrite) as files:
+    first = (records.CAMPAIGN_FILE, records.SCENARIO_FILE)
+    with growing(directory, records.MANIFEST_FILE, overwrite=overwrite, first=first) as files:
         if records.is_campaign(directory):
             records.require_same(plan, directory)
         progress = _Progress(plan, files, until_width=until_width, watch=watch)
@@ -160,8 +161,10 @@ def fly_campaign(
         def write(place: Path) -> None:
             write_report(place, table, summary, spec, campaign=directory)
 
-        put_report(files, REPORT_FILES, write if report else None)
         files.finish(summary)
+        with optional("the report"):
+            put_report(files, REPORT_FILES, write if report else None)
+        files.finish(summary)  # now with the report among its files
     return CampaignResult(directory=directory, manifest=manifest, table=table, summary=summary)
 
 

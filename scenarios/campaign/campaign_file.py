@@ -20,9 +20,10 @@ from pydantic import Field
 
 from quadsim.errors import InputError
 from quadsim.fields import Number, Positive
+from quadsim.input_limits import MOST_ENTRIES
 from quadsim.state import Array
 from scenarios.campaign.events import parse_event
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES
+from scenarios.schema.base import LARGEST_SEED
 from scenarios.schema.writing import to_toml
 
 Whole = Annotated[int, Ge(-LARGEST_SEED), Le(LARGEST_SEED)]

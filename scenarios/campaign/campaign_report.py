@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pyarrow as pa
 
-from quadsim.outputs import SUMMARY_FILE
+from quadsim.outputs import SUMMARY_FILE, optional
 from quadsim.report.figure import Bound, Figure, Panel, Series
 from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
@@ -300,8 +300,9 @@ def write_report(
     """
     campaign = campaign or directory
     sentence = verdict_sentence(summary)
-    figure = overview(table, summary, f"{spec.name}: {sentence}")
-    write_pngs([figure] if figure.panels else [], directory)
+    with optional("campaign.png"):
+        figure = overview(table, summary, f"{spec.name}: {sentence}")
+        write_pngs([figure] if figure.panels else [], directory)
     often = (event_table(summary), constraint_table(summary))
     shapes = _plots("metrics", "Flights by verdict", histograms(table), _MARGINS)
     clouds = _plots("scatter", "Worst margin over each parameter", scatters(table), _POINTS)

@@ -17,6 +17,7 @@ from annotated_types import doc
 from pydantic import StringConstraints
 
 from quadsim.errors import FileError
+from quadsim.input_limits import LARGEST_CSV
 from quadsim.state import Array, unwrapped
 from scenarios.courses.course import EXACT, Course, Path, Started, begin
 from scenarios.courses.legs import polyline
@@ -27,7 +28,6 @@ LARGEST: Final = 1e6  # largest magnitude of a number in the table, as in the sc
 MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
 ROUNDED: Final = range(2, 8)
 """Decimals of a rounded column: with fewer its numbers are exact, with more rounding cannot be detected."""
-LARGEST_FILE: Final = 64_000_000  # size [bytes] of the largest file that is read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,8 +106,8 @@ def read_table(path: FilePath) -> Table:
     try:
         if path.exists() and not path.is_file():
             raise FileError(path, "cannot be read (it is not a file)")
-        if (size := path.stat().st_size) > LARGEST_FILE:
-            raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
+        if (size := path.stat().st_size) > LARGEST_CSV:
+            raise FileError(path, f"must be of {LARGEST_CSV} or fewer bytes; got {size}")
         content = path.read_bytes()
     except FileError:
         raise

@@ -6,8 +6,7 @@ import itertools
 import math
 import shlex
 from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,7 +24,7 @@ from scenarios.identify.page import render
 from scenarios.identify.prediction import HORIZONS, QUANTITIES, Prediction, hold_out, predict
 from scenarios.identify.record import read_record
 from scenarios.identify.vehicle_file import interval, rounded, vehicle_text, verdict
-from scenarios.results import Result, Shown
+from scenarios.results import Result, Shown, after
 
 NEEDED: Final = "mass, gravity, arm_length, rotor_azimuths, rotor_spins, speed_min and speed_max"
 _SHOWN_HORIZONS: Final = (0.1, 0.5)  # of the table of errors [s]
@@ -211,13 +210,13 @@ def identify_logs(
         content=vehicle_text(identification, start, names),
         **places,
     )
-    with ExitStack() as stack:
-        for path, text in ((result.file, result.content), (result.page, render(result) if page else "")):
-            if path is not None:
-                new = stack.enter_context(writing_file(path, overwrite=overwrite))
-                new.write_text(text, encoding="utf-8")
-                if path is result.file:
-                    load_vehicle(new)  # the numbers as they are rounded
+    if result.file is not None:
+        with writing_file(result.file, overwrite=overwrite) as new:
+            new.write_text(result.content, encoding="utf-8")
+            load_vehicle(new)  # the numbers as they are rounded
+    if result.page is not None:
+        with after(replace(result, page=None), result.page), writing_file(result.page, overwrite=overwrite) as new:
+            new.write_text(render(result), encoding="utf-8")
     return result
 
 

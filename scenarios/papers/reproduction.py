@@ -14,6 +14,7 @@ from annotated_types import MaxLen, MinLen, doc
 from quadsim.assets import read_toml
 from quadsim.errors import InputError
 from quadsim.fields import NonNegative, Number, Positive
+from quadsim.input_limits import MOST_ENTRIES
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, line
 from scenarios.assembly import Assembly
 from scenarios.catalogue import paper_path, scenario_path
@@ -21,7 +22,7 @@ from scenarios.loading import parse_scenario
 from scenarios.progress import Progress, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.rollout import Rollout
-from scenarios.schema.base import MOST_ENTRIES, Pair
+from scenarios.schema.base import Pair
 from scenarios.schema.bases import merge, read_scenario
 from scenarios.schema.problems import parse_table
 from scenarios.schema.scenario import Scenario

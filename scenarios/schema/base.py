@@ -15,7 +15,6 @@ from pydantic.fields import FieldInfo
 
 from quadsim.fields import Number
 
-MOST_ENTRIES: Final = 1000  # of a list of tables
 Pair = Annotated[list[Number], Len(2, 2)]
 LARGEST_SEED: Final = 2**63 - 1  # the largest whole number that every reader of TOML takes
 

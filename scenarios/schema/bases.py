@@ -13,8 +13,6 @@ from scenarios.plugin import located
 from scenarios.schema.settings import note_changes, state_bounds
 
 _TOLERANCES: Final = ("tolerance", "tolerance_sampled")
-LARGEST_FILE: Final = 8_000_000
-"""Size [bytes] of the largest file that is read; the longest possible scenario is smaller."""
 
 
 def locate_files(data: dict[str, Any], directory: Path) -> None:
@@ -139,10 +137,7 @@ def _restated(before: Mapping[str, Any], entry: Mapping[str, Any]) -> Mapping[st
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return a file's tables; refuse a file that is too large."""
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise FileError(path, f"must be of {LARGEST_FILE} or fewer bytes; got {size}")
+    """Return a file's tables."""
     data = read_toml(path)
     if isinstance(data.get("controller"), str):  # its name alone, which a table over it, or a setting, adds to
         data["controller"] = {"type": data["controller"]}

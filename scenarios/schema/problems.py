@@ -182,6 +182,7 @@ def kinds_of(annotation: Any, metadata: tuple[Any, ...] = ()) -> tuple[Kind, ...
 
 
 _MOST_LINES: Final = 20  # problems listed in one message; the rest are counted
+_MOST_DESCRIBED: Final = 200  # problems described; of the rest there are names
 _MOST_ENTRIES: Final = 10
 _LONGEST: Final = 200
 """Entries and characters of a given value that a message shows."""
@@ -211,8 +212,18 @@ def parse_table(kind: type[Table], data: Mapping[str, Any], source: str, *, file
     try:
         table: Table = adapter(cast(Any, kind)).validate_json(json.dumps(data, default=lambda _: math.inf))
     except ValidationError as error:
-        raise ScenarioError(source, describe_all(error, data, kind, file=file)) from error
+        lines = [*_not_unicode(data)] or describe_all(error, data, kind, file=file)
+        raise ScenarioError(source, lines) from error
     return table
+
+
+def _not_unicode(data: Any, names: tuple[str, ...] = ()) -> Iterator[str]:
+    """Yield a line about each text that no file of ours can hold, such as the path of a folder that is not UTF-8."""
+    if isinstance(data, Mapping | list):
+        for name, entry in data.items() if isinstance(data, Mapping) else enumerate(data):
+            yield from _not_unicode(entry, (*names, str(name)))
+    elif isinstance(data, str) and any("\ud800" <= character <= "\udfff" for character in data):
+        yield f"{'.'.join(names)} must be UTF-8, as every path and text; got {shown(data)}; rename it"
 
 
 @functools.cache
@@ -229,7 +240,7 @@ def describe_all(
 
     Missing fields come last, since they may only be misspelt.  Arguments as for `describe`.
     """
-    lines: dict[tuple[str, ...], str] = {}
+    wrong: dict[tuple[str, ...], ErrorDetails] = {}
     whole: set[tuple[str, ...]] = set()  # lists of a wrong length, whose entries do not matter
     for details in sorted(error.errors(include_url=False), key=lambda details: details["type"] == "missing"):
         for i, part in enumerate(details["loc"]):  # where a list is too long, its entries do not matter
@@ -237,15 +248,17 @@ def describe_all(
                 details = {**details, "loc": details["loc"][:i], "type": "too_long"}
                 break
         place = find(details["loc"], data, root)
-        lines.setdefault(place.names, describe(details, data, root, file=file))
+        wrong.setdefault(place.names, details)
         if details["type"] in ("too_short", "too_long") and place.is_of_wrong_length:
             whole.add(place.names)
-    return [
-        line
-        for names, line in lines.items()
-        if not any(names[: len(above)] == above != names for above in whole)
-        and (names in whole or not any(other[: len(names)] == names != other for other in lines))
+    above = {names[:i] for names in wrong for i in range(len(names))}  # of what is wrong within
+    told = [
+        details
+        for names, details in wrong.items()
+        if not any(names[:i] in whole for i in range(len(names))) and (names in whole or names not in above)
     ]
+    lines = [describe(details, data, root, file=file) for details in told[:_MOST_DESCRIBED]]
+    return lines + [".".join(map(str, details["loc"])) for details in told[_MOST_DESCRIBED:]]
 
 
 def describe(details: ErrorDetails, data: Mapping[str, Any], root: type[Any], *, file: str = "scenario") -> str:

@@ -17,6 +17,7 @@ from mpc.indi import INDISettings
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import NonNegative, Positive, Vector
 from quadsim.flight.audit import FlightVerdict, Limit
+from quadsim.input_limits import MOST_ENTRIES, MOST_STEPS
 from quadsim.sim.autopilot import AutopilotSettings
 from quadsim.sim.computation import ComputationTime
 from quadsim.sim.effects import Effects
@@ -28,7 +29,7 @@ from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
 from scenarios.catalogue import Group
 from scenarios.courses.table import ReferenceTable
 from scenarios.plugin import PluginForce
-from scenarios.schema.base import LARGEST_SEED, MOST_ENTRIES
+from scenarios.schema.base import LARGEST_SEED
 from scenarios.schema.controllers import AnyController, changed
 from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
 from scenarios.schema.problems import ScenarioError, parse_table
@@ -163,8 +164,6 @@ class Lost:
 
 
 LONGEST_FLIGHT: Final = 86_400.0
-MOST_STEPS: Final = 10_000_000
-"""Physics steps, and planned steps (periods times horizon), that one flight may take: all are kept in memory."""
 
 
 BOUNDED: Final = (*STATE_NAMES, "tilt", "body_rate_x", "body_rate_y", "body_rate_z", "thrust", "speed", "slew")

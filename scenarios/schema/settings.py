@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 from quadsim.assets import DEEPEST, parse_toml
@@ -103,20 +103,27 @@ def _table(data: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 
 def note_change(data: dict[str, Any], path: str, value: Any) -> None:
     """Note the new value of a field in a scenario's description, if it has one; a later change replaces an earlier."""
-    description = data.get("description")
-    if not isinstance(description, str) or path in NOT_DESCRIBED:
-        return
-    text, _, noted = description.partition(_CHANGED)
-    earlier = noted.removesuffix(")").split("; ") if noted else []
-    changes = [change for change in earlier if not change.startswith(f"{path} = ")]
-    changes.append(f"{path} = {shown(value)}")
-    data["description"] = f"{text}{_CHANGED}{'; '.join(changes)})"
+    _note(data, [(path, value)])
 
 
 def note_changes(data: dict[str, Any], changes: Mapping[str, Any]) -> None:
     """Note every field of tables that were merged over a scenario's; see `note_change`."""
-    for path, value in leaves(changes):
-        note_change(data, path, value)
+    _note(data, leaves(changes))
+
+
+def _note(data: dict[str, Any], changes: Iterable[tuple[str, Any]]) -> None:
+    description = data.get("description")
+    if not isinstance(description, str):
+        return
+    text, _, noted = description.partition(_CHANGED)
+    earlier = noted.removesuffix(")").split("; ") if noted else []
+    notes = {note.partition(" = ")[0]: note for note in earlier}
+    for path, value in changes:
+        if path not in NOT_DESCRIBED:
+            notes.pop(path, None)
+            notes[path] = f"{path} = {shown(value)}"
+    if notes:
+        data["description"] = f"{text}{_CHANGED}{'; '.join(notes.values())})"
 
 
 def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:

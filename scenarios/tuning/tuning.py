@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from quadsim.errors import InputError, OutputError
 from quadsim.flight.rundir import read_json
-from quadsim.outputs import SUMMARY_FILE, growing, to_json
+from quadsim.outputs import SUMMARY_FILE, growing, optional, to_json
 from quadsim.report.page import PAGE_FILE, Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
 from quadsim.report.to_plotly import Plot, embed
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 
 MANIFEST_FILE: Final = "manifest.json"
+_FIRST: Final = ("tuning.toml", "scenario.toml")  # written before the manifest
 _MAY_CHANGE: Final = {"trials", "fresh", "description"}  # where a tuning is resumed
 
 
@@ -110,12 +111,12 @@ def fly_tuning(
     if going_on and not resume:
         raise OutputError(directory, "a tuning is already there; continue it with --resume, or choose another --out")
     name = plan.spec.name
-    with growing(directory, MANIFEST_FILE, overwrite=overwrite) as files, _quiet():
+    with growing(directory, MANIFEST_FILE, overwrite=overwrite, first=_FIRST) as files, _quiet():
         if going_on:
             _require_same(manifest, files.path)
         fronts = [path.name for path in files.path.glob("front-*.toml")]
         files.remove([SUMMARY_FILE, JOURNAL_FILE, f"{JOURNAL_FILE}.lock", *fronts])
-        texts = {"tuning.toml": plan.to_toml(), "scenario.toml": plan.start.scenario.to_toml()}
+        texts = dict(zip(_FIRST, (plan.to_toml(), plan.start.scenario.to_toml()), strict=True))
         files.write({file: text.encode() for file, text in {**texts, MANIFEST_FILE: to_json(manifest)}.items()})
         search = Search(plan, files, lambda **state: watch(CampaignProgress(**state)), workers=workers, cluster=cluster)
         table = search.run()
@@ -136,11 +137,14 @@ def fly_tuning(
                 tables[0], tables[1], ("start", "best"), differences=plan_differences(*campaigns.values())
             )
             if report:
-                comparison.write_report(files.path / "comparison", overwrite=True)
+                with optional("the comparison"):
+                    comparison.write_report(files.path / "comparison", overwrite=True)
         summary = _summary(plan, search, answer, front, tables)
         write = partial(write_page, study=search.study, summary=summary)
-        put_report(files, [PAGE_FILE], write if report else None)
         files.finish(summary)
+        with optional("the report"):
+            put_report(files, [PAGE_FILE], write if report else None)
+        files.finish(summary)  # now with the report among its files
     return TuningResult(directory=files.path, best=best, table=table, summary=summary, comparison=comparison)
 
 

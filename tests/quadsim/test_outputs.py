@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 from contextlib import AbstractContextManager
 from pathlib import Path
 
@@ -214,3 +215,85 @@ def test_one_process_at_a_time_writes(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match="another process is writing there"):
             write(target, overwrite=True)
     write(target, overwrite=True)
+
+
+def begin(target: Path, *files: str) -> None:
+    """Begin to grow a directory in a process that is killed when it has written some files."""
+    script = (
+        "import os, sys; from quadsim.outputs import growing\n"
+        "with growing(sys.argv[1], 'manifest.json', first=('one.toml', 'two.toml')) as files:\n"
+        "    for name in sys.argv[2:]: files.write({name: b'begun'})\n"
+        "    os.mkdir(f'{sys.argv[1]}/.quadsim-ab_cd012.partial')\n"
+        "    os.kill(os.getpid(), 9)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script, str(target), *files], check=False).returncode == -9
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("files", [(), ("one.toml",), ("one.toml", "two.toml")], ids=len)
+def test_a_directory_of_a_process_that_was_killed_as_it_began_is_begun_anew(
+    tmp_path: Path, files: tuple[str, ...], overwrite: bool
+) -> None:
+    begin(tmp_path / "c", *files)
+    assert set(files) | {".lock"} < tree(tmp_path / "c").keys()
+    with growing(tmp_path / "c", "manifest.json", overwrite=overwrite, first=("one.toml", "two.toml")) as growth:
+        growth.write({"one.toml": b"1", "two.toml": b"2", "manifest.json": b"{}"})
+        growth.finish({})
+    assert tree(tmp_path / "c").keys() == {".lock", "one.toml", "two.toml", "manifest.json", "summary.json"}
+
+
+def test_what_else_stands_beside_a_lock_is_somebody_s(tmp_path: Path) -> None:
+    for name, lock in (("theirs", b"pid 7"), ("ours", b"quadsim\n"), ("empty", b"")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / ".lock").write_bytes(lock)
+        (tmp_path / name / ("notes" if name == "ours" else "one.toml")).write_text("mine")
+        before = tree(tmp_path / name)
+        for overwrite in (False, True):
+            again = growing(tmp_path / name, "manifest.json", overwrite=overwrite, first=("one.toml",))
+            with pytest.raises(OutputError, match=r"it is not empty|it has no summary\.json"), again:
+                pass
+        assert tree(tmp_path / name) == before
+
+
+def test_a_half_written_folder_of_a_killed_process_is_in_nobody_s_way(output: Path) -> None:
+    partial = output / ".quadsim-x0y1z2_3.partial"
+    partial.mkdir()
+    (partial / "half").write_text("half")
+    (output / ".quadsim-notes").mkdir()
+    with pytest.raises(OutputError, match=r"does not list \.quadsim-notes; move"):
+        write(output, overwrite=True)
+    (output / ".quadsim-notes").rmdir()
+    write(output, "two", overwrite=True)
+    assert tree(output).keys() == {"figures", "figures/a.png", "summary.json", "table"}
+
+
+def test_to_overwrite_what_grows_names_the_process_that_writes_there(tmp_path: Path) -> None:
+    target = tmp_path / "c"
+    with growing(target, "manifest.json") as files:
+        files.write({"manifest.json": b"{}"})  # there is no summary as long as it grows
+        again = growing(target, "manifest.json", overwrite=True)
+        with pytest.raises(OutputError, match="another process is writing there"), again:
+            pass
+
+
+def test_a_place_that_cannot_be_read_is_refused_and_nothing_is_left_beside_it() -> None:
+    """As a user who is not root, for whom nothing is unreadable."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        place.chmod(0o777)
+        is_root = os.geteuid() == 0
+        if is_root:
+            os.seteuid(65534)
+        try:
+            (place / "closed").mkdir(mode=0o000)
+            for overwrite in (False, True):
+                with pytest.raises(OutputError, match="closed: Permission denied"):
+                    write(place / "closed", overwrite=overwrite)
+            (place / "entered").mkdir(mode=0o555)
+            write(place / "entered")
+            assert (place / "entered").stat().st_mode & 0o777 == 0o555
+            assert {path.name for path in place.iterdir()} == {"closed", "entered"}
+            (place / "entered").chmod(0o755)
+        finally:
+            if is_root:
+                os.seteuid(0)

@@ -137,8 +137,8 @@ def render_gif(
         # small by few colours and little noise
         scaled = "scale=480:-2:flags=area,hqdn3d=3:3:0:0,split[a][b]"
         colours = "[a]palettegen=max_colors=96:stats_mode=diff[p];[b][p]paletteuse=dither=none:diff_mode=rectangle"
-        looping = ("-i", str(film), "-filter_complex", f"{scaled};{colours}", "-loop", "0", str(new))
-        _work([(*_ffmpeg(), *looping)], backend, new.parent)
+        looping = ("-i", film.name, "-filter_complex", f"{scaled};{colours}", "-loop", "0", new.name)
+        _work([(*_ffmpeg(), *looping)], backend, new.parent, there=True)
 
 
 def render_portrait(
@@ -169,8 +169,8 @@ def _film(shot: Shot, path: Path, workers: int | None, progress: Progress | None
     _work(commands, backend, path.parent, None if progress is None else lambda done: progress(done, shot.count))
     listing = path.parent / "pieces.txt"
     listing.write_text("".join(f"file '{name}'\n" for name in names), encoding="utf-8")
-    joined = ("-f", "concat", "-safe", "0", "-i", str(listing), "-c", "copy", "-movflags", "+faststart", str(path))
-    _work([(*_ffmpeg(), *joined)], backend, path.parent)
+    joined = ("-f", "concat", "-safe", "0", "-i", listing.name, "-c", "copy", "-movflags", "+faststart", path.name)
+    _work([(*_ffmpeg(), *joined)], backend, path.parent, there=True)  # in a path, `#` and `?` would be a URL's
     return backend
 
 
@@ -215,11 +215,17 @@ def _environment(backend: str, workers: int = 1) -> dict[str, str]:
 
 
 def _work(
-    commands: Sequence[Sequence[str]], backend: str, folder: Path, report: Callable[[int], None] | None = None
+    commands: Sequence[Sequence[str]],
+    backend: str,
+    folder: Path,
+    report: Callable[[int], None] | None = None,
+    *,
+    there: bool = False,
 ) -> None:
     """Run commands of workers side by side; when one fails, or anything is raised here, the others are killed.
 
-    Their stderr goes to `folder`; `report` is called with the sum of the last numbers that they printed.
+    Their stderr goes to `folder`, which is their working directory where they are to be `there`; `report` is called
+    with the sum of the last numbers that they printed.
     """
     with contextlib.ExitStack() as stack:
         watched = stack.enter_context(selectors.DefaultSelector())
@@ -229,7 +235,13 @@ def _work(
         for i, command in enumerate(commands):
             logs.append(stack.enter_context((folder / f"worker{i}.log").open("w+b")))
             process = stack.enter_context(
-                subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=logs[i])
+                subprocess.Popen(
+                    command,
+                    cwd=folder if there else None,
+                    env=environment,
+                    stdout=subprocess.PIPE,
+                    stderr=logs[i],
+                )
             )
             stack.callback(process.kill)  # runs before Popen's own exit, which waits; kills none that has ended
             assert process.stdout is not None

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -31,7 +35,7 @@ from quadsim.report.figure import (
     least_range,
 )
 from quadsim.report.flight_figures import effects, inputs, overview, page_figures, states, times, write_figures
-from quadsim.report.to_matplotlib import draw, to_png
+from quadsim.report.to_matplotlib import draw, to_html, to_png
 from quadsim.report.to_plotly import thin, to_plot
 from quadsim.space import Cylinder
 from quadsim.state import INDEX, POSITION, Array
@@ -272,3 +276,25 @@ def test_an_angle_has_a_gap_at_each_wrap_and_only_there() -> None:
     np.testing.assert_array_equal(values[~gaps], wrapped)
     np.testing.assert_array_equal(times[~gaps], t)
     assert break_at_wraps(t, wrapped, "rad/s")[1].size == t.size
+
+
+def test_a_user_s_own_settings_change_no_figure_and_its_texts_are_literal() -> None:
+    """With `text.usetex` a figure would need LaTeX, and `$` would open a formula."""
+    series = (Series(x=np.arange(3.0), y=np.arange(3.0), colour="#000000", label="$\\frac"),)
+    figure = Figure(key="k", title="costs $5, or 5$_", panels=(Panel(title="$^", unit="$", series=series),))
+    expected = to_png(figure)
+    with matplotlib.rc_context({"text.usetex": True, "axes.facecolor": "red", "font.size": 30.0, "lines.linewidth": 9}):
+        assert to_png(figure) == expected
+        assert to_html(figure).count("$") >= 4
+        assert matplotlib.rcParams["text.usetex"]
+
+
+def test_matplotlib_s_notices_on_a_home_that_it_cannot_write_stay_quiet(tmp_path: Path) -> None:
+    code = "import numpy as np; from quadsim.report.figure import *; from quadsim.report.to_matplotlib import to_png\n"
+    code += "print(len(to_png(Figure(key='k', title='t', panels=(Panel(title='a', unit='-'),)))))"
+    (tmp_path / "file").write_text("")
+    outside = {name: value for name, value in os.environ.items() if not name.startswith(("XDG", "MPL"))}
+    nowhere = {**outside, "HOME": str(tmp_path / "file" / "home")}
+    done = subprocess.run([sys.executable, "-c", code], env=nowhere, capture_output=True, text=True, check=True)
+    assert int(done.stdout) > 1000
+    assert done.stderr == ""

@@ -24,7 +24,7 @@ from quadsim.palette import ON_DARK, rgb
 from quadsim.report.film import video
 from quadsim.report.film.captions import Overlay, margin_rows
 from quadsim.report.film.frames import make_footage
-from quadsim.report.film.video import render_gif, render_video, rendering_backend
+from quadsim.report.film.video import render_gif, render_video, rendering_backend, write_poster
 from quadsim.rotation import body_to_world
 from quadsim.state import EULER, INDEX, POSITION
 from scenarios.loading import load_scenario
@@ -82,6 +82,17 @@ def test_a_gif_is_small_and_moves(backend: str, short_run: Run, tmp_path: Path) 
     assert frames.shape[:3] == (8, 270, 480)
     assert np.abs(frames[3].astype(int) - frames[0]).mean() > 2.0
     assert (tmp_path / "film.gif").stat().st_size < 600_000
+
+
+@pytest.mark.parametrize("name", ["drone #2", "what?", "100 %d", "it's", "a:b"])
+def test_a_folder_of_any_name_has_its_film_its_gif_and_its_poster(backend: str, tmp_path: Path, name: str) -> None:
+    run = tmp_path / name / "run"
+    run.parent.mkdir()
+    Rollout(load_scenario("hover", ["duration=0.2"])).fly().save(run, **NO_PRODUCTS)
+    render_video(run, run.parent / "film.mp4", fps=10)
+    render_gif(run, run.parent / "film.gif")
+    assert write_poster(run.parent / "film.mp4", run.parent / "film.jpg")
+    assert {path.name for path in run.parent.iterdir()} == {"run", "film.mp4", "film.gif", "film.jpg"}
 
 
 def test_a_flight_of_one_period_far_away_can_be_filmed_and_of_none_cannot(

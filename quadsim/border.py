@@ -1,0 +1,74 @@
+"""The border to user code: whatever it raises, returns or prints, the flight and its result stay ours.
+
+Every call of a user's controller, force, autopilot or reference goes through `user_code`; `quadsim.errors.RaisedError`
+keeps the traceback, `numbers_of` what it answers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from quadsim.errors import QuadsimError
+from quadsim.state import Array
+
+
+@contextlib.contextmanager
+def user_code(
+    error_of: Callable[[BaseException], QuadsimError], passing: tuple[type[QuadsimError], ...] = ()
+) -> Iterator[None]:
+    """Turn whatever user code raises into an error of ours.
+
+    That is also what is no `Exception`, such as `asyncio.CancelledError`, `GeneratorExit`, or the `SystemExit` of
+    `sys.exit`; only Ctrl-C passes.
+
+    Args:
+        error_of: makes our error of what was raised.
+        passing: errors of ours that pass unchanged.
+    """
+    try:
+        yield
+    except BaseException as error:
+        if isinstance(error, (KeyboardInterrupt, *passing)):
+            raise
+        raise error_of(error) from error
+
+
+def numbers_of(answer: Any) -> Array:
+    """Return a copy of a user's numbers, so that it does not change with the buffer of which it was a view.
+
+    Raises:
+        TypeError: they are complex, or no numbers.
+        ValueError: they are no numbers.
+    """
+    if np.iscomplexobj(answer):  # numpy would drop the imaginary parts
+        raise TypeError("complex numbers, of which a command has none")
+    return np.array(answer, float)
+
+
+@contextlib.contextmanager
+def printing_to_stderr() -> Iterator[None]:
+    """Send to stderr what is printed inside, also by compiled libraries and child processes: stdout has a result."""
+    try:
+        stdout, stderr = sys.stdout.fileno(), sys.stderr.fileno()
+    except (OSError, AttributeError, ValueError):  # in a notebook, or in a test, they may be no files
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+        return
+    sys.stdout.flush()
+    kept = os.dup(stdout)
+    try:
+        os.dup2(stderr, stdout)
+        yield
+    finally:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+        ctypes.CDLL(None).fflush(None)  # C has a buffer of its own
+        os.dup2(kept, stdout)
+        os.close(kept)
