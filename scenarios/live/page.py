@@ -141,6 +141,7 @@ class Page:
             self.stage.show(frame)
             if frame.k % _EVERY == 0 or self._pace.paused:
                 self._announce()
+                self._widgets.follow()
                 loops = [flight.loop for flight in self._session.flights[1:]]
                 lost = [f"{law_name(loop.controller.name)} lost: {loop.reason}" for loop in loops if loop.reason]
                 states = [(value[3], math.hypot(*value[:3])) for value in values if value is not None]
