@@ -88,7 +88,7 @@ class Page:
         guard = Guard(host)
         silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
         title = f"quadsim live: {session.scenario.name}"
-        with silent, guard.installed(partial(dressed, title=title)):
+        with silent, guard.installed(partial(dressed, title=title, served=True)):
             self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
         listening = self._server.get_port()
         if port not in (0, listening):

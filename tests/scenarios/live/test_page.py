@@ -22,6 +22,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 import viser
+from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -63,6 +64,39 @@ def test_who_is_let_in(headers: dict[str, str], query: str, let_in: bool) -> Non
     guard = Guard("127.0.0.1")
     filled = {name: value.replace("{token}", guard.token) for name, value in headers.items()}
     assert (guard.refusal(filled, "/" + query.replace("{token}", guard.token), 8080) is None) == let_in
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        'prefs={"theme":"dark","n":1}',
+        "sel=[1,2]",
+        "user[id]=3",
+        "a=hello world",
+        "flag",
+        "=nameless",
+        "name=J\udcfcrgen",
+        "exp=Wed, 21 Oct 2026 07:28:00 GMT",
+        'q=a"b; c="d',
+        "secure; path=/",
+        "quadsim-8080=of-an-earlier-session",
+        "quadsim-8080=J\udcfcrgen",
+    ],
+)
+def test_cookies_of_other_programs_on_this_host_lock_nobody_out(others: str) -> None:
+    guard = Guard("127.0.0.1")
+    ours = f"quadsim-8080={guard.token}"
+
+    def refusal(*cookies: str, hosts: tuple[str, ...] = ("127.0.0.1:8080",)) -> str | None:
+        headers = Headers()
+        for name, value in (*(("Host", host) for host in hosts), *(("Cookie", line) for line in cookies)):
+            headers.set_insecure(name, value)  # as the library does with what it has received
+        return guard.refusal(headers, "/", 8080)
+
+    assert refusal(f"{others}; {ours}") is refusal(f"{ours}; {others}") is refusal(others, ours) is None
+    assert refusal(f"{others};{ours}") is None
+    assert refusal(others) is not None
+    assert refusal(ours, hosts=("127.0.0.1:8080", "evil.example")) == "a header is there twice"
 
 
 @dataclass
@@ -267,8 +301,11 @@ def tab(browser: Any, served: Served) -> Iterator[Any]:
 
 def test_the_address_alone_opens_the_page(served: Served) -> None:
     bare = served.page.address.partition("?")[0]
-    with pytest.raises(urllib.error.HTTPError, match="403"):
+    with pytest.raises(urllib.error.HTTPError, match="403") as refused:
         urllib.request.urlopen(bare)
+    text = refused.value.read().decode()
+    assert text.startswith("quadsim: the token is missing, or another session's")
+    assert "Open the whole address that quadsim live printed" in text
     with urllib.request.urlopen(served.page.address) as response:
         assert "HttpOnly" in response.headers["Set-Cookie"]
 
@@ -376,6 +413,25 @@ def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
     row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
     served.wait(lambda: row.get_by_role("slider").get_attribute("aria-valuenow") == "1")
     assert served.session.flights[0].loop.controller.horizon == 10
+
+
+def test_a_page_beside_other_cookies_flies_and_one_without_ours_says_why(browser: Any, windy: Served) -> None:
+    address = urlsplit(windy.page.address)
+    thread = threading.Thread(target=windy.pace.drive, args=(windy.session, windy.page))
+    thread.start()
+    try:
+        with browser.new_context() as context:
+            for name, value in (("prefs", '{"theme":"dark"}'), ("who", "hello world"), ("sel", "[1,2]")):
+                context.add_cookies([{"name": name, "value": value, "domain": address.hostname, "path": "/"}])
+            tab = context.new_page()
+            tab.set_default_timeout(1e3 * PATIENCE)
+            tab.goto(windy.page.address)
+            tab.get_by_text("real-time factor").wait_for()
+            context.clear_cookies()  # as of a browser that keeps none, or a session that has started anew
+            tab.get_by_text("Open the whole address that quadsim live printed").wait_for()
+    finally:
+        windy.pace.stop()
+        thread.join()
 
 
 def test_one_component_that_is_typed_leaves_the_other(browser: Any, windy: Served) -> None:
