@@ -123,7 +123,10 @@ class Backend(Protocol):
         """Prepare for QPs with these matrices, or at least with their pattern."""
 
     def solve(self, qp: QP) -> Solution:
-        """Solve; failures are reported in the solution's status."""
+        """Solve this QP, whatever differs from the one before; failures are reported in the solution's status.
+
+        A matrix or vector that has changed is another object: what is changed in place may not be seen.
+        """
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,6 +28,7 @@ from mpc.constraints import Constraint, Penalty
 from mpc.equilibrium import Trim
 from mpc.ocp import Objective, Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
+from mpc.qp import QPRows
 from mpc.robust.controller import RobustMPC
 from mpc.robust.tightening import observed
 from mpc.solvers import Answer
@@ -41,7 +42,7 @@ PENALTY: Final = 1e4
 """l1 of violating a soft row by its room on one side, for a unit weight of the first input."""
 TERMINAL_TOLERANCE: Final = 1e-4
 """Largest change per period of the steady part of the state at the plan's end [unit of the state]."""
-LOOSE: Final = 1e2
+LOOSE: Final = 1e4
 """Stands for an infinite bound that changes or is on both sides of a row, which PIQP does not take."""
 END: Final = "standing"
 """Name of the terminal constraint."""
@@ -117,16 +118,16 @@ class _Nearest:
         self._P[self._first, self._first] += 2.0
         self._backend = Piqp()
         self._backend.setup(replace(form.qp, P=self._P))
-        earlier, last = (form.qp.h_u.reshape(self._horizon, -1)[i] for i in (0, -1))
-        self._ends = (earlier == LOOSE) & (last < LOOSE)  # rows on the last state only
+        upper = QPRows(problem).upper
+        self._ends = (upper[0] == LOOSE) & (upper[-1] < LOOSE)  # the terminal constraint's rows
 
     def solve(self, query: Query, requested: Array) -> Answer:
         """Return the plan whose first input is closest to `requested` (4,) [rad/s]."""
         qp = replace(self._form.assemble(query).qp, P=self._P)
         qp.c[self._first] -= 2.0 * requested
-        if query.equilibrium is not None:
+        if query.equilibrium is not None:  # a state of predicted rotors is far from zero there, so all rows move
             for side in (qp.h_l, qp.h_u):
-                side.reshape(self._horizon, -1)[-1, self._ends] += self._steady_rows @ query.equilibrium.x
+                side.reshape(self._horizon, -1)[:, self._ends] += self._steady_rows @ query.equilibrium.x
         return Answer.of(self._form, qp, self._backend.solve(qp), SafetyFilter.solver)
 
 

@@ -44,17 +44,19 @@ class DaqpDense:
         self._model.settings = SETTINGS
         sense = np.zeros(qp.c.size + qp.h_l.size + qp.b.size, dtype=np.intc)
         sense[qp.c.size + qp.h_l.size :] = 5  # always active
-        rows = np.concatenate([_dense(qp.G), _dense(qp.A)])
-        self._model.setup(_dense(qp.P), qp.c.copy(), rows, *_bounds(qp), sense)
+        rows, bounds = np.concatenate([_dense(qp.G), _dense(qp.A)]), _bounds(qp)
+        self._finite = np.isfinite(bounds)
+        self._model.setup(_dense(qp.P), qp.c.copy(), rows, *bounds, sense)
 
     def solve(self, qp: QP) -> Solution:
         """See `mpc.qp.Backend.solve`."""
         started = clock.perf_counter()
-        if qp.P is not self._qp.P or qp.G is not self._qp.G:
-            self.setup(qp)
-        else:
-            upper, lower = _bounds(qp)
+        upper, lower = _bounds(qp)
+        same = qp.P is self._qp.P and qp.A is self._qp.A and qp.G is self._qp.G
+        if same and np.array_equal(np.isfinite([upper, lower]), self._finite):
             self._model.update(f=qp.c, bupper=upper, blower=lower)
+        else:  # from an active bound that is now infinite, it would start at NaN, and call that solved
+            self.setup(qp)
         x, _, flag, info = self._model.solve()
         elapsed = clock.perf_counter() - started
         z_box, z, y = np.split(info["lam"], [qp.c.size, qp.c.size + qp.h_l.size])

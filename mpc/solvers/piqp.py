@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 import piqp
+from numpy.typing import NDArray
 
 from mpc.qp import QP, Solution
 from quadsim.controller import SOLVED
@@ -61,9 +62,13 @@ class Piqp:
             settings.eps_rel = settings.eps_duality_gap_rel = 0.1 * CHANGING_TOLERANCE
 
     def setup(self, qp: QP) -> None:
-        """See `mpc.qp.Backend.setup`; PIQP must receive every vector that is updated later."""
-        self._solver.setup(qp.P, qp.c, qp.A, qp.b, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)
-        self._last = qp
+        """See `mpc.qp.Backend.setup`; PIQP must receive every vector that is updated later.
+
+        Rows without a finite side are left out: PIQP would set them to zero in `G` for good.
+        """
+        self._kept, self._last = _bounded(qp), qp
+        G, h_l, h_u = (self._of_rows(part) for part in (qp.G, qp.h_l, qp.h_u))
+        self._solver.setup(qp.P, qp.c, qp.A, qp.b, G, h_l, h_u, qp.x_l, qp.x_u)
 
     def solve(self, qp: QP) -> Solution:
         """Update the differences from the last QP, including matrices of the same pattern, solve, and copy the result.
@@ -72,27 +77,44 @@ class Piqp:
         is the only thing to go by.  Sizes must be right: a wrong one keeps the old data silently.  One update for all:
         two would scale the data twice.
         """
-        last, self._last = self._last, qp
-        matrices = {}
-        if qp.P is not last.P or qp.A is not last.A or qp.G is not last.G:
-            matrices = {"P": qp.P, "A": qp.A, "G": qp.G}
         started = clock.perf_counter()
-        self._solver.update(**matrices, c=qp.c, b=qp.b, h_l=qp.h_l, h_u=qp.h_u)
+        if np.array_equal(_bounded(qp), self._kept):
+            last, self._last = self._last, qp
+            changed: dict[str, Any] = {}
+            if qp.P is not last.P or qp.A is not last.A or qp.G is not last.G:
+                changed = {"P": qp.P, "A": qp.A, "G": self._of_rows(qp.G)}
+            if qp.x_l is not last.x_l or qp.x_u is not last.x_u:
+                changed |= {"x_l": qp.x_l, "x_u": qp.x_u}
+            h_l, h_u = self._of_rows(qp.h_l), self._of_rows(qp.h_u)
+            self._solver.update(**changed, c=qp.c, b=qp.b, h_l=h_l, h_u=h_u)
+        else:
+            self.setup(qp)
         status = self._solver.solve()
         elapsed = clock.perf_counter() - started
         result, info = self._solver.result, self._solver.result.info
         # At an interior-point optimum, a constraint is active if its slack is small and below its multiplier.
         lower, upper = (result.z_l, result.s_l), (result.z_u, result.s_u)
         box = (result.z_bl, result.s_bl), (result.z_bu, result.s_bu)
+        z = np.zeros(len(self._kept))
+        z[self._kept] = result.z_u - result.z_l
         return Solution(
             x=result.x.copy(),
             y=result.y.copy(),
-            z=result.z_u - result.z_l,
+            z=z,
             z_box=result.z_bu - result.z_bl,
             status=STATUS[status],
             iterations=int(info.iter),
-            active=sum(int(np.count_nonzero(np.minimum(z, ACTIVE_SLACK) > s)) for z, s in (lower, upper, *box)),
+            active=sum(int(np.count_nonzero(np.minimum(m, ACTIVE_SLACK) > s)) for m, s in (lower, upper, *box)),
             reported_primal=float(info.primal_res),
             reported_dual=float(info.dual_res),
             solve_s=elapsed,
         )
+
+    def _of_rows(self, part: Any) -> Any:
+        """Return what belongs to the rows that PIQP has, of a matrix or vector of all."""
+        return part if self._kept.all() else part[self._kept]
+
+
+def _bounded(qp: QP) -> NDArray[np.bool_]:
+    """Return which rows have a finite side."""
+    return np.asarray(np.isfinite(qp.h_l) | np.isfinite(qp.h_u))

@@ -46,8 +46,13 @@ class AnyOfQpsolvers:
         lower, upper = np.concatenate([qp.x_l, qp.h_l]), np.concatenate([qp.x_u, qp.h_u])
         above, below = np.isfinite(upper), np.isfinite(lower)
         one_sided = np.concatenate([rows[above], -rows[below]])
+        equalities = (self._matrix(qp.A), qp.b) if qp.b.size else (None, None)
         problem = qpsolvers.Problem(
-            self._matrix(qp.P), qp.c, self._matrix(one_sided), np.concatenate([upper[above], -lower[below]])
+            self._matrix(qp.P),
+            qp.c,
+            self._matrix(one_sided),
+            np.concatenate([upper[above], -lower[below]]),
+            *equalities,
         )
         try:
             with warnings.catch_warnings(action="ignore"):  # about conversions and failures, which the status reports
@@ -55,8 +60,9 @@ class AnyOfQpsolvers:
         except qpsolvers.QPError:
             answer = qpsolvers.Solution(problem)
         elapsed = clock.perf_counter() - started
-        multipliers = np.zeros(upper.size)
+        multipliers, y = np.zeros(upper.size), np.full(qp.b.size, np.nan)
         if answer.found and answer.x is not None and answer.z is not None:
+            y = y if answer.y is None else answer.y
             x, (of_upper, of_lower) = answer.x, np.split(answer.z, [np.count_nonzero(above)])
             multipliers[above] += of_upper
             multipliers[below] -= of_lower
@@ -65,7 +71,7 @@ class AnyOfQpsolvers:
         z_box, z = np.split(multipliers, [qp.c.size])
         return Solution(
             x=x,
-            y=np.empty(0),
+            y=y,
             z=z,
             z_box=z_box,
             status=UNSOLVED if np.isnan(x).any() else SOLVED,

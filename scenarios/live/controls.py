@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final, get_args
@@ -17,7 +18,7 @@ from quadsim.errors import InputError
 from quadsim.vehicle import N_ROTORS
 from scenarios.live import readout
 from scenarios.live.knobs import TURNED, Knob, Value, knobs
-from scenarios.live.session import Session
+from scenarios.live.session import Disturbances, Session
 from scenarios.live.stage import Stage
 from scenarios.schema.controllers import AnyController
 from scenarios.schema.events import SensorText
@@ -27,7 +28,9 @@ _STEER: Final = {"W": ("+", "x"), "S": ("-", "x"), "A": ("+", "y"), "D": ("-", "
 _STEER_STEP: Final = 0.5  # [m/s] by which each of these keys changes the set-point's velocity
 _STEER_MOST: Final = 5.0
 _BROKEN: Final = 0.4  # share of its thrust that a rotor loses by the button
+_WIND: Final = 15.0  # [m/s] up to which fields take a wind
 _SENSORS: Final = get_args(SensorText)
+_Input = Callable[[Any, Disturbances], Mapping[str, Any]]
 
 
 class Widgets:
@@ -41,6 +44,8 @@ class Widgets:
     def __init__(self, gui: Any, session: Session, drives: Callable[[int], bool]) -> None:
         self.gui, self.session, self._drives = gui, session, drives
         self._starts: list[tuple[Any, Any]] = []  # widgets, and what they are at the start of a flight
+        self._shown: dict[str, tuple[Any, Callable[[Disturbances], Any], _Input]] = {}  # by label: see `shows`
+        self._given: dict[str, int] = {}  # likewise, the period in which a person changed it last
 
     def on(self, register: Callable[[Any], Any], act: Callable[[Any], Any]) -> None:
         """Call a function for changes by the driving client, not for changes by Python, which have no client."""
@@ -60,6 +65,16 @@ class Widgets:
         """Show what a new flight starts with."""
         for widget, value in self._starts:
             widget.value = value
+        self._given.clear()
+        self.follow()
+
+    def follow(self) -> None:
+        """Show what acts on the vehicle, whether a person, an event of the scenario or a refusal has changed it."""
+        acts = self.session.disturbances
+        for label, (widget, value, _) in self._shown.items():
+            pending = self.session.k < self._given.get(label, -2) + 2  # what was typed acts in the period after
+            if not pending and widget.value != value(acts):
+                widget.value = value(acts)
 
     def button(self, label: str, act: Callable[[Any], Any], **look: Any) -> Any:
         """A button."""
@@ -87,6 +102,22 @@ class Widgets:
         """Submit an input made of a widget's value, likewise."""
         return self.value(widget, lambda value: self.session.submit(table(value), subject=widget.label))
 
+    def shows(self, widget: Any, value: Callable[[Disturbances], Any], table: _Input) -> Any:
+        """Show a value that acts, and submit an input made of what a person changes it to and of what else acts."""
+        self._shown[widget.label] = widget, value, table
+        self.on(widget.on_update, lambda event: self._submit(widget))
+        return widget
+
+    def give(self, widget: Any, value: Any) -> None:
+        """Change such a widget's value as a person does."""
+        widget.value = value
+        self._submit(widget)
+
+    def _submit(self, widget: Any) -> None:
+        label, acts = widget.label, self.session.disturbances
+        self._given[label] = self.session.k
+        self.session.submit(self._shown[label][2](widget.value, acts), subject=label)
+
 
 def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     """Fill the tab with every event that this scenario can have; the others are disabled, with the reason.
@@ -94,6 +125,7 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
     `use` takes a hint away.
     """
     gui, session, mass = widgets.gui, widgets.session, widgets.session.flights[0].actual.mass
+    acts = session.disturbances
     gust = {"type": "gust", "velocity": [1.0, 0.0, 0.0], "duration": 1.0}
     load, lag = {"type": "mass", "factor": 1.1}, {"type": "rotor_lag", "rise": 0.01}
     sensors = [{"type": "sensor_fault", "sensor": name, "fault": "nan", "duration": 1.0} for name in _SENSORS]
@@ -104,38 +136,56 @@ def disturb(widgets: Widgets, stage: Stage, use: Callable[[str], None]) -> None:
         session.submit({"type": "pull", "to": to}, subject="pull")
         use("pull")
 
+    def is_broken() -> bool:
+        return bool(wear[0].value > round(float(session.disturbances.worn[0]), 4))
+
     def broken(event: Any) -> None:
         use("break")
-        loss = 0.0 if wear[0].value else _BROKEN
-        wear[0].value = loss
-        session.submit(_wear(1, loss), subject=wear[0].label)
+        worn = float(session.disturbances.worn[0])
+        widgets.give(wear[0], round(worn if is_broken() else worn + (1.0 - worn) * _BROKEN, 4))
 
     async def named(event: Any) -> None:  # also after a reset
-        button.label = "Repair the rotor" if wear[0].value else "Break a rotor"
+        button.label = "Repair the rotor" if is_broken() else "Break a rotor"
 
     widgets.on(stage.grab.on_drag("left"), pulled)
     button = widgets.button("Break a rotor", broken, hint=f"rotor 1 loses {100 * _BROKEN:.0f} % of its thrust")
     wear = [
-        widgets.submits(gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, 0.0), partial(_wear, rotor))
+        widgets.shows(
+            gui.add_slider(f"Rotor {rotor} loss", 0.0, 1.0, 0.05, _rotor_loss(rotor, acts)),
+            partial(_rotor_loss, rotor),
+            partial(_wear, rotor),
+        )
         for rotor in range(1, N_ROTORS + 1)
     ]
     wear[0].on_update(named)
-    box = {"min": (-15.0, -15.0), "max": (15.0, 15.0), "step": 0.5, "disabled": bool(no_wind)}
+    most = max(_WIND, *map(abs, acts.wind))
+    box = {"min": (-most, -most), "max": (most, most), "step": 0.5, "disabled": bool(no_wind)}
     blow = gui.add_vector2("Gust x, y [m/s]", (6.0, 0.0), **box)
     widgets.event("Gust for 1 s", lambda: gust | {"velocity": [*blow.value, 0.0]}, no_wind)
-    wind = gui.add_vector2("Wind x, y [m/s]", (0.0, 0.0), **box)
-    widgets.submits(wind, lambda value: {"type": "wind", "velocity": [*value, 0.0]})
+    widgets.shows(
+        gui.add_vector2("Wind x, y [m/s]", acts.wind[:2], **box),
+        lambda acts: acts.wind[:2],
+        lambda value, acts: {"type": "wind", "velocity": [*value, acts.wind[2]]},
+    )
     gui.add_html(readout.says(f"No wind: {no_wind}" if no_wind else "", "why"))
     off = {"disabled": bool(no_load)}
-    factor = gui.add_slider("Mass factor", 0.7, 1.5, 0.01, 1.0, **off)
-    widgets.submits(factor, lambda value: {"type": "mass", "factor": float(value)})
+    least, most = min(0.7, acts.mass_factor), max(1.5, acts.mass_factor)
+    widgets.shows(
+        gui.add_slider("Mass factor", least, most, 0.01, acts.mass_factor, **off),
+        lambda acts: acts.mass_factor,
+        lambda value, acts: {"type": "mass", "factor": float(value)},
+    )
     step = round(0.01 * mass, 5)
     payload = gui.add_number("Payload [kg]", round(0.1 * mass, 4), min=0.0, max=mass, step=step, **off)
     widgets.event("Take payload", lambda: {"type": "payload_pickup", "mass": float(payload.value)}, no_load)
     widgets.event("Drop payload", lambda: {"type": "payload_drop"}, no_load)
     gui.add_html(readout.says(no_load, "why"))
-    rise = gui.add_slider("Rotor lag [ms]", 0, 100, 5, 0, disabled=bool(no_lag))
-    widgets.submits(rise, lambda value: {"type": "rotor_lag", "rise": value / 1e3})
+    ends = {"min": (0.0, 0.0), "max": (max(100.0, *_shown_lag(acts)),) * 2, "step": 1.0, "disabled": bool(no_lag)}
+    widgets.shows(
+        gui.add_vector2("Rotor lag up, down [ms]", _shown_lag(acts), **ends),
+        _shown_lag,
+        lambda value, acts: {"type": "rotor_lag", "rise": value[0] / 1e3, "fall": value[1] / 1e3},
+    )
     gui.add_html(readout.says(no_lag, "why"))
     seen = [name for name, reason in zip(_SENSORS, blind, strict=True) if not reason]
     sensor = gui.add_dropdown("Sensor", seen or _SENSORS, disabled=not seen)
@@ -165,7 +215,8 @@ class Steering:
         place = gui.add_vector3("Set-point [m]", tuple(map(float, here)), step=0.1)
         self._place = widgets.value(place, self._set_point)
         widgets.on(scene.on_click(modifier="shift"), self.clicked)
-        yaw = gui.add_slider("Yaw [deg]", -180, 180, 5, 0)
+        turned = math.degrees(math.remainder(self._session.flights[0].loop.course.row(0)[3], 2.0 * math.pi))
+        yaw = gui.add_slider("Yaw [deg]", -180.0, 180.0, 5.0, round(turned, 1))
         widgets.submits(yaw, lambda value: {"type": "setpoint", "yaw": float(value)})
         self._steered = gui.add_text("Set-point velocity [m/s]", "0, 0, 0", disabled=True)
         for key, (sign, axis) in _STEER.items():
@@ -299,5 +350,18 @@ class ControllerTab:
         return True
 
 
-def _wear(rotor: int, loss: Any) -> dict[str, Any]:
-    return {"type": "wear", "rotor": rotor, "loss": float(loss)}
+def _rotor_loss(rotor: int, acts: Disturbances) -> float:
+    return round(float(acts.loss[rotor - 1]), 4)
+
+
+def _shown_lag(acts: Disturbances) -> tuple[float, float]:
+    """Return the rotors' time constants [ms]."""
+    rise, fall = acts.lag
+    return round(1e3 * rise, 3), round(1e3 * fall, 3)
+
+
+def _wear(rotor: int, loss: Any, acts: Disturbances) -> dict[str, Any]:
+    """Return the input by which a rotor lacks a share of its thrust; what it lacks by the scenario stays."""
+    left = 1.0 - float(acts.worn[rotor - 1])
+    more = max(0.0, 1.0 - (1.0 - float(loss)) / left) if left > 0.0 else 0.0
+    return {"type": "wear", "rotor": rotor, "loss": round(more, 4)}

@@ -25,6 +25,8 @@ _ICON: Final = """<svg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32' fi
 <path d='M8 8 24 24M8 24 24 8' stroke='#7a7f87'/><path d='M2 24a6 6 0 1 0 12 0a6 6 0 1 0-12 0m16 0a6 6 0 1 0 12 0a6 6 0
 1 0-12 0' stroke='#1b7fc4'/><path d='M2 8a6 6 0 1 0 12 0a6 6 0 1 0-12 0m16 0a6 6 0 1 0 12 0a6 6 0 1 0-12 0'
 stroke='#f56b14'/></svg>"""
+ADMISSION: Final = "/admission"
+"""Path that answers whether a page may connect, and if not, why: viser's client would go on trying in silence."""
 _HEAD: Final = """<style>
 canvas[data-engine]{background:linear-gradient(#839dc0,#cad8e6 40%)}
 @media(prefers-color-scheme:dark){canvas[data-engine]{background:linear-gradient(#0e1621,#31435a 40%)}}
@@ -32,14 +34,27 @@ canvas[data-engine]{background:linear-gradient(#839dc0,#cad8e6 40%)}
 const dark = matchMedia("(prefers-color-scheme: dark)")
 window.__VISER_EMBED_CONFIG__ = {darkMode: dark.matches}
 dark.addEventListener("change", () => location.reload())
-</script></head>"""
+</script>"""
+_ASKING: Final = f"""<script>
+const asking = setInterval(ask, 5000)
+async function ask() {{
+  const answer = await fetch("{ADMISSION}").catch(() => null)
+  if (answer?.status !== 403) return
+  clearInterval(asking)
+  document.body.textContent = await answer.text()
+}}
+ask()
+</script>"""
 
 
-def dressed(page: str, title: str) -> str:
-    """Return viser's page with our title, icon and sky, in the theme of the system."""
+def dressed(page: str, title: str, *, served: bool = False) -> str:
+    """Return viser's page with our title, icon and sky, in the theme of the system.
+
+    Where it is `served`, it asks whether it may connect, and shows the reason if it may not.
+    """
     page = re.sub('data:image/svg[^"]*', "data:image/svg+xml," + quote(_ICON), page, count=1)
     page = re.sub("<title>.*?</title>", lambda found: f"<title>{escape(title)}</title>", page, count=1)
-    return page.replace("</head>", _HEAD, 1)
+    return page.replace("</head>", f"{_HEAD}{_ASKING if served else ''}</head>", 1)
 
 
 def airframe(model: mujoco.MjModel) -> Iterator[tuple[str, tuple[float, ...], trimesh.Trimesh]]:

@@ -90,7 +90,7 @@ class Page:
         guard = Guard(host)
         silent = contextlib.redirect_stdout(io.StringIO())  # viser prints an address that has no token
         title = f"quadsim live: {session.scenario.name}"
-        with silent, guard.installed(partial(dressed, title=title)):
+        with silent, guard.installed(partial(dressed, title=title, served=True)):
             self._server: Any = viser.ViserServer(host=host, port=port, label="quadsim live", verbose=False)
         listening = self._server.get_port()
         if port not in (0, listening):
@@ -143,6 +143,7 @@ class Page:
             self.stage.show(frame)
             if frame.k % _EVERY == 0 or self._pace.paused:
                 self._announce()
+                self._widgets.follow()
                 loops = [flight.loop for flight in self._session.flights[1:]]
                 lost = [f"{law_name(loop.controller.name)} lost: {loop.reason}" for loop in loops if loop.reason]
                 states = [(value[3], math.hypot(*value[:3])) for value in values if value is not None]

@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +30,7 @@ from scenarios import console
 from scenarios.app import run_directory
 from scenarios.catalogue import scenario_names
 from scenarios.flight import Flight
+from scenarios.live.look import ADMISSION
 from scenarios.live.session import Frame, Session, read_script
 from scenarios.loading import load_scenario
 from scenarios.progress import reporting
@@ -41,6 +41,7 @@ from scenarios.schema.scenario import Scenario
 LATE: Final = 0.25  # [s] beyond which lost time is given up: no period is dropped, the flight is behind real time
 POSES: Final = 2  # drawn in each period
 _IDLE: Final = 0.02  # [s] between looks for orders while nothing is flown
+_HOW_TO_OPEN: Final = "Open the whole address that quadsim live printed, with ?token= and what follows."
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 
 
@@ -107,19 +108,20 @@ class Guard:
 
     def refusal(self, headers: Any, path: str, port: int) -> str | None:
         """Return why a request with these headers, path and query, to this port, is refused, or None."""
-        try:
-            host, origin = headers.get("Host", ""), headers.get("Origin")
-        except LookupError:  # of the library's headers, where one is there twice
+        hosts, origins = _values(headers, "Host"), _values(headers, "Origin")
+        if len(hosts) > 1 or len(origins) > 1:
             return "a header is there twice"
+        host, origin = next(iter(hosts), ""), next(iter(origins), None)
         if not self._is_ours(host, port):
             return "this server goes by another name"
         if origin is not None and not self._is_ours(origin.partition("://")[2], port):
             return "a page of another site may not connect"
-        tokens = parse_qs(path.partition("?")[2]).get("token", [])
-        with contextlib.suppress(CookieError, LookupError):
-            tokens.append(SimpleCookie(headers.get("Cookie", ""))[f"quadsim-{port}"].value)
-        if not any(secrets.compare_digest(token.encode(), self.token.encode()) for token in tokens):
-            return "open the address that quadsim live printed: it has a token"
+        # Other programs on this host set cookies too, whose form is theirs: only ours is looked at.
+        cookies = [pair.strip().partition("=") for line in _values(headers, "Cookie") for pair in line.split(";")]
+        tokens = [value for name, _, value in cookies if name == f"quadsim-{port}"]
+        tokens += parse_qs(path.partition("?")[2]).get("token", [])
+        if not any(secrets.compare_digest(token.encode(errors="replace"), self.token.encode()) for token in tokens):
+            return "the token is missing, or another session's; where it was given, the browser keeps no cookie for it"
         return None
 
     @contextlib.contextmanager
@@ -134,7 +136,9 @@ class Guard:
             def check(connection: Any, request: Any) -> Any:
                 port = connection.local_address[1]
                 if refused := self.refusal(request.headers, request.path, port):
-                    return connection.respond(HTTPStatus.FORBIDDEN, f"quadsim: {refused}\n")
+                    return connection.respond(HTTPStatus.FORBIDDEN, f"quadsim: {refused}. {_HOW_TO_OPEN}\n")
+                if request.path == ADMISSION:
+                    return connection.respond(HTTPStatus.OK, "")
                 request.headers.pop("Accept-Encoding", None)  # the page is packed as it is
                 response = process_request(connection, request)
                 if response is None:  # a WebSocket
@@ -168,6 +172,13 @@ class Guard:
         with contextlib.suppress(ValueError):  # no site can be bound to the name of an address
             return self._host not in LOOPBACK and bool(ipaddress.ip_address(host))
         return False
+
+
+def _values(headers: Any, name: str) -> list[str]:
+    """Return every value of a header, of the library's headers or of a mapping."""
+    if hasattr(headers, "get_all"):
+        return list(headers.get_all(name))
+    return [headers[name]] if name in headers else []
 
 
 def fly_live(

@@ -21,10 +21,11 @@ from quadsim.assets import read_toml
 from quadsim.errors import FlightError, InputError, ParameterError
 from quadsim.fields import Fraction, Vector
 from quadsim.flight.audit import COMMANDED, Limit
-from quadsim.sim.effects.rotors import RotorLoss
+from quadsim.sim.effects.load import Load, MassChange
+from quadsim.sim.effects.rotors import LagChange, RotorDynamics, RotorLoss
+from quadsim.sim.effects.wind import Air, WindChange
 from quadsim.sim.physics import FlownPeriod
 from quadsim.state import POSITION, REFERENCE_NAMES, Array
-from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
 from scenarios.flight_events import Successor
@@ -104,6 +105,17 @@ class Frame:
     refused: tuple[str, ...]  # why inputs were refused
 
 
+@dataclass(frozen=True, kw_only=True)
+class Disturbances:
+    """What acts on the first vehicle at the start of its next period, by its scenario's effects and events."""
+
+    wind: Vector  # mean velocity of the air, world frame [m/s]
+    mass_factor: float
+    lag: tuple[float, float]  # time constants of the rotors, speeding up and slowing down [s]; 0 for none
+    worn: Array  # (4,) share of its thrust that each rotor lacks by the scenario
+    loss: Array  # (4,) the same with what `Wear` holds
+
+
 @dataclass
 class _Hand:
     """Inputs in force until they are changed."""
@@ -124,6 +136,7 @@ class Session:
 
     def __init__(self, scenario: Scenario, against: AnyController | None = None) -> None:
         self.scenario, self._against = preferring_core(scenario), against
+        self._effects = Assembly(self.scenario).effects
         self._queue: deque[tuple[Mapping[str, Any], str, Successor | None, str]] = deque()
         self.flights: tuple[Rollout, ...] = ()
         self.reset()
@@ -158,6 +171,24 @@ class Session:
     def limits(self) -> tuple[Limit, ...]:
         """Audited constraints of the flight."""
         return tuple(self.flights[0].limits)
+
+    @property
+    def disturbances(self) -> Disturbances:
+        """What acts now; after `reset`, what the scenario starts with."""
+        flight, effects = self.flights[0], self._effects
+        air, load, rotors = effects.air or Air(), effects.load or Load(), effects.rotors or RotorDynamics()
+        wind, factor, lag = air.wind, load.mass_factor, (rotors.rise or 0.0, rotors.fall or 0.0)
+        changes = [event for event in flight.scenario.events if isinstance(event, WindChange | MassChange | LagChange)]
+        for change in sorted(changes, key=lambda change: change.at):
+            match change if change.at <= flight.loop.time + 1e-9 else None:
+                case WindChange(velocity=velocity):
+                    wind = velocity
+                case MassChange(factor=other):
+                    factor = other
+                case LagChange(rise=rise, fall=fall):
+                    lag = rise, rise if fall is None else fall
+        worn = 1.0 - self._left()
+        return Disturbances(wind=wind, mass_factor=factor, lag=lag, worn=worn, loss=1.0 - self._left(by_hand=True))
 
     def submit(
         self, table: Mapping[str, Any], *, subject: str = "", successor: Successor | None = None, name: str = ""
@@ -196,12 +227,7 @@ class Session:
                     self.reason = str(error) if flight is self.flights[0] else self.reason
             shown.append(entry)
         samples, margins, horizons = zip(*shown, strict=True)
-        health, now = np.ones(N_ROTORS), self.flights[0].loop.time
-        for event in self.scenario.events:
-            if isinstance(event, RotorLoss) and event.at <= now < event.at + (event.duration or math.inf):
-                health[event.rotor - 1] *= 1.0 - event.loss
-        for rotor, loss in self._held.wear.items():
-            health[rotor - 1] *= 1.0 - loss
+        health = self._left(by_hand=True)
         time = round((self.k - 1) * self.period, 9)
         return Frame(self.k - 1, time, samples, margins, horizons, pull, health, tuple(refused))
 
@@ -283,6 +309,16 @@ class Session:
                 if event.get("type") == "setpoint" and not self._steered:
                     flight.leave_course()
         self._steered |= event.get("type") == "setpoint"
+
+    def _left(self, *, by_hand: bool = False) -> Array:
+        """Return the share of its thrust that each rotor has left (4,) by the scenario, or with the person's `Wear`."""
+        now, left = self.flights[0].loop.time + 1e-9, np.array((self._effects.rotors or RotorDynamics()).efficiency)
+        for event in self.scenario.events:
+            if isinstance(event, RotorLoss) and event.at <= now < event.at + (event.duration or math.inf):
+                left[event.rotor - 1] *= 1.0 - event.loss
+        for rotor, loss in self._held.wear.items() if by_hand else ():
+            left[rotor - 1] *= 1.0 - loss
+        return left
 
     def _hold(self, refused: list[str]) -> Array:
         """Apply the inputs in force for one more period; return the force of the pull (3,) [N]."""

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import qpsolvers
+from scipy.sparse import csc_matrix
 from support import flight_queries, paper_problem, paper_reference, random_problem
 
 from mpc.condensing import Condensed
@@ -15,7 +18,7 @@ from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Penalty
 from mpc.ocp import Query
 from mpc.partial_condensing import PartiallyCondensed
-from mpc.qp import kkt_residuals
+from mpc.qp import QP, kkt_residuals
 from mpc.solvers import CORE_OR_PIQP, SOLVERS, Answer, QPSolver, find_solver, make_backend, make_solver, solver_entries
 from mpc.solvers.daqp import DaqpDense
 from mpc.solvers.piqp import Piqp
@@ -116,6 +119,56 @@ def test_equality_rows_and_multipliers() -> None:
             plans.append(formulation.inputs(solution.x))
         if plans:
             np.testing.assert_allclose(plans[0], plans[1], atol=1e-3)
+
+
+def small_qp(rng: np.random.Generator, name: str) -> QP:
+    """Equality, one-sided and two-sided rows, and a box open in part, in the matrices that a back end takes."""
+    n, inf = 5, math.inf
+    root = rng.normal(size=(n, n))
+    entry = find_solver(name)
+    matrix = csc_matrix if entry.formulate(paper_problem()).__class__ is PartiallyCondensed else np.asarray
+    return QP(
+        P=matrix(root @ root.T + np.eye(n)),
+        c=10.0 * rng.normal(size=n),
+        A=matrix(rng.normal(size=(1, n))),
+        b=np.array([0.3]),
+        G=matrix(rng.normal(size=(3, n))),
+        h_l=np.array([-1.0, -inf, -1.0]),
+        h_u=np.array([1.0, 1.0, inf]),
+        x_l=np.array([-1.0, -inf, -1.0, -inf, -0.5]),
+        x_u=np.array([1.0, 0.5, inf, inf, 0.5]),
+    )
+
+
+@pytest.mark.parametrize("name", ALWAYS)
+def test_every_part_of_a_qp_may_change_from_one_solve_to_the_next(name: str) -> None:
+    """By the KKT conditions of what was asked, there and back, bounds that open and close included.
+
+    Other solvers of qpsolvers have the same back end as clarabel.  The core is none: it solves one problem, whose
+    queries alone change.
+    """
+    rng, inf = np.random.default_rng(2), math.inf
+    qp, other = small_qp(rng, name), small_qp(rng, name)
+    changes = {
+        **{part: getattr(other, part) for part in ("P", "c", "A", "G")},
+        "b": np.array([-0.4]),
+        "h_l": np.array([-1.0, -inf, 2.5]),
+        "h_u": np.array([1.0, 0.2, 0.1]),
+        "x_l": np.array([0.3, -inf, -1.0, -0.1, -0.5]),
+        "x_u": np.array([1.0, 0.5, -0.2, 0.1, inf]),
+    }
+    cases = [qp, *(step for part, value in changes.items() for step in (replace(qp, **{part: value}), qp))]
+    opened = replace(qp, h_l=np.full(3, -inf), h_u=np.array([inf, 0.0, inf]))
+    cases += [opened, qp, replace(qp, x_l=np.full(5, -inf), x_u=np.full(5, inf)), qp, replace(opened, P=other.P), qp]
+    backend, answers = make_backend(name), []
+    backend.setup(qp)
+    for case in cases:
+        solution = backend.solve(case)
+        assert solution.status == SOLVED
+        assert kkt_residuals(case, solution).worst < 1e-5
+        answers.append(solution.x)
+    still = [i for i, (x, y) in enumerate(itertools.pairwise(answers)) if np.abs(y - x).max() < 1e-2]
+    assert not still, "these changes move no optimum, so that nothing is tested"
 
 
 def test_a_flight_by_daqp_holds_its_audit_and_is_the_same(constrained_flight: Flight) -> None:

@@ -10,6 +10,7 @@ import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from pkgutil import resolve_name
 from types import ModuleType
 from typing import Any
 
@@ -91,6 +92,17 @@ def test_the_page_of_the_api_has_every_name() -> None:
     rooms = {name for name in mpc.__all__ if isinstance(getattr(mpc, name), ModuleType)}
     handed_out = {quadsim: {*quadsim.__all__}, quadsim.gym: {*quadsim.gym.__all__}, mpc: {*mpc.__all__} - rooms}
     assert named == {f"{package.__name__}.{name}" for package, names in handed_out.items() for name in names}
+
+
+def test_the_page_of_the_api_lists_members_that_exist() -> None:
+    """Of each entry, the attributes, properties and fields that it shows."""
+    page = (EXAMPLES.parent / "docs/api.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^::: ([\w.]+)\n    options:\n      members: \[([\w, ]+)\]$", page, re.MULTILINE)
+    assert len(listed) == page.count("members:") > 2
+    for name, members in listed:
+        public = resolve_name(name)
+        there = {*dir(public), *getattr(public, "__dataclass_fields__", ())}
+        assert {*members.split(", ")} <= there, name
 
 
 def test_a_scenario_is_changed_field_by_field() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,44 @@ def test_a_random_agent_holds_five_degrees_of_tilt_behind_it_and_crashes_without
     infos, terminated = random_episode(quadsim.gym.make_env(scenario), seed=0)
     assert terminated
     assert "tilted" in infos[-1]["reason"]
+
+
+def test_the_guides_filter_protects_to_the_end_of_the_episode() -> None:
+    """The block on the page; and whoever pushes always the same way, until that leads out of the reference's reach."""
+    page = (ROOT / "docs" / "gym.md").read_text(encoding="utf-8")
+    (block,) = [text for text in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "MPCSafetyFilter(" in text]
+    names: dict[str, Any] = {"quadsim": quadsim}
+    exec(block, names)
+    env, safe = names["env"], names["safe"]
+    flight = env.unwrapped.flight()
+    assert env.steps == flight.time.size == round(safe.duration / safe.control_period)
+    assert names["violations"] == 0
+    assert 0 < env.interventions < env.steps
+    assert {finding.limit.name for finding in flight.audit} == {"roll", "pitch", "yaw_rate", "vz", "speed", "slew"}
+    assert flight.satisfied
+    assert min(flight.margins["roll"].min(), flight.margins["pitch"].min()) > 0.0
+    vehicle, (slowest, fastest) = env.unwrapped.started.vehicle, safe.controller.input_bounds.speed
+    arm = vehicle.arm_length * vehicle.thrust_coefficient / min(vehicle.inertia[:2])
+    assert arm * (fastest**2 - slowest**2) <= safe.controller.tightening.turning
+    env.reset(seed=1)
+    ended = False
+    while not ended:
+        _, _, terminated, truncated, info = env.step(np.array([0.0, 1.0, 0.0, -1.0], np.float32))
+        assert info["filter"]["intervened"]
+        assert not info["constraint_violation"]
+        ended = terminated or truncated
+    assert terminated == ("distance from the reference" in info["reason"])
+
+
+def test_a_filter_whose_model_has_rotor_lag_finds_its_plans() -> None:
+    """Its terminal condition is about the rotors' speeds at rest, far from zero."""
+    bounds = {"roll": [-5.0, 5.0], "pitch": [-5.0, 5.0], "yaw_rate": [-60.0, 60.0], "vz": [-1.0, 1.0]}
+    changes = {"constraints": [], "controller.input_bounds.speed": [430.0, 476.0], "controller.output_bounds": bounds}
+    env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(quadsim.load("playground").replace(changes)))
+    infos, terminated = random_episode(env, seed=0)
+    assert not terminated
+    assert not any(info["filter"]["fallback"] for info in infos)
+    assert 0 < env.interventions < env.steps
 
 
 def test_what_is_safe_passes_to_the_bit() -> None:

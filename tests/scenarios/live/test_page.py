@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import shutil
 import signal
@@ -14,12 +15,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
 import viser
+from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
@@ -61,6 +64,39 @@ def test_who_is_let_in(headers: dict[str, str], query: str, let_in: bool) -> Non
     guard = Guard("127.0.0.1")
     filled = {name: value.replace("{token}", guard.token) for name, value in headers.items()}
     assert (guard.refusal(filled, "/" + query.replace("{token}", guard.token), 8080) is None) == let_in
+
+
+@pytest.mark.parametrize(
+    "others",
+    [
+        'prefs={"theme":"dark","n":1}',
+        "sel=[1,2]",
+        "user[id]=3",
+        "a=hello world",
+        "flag",
+        "=nameless",
+        "name=J\udcfcrgen",
+        "exp=Wed, 21 Oct 2026 07:28:00 GMT",
+        'q=a"b; c="d',
+        "secure; path=/",
+        "quadsim-8080=of-an-earlier-session",
+        "quadsim-8080=J\udcfcrgen",
+    ],
+)
+def test_cookies_of_other_programs_on_this_host_lock_nobody_out(others: str) -> None:
+    guard = Guard("127.0.0.1")
+    ours = f"quadsim-8080={guard.token}"
+
+    def refusal(*cookies: str, hosts: tuple[str, ...] = ("127.0.0.1:8080",)) -> str | None:
+        headers = Headers()
+        for name, value in (*(("Host", host) for host in hosts), *(("Cookie", line) for line in cookies)):
+            headers.set_insecure(name, value)  # as the library does with what it has received
+        return guard.refusal(headers, "/", 8080)
+
+    assert refusal(f"{others}; {ours}") is refusal(f"{ours}; {others}") is refusal(others, ours) is None
+    assert refusal(f"{others};{ours}") is None
+    assert refusal(others) is not None
+    assert refusal(ours, hosts=("127.0.0.1:8080", "evil.example")) == "a header is there twice"
 
 
 @dataclass
@@ -178,6 +214,67 @@ def test_an_interrupt_keeps_what_was_flown(
         assert thread.daemon or not thread.is_alive()
 
 
+@pytest.fixture
+def windy() -> Iterator[Served]:
+    """A session in wind, with a mass, a lag and a worn rotor of its own."""
+    effects = {
+        "effects.air.wind": [4.0, 0.0, 0.5],
+        "effects.load": {"mass_factor": 1.1},
+        "effects.rotors": {"rise": 0.015, "fall": 0.025, "efficiency": [0.9, 1.0, 1.0, 1.0]},
+    }
+    scenario = load_scenario("playground", ["controller.horizon=10"]).replace(effects)
+    session, pace = Session(scenario), Pace(waiting=True)
+    page = Page(session, pace, save=lambda flight: "", others={})
+    yield Served(session, pace, page, threading.Event())
+    page.close()
+    session.close()
+
+
+def test_disturbances_show_what_acts_and_change_only_what_was_given(windy: Served) -> None:
+    session, page = windy.session, windy.page
+    fields = {label: widget for label, (widget, *_) in page._widgets._shown.items()}
+
+    def shown() -> dict[str, Any]:
+        return {label: widget.value for label, widget in fields.items()}
+
+    def give(label: str, value: Any) -> None:
+        page._driver, fields[label].value = 1, value
+        event = SimpleNamespace(client=SimpleNamespace(client_id=1), client_id=1, target=fields[label])
+        for called in fields[label]._impl.update_cb:
+            asyncio.run_coroutine_threadsafe(called(event), page._server.gui._event_loop).result(PATIENCE)
+
+    def fly(periods: int) -> None:
+        for _ in range(periods):
+            page.show(session.advance(), 1.0)
+
+    start = shown()
+    assert start == {
+        "Wind x, y [m/s]": (4.0, 0.0),
+        "Mass factor": 1.1,
+        "Rotor lag up, down [ms]": (15.0, 25.0),
+        **{f"Rotor {rotor} loss": 0.1 if rotor == 1 else 0.0 for rotor in range(1, 5)},
+    }
+    fly(1)
+    given = {"Wind x, y [m/s]": (4.0, -2.0), "Rotor lag up, down [ms]": (15.0, 30.0), "Rotor 1 loss": 0.19}
+    for label, value in given.items():
+        give(label, value)
+    fly(8)
+    assert shown() == start | given
+    now = session.disturbances
+    assert (now.wind, now.mass_factor, now.lag) == ((4.0, -2.0, 0.5), 1.1, (0.015, 0.03))  # the air still rises
+    assert now.loss == pytest.approx([0.19, 0.0, 0.0, 0.0])
+    give("Rotor lag up, down [ms]", (15.0, 0.0))  # refused: the rotors have inertia
+    give("Rotor 1 loss", 0.0)  # it lacks .1 by the scenario
+    fly(8)
+    assert shown() == start | given | {"Rotor 1 loss": 0.1}
+    session.submit({"type": "wind", "velocity": [1.0, 1.0, 0.0]})  # as an event of the file, or a script
+    fly(8)
+    assert shown()["Wind x, y [m/s]"] == (1.0, 1.0)
+    session.reset()
+    page._widgets.reset()
+    assert shown() == start
+
+
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     api = pytest.importorskip("playwright.sync_api", reason="no Playwright here: pip install playwright")
@@ -204,8 +301,11 @@ def tab(browser: Any, served: Served) -> Iterator[Any]:
 
 def test_the_address_alone_opens_the_page(served: Served) -> None:
     bare = served.page.address.partition("?")[0]
-    with pytest.raises(urllib.error.HTTPError, match="403"):
+    with pytest.raises(urllib.error.HTTPError, match="403") as refused:
         urllib.request.urlopen(bare)
+    text = refused.value.read().decode()
+    assert text.startswith("quadsim: the token is missing, or another session's")
+    assert "Open the whole address that quadsim live printed" in text
     with urllib.request.urlopen(served.page.address) as response:
         assert "HttpOnly" in response.headers["Set-Cookie"]
 
@@ -313,6 +413,45 @@ def test_a_reset_puts_everything_back(tab: Any, served: Served) -> None:
     row = tab.locator("label", has_text="Mass factor").locator("xpath=ancestor::div[.//*[@role='slider']][1]")
     served.wait(lambda: row.get_by_role("slider").get_attribute("aria-valuenow") == "1")
     assert served.session.flights[0].loop.controller.horizon == 10
+
+
+def test_a_page_beside_other_cookies_flies_and_one_without_ours_says_why(browser: Any, windy: Served) -> None:
+    address = urlsplit(windy.page.address)
+    thread = threading.Thread(target=windy.pace.drive, args=(windy.session, windy.page))
+    thread.start()
+    try:
+        with browser.new_context() as context:
+            for name, value in (("prefs", '{"theme":"dark"}'), ("who", "hello world"), ("sel", "[1,2]")):
+                context.add_cookies([{"name": name, "value": value, "domain": address.hostname, "path": "/"}])
+            tab = context.new_page()
+            tab.set_default_timeout(1e3 * PATIENCE)
+            tab.goto(windy.page.address)
+            tab.get_by_text("real-time factor").wait_for()
+            context.clear_cookies()  # as of a browser that keeps none, or a session that has started anew
+            tab.get_by_text("Open the whole address that quadsim live printed").wait_for()
+    finally:
+        windy.pace.stop()
+        thread.join()
+
+
+def test_one_component_that_is_typed_leaves_the_other(browser: Any, windy: Served) -> None:
+    thread = threading.Thread(target=windy.pace.drive, args=(windy.session, windy.page))
+    thread.start()
+    try:
+        tab = browser.new_page(viewport={"width": 760, "height": 800})
+        tab.set_default_timeout(1e3 * PATIENCE)
+        tab.goto(windy.page.address)
+        tab.get_by_text("real-time factor").wait_for()
+        row = tab.locator("label", has_text="Wind x, y").locator("xpath=ancestor::div[.//input][1]").locator("input")
+        assert [row.nth(i).input_value() for i in range(2)] == ["4", "0"]
+        row.nth(1).fill("-3")
+        row.nth(1).press("Enter")
+        windy.wait(lambda: windy.session.disturbances.wind == (4.0, -3.0, 0.5))
+        assert windy.session.disturbances.lag == (0.015, 0.025)
+        tab.close()
+    finally:
+        windy.pace.stop()
+        thread.join()
 
 
 @pytest.fixture(scope="module")

@@ -165,6 +165,38 @@ def test_a_reset_begins_anew(session: Session) -> None:
     assert not [event for event in session.flight().scenario.events if event.type == "payload_pickup"]
 
 
+def test_disturbances_are_what_the_scenario_and_its_events_say_now_and_a_person_adds_to_them() -> None:
+    """Before the flight, after an event of the file, after inputs, and again after a reset."""
+    rotors = {"rise": 0.0125, "fall": 0.02, "efficiency": [1.0, 0.9, 1.0, 1.0]}
+    events = [
+        {"type": "wind", "at": 0.1, "velocity": [2.0, -1.0, 0.5]},
+        {"type": "rotor_loss", "at": 0.1, "rotor": 3, "loss": 0.2, "duration": 0.1},
+    ]
+    air = {"effects.air.wind": [4.0, 0.0, 0.5], "effects.load": {"mass_factor": 1.2}}
+    scenario = load_scenario("playground").replace({**air, "effects.rotors": rotors, "events": events})
+    session = Session(scenario)
+    start = session.disturbances
+    assert (start.wind, start.mass_factor, start.lag) == ((4.0, 0.0, 0.5), 1.2, (0.0125, 0.02))
+    assert start.loss == pytest.approx([0.0, 0.1, 0.0, 0.0])
+    flown(session, 2)
+    assert session.disturbances.wind == (2.0, -1.0, 0.5)
+    assert session.disturbances.loss == pytest.approx([0.0, 0.1, 0.2, 0.0])
+    session.submit({"type": "wear", "rotor": 2, "loss": 0.5})
+    session.submit({"type": "mass", "factor": 0.9})
+    session.submit({"type": "rotor_lag", "rise": 0.03, "fall": 0.04})
+    (frame,) = flown(session, 1)
+    assert frame.health == pytest.approx([1.0, 0.45, 0.8, 1.0])  # of the period's end
+    flown(session, 1)
+    now = session.disturbances
+    assert (now.wind, now.mass_factor, now.lag) == ((2.0, -1.0, 0.5), 0.9, (0.03, 0.04))
+    assert now.loss == pytest.approx([0.0, 0.55, 0.0, 0.0])
+    assert now.worn == pytest.approx([0.0, 0.1, 0.0, 0.0])
+    session.reset()
+    assert session.disturbances.wind == start.wind
+    assert (session.disturbances.loss == start.loss).all()
+    session.close()
+
+
 def test_a_lost_flight_ends_the_session_with_its_reason(session: Session) -> None:
     for rotor in range(1, 5):
         session.submit({"type": "wear", "rotor": rotor, "loss": 1.0})
