@@ -423,20 +423,19 @@ def read(directory: str | Path) -> Flight:
         >>> bool((read.command == flight.command).all()), read.outcome
         (True, 'satisfied')
     """
-    from quadsim.flight import rundir
-    from quadsim.flight.rundir import finding_from_json
+    from quadsim.flight.rundir import findings_of
     from quadsim.vehicle import Vehicle
     from scenarios.assembly import Assembly
     from scenarios.flight import Flight
-    from scenarios.reaudit import stored_scenario
+    from scenarios.reaudit import stored_run, stored_scenario
 
     directory = Path(directory)
-    run = rundir.load_run(directory)
+    run = stored_run(directory)
     law = run.summary["controller"]
     return Flight(
         assembly=Assembly(stored_scenario(directory), Vehicle(**run.summary["vehicle"])),
         log=run.log,
-        findings=tuple(finding_from_json(entry) for entry in run.summary["constraints"]),
+        findings=findings_of(run.summary),
         controller=law["name"],
         solver=law["solver"],
         simulate_s=run.summary["wall_s"]["simulate"],

@@ -28,7 +28,7 @@ from quadsim.flight.audit import (
     worst_finding,
 )
 from quadsim.flight.log import FlightLog
-from quadsim.flight.parquet import log_tables, write_log
+from quadsim.flight.parquet import FORMAT, log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
 from quadsim.outputs import absolute, adding, amend, to_json, writing
 from quadsim.sim.airframe import outline
@@ -459,6 +459,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=steps)
     notes = model_notes(flight.assembly) if flight.controller == scenario.controller.type else []
     return {
+        "format": FORMAT,
         "scenario": scenario.name,
         "description": scenario.description,
         "status": log.status,

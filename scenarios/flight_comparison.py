@@ -22,7 +22,7 @@ from scenarios.campaign.store import stored_plan
 from scenarios.flight import Flight, require_rendering, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
-from scenarios.reaudit import reaudit
+from scenarios.reaudit import reaudit, stored_run
 from scenarios.results import Result, Shown, after
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
@@ -217,7 +217,7 @@ def _run_of(
         with reserving(beside / target.scenario.name, free=True) as place:
             return _saved(target, place, progress, products)
     if not isinstance(target, Scenario) and Path(target).is_dir():
-        return rundir.load_run(Path(target))
+        return stored_run(Path(target))
     scenario = target if isinstance(target, Scenario) else load_scenario(str(target))
     with reserving(beside / scenario.name, free=True) as place:
         return _saved(Rollout(scenario).fly(progress), place, progress, products)

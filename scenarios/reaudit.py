@@ -25,6 +25,7 @@ from quadsim.flight.audit import Finding, FlightVerdict, audit, flight_verdict
 from quadsim.flight.log import ControlLog, FlightLog
 from quadsim.flight.parquet import FLIGHT_FILE, HORIZON_FILE, PLANT_FILE, TIMING_FILE
 from quadsim.flight.rundir import finding_from_json, limit_to_json
+from quadsim.report.comparison import comparison_rows
 from quadsim.sim.computation import physics_steps
 from quadsim.sim.effects.rotors import LagChange
 from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array, wrapped
@@ -95,7 +96,7 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
     differing = list(_changed(directory, summary, products=products))
     try:
         scenario = stored_scenario(directory)
-        run = rundir.load_run(directory)
+        run = stored_run(directory)
         log = run.log
         findings = audit(log, Assembly(scenario).limits)
     except InputError as error:
@@ -115,6 +116,24 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
         rate=scenario.log_rate,
         notes=tuple(notes),
     )
+
+
+def stored_run(directory: Path) -> rundir.Run:
+    """Read a run back, and make sure that its summary can be shown.
+
+    Raises:
+        FileError: a file is missing or damaged.
+    """
+    from scenarios.summary_tables import summary_tables
+
+    run = rundir.load_run(directory)
+    try:
+        for _ in (*comparison_rows([run]), *summary_tables(run.summary)):
+            pass
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        what = f"{type(error).__name__}: {printable(str(error))}"
+        raise FileError(directory / rundir.SUMMARY_FILE, f"is damaged ({what[:200]})") from error
+    return run
 
 
 def stored_scenario(directory: Path) -> Scenario:

@@ -7,6 +7,7 @@ positions of every period for figures and films.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -40,6 +41,8 @@ from quadsim.flight.log import (
 from quadsim.input_limits import LARGEST_TABLE, LARGEST_TEXTS, MOST_COLUMNS, MOST_ROWS
 from quadsim.vehicle import N_ROTORS
 
+FORMAT: Final = 2
+"""Version of the files of runs and campaigns; to be raised when a file of another one would be misread."""
 FLIGHT_FILE: Final = "flight.parquet"
 TIMING_FILE: Final = "timing.parquet"
 PLANT_FILE: Final = "plant.parquet"
@@ -86,7 +89,25 @@ def _table(columns: Iterable[_Column], metadata: Mapping[str, str]) -> pa.Table:
         arrays.append(array)
         gaps = name in _GAPS or (array.null_count > 0)
         schema.append(pa.field(name, array.type, nullable=gaps, metadata={"unit": unit}))
-    return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata=dict(metadata)))
+    return pa.Table.from_arrays(arrays, schema=pa.schema(schema, metadata={**metadata, "format": str(FORMAT)}))
+
+
+def require_format(found: object, path: Path, again: str) -> None:
+    """Refuse a file of another version of quadsim; `again` is the command that makes it anew.
+
+    Raises:
+        FileError: its format is not `FORMAT`.
+    """
+    if str(found) != str(FORMAT):
+        was = "an unnumbered format" if found is None else f"format {str(found)[:20]!r}"
+        problem = f"was made by another version of quadsim ({was}, this one has {FORMAT}); fly it again: {again}"
+        raise FileError(path, problem)
+
+
+def format_of(table: pa.Table) -> str | None:
+    """The format that a table states."""
+    stated: bytes | None = (table.schema.metadata or {}).get(b"format")
+    return None if stated is None else stated.decode("utf-8", "replace")
 
 
 def log_tables(log: FlightLog, *, plant_stride: int = 1, metadata: Mapping[str, str]) -> dict[str, pa.Table]:
@@ -197,6 +218,10 @@ def read_log(directory: Path, *, reason: str | None = None) -> FlightLog:
         FileError: a file is missing or damaged.
     """
     flight, timing, plant = (read_parquet(directory / name) for name in (FLIGHT_FILE, TIMING_FILE, PLANT_FILE))
+    for name, table in ((FLIGHT_FILE, flight), (TIMING_FILE, timing), (PLANT_FILE, plant)):
+        require_format(
+            format_of(table), directory / name, f"quadsim run {shlex.quote(str(directory / 'scenario.toml'))}"
+        )
     try:
         before = np.array([float(text) for text in (flight.schema.metadata or {})[b"speeds_before"].split(b",")])
         values = _fields(flight, CONTROL)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, Final
 from quadsim.errors import FileError, printable
 from quadsim.flight.audit import Finding, Limit, SpaceLimit
 from quadsim.flight.log import FlightLog
-from quadsim.flight.parquet import read_log
+from quadsim.flight.parquet import read_log, require_format
 from quadsim.input_limits import LARGEST_JSON
 from quadsim.outputs import SUMMARY_FILE as SUMMARY_FILE
 from quadsim.outputs import file_hashes
@@ -25,6 +26,7 @@ NUMBER: Final = (int, float)
 MAYBE_NUMBER: Final = (int, float, NoneType)
 _FORM: Final = {
     **dict.fromkeys(("scenario", "status", "verdict"), str),
+    "format": int,
     "reason": (str, NoneType),
     "satisfied": bool,
     "duration": NUMBER,
@@ -88,6 +90,9 @@ def read_summary(directory: Path) -> dict[str, Any]:
     path = directory / SUMMARY_FILE
     if not path.is_file():
         raise FileError(directory, f"is not a run directory: it has no {SUMMARY_FILE}")
+    stated = read_json(path, {}, "a run's summary")
+    if {"scenario", "constraints"} <= stated.keys():
+        require_format(stated.get("format"), path, f"quadsim run {shlex.quote(str(directory / SCENARIO_FILE))}")
     summary = read_json(path, _FORM, "a run's summary")
     for i, entry in enumerate(summary["constraints"]):
         if wrong := _misfits(entry, _CONSTRAINT):

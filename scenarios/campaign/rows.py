@@ -19,7 +19,7 @@ from quadsim.errors import FileError
 from quadsim.flight import metrics
 from quadsim.flight.audit import Finding, Limit, worst_finding
 from quadsim.flight.log import FlightLog
-from quadsim.flight.parquet import read_parquet
+from quadsim.flight.parquet import FORMAT, read_parquet
 from quadsim.state import REFERENCE_NAMES, REFERENCE_UNITS, Array
 from scenarios.campaign.events import HARMLESS, INCOMPLETE, UNAUDITED, VERDICTS, Event, Flags
 
@@ -87,7 +87,7 @@ def make_schema(
         fields += _fields(_FLOAT, limit.unit, MARGIN + limit.name, SAMPLED + limit.name)
         fields += _fields(_FLOAT, "s", TIME_VIOLATED + limit.name)
         fields += _fields(pa.bool_(), "-", SATISFIED + limit.name)
-    return pa.schema([*fields, *_WORST, *_TIMING], metadata={"failure": "; ".join(failure)})
+    return pa.schema([*fields, *_WORST, *_TIMING], metadata={"format": str(FORMAT), "failure": "; ".join(failure)})
 
 
 def flown_row(log: FlightLog, findings: Sequence[Finding], *, verdict: str, wall_s: float, machine: str) -> Row:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import io
+import shlex
 import sys
 import time as clock
 from collections.abc import Iterable, Mapping, Sequence
@@ -24,6 +25,7 @@ import pyarrow.parquet as pq
 from mpc.core.library import why_missing
 from quadsim.assets import models_dir
 from quadsim.errors import FileError, InputError
+from quadsim.flight.parquet import FORMAT, format_of, require_format
 from quadsim.flight.rundir import read_json, require_inside
 from quadsim.outputs import SUMMARY_FILE, Growing, digest_of, to_json
 from scenarios.campaign.campaign_file import CampaignFile
@@ -35,7 +37,7 @@ from scenarios.plugin import Plugin, PluginForce, import_plugin
 MANIFEST_FILE: Final = "manifest.json"
 CAMPAIGN_FILE: Final = "campaign.toml"
 SCENARIO_FILE: Final = "scenario.toml"
-FORMAT: Final = "quadsim campaign"
+CAMPAIGN: Final = "quadsim campaign"
 _FORM: Final = {"format": str, "name": str, "status": str, "flights": int, "flown": int, "sessions": list}
 _ROOT: Final = Path(__file__).resolve().parents[2]
 FLIGHTS_FILE: Final = "flights.parquet"
@@ -51,6 +53,7 @@ def read_flights(path: Path, schema: pa.Schema) -> pa.Table:
         FileError: it cannot be read, it has other columns than the campaign, or flights are there twice, or unsorted.
     """
     table = read_table(path)
+    require_format(format_of(table), path, f"quadsim campaign {shlex.quote(str(path.parent / CAMPAIGN_FILE))}")
     kinds = {field.name: field.type for field in table.schema}
     if any(kinds.get(field.name) != field.type for field in schema if field.name not in TIMES):
         raise FileError(path, "has other columns than this campaign")
@@ -147,7 +150,8 @@ def start(plan: Plan, files: Growing, session: Mapping[str, Any], *, flying: boo
         OutputError: they cannot be written.
     """
     manifest: dict[str, Any] = {
-        "format": FORMAT,
+        "format": CAMPAIGN,
+        "version": FORMAT,
         "name": plan.spec.name,
         "description": plan.spec.description,
         "scenario": plan.scenario.name,
@@ -261,16 +265,23 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     path = directory / MANIFEST_FILE
     if not path.is_file():
         raise FileError(directory, f"is not a campaign: it has no {MANIFEST_FILE}")
+    manifest = _read_manifest(path)
+    require_format(manifest.get("version"), path, f"quadsim campaign {shlex.quote(str(directory / CAMPAIGN_FILE))}")
+    return manifest
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
     manifest = read_json(path, _FORM, "a campaign's manifest")
-    if manifest["format"] != FORMAT:
+    if manifest["format"] != CAMPAIGN:
         raise FileError(path, "is not a campaign's manifest: it lacks or misstates format")
     return manifest
 
 
 def is_campaign(directory: Path) -> bool:
-    """Whether a path is a campaign's directory."""
+    """Whether a path is a campaign's directory, of whatever version."""
     try:
-        read_manifest(directory)
+        require_inside(directory)
+        _read_manifest(directory / MANIFEST_FILE)
     except FileError:
         return False
     return True
