@@ -18,7 +18,6 @@ from typing import Annotated, Any, Final
 
 from cyclopts import CycloptsError, Parameter
 
-from quadsim.border import printing_to_stderr
 from quadsim.errors import QuadsimError, printable
 from scenarios.app import app
 from scenarios.results import EXIT_FAILED, EXIT_WRONG_INPUT, Document, Result
@@ -49,6 +48,15 @@ def _show_verdict(flight: Result) -> None:
     from scenarios import console
 
     console.show(flight.shown())
+
+
+def _stdout_for(json: bool) -> contextlib.AbstractContextManager[None]:
+    """Keep stdout for the result where it is JSON."""
+    if not json:
+        return contextlib.nullcontext()
+    from quadsim.border import printing_to_stderr  # with numpy, which the help does not need
+
+    return printing_to_stderr()
 
 
 def _show(result: object, json: bool, *, judged: bool) -> int:
@@ -84,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 command, bound, json = parsed
                 judged = "flown" in bound.arguments
                 try:
-                    with printing_to_stderr() if json else contextlib.nullcontext():
+                    with _stdout_for(json):
                         result = command(*bound.args, **bound.kwargs)
                     status = _show(result, json, judged=judged)
                 except QuadsimError as error:  # a failure may carry a partial result

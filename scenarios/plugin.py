@@ -310,7 +310,7 @@ def _import(module: str, folders: Sequence[str], table: str) -> Any:
         changed = [file for file, digest in _digests(_imported).items() if digest != _imported[file]]
         changed += [spec.origin] if spec is not None and spec.origin and spec.origin not in _imported else []
         if changed:
-            _log.warning("%s has changed: %s is imported again", ", ".join(changed), module)
+            _log.warning("%s changed: %s is imported again", ", ".join(changed), module)
             for name in [name for name, held in sys.modules.items() if getattr(held, "__file__", None) in _imported]:
                 del sys.modules[name]
             _imported.clear()

@@ -201,7 +201,7 @@ def test_an_edited_module_is_flown_as_it_is_now_with_what_it_imports(
         (tmp_path / "edited_part.py").write_text(f"SPEED = {speed}\n")
         assert first_speed(tmp_path / "s.toml") == speed
     said = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert said == 2 * [f"{tmp_path / 'edited_part.py'} has changed: edited_law is imported again"]
+    assert said == 2 * [f"{tmp_path / 'edited_part.py'} changed: edited_law is imported again"]
 
 
 def test_modules_of_one_name_in_two_folders_are_each_their_own(tmp_path: Path) -> None:
