@@ -1303,7 +1303,7 @@ def vehicle_report(
     """
     from quadsim.assets import vehicle_path
     from quadsim.report.film.video import render_portrait
-    from quadsim.sim.autopilot import AutopilotSettings, built_in_lags
+    from quadsim.sim.autopilot import AutopilotSettings
     from quadsim.vehicle import vehicle_sources
     from scenarios import loading, results
     from scenarios.assembly import stated_autopilot
@@ -1324,7 +1324,7 @@ def vehicle_report(
         vehicle=loaded,
         sources=vehicle_sources(path),
         autopilot=autopilot,
-        inner_lag=built_in_lags(loaded, autopilot, 1e-3),
+        inner_lag=vehicle_report.inner_lag_of(loaded, autopilot),
         figures=vehicle_report.make_sheet(loaded),
         scenario=None if against is None else against.name,
         shortfalls=None if against is None else shortfalls.shortfalls(against, loaded),

@@ -7,7 +7,8 @@ import os
 import platform
 import shutil
 import time as clock
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -61,10 +62,11 @@ def capabilities() -> dict[str, dict[str, str]]:
             "disk": f"{shutil.disk_usage('.').free / 1e9:.1f} GB free here",
         },
         "packages": versions(),
-        "rendering": {"video": _rendering()},
+        "rendering": {"video": _tried(_rendering)},
         "viewer": {"native": viewer_problem() or "can be opened", "browser": "quadsim view RUN --web"},
         "solvers": {
-            name: _try_solver(name) if entry.installed else entry.line for name, entry in solver_entries().items()
+            name: _tried(partial(_try_solver, name)) if entry.installed else entry.line
+            for name, entry in solver_entries().items()
         },
     }
 
@@ -72,10 +74,17 @@ def capabilities() -> dict[str, dict[str, str]]:
 def _rendering() -> str:
     from quadsim.report.film.video import rendering_backend
 
+    return f"renders off screen through {rendering_backend().upper()}"
+
+
+def _tried(call: Callable[[], str]) -> str:
+    """Return what a part of this machine can do, or why it cannot: a broken one must not hide the others."""
     try:
-        return f"renders off screen through {rendering_backend().upper()}"
+        return call()
     except QuadsimError as error:
         return str(error)
+    except Exception as error:  # of a package that is installed and does not work
+        return f"fails: {type(error).__name__}: {error}"
 
 
 def _try_solver(name: str) -> str:

@@ -11,9 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from mpc.model import continuous_model, discretise
-from quadsim.errors import ParameterError
+from quadsim.errors import ParameterError, QuadsimError
 from quadsim.report.table import Cell, Grid, format_number
-from quadsim.sim.autopilot import AutopilotSettings
+from quadsim.sim.autopilot import AutopilotSettings, built_in_lags
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
 from scenarios.design.authority import TorqueRange, authority, torque_ranges
@@ -21,6 +21,7 @@ from scenarios.design.rules import delay_margin, design_for
 from scenarios.results import Result, Shown
 
 SHEET_PERIOD: Final = 0.05  # control period of the discrete poles [s], the paper's
+TIMESTEP: Final = 1e-3  # of the physics behind the autopilot's lags [s]
 CHAINS: Final = (4, 4, 2, 2)  # of integrators in the model at hover: x over pitch, y over roll, z, yaw
 _RPM: Final = 60.0 / (2.0 * math.pi)
 
@@ -75,7 +76,9 @@ class VehicleReport(Result):
     sources: Mapping[str, str]  # of each parameter, as its file names them
     figures: VehicleSheet  # what follows from the numbers
     autopilot: AutopilotSettings  # of its file, what is absent by rule
-    inner_lag: tuple[float, ...]  # first-order lags of thrust, p, q, r under it [s], by steps from hover
+    inner_lag: (
+        tuple[float, ...] | str
+    )  # first-order lags of thrust, p, q, r under it [s], or why none can be identified
     scenario: str | None = None  # scenario that it was compared with, or None
     shortfalls: tuple[str, ...] | None = None
     """Bounds of that scenario that it cannot meet, a sentence each; None without a scenario."""
@@ -105,11 +108,22 @@ class VehicleReport(Result):
                 for name, value, unit in self.parameters
             },
             "derived": asdict(self.figures),
-            "autopilot": {**asdict(self.autopilot), "inner_lag": self.inner_lag},
+            "autopilot": {
+                **asdict(self.autopilot),
+                **({"inner_lag": None, "why": lag} if isinstance(lag := self.inner_lag, str) else {"inner_lag": lag}),
+            },
         }
         if self.shortfalls is not None:
             data |= {"scenario": self.scenario, "shortfalls": self.shortfalls}
         return data
+
+
+def inner_lag_of(vehicle: Vehicle, autopilot: AutopilotSettings) -> tuple[float, ...] | str:
+    """Return `inner_lag` of the report: controllers that command the rotors fly without one."""
+    try:
+        return built_in_lags(vehicle, autopilot, TIMESTEP)
+    except QuadsimError as error:
+        return str(error)
 
 
 def make_sheet(vehicle: Vehicle) -> VehicleSheet:
@@ -257,7 +271,10 @@ def _autopilot(report: VehicleReport) -> list[tuple[str, ...]]:
     return [
         *((f"{name}, roll, pitch, yaw", _listed(getattr(settings, name)), unit) for name, unit in gains.items()),
         ("rate", format_number(settings.rate or 0.0), "Hz"),
-        ("inner_lag, thrust, roll, pitch, yaw", _listed(report.inner_lag), "s"),
+        (
+            "inner_lag, thrust, roll, pitch, yaw",
+            *(("none", report.inner_lag) if isinstance(report.inner_lag, str) else (_listed(report.inner_lag), "s")),
+        ),
     ]
 
 

@@ -55,8 +55,9 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
 
     `info` at each step, and at the start:
 
-    - `margins`: signed margin of each constraint at its worst within the step, at the physics rate, in the constraint's
-      unit; negative = beyond the bound, inf outside its time window.
+    - `margins`: signed margin of each constraint at its worst within the step, at the physics rate, or at the samples
+      where its signal has no others (tracking errors, `slew`), in the constraint's unit; negative = beyond the bound,
+      inf outside its time window.
     - `margins_sampled`: the margins at the end of the step, as a check at the control rate sees them.
     - `constraint_values`: (m,) g = -margin in the order of `constraint_names`, so that g <= 0 holds; -inf outside.
     - `constraint_violation`: 1 where a required constraint was violated beyond its tolerances, else 0.

@@ -25,6 +25,7 @@ from scenarios.campaign.plan import read_campaign
 from scenarios.catalogue import campaign_names, scenario_names, tuning_names
 from scenarios.cli import main
 from scenarios.loading import load_scenario
+from scenarios.machine import capabilities
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -133,6 +134,18 @@ def test_doctor_tries_every_solver(capsys: pytest.CaptureFixture[str]) -> None:
     for name, line in result["solvers"].items():
         installed = solver_entries()[name].installed
         assert line.startswith(("works: ", "fails: ") if installed else ("not installed: ", "not compiled: ")), name
+
+
+def test_doctor_reports_a_package_that_does_not_work_and_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(self: object, qp: object) -> None:
+        raise RuntimeError("libdaqp.so is of another machine")
+
+    monkeypatch.setattr("mpc.solvers.daqp.DaqpDense.setup", broken)
+    monkeypatch.setattr("scenarios.machine._rendering", lambda: 1 / 0)
+    checks = capabilities()
+    assert checks["solvers"]["daqp"] == "fails: RuntimeError: libdaqp.so is of another machine"
+    assert checks["rendering"]["video"] == "fails: ZeroDivisionError: division by zero"
+    assert checks["solvers"]["piqp-dense"].startswith("works: ")
 
 
 # --- run -----------------------------------------------------------------------------------------------------------

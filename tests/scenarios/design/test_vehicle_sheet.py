@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +15,15 @@ import pytest
 
 from mpc.model import continuous_model, hover_model
 from quadsim.assets import vehicle_names, vehicle_path
-from quadsim.errors import RenderingUnavailableError
+from quadsim.errors import InputError, RenderingUnavailableError
 from quadsim.report.film.video import render_portrait, rendering_backend
 from quadsim.state import INDEX
 from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle, load_vehicle
+from scenarios.assembly import Assembly
 from scenarios.cli import main
 from scenarios.design.authority import torque_ranges
 from scenarios.design.vehicle_report import make_sheet
+from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE
 
 VEHICLES = [load_vehicle(vehicle_path(name)) for name in vehicle_names()]
@@ -132,6 +135,34 @@ def test_the_command_prints_figures_and_sources(name: str, capsys: pytest.Captur
     for text in (vehicle.description, f"{vehicle.hover_speed:.4g}", "thrust to weight", "chains of 4, 4, 2, 2", *given):
         assert text in printed
     assert ("rotors that rise" in printed) == (vehicle.rotor_rise is not None)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "axis"),
+    [
+        ("rotor_rise", "0.7", "thrust"),  # slower than any lag that is identified
+        ("inertia", "[90.0, 90.0, 160.0]", "p"),  # more than the torque can turn in time
+    ],
+)
+def test_a_vehicle_whose_autopilot_has_no_lag_is_reported_and_flies(
+    field: str, value: str, axis: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["vehicle", "--template"]) == EXIT_DONE
+    template, file = capsys.readouterr().out, tmp_path / "slow.toml"
+    text, count = re.subn(rf"(?m)^(\[{field}\]\nvalue = ).*", rf"\g<1>{value}", template)
+    assert count == 1
+    file.write_text(text, encoding="utf-8")
+    why = f"autopilot: a step of {axis} is not reached, so no lag fits it; state inner_lag"
+    assert main(["vehicle", str(file), "--json"]) == EXIT_DONE
+    sheet = json.loads(capsys.readouterr().out)
+    assert (sheet["autopilot"]["inner_lag"], sheet["autopilot"]["why"]) == (None, why)
+    assert sheet["derived"]["hover_speed"] > 0.0
+    assert main(["vehicle", str(file)]) == EXIT_DONE
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "thrust to weight" in printed
+    assert f"none {why[:40]}" in printed
+    with pytest.raises(InputError, match=f"a step of {axis} is not reached"):  # who needs it is told
+        _ = Assembly(load_scenario("hover").replace({"vehicle.file": str(file)})).inner_lag
 
 
 def test_the_portrait_shows_the_vehicle(tmp_path: Path) -> None:
