@@ -1,7 +1,7 @@
 """A vehicle's numbers checked together: ratios that no real quadrotor has, and the unit that would explain them.
 
-Each number alone may be anything; what gives a wrong unit away is its ratio to the others.  Ranges cover quadrotors from
-30 g to 30 kg with room to spare.  They are for warnings: a vehicle outside them still flies.
+Each number alone may be anything; what gives a wrong unit away is its ratio to the others.  The ranges cover quadrotors
+of 30 g to 30 kg with room to spare.  They are for warnings: a vehicle outside them still flies.
 """
 
 from __future__ import annotations
@@ -151,6 +151,13 @@ RATIOS: Final = (
             high=1.0,
         )
         for name in ("rotor_rise", "rotor_fall")
+    ),
+    Ratio(
+        of=("rotor_fall", "rotor_rise"),
+        text="rotor_fall over rotor_rise",
+        value=lambda v: None if v.rotor_rise is None else _over(v.rotor_fall, v.rotor_rise),
+        low=0.4,
+        high=5.0,
     ),
     Ratio(
         of=("extent", "arm_length"),
