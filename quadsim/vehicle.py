@@ -157,10 +157,11 @@ class Vehicle:
     def enclosing_radius(self) -> float:
         """Radius of the vehicle's bounding ball [m]: its extent, or the distance to the propellers' tips.
 
-        Without a `rotor_radius`, the propellers are assumed as large as possible: neighbours almost touch.
+        An extent within the propellers' tips does not count.  Without either, the propellers are assumed as large as
+        possible: neighbours almost touch.
         """
         if self.extent is not None:
-            return self.extent
+            return max(self.extent, self.arm_length + (self.rotor_radius or 0.0))
         apart = np.linalg.norm(self.rotor_positions[:, None] - self.rotor_positions[None], axis=2)
         widest = 0.5 * float(apart[~np.eye(N_ROTORS, dtype=bool)].min())
         return self.arm_length + (widest if self.rotor_radius is None else self.rotor_radius)

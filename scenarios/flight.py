@@ -31,6 +31,7 @@ from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FORMAT, log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
 from quadsim.outputs import absolute, adding, amend, to_json, writing
+from quadsim.plausibility import implausible
 from quadsim.sim.airframe import outline
 from quadsim.sim.estimator import Tally
 from quadsim.sim.sensing import SensorName
@@ -457,7 +458,8 @@ def summarise(flight: Flight) -> dict[str, Any]:
     estimation = {} if log.control.measured_perfectly else {**metrics.estimation(log.control), "samples": samples}
     steps = flight.assembly.course_steps
     numbers = metrics.flight_numbers(log, deadline_ms=1e3 * scenario.control_period, course=steps)
-    notes = model_notes(flight.assembly) if flight.controller == scenario.controller.type else []
+    notes = implausible(flight.actual)
+    notes += model_notes(flight.assembly) if flight.controller == scenario.controller.type else []
     return {
         "format": FORMAT,
         "scenario": scenario.name,

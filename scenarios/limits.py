@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def audited(assembly: Assembly) -> tuple[Limit, ...]:
     """Return the limits of the audit: constraints, controller bounds, obstacles and regions."""
-    scenario, bounds = assembly.scenario, assembly.bounds
+    scenario, bounds = assembly.scenario, _flyable(assembly)
     return (
         *_stated(scenario, bounds),
         *_unnamed(scenario, bounds),
@@ -38,7 +38,7 @@ def audited(assembly: Assembly) -> tuple[Limit, ...]:
 
 def with_bounds_stated(assembly: Assembly) -> Scenario:
     """Return the scenario with its controller's bounds as constraints, to apply them to another controller."""
-    scenario, bounds = assembly.scenario, assembly.bounds
+    scenario, bounds = assembly.scenario, _flyable(assembly)
     return scenario.altered(constraints=[*_stated(scenario, bounds), *_unnamed(scenario, bounds)])
 
 
@@ -58,7 +58,7 @@ def with_law_bounds(assembly: Assembly, controller: Controller) -> Assembly:
 
 def audit_notes(assembly: Assembly) -> list[str]:
     """Return notes on the audit: bounds without a constraint, and constraints that differ from the controller's."""
-    scenario, vehicle, bounds = assembly.scenario, assembly.vehicle, assembly.bounds
+    scenario, vehicle, bounds = assembly.scenario, assembly.vehicle, _flyable(assembly)
     audited = [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]
     unnamed = [limit.name for limit in _unnamed(scenario, bounds)]
     absent = [entry.name for entry in scenario.constraints if not (entry.has_bounds or entry.signal in bounds)]
@@ -69,7 +69,7 @@ def audit_notes(assembly: Assembly) -> list[str]:
         notes.append(UNAUDITED_ADVICE)
     if absent:
         notes.append(f"{', '.join(absent)}: not audited, the controller has no such bound and the entry states none")
-    changes = [(0.0, bounds)] + [(at, spec.audited(vehicle)) for at, spec in scenario.controller_changes]
+    changes = [(0.0, assembly.bounds)] + [(at, spec.audited(vehicle)) for at, spec in scenario.controller_changes]
     for limit in audited:
         for (at, now), (_, before) in zip(changes, [(0.0, {}), *changes], strict=False):
             pair = now.get(limit.signal)
@@ -80,6 +80,15 @@ def audit_notes(assembly: Assembly) -> list[str]:
                     f"bounds {_range(*pair)} {limit.unit}{since}"
                 )
     return notes
+
+
+def _flyable(assembly: Assembly) -> dict[str, Range]:
+    """Return the controller's bounds, those on speeds within the range that the vehicle's rotors have."""
+    bounds, vehicle = assembly.bounds, assembly.actual
+    if "speed" in bounds:
+        lower, upper = max(bounds["speed"][0], vehicle.speed_min), min(bounds["speed"][1], vehicle.speed_max)
+        bounds = {**bounds, "speed": (lower, upper) if lower < upper else (vehicle.speed_min, vehicle.speed_max)}
+    return dict(bounds)
 
 
 def _stated(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from mpc.model import continuous_model, discretise
 from quadsim.errors import ParameterError, QuadsimError
+from quadsim.plausibility import implausible
 from quadsim.report.table import Cell, Grid, format_number
 from quadsim.sim.autopilot import AutopilotSettings, built_in_lags
 from quadsim.state import INDEX
@@ -95,6 +96,7 @@ class VehicleReport(Result):
         from scenarios import console
 
         yield from console.grids(vehicle_tables(self), left=("unit", "source", "what and why"))
+        yield from implausible(self.vehicle)
         if self.picture is not None:
             yield console.written_to(self.picture)
 
@@ -108,6 +110,7 @@ class VehicleReport(Result):
                 for name, value, unit in self.parameters
             },
             "derived": asdict(self.figures),
+            "notes": implausible(self.vehicle),
             "autopilot": {
                 **asdict(self.autopilot),
                 **({"inner_lag": None, "why": lag} if isinstance(lag := self.inner_lag, str) else {"inner_lag": lag}),

@@ -127,7 +127,9 @@ class Simulation:
             "step of a free rigid body with all forces evaluated at each stage, as in published simulations"
         ),
     ] = "mujoco"
-    limit_speeds: Annotated[bool, doc("whether rotors saturate at the vehicle's speed_min and speed_max")] = False
+    limit_speeds: Annotated[
+        bool, doc("whether rotors saturate at the vehicle's speed_min and speed_max; false: they take any speed >= 0")
+    ] = True
 
 
 def _false_alone(value: object) -> object:

@@ -1,0 +1,229 @@
+"""A vehicle's numbers checked together: ratios that no real quadrotor has, and the unit that would explain them.
+
+Each number alone may be anything; what gives a wrong unit away is its ratio to the others.  The ranges cover quadrotors
+of 30 g to 30 kg with room to spare.  They are for warnings: a vehicle outside them still flies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from quadsim.errors import ParameterError
+from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
+
+AIR_DENSITY: Final = 1.225  # [kg/m^3]
+UNKNOWN_RADIUS: Final = 0.5  # radius of a propeller whose file states none, in arm lengths
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ratio:
+    """A ratio of a vehicle's numbers, and the range that quadrotors have."""
+
+    of: tuple[str, ...]  # parameters that it depends on, the one most likely wrong first
+    text: str  # what it is, in words
+    value: Callable[[Vehicle], float | None]  # None where the vehicle does not state it
+    low: float
+    high: float
+
+    def misfit(self, vehicle: Vehicle) -> float:
+        """Return by how many factors of e a vehicle is outside the range; 0 inside, or where it states nothing."""
+        value = self.value(vehicle)
+        if value is None:
+            return 0.0
+        if value <= 0.0:
+            return math.inf if self.low > 0.0 else 0.0
+        return max(math.log(value / self.high), math.log(self.low / value) if self.low > 0.0 else 0.0, 0.0)
+
+
+def _radius(vehicle: Vehicle) -> float:
+    return UNKNOWN_RADIUS * vehicle.arm_length if vehicle.rotor_radius is None else vehicle.rotor_radius
+
+
+def _over(value: float | None, other: float) -> float | None:
+    return None if value is None else value / other
+
+
+def _thrust_coefficient(vehicle: Vehicle) -> float:
+    """C_T = b / (rho pi R^4)."""
+    return vehicle.thrust_coefficient / (AIR_DENSITY * math.pi * _radius(vehicle) ** 4)
+
+
+def _slowing(vehicle: Vehicle) -> float | None:
+    """Share of the speed that the rotors' drag takes per second at hover [1/s]."""
+    return _over(vehicle.rotor_drag, vehicle.mass / (N_ROTORS * vehicle.hover_speed))
+
+
+RATIOS: Final = (
+    Ratio(of=("gravity",), text="gravity [m/s^2]", value=lambda v: v.gravity, low=1.3, high=26.0),
+    Ratio(
+        of=("arm_length", "mass"),
+        text="mass / arm_length^3 [kg/m^3]",
+        value=lambda v: v.mass / v.arm_length**3,
+        low=8.0,
+        high=3000.0,
+    ),
+    Ratio(
+        of=("inertia", "arm_length", "mass"),
+        text="the larger of Ixx and Iyy over mass arm_length^2",
+        value=lambda v: max(v.inertia[:2]) / (v.mass * v.arm_length**2),
+        low=0.02,
+        high=1.5,
+    ),
+    Ratio(
+        of=("inertia", "arm_length", "mass"),
+        text="the smaller of Ixx and Iyy over mass arm_length^2",
+        value=lambda v: min(v.inertia[:2]) / (v.mass * v.arm_length**2),
+        low=0.02,
+        high=1.5,
+    ),
+    Ratio(
+        of=("inertia", "arm_length", "mass"),
+        text="Izz over mass arm_length^2",
+        value=lambda v: v.inertia[2] / (v.mass * v.arm_length**2),
+        low=0.04,
+        high=3.0,
+    ),
+    Ratio(
+        of=("speed_max", "thrust_coefficient", "mass"),
+        text="largest thrust over weight",
+        value=lambda v: (v.speed_max / v.hover_speed) ** 2,
+        low=1.0,
+        high=12.0,
+    ),
+    Ratio(
+        of=("thrust_coefficient", "rotor_radius", "arm_length"),
+        text="thrust_coefficient over rho pi rotor_radius^4",
+        value=_thrust_coefficient,
+        low=1e-3,
+        high=0.6,
+    ),
+    Ratio(
+        of=("speed_max", "rotor_radius", "thrust_coefficient"),
+        text="tip speed of the rotors at hover [m/s]",
+        value=lambda v: v.hover_speed * _radius(v),
+        low=4.0,
+        high=200.0,
+    ),
+    Ratio(
+        of=("rotor_radius", "arm_length"),
+        text="rotor_radius over arm_length",
+        value=lambda v: _over(v.rotor_radius, v.arm_length),
+        low=0.12,
+        high=1.0,
+    ),
+    Ratio(
+        of=("drag_to_thrust", "rotor_radius", "arm_length"),
+        text="drag_to_thrust over rotor_radius",
+        value=lambda v: v.drag_to_thrust / _radius(v),
+        low=0.01,
+        high=0.6,
+    ),
+    Ratio(
+        of=("rotor_inertia", "rotor_radius", "mass"),
+        text="rotor_inertia over mass rotor_radius^2",
+        value=lambda v: _over(v.rotor_inertia, v.mass * _radius(v) ** 2),
+        low=1e-5,
+        high=6e-3,
+    ),
+    Ratio(
+        of=("rotor_drag", "mass"),
+        text="share of the speed that rotor_drag takes per second at hover",
+        value=_slowing,
+        low=1e-3,
+        high=1.2,
+    ),
+    Ratio(
+        of=("body_drag", "arm_length"),
+        text="the largest body_drag over pi arm_length^2",
+        value=lambda v: _over(None if v.body_drag is None else max(v.body_drag), math.pi * v.arm_length**2),
+        low=1e-3,
+        high=3.0,
+    ),
+    *(
+        Ratio(
+            of=(name, "rotor_radius"),
+            text=f"{name} [s] over 0.12 s + rotor_radius / (1 m/s)",
+            value=lambda v, name=name: _over(getattr(v, name), 0.12 + _radius(v)),  # type: ignore[misc]
+            low=5e-3,
+            high=1.0,
+        )
+        for name in ("rotor_rise", "rotor_fall")
+    ),
+    Ratio(
+        of=("rotor_fall", "rotor_rise"),
+        text="rotor_fall over rotor_rise",
+        value=lambda v: None if v.rotor_rise is None else _over(v.rotor_fall, v.rotor_rise),
+        low=0.4,
+        high=5.0,
+    ),
+    Ratio(
+        of=("extent", "arm_length"),
+        text="extent over arm_length + rotor_radius",
+        value=lambda v: _over(v.extent, v.arm_length + (v.rotor_radius or 0.0)),
+        low=0.999,
+        high=3.0,
+    ),
+)
+_LENGTHS: Final = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
+_TIMES: Final = {"ms": 1e-3}
+_MOMENTS: Final = {"kg cm^2": 1e-4, "g cm^2": 1e-7, "kg mm^2": 1e-6, "g mm^2": 1e-9}
+_SPEEDS: Final = {"rpm": math.pi / 30.0}
+UNITS: Final[dict[str, dict[str, float]]] = {
+    **dict.fromkeys(("arm_length", "rotor_radius", "drag_to_thrust", "extent"), _LENGTHS),
+    **dict.fromkeys(("inertia", "rotor_inertia"), _MOMENTS),
+    **dict.fromkeys(("rotor_rise", "rotor_fall"), _TIMES),
+    **dict.fromkeys(("speed_min", "speed_max"), _SPEEDS),
+    "thrust_coefficient": {"N/rpm^2": (30.0 / math.pi) ** 2, "g/rpm^2": 9.80665e-3 * (30.0 / math.pi) ** 2},
+    "body_drag": {"cm^2": 1e-4, "mm^2": 1e-6},
+    "mass": {"g": 1e-3},
+}
+"""Units, with their factors to the file's, in which each parameter is given by mistake."""
+
+
+def implausible(vehicle: Vehicle) -> list[str]:
+    """Return a line per ratio outside its range, or one about the unit that would explain all of them."""
+    off = [ratio for ratio in RATIOS if ratio.misfit(vehicle) > 0.0]
+    if off and (explanation := _explanation(vehicle)) is not None:
+        more = "" if len(off) == 1 else f", and {len(off) - 1} more ratios are off"
+        return [f"vehicle: {explanation}; as it is, {_line(off[0], vehicle)}{more}"]
+    return [f"vehicle: {_line(ratio, vehicle)}; check {', '.join(ratio.of)}" for ratio in off]
+
+
+def _line(ratio: Ratio, vehicle: Vehicle) -> str:
+    return f"{ratio.text} is {ratio.value(vehicle):.3g}, usually {ratio.low:g} to {ratio.high:g}"
+
+
+def _explanation(vehicle: Vehicle) -> str | None:
+    """Return which one parameter in another unit would make the vehicle plausible; None if none would."""
+    before, best = _misfit(vehicle), None
+    for name, unit, other in _converted(vehicle):
+        misfit = _misfit(other)
+        if misfit < 0.2 * before and (best is None or misfit < best[0] - 1e-9):
+            given, fits = _shown(getattr(vehicle, name)), _shown(getattr(other, name))
+            best = misfit, f"is {name} = {given} given in {unit}? {fits} {VEHICLE_UNITS[name]} would fit"
+    return None if best is None else best[1]
+
+
+def _misfit(vehicle: Vehicle) -> float:
+    return sum(ratio.misfit(vehicle) for ratio in RATIOS)
+
+
+def _converted(vehicle: Vehicle) -> Iterator[tuple[str, str, Vehicle]]:
+    """Yield the vehicle with one parameter taken to be in another unit."""
+    for name, units in UNITS.items():
+        value: Any = getattr(vehicle, name)
+        if value is None:
+            continue
+        for unit, factor in units.items():
+            scaled = tuple(factor * entry for entry in value) if isinstance(value, tuple) else factor * value
+            try:
+                yield name, unit, replace(vehicle, **{name: scaled})
+            except ParameterError:  # no vehicle at all
+                continue
+
+
+def _shown(value: Any) -> str:
+    return ", ".join(f"{entry:.4g}" for entry in value) if isinstance(value, tuple) else f"{value:.4g}"
