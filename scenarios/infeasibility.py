@@ -25,7 +25,8 @@ from mpc.ocp import InfeasiblePeriod
 from mpc.robust.settings import Robust
 from quadsim.errors import InputError
 from quadsim.flight.audit import TERMS, sum_signal
-from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES
+from quadsim.flight.metrics import unrecovered
+from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios.feasibility_check import hover_notes, hover_speed
 from scenarios.schema.base import fields_of
@@ -47,6 +48,9 @@ ITERATIONS: Final = (2, 3, 5, 10, 20, 50, 100)
 AFTER: Final = 5.0  # flown beyond the first period without an answer [s]
 LONGEST: Final = 60.0  # longest flight of a change [s]; what would have to be flown for longer is not flown
 MOST_FLOWN: Final = 6  # flights of one diagnosis
+LEAVING_FROM, LEAVING_FOR = 1.0, 1.0
+"""Distance from the reference [m], and time for which it has grown [s], from which on a vehicle is leaving it."""
+RETURNING: Final = 0.9  # violation at the end of a flight, over its largest, up to which it is passing
 HOVER_RESERVE: Final = 0.1  # distance of the advised bound on rotor speeds from hover, over hover
 _SPEED: Final = "controller.input_bounds.speed"
 _ROTORS: Final = {1: "slew", 2: "speed"}
@@ -95,35 +99,37 @@ def diagnose(infeasible_period: InfeasiblePeriod, scenario: Scenario, vehicle: V
 def tried(explanation: Mapping[str, Any], flight: Flight) -> dict[str, Any]:
     """Fly each suggestion of a flight's `diagnose`; return the report with those that prevent the failure as advice.
 
-    `suggestions` are then those whose flight is satisfied, or as far as it goes; the others are in `rejected`, each
-    with a reason `why`.  Both have the same order and times for the same flight.
+    `suggestions` are then those with an answer in every period, or the fallback, and a flight that is satisfied as far
+    as it goes; if there are none, those that violate constraints (`violated`) on the way back to them, as from a start
+    beyond a bound.  The others are in `rejected`, each with a reason `why`.
 
     A flight with code that was passed in cannot be repeated, nor can one be continued in the middle: where an event had
     changed the controller, or the failure is late, the advice says that it was not flown.
     """
-    report, scenario, assembly = dict(explanation), flight.scenario, flight.assembly
+    report, scenario, assembly = {**explanation, "rejected": []}, flight.scenario, flight.assembly
     notes = hover_notes(assembly)
     report["sentence"] = "; ".join([*notes, report["sentence"]])
-    candidates = [*_predicting_lag(scenario, assembly), *report["suggestions"]]
-    if notes:
-        candidates = _reaching_hover(scenario, assembly)
+    lagging = _predicting_lag(scenario, assembly) if report["feasible"] is False else []
+    candidates = _reaching_hover(scenario, assembly) if notes else [*lagging, *report["suggestions"]]
+    if not candidates:
+        return report
     until = min(report["time"] + AFTER, scenario.duration)
-    unflown = _not_flown(flight, report["time"], until)
-    if not candidates or unflown:
-        if candidates and unflown and report["advice"]:
-            report["advice"] = f"not flown, as {unflown}; the model alone: {report['advice'].removeprefix('to try: ')}"
-        return {**report, "rejected": []}
-    kept, rejected = [], []
-    for i, change in enumerate(candidates):
-        why = "not flown" if i >= MOST_FLOWN else _failure(scenario, assembly, change["settings"], until)
-        kept += [] if why else [change]
-        rejected += [{**change, "why": why}] if why else []
-    report |= {"suggestions": kept, "rejected": rejected}
+    if unflown := _not_flown(flight, report["time"], until):
+        report["advice"] = f"to try, not flown, as {unflown}: {'; '.join(map(_change_text, candidates))}"
+        return {**report, "suggestions": candidates}
+    trials = [_trial(scenario, assembly, change["settings"], until) for change in candidates[:MOST_FLOWN]]
+    flown = [{**change, "violated": [*trial.violated]} for change, trial in zip(candidates, trials, strict=False)]
+    flying = [change for change, trial in zip(flown, trials, strict=True) if not trial.why]
+    kept = [change for change in flying if not change["violated"]] or flying
+    reasons = [trial.why or f"violated: {', '.join(trial.violated)}" for trial in trials]
+    left = [{**change, "why": why} for change, why in zip(flown, reasons, strict=True) if change not in kept]
+    report |= {"suggestions": kept, "rejected": left}
+    until_text = f"flown until {until:.4g} s"
     if kept:
-        report["advice"] = f"to try, each flown until {until:.4g} s: {'; '.join(map(_change_text, kept))}"
+        report["advice"] = f"to try, each {until_text}: {'; '.join(map(_change_text, kept))}"
     else:
-        shown = "; ".join(f"{_change_text(change)} ({change['why']})" for change in rejected)
-        report["advice"] = f"flown until {until:.4g} s, no change prevents it: {shown}"
+        failed = "; ".join(f"{_change_text(change)} ({change['why']})" for change in report["rejected"])
+        report["advice"] = f"{until_text}, no change prevents it: {failed}"
     return report
 
 
@@ -136,25 +142,47 @@ def _not_flown(flight: Flight, time: float, until: float) -> str:
     return f"it would take more than {LONGEST:g} s of flight" if until > LONGEST else ""
 
 
-def _failure(scenario: Scenario, assembly: Assembly, settings: Settings, until: float) -> str:
-    """Fly a scenario with other fields; return why the flight fails, empty if it does not."""
+@dataclass(frozen=True, kw_only=True)
+class _Trial:
+    """The flight of a change."""
+
+    why: str = ""  # why it fails; empty if it does not
+    violated: tuple[str, ...] = ()  # required constraints that it violates, while it returns to them
+
+
+def _trial(scenario: Scenario, assembly: Assembly, settings: Settings, until: float) -> _Trial:
+    """Fly a scenario with other fields."""
     from scenarios.rollout import Rollout  # which imports flights, and these this module
 
     changed = changed_scenario(scenario, settings)
     if changed is None:
-        return "the file would be refused"
+        return _Trial(why="the file would be refused")
     try:
         flight = Rollout(assembly.of(changed)).fly(until=until)
     except InputError as error:
-        return str(error)
+        return _Trial(why=str(error))
     if flight.log.interrupted:
         raise KeyboardInterrupt
-    if flight.outcome in ("satisfied", "incomplete"):
-        return ""
-    violated = [f.limit.name for f in flight.findings if f.verdict == "violated" and f.limit.required]
+    unanswered, period = flight.infeasible_period, scenario.control_period
     if flight.log.reason is not None:
-        return f"{flight.outcome} at t = {flight.log.control.t.size * scenario.control_period:.4g} s"
-    return f"violated: {', '.join(violated)}" if violated else "crashed, or in fallback to its end"
+        return _Trial(why=f"{flight.outcome} at t = {flight.time.size * period:.4g} s")
+    if unanswered is not None and unanswered.converges is None and "controller.fallback" not in settings:
+        return _Trial(why=f"no answer at t = {unanswered.time:.4g} s")
+    if flight.log.control.crashed or unrecovered(flight.log.control):
+        return _Trial(why="crashed" if flight.log.control.crashed else "in fallback to its end")
+    distance = np.linalg.norm([flight.state[axis] - flight.reference[axis] for axis in "xyz"], axis=0)
+    last = distance[-max(round(LEAVING_FOR / period), 1) - 1 :]
+    if last[-1] > LEAVING_FROM and (np.diff(last) > 0.0).all():
+        return _Trial(why=f"{last[-1]:.3g} m from the reference at its end, and leaving")
+    violated = [each.limit.name for each in flight.findings if each.limit.required and each.verdict == "violated"]
+    lasting = [name for name in violated if _lasts(flight.margins[name])]
+    return _Trial(why=f"violated: {', '.join(violated)}" if lasting else "", violated=tuple(violated))
+
+
+def _lasts(margins: Array) -> bool:
+    """Return whether a constraint's margins (K,), of which some are negative, end near the worst one."""
+    margins = margins[np.isfinite(margins)]
+    return bool(margins[-1] < RETURNING * margins.min())
 
 
 def _predicting_lag(scenario: Scenario, assembly: Assembly) -> list[dict[str, Any]]:
@@ -463,7 +491,9 @@ def _change_text(change: Mapping[str, Any]) -> str:
     fields += " (without the field solver)" if "controller.type" in settings else ""
     if (count := settings.get("controller.iterations")) is not None:
         fields += f", which takes up to {count} times as long"
-    return fields + (f" (level hover; an answer again after {after:.2f} s, by the model)" if after else "")
+    fields += f" (level hover; an answer again after {after:.2f} s, by the model)" if after else ""
+    violated = ", ".join(change.get("violated", ()))
+    return fields + (f" (violates {violated} on its way)" if violated and "why" not in change else "")
 
 
 def _toml(value: object) -> str:

@@ -36,6 +36,7 @@ TURNS, TURNING, FASTEST_TURNING = 5.0, 180.0, 2000.0
 DISAGREEMENT: Final = 0.25
 """Mean difference between stated and covered velocity, over the larger of both, above which a table is doubted."""
 SMALL: Final = 0.05  # such a difference that is never doubted [m/s]
+ALIKE: Final = 0.04  # relative difference up to which a ratio is that of a unit
 OVERSTATED: Final = 5.0  # stated over covered velocity, plus 1 m/s, above which a table is refused
 MILLIMETRES: Final = 1000.0  # per m
 SPEED_UNITS: Final = {"mm/s": 1000.0, "cm/s": 100.0, "km/h": 3.6, "ft/s": 3.281, "knots": 1.944}  # per m/s
@@ -251,7 +252,7 @@ def _velocity_notes(
         if off <= DISAGREEMENT * max(moved, said) or off <= SMALL + rounding:
             continue
         ratio = said / moved if moved > 0.0 else math.inf
-        likely = [f"; is it in {known}?" for known, factor in SPEED_UNITS.items() if abs(ratio / factor - 1.0) < 0.1]
+        likely = [f"; is it in {known}?" for known, factor in SPEED_UNITS.items() if abs(ratio / factor - 1.0) < ALIKE]
         likely += ["; is its sign wrong?"] if mean(stated + covered) < DISAGREEMENT * said else []
         hint = likely[0] if likely else ""
         if said > OVERSTATED * (moved + rounding) + 1.0:

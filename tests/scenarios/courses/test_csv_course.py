@@ -147,8 +147,8 @@ def test_velocities_many_times_those_of_the_positions_are_refused(tmp_path: Path
 
 def test_positions_in_millimetres_are_noted_or_refused_by_their_size(tmp_path: Path) -> None:
     (note,) = read_table(circle(tmp_path, place=100.0)).notes
-    assert note == "column x: the course moves at 100 m/s on average; if it is in mm instead of m, 0.1 m/s"
-    rule = "must not make the course faster than 340 m/s on average; got 1000 .if it is in mm instead of m, 1 m/s"
+    assert note == "column x: the course moves at 99.99 m/s on average; if it is in mm instead of m, 0.09999 m/s"
+    rule = "must not make the course faster than 340 m/s on average; got 999.9 .if it is in mm instead of m, 0.9999 m/s"
     with pytest.raises(FileError, match=rule):
         read_table(circle(tmp_path, place=1000.0))
     still = "t,x,y,z,yaw\n0,0,0,1000,0\n10,0,0,1000,0\n"
@@ -168,8 +168,9 @@ def test_yaw_in_degrees_is_noted_or_refused_by_its_size(tmp_path: Path) -> None:
     assert "turns at 429.7 deg/s" in note
     (note,) = read_table(circle(tmp_path, yaw=6.0 * np.minimum(T, 5.9) - 0.3)).notes
     assert "turns at" in note
+    rows = "".join(f"{t / 100},0,0,1,{0.45 * t}\n" for t in range(100))
     with pytest.raises(FileError, match=r"must not turn faster than 2000 deg/s on average; got 2578 .* 45 deg/s"):
-        read_table(circle(tmp_path, yaw=45.0 * T))
+        read_table(write(tmp_path, f"t,x,y,z,yaw\n{rows}"))
     wrapped = np.array([math.remainder(170.0 + 10.0 * t, 360.0) for t in T.tolist()])
     with pytest.raises(FileError, match=r"row \d+, column yaw: must be within half a turn, .* is it in degrees"):
         read_table(circle(tmp_path, yaw=wrapped))
