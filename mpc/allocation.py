@@ -23,7 +23,6 @@ from quadsim.vehicle import Vehicle
 
 WEIGHTS: Final = (30.0, 1000.0, 1000.0, 1.0)
 """Weights of thrust, roll, pitch and yaw in stage 2.  Squared, they differ by a factor of about 1000."""
-LARGEST_SPEED: Final = 1e4  # stands in for an infinite upper bound [rad/s]; no rotor reaches it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +43,21 @@ def make_allocation(vehicle: Vehicle) -> Allocation:
     )
 
 
+def thrust_to_command(largest: float, weight: float, share: float) -> float:
+    """Return the largest collective thrust [N] that a law commands; the rest is for torques.
+
+    It is a share of the `largest` that the rotors give [N], but at least half way from the weight [N] to it: a vehicle
+    of low thrust to weight still climbs.  All of it, if the rotors cannot carry the weight.
+    """
+    return min(largest, max(share * largest, 0.5 * (weight + largest)))
+
+
 def allocate(allocation: Allocation, wrench: Array, lower: Array, upper: Array) -> Array:
     """Return the rotor speeds (4,) within `lower` and `upper` (4,) [rad/s] whose wrench is closest to the one demanded.
 
-    The wrench (4,) is thrust [N] along body z and torques [N m] about the body axes; upper speeds may be infinite.
+    The wrench (4,) is thrust [N] along body z and torques [N m] about the body axes; the bounds are finite.
     """
-    low, high = lower**2, np.minimum(upper, LARGEST_SPEED) ** 2
+    low, high = lower**2, upper**2
     squares = allocation.inverse @ wrench
     if not ((low <= squares) & (squares <= high)).all():
         squares_less_yaw = _less_yaw(squares, allocation.inverse[:, 3], low, high)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 
+from mpc.allocation import thrust_to_command
 from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.model import SHORTEST_LAG
 from mpc.obstacles import AvoidanceSettings, Shape, Space
@@ -152,10 +153,7 @@ class TargetBounds:
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """Return the bounds on collective thrust [N] and on each body rate [deg/s]."""
         largest, weight = N_ROTORS * vehicle.thrust_coefficient * vehicle.speed_max**2, vehicle.mass * vehicle.gravity
-        lower, upper = self.thrust or (
-            LEAST_THRUST * weight,
-            max(MOST_THRUST * largest, 0.5 * (weight + largest)),
-        )
+        lower, upper = self.thrust or (LEAST_THRUST * weight, thrust_to_command(largest, weight, MOST_THRUST))
         if not lower < weight < upper:
             rule = f"below and above the weight, {weight:.4g} N"
             raise ParameterError("controller", "target_bounds.thrust", [lower, upper], rule)

@@ -12,6 +12,7 @@ import numpy as np
 
 from quadsim.motion import Motion
 from quadsim.state import Array
+from quadsim.vehicle import LARGEST
 
 SOLVED: Final = "solved"  # status: a QP solver or the core computed the optimum
 UNCONSTRAINED: Final = "unconstrained"
@@ -44,8 +45,8 @@ ROTORS: Final = "rotors"
 """Commands of rotor speeds; others are targets of an autopilot: `rates` (4,), `attitude` (8,)."""
 TARGET_SIZES: Final = {ROTORS: 4, "rates": 4, "attitude": 8}
 """What a controller commands (its attribute or field `commands`), and the numbers in a command."""
-LARGEST_SPEED: Final = 1e5
-"""Largest magnitude of a valid rotor speed command [rad/s]; a larger one is a fault."""
+LARGEST_SPEED: Final = LARGEST
+"""Largest magnitude of a valid rotor speed command [rad/s], that of a vehicle's numbers; a larger one is a fault."""
 
 
 class Signals(Protocol):

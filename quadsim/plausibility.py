@@ -218,9 +218,10 @@ def _converted(vehicle: Vehicle) -> Iterator[tuple[str, str, Vehicle]]:
         if value is None:
             continue
         for unit, factor in units.items():
-            scaled = tuple(factor * entry for entry in value) if isinstance(value, tuple) else factor * value
+            other: Any = tuple(factor * entry for entry in value) if isinstance(value, tuple) else factor * value
+            changes: dict[str, Any] = {name: other}
             try:
-                yield name, unit, replace(vehicle, **{name: scaled})
+                yield name, unit, replace(vehicle, **changes)
             except ParameterError:  # no vehicle at all
                 continue
 

@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     UserCode = object
     UserForces = Sequence[object]
     UserReference: TypeAlias = Callable[[float], ArrayLike] | None
-    Fields: TypeAlias = Mapping[str, Any]
+    Fields: TypeAlias = Mapping[str, Any] | None
     Draws: TypeAlias = Sequence[Mapping[str, Any]]
     Watched: TypeAlias = Progress | bool
     Flown: TypeAlias = Callable[[Flight], object] | None
@@ -317,6 +317,7 @@ def run(
         ('satisfied', 'run')
     """
     from scenarios import loading, user_code
+    from scenarios.feasibility_check import hover_notes
     from scenarios.flight import require_rendering
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
@@ -325,6 +326,8 @@ def run(
         require_rendering()
     parts = user_code.set_up(loading.assemble(scenario, changes, seed), controller, forces, reference)
     products = {"video": video, "recording": recording, "figures": figures}
+    for note in hover_notes(parts[0]):
+        _log.info(note)
     with run_directory(parts[0].scenario.name, out, overwrite=overwrite) as directory:
         with reporting(progress) as report:
             flight = replace(Rollout(*parts).fly(report), directory=directory)
@@ -816,7 +819,7 @@ def campaign(
     changes: Changes = (),
     seed: Whole | None = None,
     vary: Draws = (),
-    fields: Fields | None = None,
+    fields: Fields = None,
     controller: UserCode = None,
     forces: UserForces = (),
     progress: Watched = True,
@@ -1207,6 +1210,7 @@ def scenario(
     vehicle: Annotated[VehicleName | None, Parameter(name="--for")] = None,
     course: str | None = None,
     controller: str | None = None,
+    tilt: float | None = None,
     schema: Flag = False,
 ) -> ScenarioFile:
     """Print a scenario with all defaults and comments, as a start for your own.
@@ -1219,6 +1223,7 @@ def scenario(
         course: its course: hover, step (of 1 m) or figure-eight, at 60 % of the vehicle's limits (default: hover).
         controller: its controller: robust, lqr, pid or geometric, or rates for nonlinear MPC of thrust and body rates
             through its autopilot (default: robust).
+        tilt: its tilt bound [deg] (default: by rule, at most 40).
         schema: print the JSON Schema of scenario files instead.
 
     Returns:
@@ -1244,14 +1249,15 @@ def scenario(
 
     if schema:
         return results.ScenarioFile(json.dumps(scenario_schema(), indent=2) + "\n", scenario_schema())
-    choice = {option: value for option, value in {"course": course, "law": controller}.items() if value is not None}
+    options = {"course": course, "law": controller, "tilt": tilt}
+    choice: dict[str, Any] = {option: value for option, value in options.items() if value is not None}
     if vehicle is not None:
         for option, value in {"a scenario": name, "--set": changes, "--seed": seed}.items():
             if value:
                 raise ParameterError("", "--for", vehicle, f"given without {option}")
         return results.ScenarioFile(first_scenario(load_vehicle(vehicle), str(vehicle), **choice).to_toml())
     for option, value in choice.items():
-        raise ParameterError("", "--course" if option == "course" else "--controller", value, "given with --for alone")
+        raise ParameterError("", f"--{'controller' if option == 'law' else option}", value, "given with --for alone")
     if name is None:
         names = ", ".join(scenario_names())
         raise InputError(f"scenario needs a name or a TOML file, or --schema (there are: {names})")

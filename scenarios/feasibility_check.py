@@ -16,12 +16,13 @@ from mpc.robust.settings import Robust
 from quadsim.errors import ParameterError
 from quadsim.flight.audit import Mask
 from quadsim.flight.feasibility import STENCIL, Feasibility, assess, demand
-from quadsim.state import STATE_NAMES, Array
+from quadsim.sim.effects.load import Load, mass_properties
+from quadsim.state import REFERENCE_NAMES, STATE_NAMES, Array
 from quadsim.vehicle import Vehicle
 from scenarios.courses.course import Course
 from scenarios.courses.csv_course import Csv
 from scenarios.courses.smoothing import within_rounding
-from scenarios.schema.events import SetpointEvent
+from scenarios.schema.events import SetpointEvent, first_period
 
 if TYPE_CHECKING:
     from scenarios.assembly import Assembly
@@ -31,20 +32,37 @@ Range = tuple[float, float]
 
 
 def report(assembly: Assembly) -> Feasibility:
-    """Compare the filtered course's demands, up to a set-point, with the vehicle's limits and the controller's bounds.
+    """Compare the demands of what is flown with the vehicle's limits and the controller's bounds.
 
-    A rounded table is replaced by the smoothest one within its last decimal: fourth differences would turn 0.1 mm into
-    steps of tens of rad/s, which no controller flies.
+    That is the filtered course; a set-point replaces it on its axes, as in flight.  A rounded table is replaced by the
+    smoothest one within its last decimal: fourth differences would turn 0.1 mm into steps of tens of rad/s, which no
+    controller flies.
 
     Raises:
         InputError: the course cannot be built.
     """
-    course, followed = assembly.course, _followed(assembly.scenario)
-    required = _required(course, assembly, duration=followed)
-    sentence = required.sentence
-    if followed < course.end < math.inf and not _sampled(assembly.scenario):
-        sentence += f" It lasts until {course.end:g} s, but the flight follows it for {followed:g} s."
-    return replace(required, sentence=sentence, advice=fitting(assembly) if required.problems else "")
+    scenario, course = assembly.scenario, assembly.course
+    required = _required(course, assembly, duration=scenario.duration)
+    sentence, until = required.sentence, _left(assembly)
+    if until < course.end < math.inf and not _sampled(scenario):
+        sentence += f" It lasts until {course.end:g} s, but the flight follows it for {until:g} s."
+    advice = fitting(assembly) if required.problems else ""
+    return replace(required, sentence=sentence, advice=advice, notes=(*hover_notes(assembly), *course.notes))
+
+
+def hover_speed(assembly: Assembly) -> float:
+    """Return the rotor speed [rad/s] at which the actual vehicle hovers, with its load at the start."""
+    vehicle, load = assembly.actual, assembly.effects.load or Load()
+    return vehicle.hover_speed * math.sqrt(mass_properties(vehicle, load, load.payloads).mass / vehicle.mass)
+
+
+def hover_notes(assembly: Assembly) -> tuple[str, ...]:
+    """Return a note if hover needs rotor speeds outside the controller's bounds."""
+    hover, (lower, upper) = hover_speed(assembly), assembly.bounds.get("speed", (0.0, math.inf))
+    if lower <= hover <= upper:
+        return ()
+    bound, side = (upper, "") if hover > upper else (lower, "at least ")
+    return (f"hover needs {hover:.4g} rad/s, the bound is {side}{bound:.4g}: no controller can hold altitude",)
 
 
 def _sampled(scenario: Scenario) -> bool:
@@ -55,17 +73,17 @@ def _sampled(scenario: Scenario) -> bool:
 def fitting(assembly: Assembly) -> str:
     """Find two ways to fly a course that exceeds limits or bounds within them, by speed, response time or size.
 
-    The course is flown more slowly, made smaller about its start, or filtered more, to the nearest percent; jumps are
-    excluded as in `report`.
+    The course is flown more slowly, set-points later in proportion, or made smaller about its start, or filtered more,
+    to the nearest percent; jumps are excluded as in `report`.  This is computed as `report` is, not flown.
 
     Returns:
         A sentence; empty if the course fits as it is, or not even at a tenth.
     """
     scenario, course = assembly.scenario, assembly.course
-    duration, filtered_by = _followed(scenario), scenario.reference.response_time
+    duration, filtered_by = scenario.duration, scenario.reference.response_time
 
     def slower(share: float) -> bool:
-        return not _required(_scaled(course, pace=share), assembly, duration=duration / share).problems
+        return not _required(_scaled(course, pace=share), assembly, duration=duration / share, pace=share).problems
 
     def smaller(share: float) -> bool:
         return not _required(_scaled(course, size=share), assembly, duration=duration).problems
@@ -87,10 +105,18 @@ def fitting(assembly: Assembly) -> str:
     return f"It would fit {', or '.join(ways)}." if ways else ""
 
 
-def _followed(scenario: Scenario) -> float:
-    """Time for which the course is followed [s]: up to the first set-point."""
-    until = min((event.at for event in scenario.events if isinstance(event, SetpointEvent)), default=scenario.duration)
-    return max(until, scenario.control_period)
+def _setpoints(scenario: Scenario) -> list[SetpointEvent]:
+    """Return the set-points in order of time."""
+    return sorted((e for e in scenario.events if isinstance(e, SetpointEvent)), key=lambda event: event.at)
+
+
+def _left(assembly: Assembly) -> float:
+    """Time for which the course is followed [s]: until set-points have replaced it on every axis that it moves."""
+    scenario, course = assembly.scenario, assembly.course
+    t = scenario.control_period * np.arange(scenario.periods + 1, dtype=np.float64)
+    moving = [n for n, values in zip(REFERENCE_NAMES, course.sample(t).T, strict=True) if np.ptp(values) > 0.0]
+    taken = {name: event.at for event in reversed(_setpoints(scenario)) for name in event.values}
+    return max((min(taken.get(name, math.inf), scenario.duration) for name in moving), default=scenario.duration)
 
 
 def _largest(fits: Callable[[float], bool]) -> float | None:
@@ -120,19 +146,23 @@ def _scaled(course: Course, *, pace: float = 1.0, size: float = 1.0) -> Course:
     )
 
 
-def _required(course: Course, assembly: Assembly, *, duration: float) -> Feasibility:
-    """Return the demands of a course that replaces the scenario's for this duration [s]."""
+def _required(course: Course, assembly: Assembly, *, duration: float, pace: float = 1.0) -> Feasibility:
+    """Return the demands of a course that replaces the scenario's for this duration [s]; set-points come at a pace."""
     scenario, vehicle = assembly.scenario, assembly.vehicle
     period = scenario.control_period
     samples = round(duration / period) + 1
-    poses_along = assembly.followed(course).first(samples + STENCIL)
-    poses = np.vstack([np.tile(course.initial, (STENCIL, 1)), poses_along])  # the vehicle is at rest before the flight
+    given = [(event.at / pace, event.values) for event in _setpoints(scenario)]
+    changes = [(first_period(at, period), values) for at, values in given]
+    before, count = np.tile(course.initial, (STENCIL, 1)), samples + STENCIL  # the vehicle is at rest before the flight
+    unfiltered, poses_along = assembly.followed(course).flown(count, changes)
+    poses, raw = np.vstack([before, poses_along]), np.vstack([before, unfiltered])
     t: Array = period * np.arange(-STENCIL, samples + STENCIL, dtype=np.float64)
-    raw = np.vstack([np.tile(course.initial, (STENCIL, 1)), course.sample(t[STENCIL:])])
-    changes = np.any(raw[1:] != raw[:-1], axis=1)
+    changed = np.any(raw[1:] != raw[:-1], axis=1)
     away = () if np.allclose(assembly.initial_pose, course.initial, rtol=0.0, atol=1e-9) else (0.0,)
-    jumps = sorted({time for time in (*course.jumps, *away) if time < duration})
-    jumped, kinked = _touched(t, course.jumps) & changes, _touched(t, _isolated(course.kinks, period))
+    replaced = np.zeros_like(changed)  # by a set-point, between a sample and the next
+    replaced[[STENCIL + k for k, _ in changes if k + 1 < count]] = True
+    jumps = sorted({time for time in (*course.jumps, *away, *(at for at, _ in given)) if time < duration})
+    jumped, kinked = (replaced | _touched(t, course.jumps)) & changed, _touched(t, _isolated(course.kinks, period))
     channels = zip(poses.T, course.resolution, strict=True)
     smooth = np.column_stack([within_rounding(values, unit, jumped | kinked) for values, unit in channels])
     needed = demand(smooth, period, vehicle, jumps=jumped, kinks=kinked)

@@ -78,6 +78,7 @@ class Flight(Result):
         directory: where it was read from or written to; None if it is only in memory.
         recorded: `summary.json` of a flight that was read; None for a new flight.
         infeasible_period: the first period whose QP had no answer; None if there is none, or the flight was read.
+        own_code: whether a controller, force or autopilot flew that was passed in, which the scenario cannot repeat.
 
     Examples:
         >>> import quadsim
@@ -98,6 +99,7 @@ class Flight(Result):
     directory: Path | None = None
     recorded: Mapping[str, Any] | None = field(default=None, repr=False)
     infeasible_period: InfeasiblePeriod | None = field(default=None, repr=False)
+    own_code: bool = field(default=False, repr=False)
 
     @property
     def scenario(self) -> Scenario:
@@ -136,12 +138,23 @@ class Flight(Result):
 
     @cached_property
     def diagnosis(self) -> Mapping[str, Any] | None:
-        """Why the first QP without an answer had none, and what would help; None if all QPs had one.
+        """Why the first QP without an answer had none, and what helps; None if all QPs had one.
 
-        If all had one and a constraint does not hold, it explains the first SQP that did not converge, if any.
+        If all had one and a constraint does not hold, it explains the first SQP that did not converge, if any.  What is
+        advised has been flown, in `scenarios.infeasibility.MOST_FLOWN` flights at most; this takes seconds, once.
 
         `sentence` and `advice` are for users; `docs/controllers.md` explains the other entries.
         """
+        explanation = self._explanation
+        if self.recorded is not None or explanation is None:
+            return explanation
+        from scenarios.infeasibility import tried
+
+        return tried(explanation, self)
+
+    @cached_property
+    def _explanation(self) -> Mapping[str, Any] | None:
+        """`diagnosis` before anything is flown."""
         if self.recorded is not None:
             return self.recorded.get("diagnosis")
         if self.infeasible_period is None or (self.infeasible_period.status == NOT_CONVERGED and self.satisfied):
@@ -216,12 +229,17 @@ class Flight(Result):
     @cached_property
     def summary(self) -> Mapping[str, Any]:
         """All numbers: the content of `summary.json`."""
+        return self._numbers if self.recorded is not None else {**self._numbers, "diagnosis": self.diagnosis}
+
+    @cached_property
+    def _numbers(self) -> Mapping[str, Any]:
+        """`summary` before a change that its diagnosis advises is flown."""
         return self.recorded if self.recorded is not None else summarise(self)
 
     @cached_property
     def metrics(self) -> dict[str, float]:
         """The flight's numbers by name, e.g. `rmse.x`, `speed_max`, `step_ms.p99`; units as in `summary`."""
-        numbers = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self.summary[name]))
+        numbers = (leaf for name in ("tracking", "control", "controller") for leaf in leaves(self._numbers[name]))
         return {
             name: value for name, value in numbers if isinstance(value, int | float) and not isinstance(value, bool)
         }
@@ -229,11 +247,12 @@ class Flight(Result):
     @property
     def run(self) -> rundir.Run:
         """The flight in the form that figures and pages use."""
+        return self._run(self.summary)
+
+    def _run(self, summary: Mapping[str, Any]) -> rundir.Run:
         limits = tuple(finding.limit for finding in self.findings)
         directory = self.directory or Path(self.scenario.name)
-        return rundir.Run(
-            directory=directory, summary=dict(self.summary), log=self.log, vehicle=self.actual, limits=limits
-        )
+        return rundir.Run(directory=directory, summary=dict(summary), log=self.log, vehicle=self.actual, limits=limits)
 
     def to_arrow(self, table: str = "flight") -> pa.Table:
         """A table of the flight, units in its columns' metadata.
@@ -277,7 +296,7 @@ class Flight(Result):
         for name in signals:
             if name not in (known := (*SIGNALS, "xy", *self.logged)):
                 raise UnknownNameError("signal", name, known)
-        figure = draw_signals([self.run], signals or ("x", "y", "z", "roll", "pitch", "yaw"))
+        figure = draw_signals([self._run(self._numbers)], signals or ("x", "y", "z", "roll", "pitch", "yaw"))
         return draw(figure, interactive=True).axes
 
     def save(
@@ -332,13 +351,19 @@ class Flight(Result):
                     (partial / course.file).write_bytes(course.content)
                 write_log(partial, self.log, plant_stride=self.scenario.plant_stride, metadata=self.metadata)
                 wall_s = {"simulate": self.simulate_s, "total": clock.perf_counter() - started}
-                summary = to_json({**self.summary, "wall_s": wall_s})
+                summary = to_json({**self._numbers, "wall_s": wall_s})
                 (partial / rundir.SUMMARY_FILE).write_text(summary, encoding="utf-8")
 
         try:
             write(overwrite=overwrite)
         except KeyboardInterrupt:
             write(overwrite=True)
+            return False
+        try:
+            if self._explanation is not None:
+                diagnosis = self.diagnosis  # which flies the changes that it advises
+                amend(absolute(directory), {"diagnosis": diagnosis})
+        except KeyboardInterrupt:
             return False
         return True
 
@@ -391,7 +416,7 @@ class Flight(Result):
         """See `Result.small_plot`: position over time."""
         from quadsim.report.flight_figures import signals
 
-        return signals([self.run], ("x", "y", "z")) if self.time.size else None
+        return signals([self._run(self._numbers)], ("x", "y", "z")) if self.time.size else None
 
     def _repr_html_(self) -> str:
         """Numbers and a small plot, for notebooks."""
@@ -404,7 +429,7 @@ class Flight(Result):
         )
         errors = ", ".join(f"{name} {self.metrics[f'rmse.{name}']:.3g}" for name in "xyz" if self.time.size)
         return (
-            f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self.summary['duration']:g} s flown, "
+            f"<p><b>{escape(self.scenario.name)}</b>: {self.outcome}, {self._numbers['duration']:g} s flown, "
             f"RMS error [m]: {errors or 'none'}</p>"
             "<table><tr><th>constraint</th><th>margin</th><th>tolerance</th><th>verdict</th></tr>"
             f"{rows}</table>{plot_html(self.small_plot())}"
@@ -482,7 +507,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         "audit_notes": audit_notes(flight.assembly),
         **({"model_notes": notes} if notes else {}),
         "control": numbers["control"],
-        "diagnosis": flight.diagnosis,
+        "diagnosis": flight._explanation,
         "controller": {
             "name": flight.controller,
             "solver": flight.solver,

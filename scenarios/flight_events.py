@@ -35,6 +35,7 @@ from scenarios.schema.events import (
     SensorFaultEvent,
     SensorText,
     SetpointEvent,
+    first_period,
 )
 from scenarios.schema.problems import parse_table
 
@@ -196,7 +197,7 @@ class FlightEvents:
     def _schedule(self, event: Event, ready: Successor | None = None) -> None:
         """Schedule an event outside the plant for the first period from its time on."""
         if isinstance(event, SetpointEvent | ControllerEvent):
-            first = math.ceil(event.at / self.scenario.control_period - 1e-6)
+            first = first_period(event.at, self.scenario.control_period)
             insort(self._due, (first, event.at, event, ready), key=itemgetter(0, 1))
 
     def _begin(self, k: int) -> None:

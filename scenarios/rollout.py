@@ -146,6 +146,7 @@ class Rollout:
         for _, spec in scenario.controller_changes:
             assembly.controller(spec)  # checked before the flight, one by one, as each may take megabytes
         self._law = controller.name, controller.solver
+        self._own_code = law is not None or forces is not None or assembly.user_autopilot is not None
         self._plant, self._navigation = assembly.plant(forces), assembly.navigation()
         started = clock.perf_counter()
         reference = assembly.followed()
@@ -227,13 +228,18 @@ class Rollout:
             self._simulate_s += clock.perf_counter() - started
 
     @_staying()
-    def fly(self, progress: Progress = silent) -> Flight:
+    def fly(self, progress: Progress = silent, *, until: float = math.inf) -> Flight:
         """Fly to the scenario's end, audit the flight and close; a flight error or Ctrl-C ends it early, in order.
 
         A change of the working directory by a controller lasts only for the flight.
+
+        Args:
+            progress: called with (activity, done, total).
+            until: [s] ends it earlier, rounded up to whole control periods.
         """
         with self:
             started, periods = clock.perf_counter(), self.scenario.periods
+            periods = min(periods, math.ceil(min(until, LONGEST_FLIGHT) / self.scenario.control_period - 1e-6))
             progress("flight", self.k, periods)
             complete(self.loop, periods=periods, progress=lambda done: progress("flight", done, periods))
             self._simulate_s += clock.perf_counter() - started
@@ -309,4 +315,5 @@ class Rollout:
             simulate_s=self._simulate_s,
             tallies={} if self._navigation is None else self._navigation.tallies,
             infeasible_period=self._events.first_infeasible_period(),
+            own_code=self._own_code,
         )

@@ -36,6 +36,7 @@ def summary_tables(summary: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield from summary.get("traceback", ())
     if "course" in summary:
         yield f"{summary['course']['sentence']} {summary['course'].get('advice', '')}".rstrip()
+        yield from summary["course"].get("notes", ())
     if summary["tracking"]:
         yield _tracking_table(summary["tracking"])
     if summary["constraints"]:

@@ -23,7 +23,7 @@ from scenarios.rollout import Rollout
 REQUIREMENTS: Final = {
     "tracking": ("hold_x", "hold_y", "hold_z"),
     "floor": ("floor",),
-    "tilt": ("roll", "pitch"),
+    "tilt": ("roll", "pitch", "tilt"),
     "rotors": ("speed", "slew"),
 }
 """What a first scenario requires, and the constraints that state it."""

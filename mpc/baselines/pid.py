@@ -13,7 +13,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from annotated_types import doc
 
-from mpc.allocation import allocate, make_allocation
+from mpc.allocation import allocate, make_allocation, thrust_to_command
 from mpc.answer import ActuatorBounds
 from mpc.baselines.attitude import LEAST_LIFT, Measured, attitude_for, limit_force, motion_of, prioritised_error
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
@@ -28,7 +28,8 @@ from quadsim.vehicle import Vehicle
 
 HORIZONTAL_MARGIN: Final = 0.3  # share of the largest thrust that climbing leaves to the sides: PX4's MPC_THR_XY_MARG
 LARGEST_THRUST: Final = 0.85
-"""Largest share of the rotors' total thrust that is demanded: PX4's mixer gives up to 15 % of it to yaw."""
+"""Share of the rotors' total thrust that is demanded at most, see `thrust_to_command`: PX4's mixer gives up to 15 % of
+it to yaw."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,8 +81,8 @@ class CascadedPID(FeedbackLaw):
         self.settings, self._vehicle, self._inertia = settings, vehicle, np.array(vehicle.inertia)
         super().__init__(vehicle, settings.period, settings.horizon, settings.bounds)
         self.allocation = make_allocation(vehicle)
-        highest = float(self.bounds.u_max.min())
-        self._largest = LARGEST_THRUST * 4.0 * vehicle.thrust_coefficient * highest**2  # thrust to command [N]
+        highest = 4.0 * vehicle.thrust_coefficient * float(self.bounds.u_max.min()) ** 2
+        self._largest = thrust_to_command(highest, vehicle.mass * vehicle.gravity, LARGEST_THRUST)
 
     def reset(self, speeds: Array) -> None:
         """Restart after the command u(-1) (4,) [rad/s]."""
@@ -166,10 +167,14 @@ def desired_velocity(settings: PIDSettings, position: Array, target: Target) -> 
 
 
 def force_within(force: Array, *, weight: float, largest: float, tilt: float) -> Array:
-    """Limit a demanded force (3,) [N], world, to a tilt [rad] and to the thrust: height before horizontal motion."""
+    """Limit a demanded force (3,) [N], world, to a tilt [rad] and to the thrust: height before horizontal motion.
+
+    What climbing leaves to the sides never takes more than half of the thrust above the weight.
+    """
     upright = limit_force(force, least=LEAST_LIFT * weight, tilt=tilt)
     horizontal = math.hypot(upright[0], upright[1])
-    spared = min(horizontal, HORIZONTAL_MARGIN * largest)
+    climbing = min(0.5 * (weight + largest), largest)
+    spared = min(horizontal, HORIZONTAL_MARGIN * largest, math.sqrt(largest**2 - climbing**2))
     upward = min(upright[2], math.sqrt(largest**2 - spared**2))
     allowed = min(math.sqrt(largest**2 - upward**2), upward * math.tan(tilt))
     share = 1.0 if horizontal <= allowed else allowed / horizontal

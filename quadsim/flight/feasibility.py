@@ -72,6 +72,7 @@ class Feasibility:
     """One line per exceeded limit or bound; empty for a course that can be flown exactly."""
     sentence: str  # summary for the user
     advice: str  # the speed, response time or size that would be within limits and bounds, in a sentence
+    notes: tuple[str, ...]  # what no controller can do, and doubts about the course's numbers
 
 
 def demand(
@@ -166,7 +167,7 @@ def assess(
     }
     problems = _problems(needed, vehicle, bounds, tightened or {})
     sentence = _sentence(peaks, vehicle, min(tilts, default=None), jumps, problems)
-    return Feasibility(**peaks, jumps=tuple(jumps), problems=problems, sentence=sentence, advice="")
+    return Feasibility(**peaks, jumps=tuple(jumps), problems=problems, sentence=sentence, advice="", notes=())
 
 
 def _attitudes(pushed: Array, yaw: Array) -> Array:

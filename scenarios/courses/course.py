@@ -36,6 +36,7 @@ class Path:
     resolution: tuple[float, ...] = EXACT  # to how much x, y, z [m], yaw [rad] were rounded; 0 where they are exact
     derivatives: Derivatives | None = None  # of the position, where they are known
     free_heading: bool = False  # whether the heading is what leaves no rate about body z; else the initial one
+    notes: tuple[str, ...] = ()  # doubts about its numbers, for the user
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +51,7 @@ class Course:
     derivatives: Derivatives | None = None  # of the position, where they are known
     end: float = math.inf  # time [s] from which on it stays where it is
     free_heading: bool = False  # whether the heading is what leaves no rate about body z; else the initial one
+    notes: tuple[str, ...] = ()  # doubts about its numbers, for the user
 
 
 def begin(path: Path, *, start: float, initial: Array) -> Course:
@@ -86,6 +88,7 @@ def begin(path: Path, *, start: float, initial: Array) -> Course:
         derivatives=None if path.derivatives is None else derivatives,
         end=start + path.duration,
         free_heading=path.free_heading,
+        notes=path.notes,
     )
 
 

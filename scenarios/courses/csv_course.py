@@ -6,7 +6,7 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path as FilePath
@@ -28,6 +28,18 @@ LARGEST: Final = 1e6  # largest magnitude of a number in the table, as in the sc
 MOST_ROWS: Final = 200_000  # rows below the header: 200 s at 1 kHz. Each is held in memory
 ROUNDED: Final = range(2, 8)
 """Decimals of a rounded column: with fewer its numbers are exact, with more rounding cannot be detected."""
+FAR, FAST, FASTEST = 50.0, 50.0, 340.0
+"""Distance of the first row from the vehicle [m] and mean speed [m/s] above which a table is doubted, those at which a
+flight is lost by default, and mean speed above which it is refused, that of sound."""
+TURNS, TURNING, FASTEST_TURNING = 5.0, 180.0, 2000.0
+"""The same for yaw: turns in all, and mean rates [deg/s]; the last is the full scale of the usual gyroscopes."""
+DISAGREEMENT: Final = 0.25
+"""Mean difference between stated and covered velocity, over the larger of both, above which a table is doubted."""
+SMALL: Final = 0.05  # such a difference that is never doubted [m/s]
+ALIKE: Final = 0.04  # relative difference up to which a ratio is that of a unit
+OVERSTATED: Final = 5.0  # stated over covered velocity, plus 1 m/s, above which a table is refused
+MILLIMETRES: Final = 1000.0  # per m
+SPEED_UNITS: Final = {"mm/s": 1000.0, "cm/s": 100.0, "km/h": 3.6, "ft/s": 3.281, "knots": 1.944}  # per m/s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +52,7 @@ class Table:
     sha256: str  # hash of the file
     # one unit of the last decimal in each column of the poses [m, m, m, rad]; 0 where it is not rounded
     resolution: tuple[float, ...] = EXACT
+    notes: tuple[str, ...] = ()  # columns that contradict each other, or look as if they were in another unit
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +84,8 @@ class Csv(Started):
         table = read_table(path) if self.content is None else parse_table(path, self.content)
         if self.sha256 not in (None, table.sha256):
             raise FileError(self.file, f"is not the file of the scenario: its SHA-256 is not {self.sha256}")
-        return begin(through_rows(table), start=self.start + float(table.t[0]), initial=initial)
+        course = begin(through_rows(table), start=self.start + float(table.t[0]), initial=initial)
+        return replace(course, notes=(*course.notes, *_far(table.poses[0, :3], initial[:3])))
 
     def located(self, directory: FilePath) -> Csv:
         """Return the table with absolute path and hash, so that a resolved scenario defines its flight.
@@ -122,7 +136,8 @@ def parse_table(path: FilePath, content: bytes) -> Table:
     Yaw that changes by more than half a turn between rows is taken as wrapped, and unwrapped.
 
     Raises:
-        FileError: naming the row (the header is row 1) and the column that is wrong.
+        FileError: naming the row (the header is row 1) and the column that is wrong; or columns contradict each other,
+            or are in another unit, beyond doubt.
     """
     try:
         lines = csv.reader(io.StringIO(content.decode("utf-8-sig"), newline=""), strict=True)
@@ -149,11 +164,101 @@ def parse_table(path: FilePath, content: bytes) -> Table:
         rule = f"must be above that of the row before = {rows[number - 2][0]}"
         raise FileError(path, f"row {number}, column t: {rule}; got {rows[number - 1][0]}")
     poses = numbers[:, 1:5].copy()
+    _check_turns(path, poses[:, 3])
     poses[:, 3] = unwrapped(poses[:, 3], float(poses[0, 3]))
     velocities = numbers[:, 5:] if len(header) > len(POSE_HEADER) else None
     resolution = tuple(_resolution(row[column] for row in rows[1:]) for column in range(1, 5))
     digest = hashlib.sha256(content).hexdigest()
-    return Table(t=t, poses=poses, velocities=velocities, sha256=digest, resolution=resolution)
+    notes = [*_speed_notes(path, t, poses[:, :3]), *_yaw_notes(path, t, poses[:, 3])]
+    if velocities is not None:
+        notes += _velocity_notes(path, t, poses, velocities, resolution)
+    return Table(t=t, poses=poses, velocities=velocities, sha256=digest, resolution=resolution, notes=tuple(notes))
+
+
+def _far(first: Array, vehicle: Array) -> Iterator[str]:
+    """Yield a note on a first row (3,) [m] far from the vehicle (3,) [m]."""
+    if (distance := math.dist(first, vehicle)) > FAR:
+        millimetres = math.dist(first / MILLIMETRES, vehicle)
+        yield (
+            f"columns x, y, z begin {distance:.4g} m from the vehicle; if they are in mm instead of m, "
+            f"{millimetres:.4g} m"
+        )
+
+
+def _speed_notes(path: FilePath, t: Array, positions: Array) -> Iterator[str]:
+    """Yield a note on positions (n, 3) [m] that move too fast on average; refuse what cannot be meant."""
+    lengths = np.abs(np.diff(positions, axis=0)).sum(axis=0)
+    speed = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum() / (t[-1] - t[0]))
+    column = "xyz"[int(np.argmax(lengths))]
+    if speed > FASTEST:
+        rule = f"column {column}: must not make the course faster than {FASTEST:g} m/s on average; got {speed:.4g}"
+        raise FileError(path, f"{rule} (if it is in mm instead of m, {speed / MILLIMETRES:.4g} m/s)")
+    if speed > FAST:
+        yield (
+            f"column {column}: the course moves at {speed:.4g} m/s on average; if it is in mm instead of m, "
+            f"{speed / MILLIMETRES:.4g} m/s"
+        )
+
+
+def _check_turns(path: FilePath, yaw: Array) -> None:
+    """Refuse a column (n,) [rad] that counts turns, and so is not wrapped, with rows over half a turn apart."""
+    if np.ptp(yaw) <= math.tau + 1e-3:
+        return
+    steps = np.diff(yaw)
+    (beyond,) = np.nonzero(np.abs(steps) > math.pi)
+    if beyond.size:
+        i = int(beyond[0])
+        rule = f"must be within half a turn, {math.pi:.4g} rad, of the row before = {yaw[i]:.6g}"
+        why = f"the column spans {np.ptp(yaw) / math.tau:.3g} turns; is it in degrees instead of radians?"
+        raise FileError(path, f"row {i + 3}, column yaw: {rule}; got {yaw[i + 1]:.6g} ({why})")
+
+
+def _yaw_notes(path: FilePath, t: Array, yaw: Array) -> Iterator[str]:
+    """Yield a note on an unwrapped yaw (n,) [rad] that turns too fast or too far; refuse what cannot be meant."""
+    rate = math.degrees(float(np.abs(np.diff(yaw)).sum() / (t[-1] - t[0])))
+    many = float(np.ptp(yaw)) > TURNS * math.tau or abs(float(yaw[0])) > math.tau
+    if rate > FASTEST_TURNING:
+        rule = f"column yaw: must not turn faster than {FASTEST_TURNING:g} deg/s on average; got {rate:.4g}"
+        raise FileError(path, f"{rule} (if it is in degrees instead of radians, {math.radians(rate):.4g} deg/s)")
+    if rate > TURNING:
+        yield (
+            f"column yaw turns at {rate:.4g} deg/s on average; if it is in degrees instead of radians, "
+            f"{math.radians(rate):.4g} deg/s"
+        )
+    elif many:
+        low, high = float(yaw.min()), float(yaw.max())
+        yield (
+            f"column yaw goes from {math.degrees(low):.4g} to {math.degrees(high):.4g} deg; if it is in degrees "
+            f"instead of radians, from {low:.4g} to {high:.4g} deg"
+        )
+
+
+def _velocity_notes(
+    path: FilePath, t: Array, poses: Array, velocities: Array, resolution: Sequence[float]
+) -> Iterator[str]:
+    """Yield notes on stated velocities (n, 3) [m/s] that contradict the positions; refuse what cannot be meant.
+
+    Between rows, the mean of the two stated velocities is that of the covered distance up to the third derivative.
+    """
+    periods = np.diff(t)
+
+    def mean(values: Array) -> float:
+        return float(periods @ np.abs(values) / periods.sum())
+
+    for name, place, velocity, unit in zip("xyz", poses.T, velocities.T, resolution, strict=False):
+        covered, stated = np.diff(place) / periods, 0.5 * (velocity[1:] + velocity[:-1])
+        moved, said, off = mean(covered), mean(stated), mean(stated - covered)
+        rounding = 2.0 * unit * periods.size / float(periods.sum())
+        if off <= DISAGREEMENT * max(moved, said) or off <= SMALL + rounding:
+            continue
+        ratio = said / moved if moved > 0.0 else math.inf
+        likely = [f"; is it in {known}?" for known, factor in SPEED_UNITS.items() if abs(ratio / factor - 1.0) < ALIKE]
+        likely += ["; is its sign wrong?"] if mean(stated + covered) < DISAGREEMENT * said else []
+        hint = likely[0] if likely else ""
+        if said > OVERSTATED * (moved + rounding) + 1.0:
+            rule = f"column v{name}: must agree with column {name}, which moves at {moved:.4g} m/s on average"
+            raise FileError(path, f"{rule}; got {said:.4g} m/s{hint}")
+        yield f"column v{name} is {said:.4g} m/s on average, but column {name} moves at {moved:.4g} m/s{hint}"
 
 
 def through_rows(table: Table) -> Path:
@@ -165,7 +270,7 @@ def through_rows(table: Table) -> Path:
     t = table.t - table.t[0]
     straight = polyline(t, table.poses)
     if table.velocities is None:
-        return replace(straight, resolution=table.resolution)
+        return replace(straight, resolution=table.resolution, notes=table.notes)
     from scipy.interpolate import CubicHermiteSpline
 
     cubics = CubicHermiteSpline(t, table.poses[:, :3], table.velocities)
@@ -173,7 +278,7 @@ def through_rows(table: Table) -> Path:
     def pose(times: Array) -> Array:
         return np.hstack([cubics(times), straight.pose(times)[:, 3:]])
 
-    return Path(pose=pose, duration=straight.duration, kinks=straight.kinks, resolution=table.resolution)
+    return replace(straight, pose=pose, resolution=table.resolution, notes=table.notes)
 
 
 def _resolution(cells: Iterable[str]) -> float:

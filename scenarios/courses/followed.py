@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -48,6 +48,21 @@ class FollowedCourse:
         rows: Array = self._rows[k + 1 : k + 1 + n]
         return rows
 
+    def flown(self, count: int, setpoints: Sequence[tuple[int, Mapping[str, float]]]) -> tuple[Array, Array]:
+        """Return the (count, 4) samples and rows of a flight with set-points (k, values) in order; as `set` makes them.
+
+        Samples are those before the filter.  Nothing here changes.
+        """
+        self._extend(count)
+        samples, places = self._samples[:count].copy(), np.arange(count)
+        for channel, name in enumerate(REFERENCE_NAMES):
+            given = [(k, values[name]) for k, values in setpoints if name in values]
+            if given:
+                first, value = (np.array(column) for column in zip(*given, strict=True))
+                latest = np.searchsorted(first, places, side="left") - 1  # from the row after the set-point on
+                samples[:, channel] = np.where(latest < 0, samples[:, channel], value[np.maximum(latest, 0)])
+        return samples, self._filtered(samples, self._course.initial)
+
     def set(self, k: int, values: Mapping[str, float]) -> None:
         """Apply a set-point at t_k, by the names of its axes [m, rad]."""
         self._extend(k + 1)
@@ -71,8 +86,13 @@ class FollowedCourse:
         for channel, value in self._setpoint.items():
             samples[:, channel] = value
         before = self._rows[-1] if known else self._course.initial
+        self._rows = np.concatenate([self._rows, self._filtered(samples, before)])
+
+    def _filtered(self, samples: Array, before: Array) -> Array:
+        """Filter samples (M, 4) that follow a row (4,)."""
+        channels = zip(samples.T, before.tolist(), strict=True)
         further = [
             smooth(values, initial=last, response_time=self._response_time, period=self._period)
-            for values, last in zip(samples.T, before.tolist(), strict=True)
+            for values, last in channels
         ]
-        self._rows = np.concatenate([self._rows, np.stack(further, axis=1)])
+        return np.stack(further, axis=1)

@@ -95,15 +95,18 @@ class FirstScenario:
         return self.text
 
 
-def first_scenario(vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust") -> FirstScenario:
+def first_scenario(
+    vehicle: Vehicle, file: str, *, course: str = "hover", law: str = "robust", tilt: float | None = None
+) -> FirstScenario:
     """Return a scenario that the vehicle flies well, with numbers derived from the vehicle; see `quadsim.scenario`.
 
-    `file` is where these are, as the scenario is to name it; `course` is one of `COURSES`, `law` of `LAWS`.
+    `file` is where these are, as the scenario is to name it; `course` is one of `COURSES`, `law` of `LAWS`; a `tilt`
+    bound [deg] replaces that of the rules.
     """
     for kind, name, known in (("course", course, COURSES), ("controller", law, LAWS)):
         if name not in known:
             raise UnknownNameError(kind, name, known)
-    tuning = design_for(vehicle)
+    tuning = design_for(vehicle, tilt)
     reference, duration, size = _course(course, vehicle, tuning)
     name = re.sub(r"[^a-z0-9._-]+", "-", f"first-{vehicle.name}-{course}".lower())[:80]
     for_duration = "" if duration is None else f"duration = {duration}  # s\n"
@@ -142,8 +145,9 @@ def _notes(vehicle: Vehicle, tuning: Design, course: str, law: str) -> str:
     limits = {
         "lag": f"the rotors' lag: 1 / ({LAG_RATIO:g} (T + tau / 2)), T = {1e3 * can.lag:.3g} ms",
         "torque": "torque: 0.5 sqrt(alpha / tilt bound), alpha the smaller of roll's and pitch's",
-        "period": "what a period of 10 ms or more can serve",
+        "period": f"what a period of {1e3 * tuning.period:g} ms can serve",
     }
+    stated = f" --tilt {_tilt(tuning):g}" if tuning.tilt_stated else ""
     option, what = "", "The loop's bandwidth for x and y"
     then = (
         f"Without bounds it tolerates {1e3 * delay_margin(vehicle, tuning):.3g} ms more delay than it knows of.\n"
@@ -153,7 +157,7 @@ def _notes(vehicle: Vehicle, tuning: Design, course: str, law: str) -> str:
         option, what = f" --controller {law}", "The course is made for a robust MPC, whose bandwidth for x and y"
         then = "The controller's own rules: docs/own-vehicle.md."
     return f"""# A first flight of {printable(_description(course, vehicle, tuning))}.
-# Made by: quadsim scenario --for VEHICLE --course {course}{option}
+# Made by: quadsim scenario --for VEHICLE --course {course}{option}{stated}
 #
 # Thrust to weight {can.thrust_to_weight:.3g}: at most {math.degrees(can.steady_tilt):.3g} deg of steady tilt; \
 angular acceleration in reserve at hover
@@ -246,13 +250,20 @@ tilt = {_tilt(tuning)}  # deg, the bound of the linear controllers
 """
 
 
+def _why_tilt(tuning: Design) -> str:
+    """Where the tilt bound is from, as a comment."""
+    if tuning.tilt_stated:
+        return "as --tilt states it"
+    held = math.degrees(math.acos(min(1.0, 1.0 / (THRUST_SHARE * tuning.authority.thrust_to_weight))))
+    return f"the limit of the linear model, or {held:.3g} deg, what {100 * THRUST_SHARE:g} % of the thrust holds"
+
+
 def _robust(vehicle: Vehicle, tuning: Design) -> str:
     place, height, heading = (_rounded(weight) for weight in tuning.weights)
     speed, w, tilt = _rounded(tuning.speed_weight), tuning.bandwidth, _tilt(tuning)
     lag, known = "0.0", "the vehicle gives no lag"
     if vehicle.rotor_rise is not None and vehicle.rotor_rise >= SHORTEST_LAG:
         lag, known = '"vehicle"', "the vehicle's rotor_rise is predicted"
-    limit = math.degrees(math.acos(min(1.0, 1.0 / (THRUST_SHARE * tuning.authority.thrust_to_weight))))
     return f"""[controller]
 type = "robust"
 horizon = {tuning.horizon}  # N, periods: {HORIZON_TIMES:g} / w = {HORIZON_TIMES / w:.3g} s
@@ -279,8 +290,7 @@ all torque in reserve answers {math.degrees(HEADING_STEP):.3g} deg or more
 speed = {speed}  # 1 / ({speed**-0.5:.3g} rad/s)^2: with it four integrators have the bandwidth w, (g beta)^2 x / w^8
 
 [controller.output_bounds]
-roll = {[-tilt, tilt]}  # deg: the limit of the linear model, or {limit:.3g} deg, \
-what {100 * THRUST_SHARE:g} % of the thrust holds
+roll = {[-tilt, tilt]}  # deg: {_why_tilt(tuning)}
 pitch = {[-tilt, tilt]}  # as roll
 """
 
@@ -305,33 +315,25 @@ horizon = {math.ceil(PREVIEW / (w * tuning.period))}  # periods of preview for t
 
 
 def _constraints(law: str, vehicle: Vehicle, tuning: Design, size: float) -> str:
-    """Return the audited constraints, the same for every controller of rotor speeds; `size` of the course [m]."""
+    """Return the audited constraints that are not bounds of the controller; `size` of the course [m]."""
     tilt, off = _tilt(tuning), _rounded(ROOM * size)
-    rounding = _rounded(1e-9 * vehicle.speed_max)
 
-    def entry(name: str, signal: str, lower: float, upper: float | None, why: str, tolerance: float = 0.0) -> str:
+    def entry(name: str, signal: str, lower: float, upper: float | None, why: str) -> str:
         text = f'\n[[constraints]]\nname = "{name}"\nsignal = "{signal}"\nlower = {lower}  # {why}\n'
-        text += "" if upper is None else f"upper = {upper}\n"
-        return text + (f"tolerance = {tolerance}  # rounding\ntolerance_sampled = {tolerance}\n" if tolerance else "")
+        return text + ("" if upper is None else f"upper = {upper}\n")
 
-    reached = "rad/s, what the rotors hold"
     hull = (
         "m, radius of the ball about the hull: the lowest centre that keeps all of the vehicle above the ground, z = 0"
     )
     room = f"m, {100 * ROOM:g} % of the course's size, {size:g} m: the same for every controller"
-    return "".join(
-        [
-            *(entry(name, name, -tilt, tilt, "deg, the tilt bound, at every instant") for name in ("roll", "pitch")),
-            entry("speed", "speed", vehicle.speed_min, vehicle.speed_max, reached, rounding),
-            *(
-                [entry("slew", "slew", *_slew(tuning), "rad/s per period, the controller's bound", rounding)]
-                if law != "rates"
-                else []
-            ),
-            entry("floor", "z", _floor(vehicle), None, hull),
-            *(entry(f"hold_{axis}", f"{axis}_error", -off, off, room) for axis in "xyz"),
-        ]
-    )
+    entries = ["\n# Audited without an entry: every bound of the controller.\n"]
+    if law == "rates":  # it bounds the thrust of all rotors together
+        entries += [entry("speed", "speed", vehicle.speed_min, vehicle.speed_max, "rad/s, what the rotors hold")]
+    elif law != "robust":  # baselines bound the tilt that they command, and overshoot it
+        why = "deg, the tilt bound, at every instant"
+        entries += [entry(name, name, -tilt, tilt, why) for name in ("roll", "pitch")]
+    entries += [entry("floor", "z", _floor(vehicle), None, hull)]
+    return "".join(entries + [entry(f"hold_{axis}", f"{axis}_error", -off, off, room) for axis in "xyz"])
 
 
 def _floor(vehicle: Vehicle) -> float:
@@ -345,8 +347,10 @@ def _height(vehicle: Vehicle, size: float) -> float:
 
 
 def _tilt(tuning: Design) -> float:
-    """The tilt bound [deg], a whole number where it is above 5."""
+    """The tilt bound [deg], by rule a whole number where it is above 5."""
     degrees = math.degrees(tuning.tilt) + 1e-9
+    if tuning.tilt_stated:
+        return round(degrees, 6)
     return float(math.floor(degrees)) if degrees > 5.0 else _rounded(degrees)
 
 

@@ -43,6 +43,8 @@ LAG_RATIO: Final = 2.5  # 1 / w over the lag and half a period
 FASTEST: Final = 6.0  # largest bandwidth [rad/s]
 STEEPEST: Final = math.radians(40.0)
 """Largest tilt bound [rad]: at hover the model takes tan(tilt) for tilt, 20 % less at 40 deg."""
+LEAST_TILT, LARGEST_TILT = 1.0, 80.0
+"""Range of a tilt bound that replaces that of the rules [deg]."""
 THRUST_SHARE: Final = 0.85  # share of the thrust that holds the vehicle at the tilt bound; the rest is for torques
 PERIOD_SHARE: Final = 0.16  # largest w tau
 HORIZON_TIMES: Final = 5.0  # horizon times w
@@ -65,6 +67,7 @@ class Design:
     period: float  # tau [s]
     horizon: int  # N [periods]
     tilt: float  # bound on roll and on pitch [rad]
+    tilt_stated: bool  # whether somebody gave it; else it is by rule
     bandwidth: float  # w of x and y [rad/s]
     limited_by: Literal["lag", "torque", "period"]  # what w is the limit of
     height: float  # bandwidth of z [rad/s]
@@ -82,35 +85,35 @@ class Design:
         return math.tan(self.tilt)
 
 
-def design_for(vehicle: Vehicle) -> Design:
-    """The numbers for a vehicle; see the module.
+def design_for(vehicle: Vehicle, tilt: float | None = None) -> Design:
+    """The numbers for a vehicle; see the module.  A tilt bound [deg] replaces that of the rules.
 
     Raises:
-        ParameterError: hover leaves no thrust or no torque in reserve.
+        ParameterError: hover leaves no thrust or no torque in reserve, or the rotors do not carry the weight at this
+            tilt.
     """
     can = authority(vehicle)
     if min(can.climb, can.sink, *can.turning) < LEAST_RESERVE:
         rule = f"further from its hover speed, {vehicle.hover_speed:.4g} rad/s, or nothing is left to control it with"
         side = "speed_max" if can.climb <= can.sink else "speed_min"
         raise ParameterError("vehicle", side, getattr(vehicle, side), rule)
-    tilt = min(STEEPEST, math.acos(min(1.0, 1.0 / (THRUST_SHARE * can.thrust_to_weight))))
-    # A vehicle that barely hovers keeps at least a third of the tilt that it can hold.
-    tilt = max(tilt, can.steady_tilt / 3.0)
-    bandwidth, limited_by, period = _bandwidth(can, tilt)
+    bound = _tilt_bound(can) if tilt is None else _stated_tilt(can, tilt)
+    bandwidth, limited_by, period = _bandwidth(can, bound)
     height = min(HEIGHT_RATIO * bandwidth, math.sqrt(min(can.climb, can.sink) / HEIGHT_STEP))
     heading = min(HEADING_RATIO * bandwidth, math.sqrt(can.turning[2] / HEADING_STEP))
     _, B = continuous_model(vehicle)
     lift, roll, pitch, yaw = (
         float(np.linalg.norm(B[INDEX[name]])) for name in ("vz", "roll_rate", "pitch_rate", "yaw_rate")
     )
-    deviation = vehicle.gravity * math.tan(tilt) / bandwidth**2
+    deviation = vehicle.gravity * math.tan(bound) / bandwidth**2
     place = deviation**-2.0
     speed = place * (vehicle.gravity * min(roll, pitch)) ** 2 / bandwidth**8
     return Design(
         authority=can,
         period=period,
         horizon=math.ceil(HORIZON_TIMES / (bandwidth * period)),
-        tilt=tilt,
+        tilt=bound,
+        tilt_stated=tilt is not None,
         bandwidth=bandwidth,
         limited_by=limited_by,
         height=height,
@@ -125,6 +128,23 @@ def design_for(vehicle: Vehicle) -> Design:
         ),
         fastest=bandwidth / can.munk if can.munk else math.inf,
     )
+
+
+def _tilt_bound(can: Authority) -> float:
+    """The tilt bound [rad] by rule; a vehicle that barely hovers keeps a third of the tilt that it can hold."""
+    held = math.acos(min(1.0, 1.0 / (THRUST_SHARE * can.thrust_to_weight)))
+    return max(min(STEEPEST, held), can.steady_tilt / 3.0)
+
+
+def _stated_tilt(can: Authority, tilt: float) -> float:
+    """A tilt bound [deg] in radians, if the vehicle can hold it."""
+    steady = math.degrees(can.steady_tilt)
+    if not LEAST_TILT <= tilt <= min(steady, LARGEST_TILT):
+        most = (
+            f"{steady:.3g}, up to where the rotors carry the weight" if steady < LARGEST_TILT else f"{LARGEST_TILT:g}"
+        )
+        raise ParameterError("", "--tilt", tilt, f"between {LEAST_TILT:g} and {most} [deg]")
+    return math.radians(tilt)
 
 
 def _bandwidth(can: Authority, tilt: float) -> tuple[float, Literal["lag", "torque", "period"], float]:

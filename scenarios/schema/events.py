@@ -24,6 +24,11 @@ _UNITS: Final = {name: "deg" if name == "yaw" else "m" for name in REFERENCE_NAM
 _FAULTS: Final = {"dropout": "gives no samples", "freeze": "is frozen", "nan": "gives no numbers", "bias": "is offset"}
 
 
+def first_period(at: float, period: float) -> int:
+    """Return the first control period in which an event at a time [s] acts outside the plant."""
+    return math.ceil(at / period - 1e-6)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SetpointEvent:
     """The reference leaves the course: each axis given here keeps its value until a later set-point.

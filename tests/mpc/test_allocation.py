@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mpc.allocation import Allocation, allocate, make_allocation
+from mpc.allocation import Allocation, allocate, make_allocation, thrust_to_command
 from quadsim.assets import vehicle_path
 from quadsim.vehicle import load_vehicle
 
@@ -75,3 +75,17 @@ def test_torque_for_roll_goes_before_thrust_that_cannot_be_had(name: str) -> Non
         assert abs(error[1]) < 0.02
         assert abs(error[2]) < 0.02
         assert abs(error[0]) > 1.0
+
+
+@given(largest=st.floats(0.1, 1e3), ratio=st.floats(0.5, 20.0), share=st.floats(0.5, 1.0))
+def test_the_thrust_that_is_commanded_carries_the_weight_wherever_the_rotors_do(
+    largest: float, ratio: float, share: float
+) -> None:
+    weight = largest / ratio
+    commanded = thrust_to_command(largest, weight, share)
+    assert commanded <= largest
+    assert commanded >= min(largest, weight)
+    if ratio > 1.0:
+        assert commanded - weight >= (0.5 - 1e-9) * (largest - weight)
+    if share * largest >= 0.5 * (weight + largest):
+        assert commanded == share * largest

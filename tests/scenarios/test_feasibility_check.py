@@ -169,3 +169,33 @@ def test_filtered_steps_would_fit_with_a_slower_filter_or_smaller(vehicle: Vehic
     time = 3.0 * math.sqrt(2.0 / (vehicle.gravity * math.tan(math.radians(5.0))))
     assert advice.startswith("It would fit with a response time of ")
     assert float(advice.partition(" s,")[0].rpartition(" ")[2]) == pytest.approx(time, rel=0.06)
+
+
+def test_what_a_set_point_leaves_of_the_course_is_counted(vehicle: Vehicle) -> None:
+    """A circle of 2.5 deg that turns its yaw by 10 deg at 2 s, when it has hardly begun."""
+    circle = {"type": "circle", "radius": 3.0, "speed": 1.136, "turns": 2.0, "ramp": 10.0}
+    turn = {"type": "setpoint", "at": 2.0, "yaw": 10.0}
+    alone, turned = found(circle, vehicle, duration=44.0), found(circle, vehicle, duration=44.0, events=[turn])
+    assert turned.tilt == pytest.approx(alone.tilt, rel=1e-3)
+    assert turned.tilt == pytest.approx(math.degrees(math.atan(1.136**2 / 3.0 / vehicle.gravity)), rel=2e-2)
+    assert (turned.jumps, turned.yaw) == ((2.0,), pytest.approx(10.0))
+    assert "lasts" not in turned.sentence
+    fast = found(circle | {"speed": 3.0, "turns": 9.0}, vehicle, duration=44.0, events=[turn])
+    assert fast.problems[0].startswith("roll up to ")
+    assert fast.advice.startswith("It would fit at ")
+
+
+def test_a_course_is_followed_until_each_axis_that_moves_has_a_set_point(vehicle: Vehicle) -> None:
+    circle = {"type": "circle", "radius": 3.0, "speed": 1.0, "turns": 1.0, "ramp": 4.0}
+    events = [{"type": "setpoint", "at": 2.0, "x": 0.0}, {"type": "setpoint", "at": 6.0, "y": 1.0, "z": 0.5}]
+    sentence = found(circle, vehicle, duration=20.0, events=events).sentence
+    assert sentence.endswith("the flight follows it for 6 s.")
+    assert "lasts" not in found(circle, vehicle, duration=23.0, events=events[:1]).sentence
+
+
+def test_a_filtered_set_point_requires_what_the_filter_leaves_of_it(vehicle: Vehicle) -> None:
+    """At most d (3 / tau_r)^2, of a step of 1 m."""
+    still, step = {"response_time": 3.0}, [{"type": "setpoint", "at": 1.0, "y": 1.0}]
+    required = math.degrees(math.atan(1.0 / vehicle.gravity))
+    assert found(still, vehicle, events=step).tilt == pytest.approx(required, rel=0.1)
+    assert found({"response_time": 1.0}, vehicle, events=step).problems[0].startswith("roll up to 34.25 deg (bound 5)")

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support import fly_here
 
 import mpc
 import quadsim
@@ -26,11 +27,13 @@ from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
+from scenarios import infeasibility
 from scenarios.assembly import Assembly
 from scenarios.catalogue import scenario_path
 from scenarios.flight import Flight
 from scenarios.infeasibility import diagnose
-from scenarios.loading import load_scenario
+from scenarios.loading import load_scenario, parse_scenario
+from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
 
@@ -370,3 +373,147 @@ def test_a_controller_of_the_user_is_diagnosed_in_the_words_of_its_problem() -> 
     assert re.search(r"has an answer with roll upper wider by \S+ deg", result["advice"])
     enough = quadsim.fly(tilted, controller=partial(Keeping, largest=12.0))
     assert enough.diagnosis is None
+
+
+# --- advice is flown before it is given ------------------------------------------------------------------------------
+
+
+@cache
+def lagging() -> Flight:
+    """A hard bound on pitch, and rotors with a lag that the prediction lacks."""
+    return quadsim.fly(quadsim.load("paper-constrained-lag20"), progress=False)
+
+
+def flown_with(flight: Flight, settings: dict[str, Any], until: float) -> Flight:
+    """Fly a change without the code under test: a robust law has no field `solver`."""
+    data = tomllib.loads(flight.scenario.to_toml())
+    if "controller.type" in settings:
+        del data["controller"]["solver"]
+    for path, value in settings.items():
+        *tables, name = path.split(".")
+        place = data
+        for table in tables:
+            place = place[table]
+        place[name] = value
+    data |= {"duration": until, "expect": "satisfied"}
+    return quadsim.fly(parse_scenario(data), progress=False)
+
+
+def test_what_is_advised_keeps_the_flight_and_what_is_not_would_not_have() -> None:
+    """Each change gives the period an answer, but without the lag the next ones have none."""
+    flight = lagging()
+    result = flight.diagnosis
+    assert result is not None
+    assert flight.outcome == "lost"
+    until = round(result["time"] + infeasibility.AFTER, 9)
+    (helping,) = result["suggestions"]
+    assert helping["settings"] == {"controller.type": "robust", "controller.soft": {}, "controller.rotor_lag": 0.02}
+    helped = flown_with(flight, helping["settings"], until)
+    assert (helped.outcome, helped.infeasible_period) == ("incomplete", None)  # it holds the windows that it reaches
+    reasons = {next(iter(each["settings"])): each["why"] for each in result["rejected"]}
+    assert {"controller.output_bounds.pitch", "controller.input_bounds.slew"} <= reasons.keys()
+    for each in result["rejected"]:
+        if not each["settings"].keys() & {"controller.type", "controller.fallback"}:
+            failed = flown_with(flight, each["settings"], until)
+            lost = f"lost at t = {failed.time.size * 0.05:.4g} s"
+            assert (failed.outcome, each["why"]) == ("lost", lost)
+    assert result["advice"].startswith(f"to try, each flown until {until:.4g} s: controller.type = ")
+    text = (Path(__file__).resolve().parents[2] / "docs" / "controllers.md").read_text(encoding="utf-8")
+    assert f"{result['sentence']}\n{result['advice']}\n" in text
+
+
+@pytest.mark.parametrize(("speed", "note"), [([0.0, 150.0], "150"), ([200.0, 250.0], "at least 200")])
+def test_a_bound_that_excludes_hover_is_named_first_and_moved_past_hover(speed: list[float], note: str) -> None:
+    """The smallest bound with an answer, 183 rad/s, would fall: hover needs 192.8."""
+    bounded = quadsim.load("hover").replace({"controller.input_bounds.speed": speed, "constraints": []})
+    first = f"hover needs 192.8 rad/s, the bound is {note}: no controller can hold altitude"
+    assert quadsim.feasibility(bounded).notes == (first,)
+    result = quadsim.fly(bounded, progress=False).diagnosis
+    assert result is not None
+    assert result["sentence"].startswith(f"{first}; no answer at t = 0.00 s")
+    (change,) = result["suggestions"]
+    lower, upper = change["settings"]["controller.input_bounds.speed"]
+    assert lower < 192.8 < upper
+    helped = quadsim.fly(bounded.replace(change["settings"]), progress=False)
+    assert helped.outcome == "satisfied"
+    assert np.abs(helped.state["z"] - helped.reference["z"]).max() < 1e-6
+
+
+def test_hover_is_noted_before_the_flight(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", logger="quadsim"):
+        changes = {"controller": {"type": "pid", "input_bounds": {"speed": [0.0, 150.0], "slew": [-10.0, 10.0]}}}
+        changes |= {"duration": 0.1}  # type: ignore[dict-item]
+        scenario = quadsim.load("hover").replace(changes)
+        quadsim.run(scenario, out=tmp_path / "run", progress=False, video=False, recording=False, figures=False)
+    assert "hover needs 192.8 rad/s, the bound is 150: no controller can hold altitude" in caplog.messages
+
+
+def test_a_start_beyond_a_bound_is_advised_on_by_how_it_returns(file: str) -> None:
+    tilted = load_scenario(file, ["initial.euler=[10.0, 0.0, 0.0]", "duration=3.0"])
+    result = quadsim.fly(tilted, progress=False).diagnosis
+    assert result is not None
+    assert result["suggestions"]
+    for change in result["suggestions"]:
+        assert "roll" in change["violated"]
+        assert "violates roll, hold_x, hold_y, hold_z on its way" in result["advice"]
+
+
+def test_the_flights_of_a_diagnosis_are_not_diagnosed_and_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, flights = [], []
+    explain, fly = infeasibility.diagnose, Rollout.fly
+    monkeypatch.setattr(infeasibility, "diagnose", lambda *given: calls.append(1) or explain(*given))
+
+    def counted(rollout: Rollout, *given: Any, **options: Any) -> Flight:
+        flights.append(options.get("until"))
+        return fly(rollout, *given, **options)
+
+    tilted = quadsim.load("hover").replace({"duration": 0.4, "initial.euler": [20.0, 0.0, 0.0]})
+    first, second = (quadsim.fly(tilted, progress=False) for _ in range(2))
+    monkeypatch.setattr(Rollout, "fly", counted)
+    assert json.dumps(first.diagnosis) == json.dumps(first.summary["diagnosis"]) == json.dumps(second.diagnosis)
+    assert len(calls) == 2
+    assert set(flights) == {0.4}
+    assert 2 <= len(flights) <= 2 * infeasibility.MOST_FLOWN
+
+
+def test_nobody_but_the_summary_of_one_flight_pays_for_advice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Numbers, pictures and campaigns do not; Ctrl-C in the flights of the advice loses nothing."""
+    tilted = quadsim.load("hover").replace(
+        {"duration": 0.4, "initial.euler": [20.0, 0.0, 0.0], "controller.fallback": {}}
+    )
+    asked = []
+
+    def interrupted(*_: object) -> None:
+        asked.append(1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(infeasibility, "tried", interrupted)
+    flight = quadsim.fly(tilted, progress=False)
+    assert flight.metrics["speed_max"] > 0.0
+    assert flight.small_plot() is not None
+    assert flight._repr_html_()
+    fly_here(monkeypatch)
+    sweep = quadsim.sweep(tilted, {"vehicle.mass": [4.0, 4.1]}, progress=False)
+    assert len(sweep.table) == 2
+    assert not asked
+    assert not flight.write_tables(tmp_path / "run")
+    assert asked == [1]
+    read = quadsim.read(tmp_path / "run")
+    assert read.diagnosis is not None
+    assert read.diagnosis["sentence"].startswith("no answer at t = 0.00 s")
+
+
+def test_what_cannot_be_flown_again_is_advised_as_not_flown(monkeypatch: pytest.MonkeyPatch) -> None:
+    tilted = quadsim.load("hover").replace({"duration": 0.2, "initial.euler": [20.0, 0.0, 0.0]})
+    pushed = quadsim.fly(tilted, forces=[lambda time, state: np.zeros(6)], progress=False)
+    assert pushed.diagnosis is not None
+    code = "to try, not flown, as the scenario does not repeat code that was passed in: controller.output_bounds.roll"
+    assert pushed.diagnosis["advice"].startswith(code)
+    event = {"type": "controller", "at": 0.0, "fields": {"output_bounds.roll": [-4.0, 4.0]}}
+    changed = quadsim.fly(tilted.replace({"events": [event]}), progress=False)
+    assert changed.diagnosis is not None
+    assert changed.diagnosis["advice"].startswith("to try, not flown, as an event had changed the controller: ")
+    monkeypatch.setattr(infeasibility, "LONGEST", 0.1)
+    late = quadsim.fly(tilted, progress=False).diagnosis
+    assert late is not None
+    assert late["advice"].startswith("to try, not flown, as it would take more than 0.1 s of flight: ")

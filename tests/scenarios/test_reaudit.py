@@ -233,7 +233,7 @@ def test_what_a_run_records_is_what_its_tables_give(
     """
     flight = fly_once(name)
     scenario = flight.scenario.altered(log_rate=rate)
-    monkeypatch.setattr("scenarios.rollout.Rollout.fly", lambda *_: replace(flight, assembly=Assembly(scenario)))
+    monkeypatch.setattr("scenarios.rollout.Rollout.fly", lambda *_, **__: replace(flight, assembly=Assembly(scenario)))
     out = str(tmp_path / "run")
     status = main(["run", name, "--set", f"log_rate={rate}", *TABLES, "--json", "--out", out])
     assert main(["check", out]) == status
@@ -270,7 +270,7 @@ def test_permanent_fallback_is_no_success_and_reports_why(stuck: Path, capsys: p
     assert "completed, but in permanent fallback  0.50 s flown" in output
     assert "10 periods in fallback, never recovered\n" in output
     assert "cannot hold together: left upper at +0.05 s .. +2.50 s by " in output
-    assert "to try: controller." in output
+    assert "flown until 0.5 s, no change prevents it: controller." in " ".join(output.split())
     assert 'message="completed; 10 periods in fallback, never recovered; no answer at t = 0.00 s' in (
         stuck.parent / "verdicts.xml"
     ).read_text(encoding="utf-8")

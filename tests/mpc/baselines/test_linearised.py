@@ -25,7 +25,7 @@ PERIOD = 0.05
 AT_REST = Target(
     position=np.zeros(3), velocity=np.zeros(3), acceleration=np.zeros(3), yaw=0.0, yaw_rate=0.0, yaw_acceleration=0.0
 )
-NO_BOUNDS = np.zeros(4), np.full(4, np.inf)
+NO_BOUNDS = np.zeros(4), np.full(4, 1e6)
 
 Law = Callable[[Array, Array], tuple[Array, Array]]
 """(12,) state and (m,) memory -> (4,) speeds and (m,) memory."""

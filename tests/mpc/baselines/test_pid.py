@@ -58,6 +58,23 @@ def test_climbing_leaves_horizontal_acceleration_its_margin() -> None:
     np.testing.assert_allclose(given, [18.0, 0.0, math.sqrt(60.0**2 - 18.0**2)])
 
 
+@pytest.mark.parametrize("ratio", [1.001, 1.02, 1.15, 1.4, 2.0, 8.0])
+def test_the_cap_of_the_thrust_is_never_below_the_weight(
+    ratio: float, vehicle: Vehicle, build: Callable[..., Any]
+) -> None:
+    """Whatever the horizontal demand: half of the thrust above the weight is left to climb with."""
+    weight = vehicle.mass * vehicle.gravity
+    weak = replace(vehicle, speed_max=math.sqrt(ratio) * vehicle.hover_speed)
+    largest = build("pid", weak)._largest
+    assert weight + 0.5 * (ratio - 1.0) * weight <= largest + 1e-9
+    assert largest <= ratio * weight + 1e-9
+    for sideways in (0.0, 0.1, 1.0, 10.0):
+        force = np.array([sideways * weight, 0.0, 20.0 * weight])
+        given = force_within(force, weight=weight, largest=largest, tilt=math.radians(60.0))
+        assert given[2] >= 0.5 * (weight + largest) - 1e-9
+        assert np.linalg.norm(given) <= largest + 1e-9
+
+
 @pytest.mark.parametrize("limit", [10.0, 25.0])
 def test_tilt_stays_near_its_limit_in_flight(
     limit: float, vehicle: Vehicle, build: Callable[..., Any], fly_from: Callable[..., FlightLog]

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import math
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from scenarios.courses.csv_course import Table, read_table, through_rows
+import quadsim
+from quadsim.errors import FileError
+from quadsim.state import Array
+from scenarios.catalogue import scenario_names
+from scenarios.console import to_text
+from scenarios.courses.csv_course import Csv, Table, read_table, through_rows
 
 ROWS = "0,0,0,1,0\n1,2,0,1,0.5\n3,2,4,2,1\n"
 
@@ -68,3 +75,118 @@ def test_with_velocities_a_cubic_is_met_exactly() -> None:
 def test_yaw_that_wraps_is_unwrapped(tmp_path: Path) -> None:
     path = write(tmp_path, "t,x,y,z,yaw\n0,0,0,0,3.1\n1,0,0,0,-3.1\n2,0,0,0,-2.9\n")
     np.testing.assert_allclose(read_table(path).poses[:, 3], [3.1, math.tau - 3.1, math.tau - 2.9])
+
+
+T = np.arange(0.0, 6.05, 0.1)
+RADIUS, RATE = 2.0, 0.5
+"""A circle, [m] and [rad/s]: 1 m/s."""
+
+
+def circle(
+    tmp_path: Path, *, velocity: Array | float | None = None, place: float = 1.0, yaw: Array | float = 0.0
+) -> Path:
+    """A table of the circle; velocity (none: no columns) and place are factors, yaw is the column [rad]."""
+    angle = RATE * T
+    position = RADIUS * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1) * place + [0.0, 0.0, 1.0]
+    columns = [T, *position.T, yaw * np.ones_like(T)]
+    if velocity is not None:
+        columns += [*(RADIUS * RATE * np.stack([-np.sin(angle), np.cos(angle), 0.0 * angle], axis=1) * velocity).T]
+    text = io.StringIO()
+    np.savetxt(
+        text,
+        np.stack(columns, axis=1),
+        delimiter=",",
+        header="t,x,y,z,yaw,vx,vy,vz"[: 11 if velocity is None else 20],
+        comments="",
+    )
+    return write(tmp_path, text.getvalue())
+
+
+def test_columns_that_agree_have_no_notes(tmp_path: Path) -> None:
+    assert read_table(circle(tmp_path, velocity=1.0)).notes == ()
+    assert read_table(circle(tmp_path, yaw=RATE * T)).notes == ()
+    for name in scenario_names():
+        course = quadsim.load(name).reference
+        if isinstance(course, Csv):
+            assert read_table(Path(course.file)).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("factor", "hint"),
+    [(0.0, ""), (3.6, "; is it in km/h?"), (3.281, "; is it in ft/s?"), (-1.0, "; is its sign wrong?"), (0.5, "")],
+)
+def test_velocities_that_contradict_the_positions_are_noted_with_both_numbers(
+    tmp_path: Path, factor: float, hint: str
+) -> None:
+    notes = read_table(circle(tmp_path, velocity=np.array([factor, 1.0, 1.0]))).notes
+    moved = float(np.abs(np.diff(RADIUS * np.cos(RATE * T))).sum() / T[-1])
+    said = abs(factor) * moved
+    assert len(notes) == 1
+    words = notes[0].split()
+    assert notes[0].startswith("column vx is ")
+    assert (float(words[3]), float(words[12])) == (pytest.approx(said, rel=2e-3), pytest.approx(moved, rel=1e-3))
+    assert notes[0].endswith(f" m/s{hint}")
+
+
+def test_velocities_at_rest_in_every_row_are_noted(tmp_path: Path) -> None:
+    """Rows a second apart, between which the course would stop each time."""
+    rows = "".join(f"{t},{1.5 * t},0,1,0,0,0,0\n" for t in range(9))
+    (note,) = read_table(write(tmp_path, f"t,x,y,z,yaw,vx,vy,vz\n{rows}")).notes
+    assert note == "column vx is 0 m/s on average, but column x moves at 1.5 m/s"
+
+
+@pytest.mark.parametrize(("factor", "hint"), [(1000.0, "mm/s"), (100.0, "cm/s")])
+def test_velocities_many_times_those_of_the_positions_are_refused(tmp_path: Path, factor: float, hint: str) -> None:
+    with pytest.raises(FileError, match=rf"column vx: must agree with column x, which moves at .* is it in {hint}\?"):
+        read_table(circle(tmp_path, velocity=factor))
+    rows = "".join(f"{t / 10},0,0,1,0,100,0,0\n" for t in range(20))
+    rule = "column vx: must agree with column x, which moves at 0 m/s on average; got 100 m/s"
+    with pytest.raises(FileError, match=rule):
+        read_table(write(tmp_path, f"t,x,y,z,yaw,vx,vy,vz\n{rows}"))
+
+
+def test_positions_in_millimetres_are_noted_or_refused_by_their_size(tmp_path: Path) -> None:
+    (note,) = read_table(circle(tmp_path, place=100.0)).notes
+    assert note == "column x: the course moves at 99.99 m/s on average; if it is in mm instead of m, 0.09999 m/s"
+    rule = "must not make the course faster than 340 m/s on average; got 999.9 .if it is in mm instead of m, 0.9999 m/s"
+    with pytest.raises(FileError, match=rule):
+        read_table(circle(tmp_path, place=1000.0))
+    still = "t,x,y,z,yaw\n0,0,0,1000,0\n10,0,0,1000,0\n"
+    course = Csv(type="csv", file=str(write(tmp_path, still))).build(np.array([0.0, 0.0, 1.0, 0.0]), 9.81)
+    assert course.notes == ("columns x, y, z begin 999 m from the vehicle; if they are in mm instead of m, 0 m",)
+
+
+def test_yaw_in_degrees_is_noted_or_refused_by_its_size(tmp_path: Path) -> None:
+    (note,) = read_table(circle(tmp_path, yaw=15.0 * T)).notes
+    turned = "column yaw turns at 859.4 deg/s on average; if it is in degrees instead of radians, 15 deg/s"
+    assert note == turned
+    (note,) = read_table(circle(tmp_path, yaw=90.0)).notes
+    assert note.startswith(
+        "column yaw goes from 5157 to 5157 deg; if it is in degrees instead of radians, from 90 to 90"
+    )
+    (note,) = read_table(circle(tmp_path, yaw=7.5 * T)).notes
+    assert "turns at 429.7 deg/s" in note
+    (note,) = read_table(circle(tmp_path, yaw=6.0 * np.minimum(T, 5.9) - 0.3)).notes
+    assert "turns at" in note
+    rows = "".join(f"{t / 100},0,0,1,{0.45 * t}\n" for t in range(100))
+    with pytest.raises(FileError, match=r"must not turn faster than 2000 deg/s on average; got 2578 .* 45 deg/s"):
+        read_table(write(tmp_path, f"t,x,y,z,yaw\n{rows}"))
+    wrapped = np.array([math.remainder(170.0 + 10.0 * t, 360.0) for t in T.tolist()])
+    with pytest.raises(FileError, match=r"row \d+, column yaw: must be within half a turn, .* is it in degrees"):
+        read_table(circle(tmp_path, yaw=wrapped))
+
+
+def test_a_turn_of_yaw_per_row_is_refused_as_it_would_be_read_as_none(tmp_path: Path) -> None:
+    rows = "".join(f"{t},0,0,1,{math.tau * t}\n" for t in range(7))
+    with pytest.raises(FileError, match=r"row 3, column yaw: must be within half a turn, 3.142 rad, .* got 6.28319"):
+        read_table(write(tmp_path, f"t,x,y,z,yaw\n{rows}"))
+
+
+def test_the_notes_on_a_table_are_part_of_the_flights_summary(tmp_path: Path) -> None:
+    table = {"type": "csv", "file": str(circle(tmp_path, yaw=15.0 * T))}
+    changes = {"reference": table, "duration": 0.2, "initial.position": [2.0, 0.0, 1.0], "constraints": []}
+    scenario = quadsim.load("robust").replace(changes)
+    flight = quadsim.fly(scenario, progress=False)
+    assert flight.summary["course"]["notes"] == quadsim.feasibility(scenario).notes
+    assert any("column yaw turns at 859.4 deg/s" in note for note in flight.summary["course"]["notes"])
+    assert "column yaw turns at 859.4 deg/s" in to_text(flight.shown())

@@ -49,6 +49,9 @@ def test_a_set_point_runs_the_filter_on_from_its_row() -> None:
     np.testing.assert_array_equal(result[:, 1:3], before[:, 1:3])  # the other axes stay on the course
     np.testing.assert_array_equal(preview, before[101:151])  # what was known then
     assert (followed.preview(300, 3)[:, 0] == result[301:304, 0]).all()
+    setpoints = [(100, {"x": 2.0}), (300, {"yaw": -1.0, "x": 0.5})]
+    _, flown = Assembly(scenario).followed().flown(SAMPLES, setpoints)  # with all of them known
+    np.testing.assert_array_equal(flown, result)
 
 
 def test_without_a_response_time_a_set_point_is_reached_at_once() -> None:
@@ -58,8 +61,8 @@ def test_without_a_response_time_a_set_point_is_reached_at_once() -> None:
     assert rows(followed, 10)[:, 2].tolist() == [before] * 6 + [3.0] * 4
 
 
-def with_setpoint(at: float) -> Scenario:
-    return load_scenario("paper-constrained", [f"events=[{{type='setpoint', at={at}, x=0.1}}]"])
+def with_setpoint(at: float, axes: str = "x=0.1") -> Scenario:
+    return load_scenario("paper-constrained", [f"events=[{{type='setpoint', at={at}, {axes}}}]"])
 
 
 def test_what_is_reported_of_a_course_is_what_was_followed_of_it() -> None:
@@ -68,4 +71,5 @@ def test_what_is_reported_of_a_course_is_what_was_followed_of_it() -> None:
     assert {step.channel for step in Assembly(with_setpoint(5.0)).course_steps} == {"y", "z", "yaw"}
     whole, nearly = report(Assembly(plain)), report(Assembly(with_setpoint(59.9)))
     assert nearly.tilt == whole.tilt
-    assert report(Assembly(with_setpoint(0.05))).tilt < 0.1 * whole.tilt
+    assert report(Assembly(with_setpoint(0.05))).tilt > 0.9 * whole.tilt  # y steps by 10 m as before
+    assert report(Assembly(with_setpoint(0.05, "x=0.1, y=0.1"))).tilt < 0.1 * whole.tilt

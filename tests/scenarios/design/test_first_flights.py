@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -15,7 +17,9 @@ import quadsim
 from mpc.baselines.lqr import bryson_objective
 from mpc.robust.settings import Robust
 from quadsim.assets import vehicle_path
-from quadsim.vehicle import Vehicle, load_vehicle
+from quadsim.errors import ParameterError
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle, load_vehicle
+from scenarios.assembly import Assembly
 from scenarios.design.first_scenario import BASELINE_SHARE, CLEARANCE, COURSES, LAWS, ROOM, first_scenario
 from scenarios.loading import parse_scenario
 
@@ -96,18 +100,103 @@ def test_the_file_states_what_is_flown(course: str, law: str) -> None:
     assert max(map(len, text.splitlines())) <= 160
     scenario = parse_scenario(made.to_data())
     assert scenario.controller.type == ("nonlinear" if law == "rates" else law)
-    bounds = {limit.signal: (limit.lower, limit.upper) for limit in scenario.constraints}
+    stated = {limit.signal: (limit.lower, limit.upper) for limit in scenario.constraints}
+    limits = Assembly(scenario, ALL["hummingbird"]).limits
+    bounds = {limit.signal: (limit.lower, limit.upper) for limit in limits}
     if isinstance(scenario.controller, Robust):
         assert bounds["roll"] == tuple(scenario.controller.output_bounds["roll"])
         assert bounds["slew"] == tuple(scenario.controller.input_bounds.slew)
     elif law == "rates":
-        assert made.to_data()["controller"]["tilt"] == bounds["roll"][1]
+        assert made.to_data()["controller"]["tilt"] == bounds["tilt"][1]
         assert "slew" not in bounds
     else:
         assert made.to_data()["controller"]["tilt"] <= BASELINE_SHARE * (bounds["roll"][1] or 0.0)
+    assert bounds["speed"] == (ALL["hummingbird"].speed_min, ALL["hummingbird"].speed_max)
+    assert not stated.keys() & Assembly(scenario, ALL["hummingbird"]).bounds.keys()  # nothing is said twice
     for axis in "xyz":
         assert bounds[f"{axis}_error"] == pytest.approx((-ROOM * made.size, ROOM * made.size), rel=0.01)
     assert bounds["z"][0] == pytest.approx(ALL["hummingbird"].enclosing_radius, abs=1e-3)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_a_tilt_bound_of_ones_own_is_in_the_design_and_in_the_audit(law: str) -> None:
+    made = first_scenario(ALL["hummingbird"], "hummingbird", law=law, tilt=22.5)
+    assert made.notes[1].endswith(" --tilt 22.5")
+    limits = {limit.signal: limit.upper for limit in Assembly(parse_scenario(made.to_data())).limits}
+    assert {limits[name] for name in ("roll", "pitch", "tilt") if name in limits} == {22.5}
+    commanded = made.to_data()["controller"].get("tilt", 22.5)
+    assert commanded == (22.5 if law in ("robust", "rates") else BASELINE_SHARE * 22.5)
+    deviation = ALL["hummingbird"].gravity * math.tan(math.radians(22.5)) / 6.0**2  # m, at w = 6 rad/s
+    if law == "robust":
+        assert made.to_data()["controller"]["output_weights"]["x"] == pytest.approx(deviation**-2.0, rel=5e-3)
+
+
+def test_a_tilt_bound_is_one_at_which_the_rotors_carry_the_weight() -> None:
+    weak = replace(ALL["hummingbird"], speed_max=1.1 * ALL["hummingbird"].hover_speed)
+    held = math.degrees(math.acos(1.0 / 1.1**2))
+    assert first_scenario(weak, "hummingbird", tilt=round(held, 1) - 0.1).size == 1.0
+    for tilt, most in ((round(held, 1) + 0.1, f"{held:.3g}"), (0.5, f"{held:.3g}")):
+        with pytest.raises(ParameterError, match=f"--tilt must be between 1 and {most}, up to where the rotors carry"):
+            first_scenario(weak, "hummingbird", tilt=tilt)
+    strong = replace(ALL["hummingbird"], speed_max=3.0 * ALL["hummingbird"].hover_speed)
+    with pytest.raises(ParameterError, match=r"--tilt must be between 1 and 80 \[deg\]; got 81"):
+        first_scenario(strong, "hummingbird", tilt=81.0)
+    with pytest.raises(ParameterError, match="--tilt must be given with --for alone; got 25"):
+        quadsim.scenario("hover", tilt=25.0)
+
+
+def test_the_comment_on_the_period_names_the_one_that_was_chosen() -> None:
+    made = first_scenario(ALL["hummingbird"], "hummingbird", tilt=20.0)
+    period = made.to_data()["control_period"]
+    assert f"limited by what a period of {1e3 * period:g} ms can serve;" in made.notes
+
+
+def in_other_units(vehicle: Vehicle, scale: float) -> Vehicle:
+    """The same vehicle with its rotors' speeds in another unit than rad/s: the same thrusts, torques and drag."""
+    assert vehicle.rotor_inertia is not None
+    assert vehicle.rotor_drag is not None
+    return replace(
+        vehicle,
+        speed_min=scale * vehicle.speed_min,
+        speed_max=scale * vehicle.speed_max,
+        thrust_coefficient=vehicle.thrust_coefficient / scale**2,
+        rotor_inertia=vehicle.rotor_inertia / scale,
+        rotor_drag=vehicle.rotor_drag / scale,
+    )
+
+
+RPM = 60.0 / math.tau
+
+
+@pytest.mark.parametrize(
+    ("law", "scale"), [("robust", RPM), *((law, scale) for law in ("lqr", "pid", "geometric") for scale in (RPM, 1e3))]
+)
+def test_no_speed_but_the_vehicles_own_limits_a_flight(law: str, scale: float) -> None:
+    flights = []
+    for vehicle in (ALL["hummingbird"], in_other_units(ALL["hummingbird"], scale)):
+        made = first_scenario(vehicle, vehicle.name, course="step", law=law).to_data()
+        numbers = {name: getattr(vehicle, name) for name in VEHICLE_UNITS if getattr(vehicle, name) is not None}
+        table = {name: [*value] if isinstance(value, tuple) else value for name, value in numbers.items()}
+        made |= {"duration": 1.5, "vehicle": {"file": vehicle.name, **table}}
+        made["reference"] |= {axis: [{"start": 0.2, "stop": 9.0, "value": 2.0}] for axis in "xyz"}
+        flights.append(quadsim.fly(parse_scenario(made), progress=False))
+    one, other = flights
+    assert one.command.max() > 1.1 * one.vehicle.hover_speed
+    np.testing.assert_allclose(other.command, scale * one.command, rtol=5e-3)  # numbers of a file have three digits
+    np.testing.assert_allclose(other.log.control.truth, one.log.control.truth, atol=1e-2)
+
+
+@pytest.mark.parametrize("ratio", [1.02, 1.15])
+@pytest.mark.parametrize("law", ["robust", "lqr", "pid", "geometric"])
+def test_a_vehicle_of_little_thrust_to_weight_keeps_its_height(law: str, ratio: float) -> None:
+    """A step aside, for which the thrust must carry the weight at a tilt."""
+    vehicle = replace(ALL["lopes2011"], speed_max=math.sqrt(ratio) * ALL["lopes2011"].hover_speed)
+    made = first_scenario(vehicle, "lopes2011", law=law).to_data()
+    made["vehicle"]["speed_max"] = vehicle.speed_max
+    made["reference"] = {"x": [{"start": 0.5, "stop": 9.0, "value": 0.5}], "response_time": 2.0}
+    flight = quadsim.fly(parse_scenario(made), progress=False)
+    assert np.abs(flight.state["z"] - flight.reference["z"]).max() < 0.1
+    assert np.abs(flight.state["x"][-1] - flight.reference["x"][-1]) < 0.1
 
 
 def test_the_default_lqr_is_slower_where_rotors_are_slow_and_as_it_was_elsewhere() -> None:
