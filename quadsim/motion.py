@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from quadsim.state import Array
 
@@ -26,3 +28,7 @@ class Motion:
         """Return the motion from sample k on, as views; beyond the end, its last sample."""
         first = min(k, len(self) - 1)
         return Motion(**{name: samples[first:] for name, samples in vars(self).items()})
+
+    def raised(self, height: float) -> Motion:
+        """Return the same motion, higher by a height [m]."""
+        return replace(self, position=self.position + np.array([0.0, 0.0, height]))

@@ -109,7 +109,8 @@ class Flight(Result):
     def satisfied(self) -> bool:
         """Whether the flight was completed, without a crash or permanent fallback, and every required constraint held.
 
-        `quadsim.flight.metrics.unrecovered` defines permanent fallback.
+        A flight that was told to leave the ground must have left it.  `quadsim.flight.metrics.unrecovered` and
+        `never_took_off` define permanent fallback and a failed take-off.
         """
         return self.outcome == "satisfied"
 
@@ -129,8 +130,9 @@ class Flight(Result):
             return "aborted"
         if self.log.reason is not None:
             return "lost"
-        verdicts = {finding.verdict for finding in self.findings if finding.limit.required}
-        if self.log.control.crashed or metrics.unrecovered(self.log.control) or "violated" in verdicts:
+        verdicts, control = {finding.verdict for finding in self.findings if finding.limit.required}, self.log.control
+        failed = control.crashed or metrics.unrecovered(control) or metrics.never_took_off(control) is not None
+        if failed or "violated" in verdicts:
             return "violated"
         return "incomplete" if "incomplete" in verdicts else "satisfied"
 

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 from quadsim.errors import printable
 from quadsim.flight.rundir import constraint_verdict
 from quadsim.outputs import absolute, require_file, writing_file
-from quadsim.report.comparison import failure_sentences
+from quadsim.report.comparison import failed_takeoff, failure_sentences
 from quadsim.report.table import format_number
 
 if TYPE_CHECKING:
@@ -63,7 +63,8 @@ def write_junit(result: Reaudit | CampaignResult | Sequence[Reproduction], path:
         test_cases = [(entry.requirement.text, entry.holds, entry.sentence) for entry in judged]
         return write_cases(summary["campaign"], test_cases, Path(path))
     text = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
-    whole = summary["status"] == "completed" and not summary["controller"].get("unrecovered")
+    failed = summary["controller"].get("unrecovered") or failed_takeoff(summary)
+    whole = summary["status"] == "completed" and not failed
     cases = [("flight", whole, text), *map(_case, summary["constraints"])]
     return write_cases(summary["scenario"], cases, Path(path))
 

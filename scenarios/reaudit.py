@@ -108,7 +108,7 @@ def reaudit(directory: Path, *, products: bool = True) -> Reaudit:
         shown = ", ".join(others[:MOST_REPORTED]) + (" ..." if len(others) > MOST_REPORTED else "")
         notes.append(f"not of this run: {printable(shown)}")
     whole = summary["reason"] is None and log.control.t.size == scenario.periods and not log.control.crashed
-    whole = whole and not metrics.unrecovered(log.control)
+    whole = whole and not metrics.unrecovered(log.control) and metrics.never_took_off(log.control) is None
     return Reaudit(
         summary=summary,
         findings=findings,
@@ -243,6 +243,7 @@ def _differences(
             yield f"{entry['name']}: satisfied is {entry['satisfied']}, and its worst margins say {implied}"
     required = all(entry["satisfied"] for entry in entries if entry["required"])
     satisfied = reason is None and required and not (log.control.crashed or metrics.unrecovered(log.control))
+    satisfied = satisfied and metrics.never_took_off(log.control) is None
     yield from _recorded("satisfied", summary["satisfied"], satisfied, "its audit and outcome make it")
     outcome = verdict(summary)
     yield from _recorded("verdict", summary.get("verdict", outcome), outcome, "its audit and outcome make it")

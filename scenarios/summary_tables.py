@@ -19,7 +19,7 @@ from quadsim.report.comparison import (
     failure_sentences,
     required,
     verdict,
-    violated_by_fallback,
+    violated_otherwise,
 )
 from scenarios import console
 
@@ -65,8 +65,7 @@ def outcome_line(summary: Mapping[str, Any]) -> Text:
     if verdict(summary) == "incomplete":
         colour = "green" if remark and as_expected else "yellow"
         return console.styled((f"incomplete, {required(summary).text}{remark}", colour))
-    if violated_by_fallback(summary):
-        phrase = "but in permanent fallback"
+    phrase = violated_otherwise(summary) or phrase
     return console.styled((f"{crash(summary) or 'completed'}, {phrase}{remark}", colour))
 
 
