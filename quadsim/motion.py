@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from quadsim.state import Array
 
@@ -33,3 +35,7 @@ class Motion:
         for view in views.values():
             view.flags.writeable = False
         return Motion(**views)
+
+    def raised(self, height: float) -> Motion:
+        """Return the same motion, higher by a height [m]."""
+        return replace(self, position=self.position + np.array([0.0, 0.0, height]))

@@ -11,7 +11,7 @@ from quadsim.errors import printable
 from quadsim.flight.audit import Finding
 from quadsim.flight.rundir import findings_of
 from quadsim.outputs import absolute, require_file, writing_file
-from quadsim.report.comparison import failure_sentences
+from quadsim.report.comparison import failed_takeoff, failure_sentences
 from quadsim.report.table import format_number
 
 if TYPE_CHECKING:
@@ -64,7 +64,8 @@ def write_junit(result: Reaudit | CampaignResult | Sequence[Reproduction], path:
         test_cases = [(entry.requirement.text, entry.holds, entry.sentence) for entry in judged]
         return write_cases(summary["campaign"], test_cases, Path(path))
     text = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
-    whole = summary["status"] == "completed" and not summary["controller"].get("unrecovered")
+    failed = summary["controller"].get("unrecovered") or failed_takeoff(summary)
+    whole = summary["status"] == "completed" and not failed
     findings = findings_of(summary)
     cases = [("flight", whole, text), *map(_case, findings)]
     if not findings:

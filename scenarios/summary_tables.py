@@ -19,7 +19,7 @@ from quadsim.report.comparison import (
     failure_sentences,
     required,
     tolerance_text,
-    violated_by_fallback,
+    violated_otherwise,
 )
 from scenarios import console
 
@@ -68,8 +68,7 @@ def outcome_line(summary: Mapping[str, Any]) -> Text:
         what = required(summary).text if verdict == "incomplete" else "no constraint was audited"
         return console.styled((f"{verdict}, {what}{remark}", colour))
     phrase = "every required constraint holds" if summary["satisfied"] else _violations(findings_of(summary))
-    if violated_by_fallback(summary):
-        phrase = "but in permanent fallback"
+    phrase = violated_otherwise(summary) or phrase
     return console.styled((f"{crash(summary) or 'completed'}, {phrase}{remark}", colour))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from quadsim.controller import ACCEPTED, MISSED, NO_SOLVER, Phase
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, TimingLog
-from quadsim.flight.phase import AIRBORNE, Outline, clearance, takeoff_time, touchdown
+from quadsim.flight.phase import AIRBORNE, TAKEOFF_RISE, Outline, clearance, takeoff_time, touchdown
 from quadsim.state import (
     INDEX,
     REFERENCE_NAMES,
@@ -28,6 +28,9 @@ SETTLING_BAND: Final = 0.05  # half-width of the settling band, as a share of th
 
 UNRECOVERED: Final = 1.0
 """Time in fallback at the end of a flight that counts as permanent [s]: the default limit on one shifted plan."""
+TAKEOFF_PATIENCE: Final = 3.0
+"""Time on the ground under a course in the air after which a vehicle has not taken off [s]; cold rotors need some of it
+to spin up, up to 2.2 s with the paper's bound on steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +130,7 @@ def percentiles(values: Array) -> dict[str, float]:
 
 
 def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[str, Any]:
-    """Count statuses, answerers and fallbacks; `unrecovered`, iterations, residuals, times [ms].
+    """Count statuses, answerers and fallbacks; `unrecovered`, `never_took_off`, iterations, residuals, times [ms].
 
     `iterations` covers the periods that the QP solver answered, None if there are none, or several solvers;
     `iterations_by` lists every answerer that iterates.  Each residual has its largest value among accepted answers, and
@@ -146,6 +149,7 @@ def controller(log: ControlLog, timing: TimingLog, deadline_ms: float) -> dict[s
         "statuses": dict(sorted(Counter(log.status).items())),
         "fallbacks": {str(level): count for level, count in sorted(Counter(log.fallback.tolist()).items())},
         "unrecovered": unrecovered(log),
+        "never_took_off": never_took_off(log),
         "answered_by": dict(sorted(Counter(log.answered_by).items())),
         "iterations": by_answerer.get(solvers.pop()) if len(solvers) == 1 else None,
         "iterations_by": by_answerer,
@@ -171,10 +175,31 @@ def unrecovered(log: ControlLog) -> int:
 
 
 def failure(log: ControlLog) -> str | None:
-    """Return how a flight failed apart from its audit: `crash` or `permanent fallback`; None if it did not."""
+    """Return how a flight failed apart from its audit; None if it did not.
+
+    `crash`, `permanent fallback` (see `unrecovered`) or `no take-off` (see `never_took_off`).
+    """
     if log.crashed:
         return "crash"
+    if never_took_off(log) is not None:
+        return "no take-off"
     return "permanent fallback" if unrecovered(log) else None
+
+
+def never_took_off(log: ControlLog) -> float | None:
+    """Return when a vehicle was told to leave the ground that it stands on at the end [s]; None if it need not, or did.
+
+    It is told by a reference `TAKEOFF_RISE` above the place where it stands, and counts once such a reference has
+    lasted `TAKEOFF_PATIENCE`.  A crash is another failure.
+    """
+    flown = [k for k, phase in enumerate(log.phase) if phase == Phase.FLYING]
+    start = flown[-1] + 1 if flown else 0
+    if log.crashed or log.t.size - start < 2:
+        return None
+    heights = log.truth[start:, INDEX["z"]]
+    told = np.flatnonzero(log.reference[start:, REFERENCE_NAMES.index("z")] > heights.min() + TAKEOFF_RISE)
+    lasted = told.size * float(log.t[1] - log.t[0])
+    return float(log.t[start + told[0]]) if lasted >= TAKEOFF_PATIENCE - 1e-9 else None
 
 
 def computation(log: ControlLog) -> dict[str, Any]:

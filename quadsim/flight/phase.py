@@ -1,4 +1,4 @@
-"""Ground contact and loss: the parts that may touch the ground, the phase of the flight, and the loss criteria."""
+"""Ground contact and loss: the parts that may touch the ground, the phase of the flight, take-off, loss criteria."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from quadsim.controller import Phase
+from quadsim.controller import GROUNDED, Phase
 from quadsim.errors import LostError
 from quadsim.rotation import body_to_world
 from quadsim.space import Obstacle, Solids
@@ -89,6 +89,16 @@ TAKEOFF_RISE: Final = 0.05  # rise of the reference above the resting height tha
 REST: Final = 0.2  # uninterrupted contact of the feet after which the vehicle has landed [s]
 CAPSIZED: Final = 60.0  # tilt [deg] above which a vehicle that touches the ground has crashed
 
+LEVEL: Final = 10.0  # tilt [deg] up to which a vehicle on the ground may be pushed to take off
+STANDSTILL: Final = 0.5  # time [s] without more thrust or a rise after which a vehicle does not take off by itself
+MORE_THRUST: Final = 1.01  # ratio of thrusts that counts as more
+RISING: Final = 0.05  # vertical speed [m/s] above which a vehicle on the ground is taking off
+LEAD_RATE: Final = 1.0  # [m/s] growth of the lead
+LARGEST_LEAD: Final = 10.0  # [m]
+FADING: Final = 0.5  # largest climb after lift-off over which the lead fades [m]
+FADING_TIME: Final = 1.0  # shortest time constant of the fading [s]: that of `mpc.observer`'s force by default
+NO_LEAD: Final = 1e-3  # [m]; a smaller lead in the air counts as none
+
 CRITERIA: Final = {
     "tilt": ("the thrust axis is tilted by", "deg"),
     "distance": ("the distance from the reference is", "m"),
@@ -96,6 +106,62 @@ CRITERIA: Final = {
     "speed": ("the speed is", "m/s"),
 }
 """Criteria by their name in `[lost]`, with units; the first one met is the reason."""
+
+
+class TakeoffLead:
+    """The height to add to a controller's reference so that a vehicle takes off which is heavier than its model.
+
+    On the ground, most laws cannot learn a mismatch: the ground carries what thrust does not, so observers and
+    integrals hold until lift-off, and a law without them never learns.  Every law demands more thrust for a higher
+    reference, so the lead is an integral on thrust for all of them, within the law's own bounds.
+
+    - It stays zero until an armed, level vehicle with its course in the air has stood for `STANDSTILL` without more
+      thrust.  A law that takes off by itself never sees it.
+    - It then grows at `LEAD_RATE` up to `LARGEST_LEAD`, while the vehicle does not rise and thrust follows: rotors that
+      saturate stop it.
+    - From lift-off at height z_0 on it fades with the climb, and never grows again:
+
+          lead = lead_0 (1 - (z - z_0) / min(FADING, z_ref - z_0)).
+
+      It is thus released as the law's own estimate or integral takes over, and gone at the course.  A law with neither
+      keeps its steady altitude error, but hovers just above the ground where it would have stayed on it.
+    """
+
+    def __init__(self, period: float) -> None:
+        self._period, self._slowest_decay = period, math.exp(-period / FADING_TIME)
+        self.reset()
+
+    def reset(self) -> None:
+        """No lead; the next take-off is the first."""
+        self.lead = self._at_liftoff = 0.0
+        self._height = self._most = self._idle = 0.0
+        self._pushing = False
+
+    def push(self, height: float, climb: float, thrust: float) -> float:
+        """Return the lead of a period on the ground [m], from height [m], vertical speed [m/s] and thrust, any unit."""
+        if thrust > MORE_THRUST * self._most or climb > RISING:
+            self._most, self._idle = max(thrust, self._most), 0.0
+        else:
+            self._idle += self._period
+        standing = self._idle > STANDSTILL - 1e-9
+        if not self._pushing:
+            self._pushing, self._idle = standing, 0.0 if standing else self._idle
+        elif not standing and climb <= RISING:
+            self.lead = min(self.lead + LEAD_RATE * self._period, LARGEST_LEAD)
+        self._height, self._at_liftoff = height, self.lead
+        return self.lead
+
+    def fade(self, height: float, course: float) -> float:
+        """Return the lead of a period in the air [m], from the heights of the vehicle and its course [m]."""
+        if self.lead > 0.0:
+            span = min(FADING, course - self._height)
+            climbed = (height - self._height) / span if span > 0.0 else 1.0
+            faded = max(1.0 - climbed, 0.0) * self._at_liftoff
+            self.lead = min(self.lead, max(faded, self._slowest_decay * self.lead))
+            if self.lead < NO_LEAD:
+                self.lead = 0.0
+        self._most, self._idle, self._pushing = 0.0, 0.0, False
+        return self.lead
 
 
 class PhaseMonitor:
@@ -123,12 +189,14 @@ class PhaseMonitor:
             self._takeoff_height = outline.floor + outline.foot_radius - float(outline.feet[:, 2].min()) + TAKEOFF_RISE
             self._reach = float(np.linalg.norm(outline.hull, axis=1).max()) + TOUCH  # nothing can touch above it
             self._periods_of_rest = math.ceil(REST / period - 1e-9)
+        self._takeoff = TakeoffLead(period)
         self.reset()
 
     def reset(self) -> None:
         """Restart: the next state is the first."""
         self._phase: Phase | None = None
         self._touched = 0
+        self._takeoff.reset()
 
     def advance(self, t: Array, states: Array, preview: Array) -> Phase:
         """Return the phase of the control period that starts now.
@@ -156,7 +224,27 @@ class PhaseMonitor:
             self._phase = Phase.FLYING
         elif self._phase is not Phase.CRASHED:
             self._phase = Phase.ARMED if flight_required else Phase.LANDED
+        if self._phase in GROUNDED:
+            self._takeoff.reset()
         return self._phase
+
+    def lead(self, state: Array, course: float, thrust: float) -> float:
+        """Return the height to add to the controller's reference in the period of the last `advance` [m].
+
+        Args:
+            state: (12,) the true state now.
+            course: height of the reference now [m].
+            thrust: of the rotors as they turn now, in any unit.
+        """
+        if self._outline is None:
+            return 0.0
+        height, climb = float(state[INDEX["z"]]), float(state[INDEX["vz"]])
+        if self._phase is Phase.FLYING and self._touched < self._periods_of_rest:
+            return self._takeoff.fade(height, course)
+        if course > self._takeoff_height and np.degrees(tilt(state[None])[0]) <= LEVEL:
+            return self._takeoff.push(height, climb, thrust)
+        self._takeoff.reset()
+        return 0.0
 
     def _crashed(self, outline: Outline, states: Array) -> bool:
         if self._touched and np.degrees(tilt(states[-1:])[0]) > CAPSIZED:

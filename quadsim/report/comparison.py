@@ -110,6 +110,8 @@ def outcome(summary: Summary) -> Cell:
         cell = replace(cell, text=f"{cell.text}: {summary.get('reason')}")
     elif summary["verdict"] == "incomplete":
         cell = replace(cell, text=f"{cell.text}; {required(summary).text}")
+    elif sentence := failed_takeoff(summary):
+        cell = replace(cell, text=f"{cell.text}: {sentence}")
     free = [finding for finding in findings_of(summary) if not finding.limit.required]
     if exceeded := [finding.limit.name for finding in free if finding.verdict == "violated"]:
         mark = Mark.WARN if cell.mark is Mark.GOOD else cell.mark
@@ -146,15 +148,32 @@ def _step_time(summary: Summary) -> Cell:
     return Cell(text=text, mark=Mark.WARN if nested(summary, "controller", "deadline_misses") else Mark.NONE)
 
 
-def violated_by_fallback(summary: Summary) -> bool:
-    """Return whether a completed flight met its required constraints and is violated only by permanent fallback."""
-    violated = any(finding.limit.required and finding.verdict == "violated" for finding in findings_of(summary))
-    return bool(summary["controller"].get("unrecovered")) and not violated
+def violated_otherwise(summary: Summary) -> str | None:
+    """Return what else than a required constraint, none of which is violated, makes a completed flight `violated`.
+
+    That is no take-off, or permanent fallback; None if it is neither.
+    """
+    if any(finding.limit.required and finding.verdict == "violated" for finding in findings_of(summary)):
+        return None
+    if failed_takeoff(summary):
+        return "but it never took off"
+    return "but in permanent fallback" if summary["controller"].get("unrecovered") else None
 
 
 def fallback_sentence(periods: int) -> str:
     """Say that a flight ended in fallback, after so many periods of it."""
     return f"{periods} periods in fallback, never recovered"
+
+
+def takeoff_sentence(told: float) -> str:
+    """Say that the vehicle never left the ground that it was told to leave at a time [s]."""
+    return f"told to take off at t = {format_number(told)} s, never left the ground"
+
+
+def failed_takeoff(summary: Summary) -> str | None:
+    """Say when a vehicle that never left the ground was told to; None if it need not, or did."""
+    told = summary["controller"].get("never_took_off")
+    return None if told is None else takeoff_sentence(told)
 
 
 def crash(summary: Summary) -> str | None:
@@ -167,6 +186,11 @@ def crash(summary: Summary) -> str | None:
 
 
 def failure_sentences(summary: Summary) -> list[str]:
+    """Return what failed other than a constraint: the take-off, or as in `optimum_sentences`."""
+    return [*filter(None, [failed_takeoff(summary)]), *optimum_sentences(summary)]
+
+
+def optimum_sentences(summary: Summary) -> list[str]:
     """Return why there was no optimum: permanent fallback, and the reason for the first QP without an answer."""
     periods, diagnosis = summary["controller"].get("unrecovered"), summary.get("diagnosis")
     sentences = [fallback_sentence(periods)] if periods else []
@@ -405,7 +429,7 @@ _GLANCE: Final[tuple[_Line, ...]] = (("outcome", "", outcome), ("worst constrain
 _FLIGHT: Final[tuple[_Line, ...]] = (
     ("required constraints", "", required),
     ("audit", "", lambda summary: Cell(text="; ".join(summary.get("audit_notes", ())) or "as the controller bounds")),
-    ("why no optimum", "", _text(lambda summary: "; ".join(failure_sentences(summary)) or ABSENT)),
+    ("why no optimum", "", _text(lambda summary: "; ".join(optimum_sentences(summary)) or ABSENT)),
     ("events", "", _text(lambda summary: "; ".join(event_sentences(summary.get("events", ()))) or ABSENT)),
     ("time flown", "s", _number("duration")),
     ("controller", "", _text(lambda summary: law_name(summary["controller"].get("name", ABSENT)))),

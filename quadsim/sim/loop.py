@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from quadsim.border import user_code
-from quadsim.controller import Command, Controller, InnerLoop, Phase, StepInputs
+from quadsim.controller import GROUNDED, Command, Controller, InnerLoop, Phase, StepInputs
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError, described
 from quadsim.flight.log import FlightLog, LoggedSignals
 from quadsim.flight.phase import check_loss
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 _log: Final = logging.getLogger("quadsim")
 _HEIGHT: Final = REFERENCE_NAMES.index("z")
+TAKEOFF_LEAD: Final = "takeoff_lead"
+"""What is logged of `quadsim.flight.phase.TakeoffLead` in the periods that have one [m]."""
 
 
 Hold = tuple[InnerLoop | None, Array, int]
@@ -303,13 +305,27 @@ class ClosedLoop:
             _log.warning("no predictions are kept: predict raised %s", error)
             return None
 
+    def _asked(self, observed: Observation) -> tuple[StepInputs, Array, Array]:
+        """Return a controller's inputs; the reference is raised where it has to be for the vehicle to take off."""
+        now, state, preview = observed.moment, observed.state, observed.preview
+        if self._ground is None or now.phase in GROUNDED:
+            return now, state, preview
+        thrust = float(np.sum(np.square(self._plant.speeds)))
+        lead = self._ground.lead(observed.truth, float(observed.reference[_HEIGHT]), thrust)
+        if lead == 0.0:
+            return now, state, preview
+        now.log(TAKEOFF_LEAD, lead, "m")
+        raised = preview.copy()
+        raised[:, _HEIGHT] += lead
+        return replace(now, motion=None if now.motion is None else now.motion.raised(lead)), state, raised
+
     def _fly(self, observed: Observation, command: Command | None) -> FlownPeriod:
         plant, computation, steps, now = self._plant, self.computation, self._steps, observed.moment
         step_s = 0.0
         if command is None:
             started = clock.perf_counter()
             with _ending_flight(now.time):
-                command = self.controller.step(now, observed.state, observed.preview)
+                command = self.controller.step(*self._asked(observed))
             step_s = clock.perf_counter() - started
         delay = 0.0 if computation is None else computation.taken(now.time, command, self._draws)
         self.answered = max(self.answered, now.time + delay)

@@ -19,7 +19,7 @@ from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
 from types import TracebackType
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from mpc.core.law import ANSWERERS, LEVELS, STATUSES
 from mpc.export.ctext import Precision
 from mpc.export.targets import EMULATOR, TARGETS, Target
 from mpc.ocp import Problem
-from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, StepInputs, stopped
+from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Phase, StepInputs, stopped
 from quadsim.errors import FlightError, MissingProgramError, QuadsimError
 from quadsim.flight.audit import COMMANDED, Limit
 from quadsim.outputs import reserving
@@ -116,6 +116,10 @@ class Kind(IntEnum):
     START = 0  # begin anew after u(-1), the reference its one row throughout
     ROW = 1  # take one more row of the reference
     STEP = 2  # take one more row and solve
+    STAND = 3  # the same while the ground holds the vehicle, which shows no disturbance
+
+
+Solving = Literal[Kind.STEP, Kind.STAND]
 
 
 class Reply(NamedTuple):
@@ -177,7 +181,7 @@ class SerialMPC:
         """Restart after u(-1) (4,) [rad/s]."""
         self._speeds, self._window = np.array(speeds, float), np.zeros((0, 4))
 
-    def step(self, time: float, state: Array, reference: Array, acting: Array) -> Reply:
+    def step(self, time: float, state: Array, reference: Array, acting: Array, kind: Solving = Kind.STEP) -> Reply:
         """The answer at t_k [s] to x(k) (12,), the reference (N, 4) and u(k-1) (4,) [rad/s].
 
         Where the reference is the last one moved on, its last row alone is sent.
@@ -191,7 +195,7 @@ class SerialMPC:
             for row in reference[:-1]:
                 self._query(time, Kind.ROW, state, row, acting)
         self._window = np.array(reference)
-        return self._query(time, Kind.STEP, state, reference[-1], acting)
+        return self._query(time, kind, state, reference[-1], acting)
 
     def _query(self, time: float, kind: Kind, state: Array, row: Array, acting: Array) -> Reply:
         self._number += 1
@@ -238,7 +242,8 @@ class MPCInTheLoop:
             self._before = np.zeros(N_ROTORS) if self._bounds is None else self._bounds.reach(acting)[0]
             self._serial.reset(self._before)
             return stopped(self._before.copy(), self.horizon, now.phase)
-        reply = self._serial.step(now.time, state, reference, acting)
+        kind: Solving = Kind.STEP if now.phase is Phase.FLYING else Kind.STAND
+        reply = self._serial.step(now.time, state, reference, acting, kind)
         self._before = reply.command
         self.ways[reply.status] += 1
         return Command(

@@ -15,7 +15,8 @@
 #define MARK 0x4D504351U
 #define N QUADSIM_HORIZON
 
-enum kind { START, ROW, STEP }; /* anew, after u(-1) = acting; a row of the reference alone; all */
+/* anew, after u(-1) = acting; a row of the reference alone; all; the same while the ground holds the vehicle */
+enum kind { START, ROW, STEP, STAND };
 
 struct question {
     uint32_t mark, number;  /* MARK; one more with each question */
@@ -98,11 +99,15 @@ static int solve(const struct question *question)
     }
     answer.number = question->number;
     answer.status = QUADSIM_BEFORE;
-    if (question->kind == STEP) {
-        flying = 1;
-        answer.status = quadsim_mpc_step(&mpc, question->state, window, question->acting, answer.command);
+    if (question->kind != STEP && question->kind != STAND) {
+        return 0;
     }
-    return question->kind == STEP;
+    flying = 1;
+    answer.status = quadsim_mpc_step(&mpc, question->state, window, question->acting, answer.command);
+    if (question->kind == STAND) {
+        mpc.known = 0;
+    }
+    return 1;
 }
 
 int main(void)

@@ -13,10 +13,10 @@ import rerun.blueprint as rrb
 from quadsim.controller import OPTIMAL, Phase
 from quadsim.flight.audit import SIGNALS, Limit, margins_sampled
 from quadsim.flight.log import BODY_RATES, QUATERNION
-from quadsim.flight.metrics import unrecovered
+from quadsim.flight.metrics import never_took_off, unrecovered
 from quadsim.flight.rundir import Run
 from quadsim.palette import line_colour
-from quadsim.report.comparison import comparison_rows, fallback_sentence
+from quadsim.report.comparison import comparison_rows, fallback_sentence, takeoff_sentence
 from quadsim.report.figure import (
     break_at_wraps,
     commanded_speeds,
@@ -181,7 +181,7 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     """The summary, and what happened when.
 
     Changes of the status, of who answers and of the phase; why the first QP without an answer had none; when permanent
-    fallback begins; the flight's events and its end.
+    fallback begins; when a vehicle that stays on the ground was told to leave it; the flight's events and its end.
     """
     log, summary = run.log.control, run.summary
     diagnosis, periods = summary.get("diagnosis") or {}, unrecovered(log)
@@ -200,6 +200,8 @@ def send_texts(recording: rr.RecordingStream, run: Run) -> None:
     events += [(diagnosis["time"], diagnosis[name], "ERROR") for name in ("sentence", "advice") if diagnosis.get(name)]
     if periods:
         events.append((float(log.t[-periods]), fallback_sentence(periods), "ERROR"))
+    if (told := never_took_off(log)) is not None:
+        events.append((told, takeoff_sentence(told), "ERROR"))
     events += [(event["time"], event["text"], "WARN") for event in summary.get("events", ())]
     reason = run.log.reason
     events.append((run.end, "completed", "INFO") if reason is None else (run.end, f"aborted: {reason}", "ERROR"))

@@ -17,7 +17,7 @@ from quadsim.report.comparison import (
     failure_sentences,
     run_names,
     verdict_cell,
-    violated_by_fallback,
+    violated_otherwise,
 )
 from quadsim.report.table import Cell, Mark, Row, format_number, to_markdown
 from quadsim.state import VELOCITY
@@ -223,11 +223,27 @@ def test_permanent_fallback_is_no_success_and_is_reported_with_its_reason(bare_r
     good = having(bare_run, "good", constraints=held)
     stuck = having(good, "stuck", controller=controller, diagnosis=result)
     crashed = having(good, "crashed", ground={"crashed": True})
-    assert violated_by_fallback(stuck.summary)
-    assert not violated_by_fallback(crashed.summary)
-    assert not violated_by_fallback(having(stuck, "both", constraints=broken).summary)
+    assert violated_otherwise(stuck.summary) == "but in permanent fallback"
+    assert violated_otherwise(crashed.summary) is None
+    assert violated_otherwise(having(stuck, "both", constraints=broken).summary) is None
     reasons = ["318 periods in fallback, never recovered", result["sentence"], result["advice"]]
     assert failure_sentences(stuck.summary) == reasons
     rows = comparison_rows([good, stuck])
     assert texts(rows, "why no optimum") == ["-", "; ".join(map(str, reasons))]
     assert texts(rows, "in permanent fallback") == ["0", "318"]
+
+
+def test_a_vehicle_that_never_took_off_is_violated_and_told_so(bare_run: Run) -> None:
+    held, broken = ([with_margin(entry, by) for entry in bare_run.summary["constraints"]] for by in (1.0, -1.0))
+    controller = {**bare_run.summary["controller"], "never_took_off": 1.0}
+    stays = having(bare_run, "stays", constraints=held, controller=controller)
+    reason = "told to take off at t = 1 s, never left the ground"
+    assert failure_sentences(stays.summary) == [reason]
+    assert violated_otherwise(stays.summary) == "but it never took off"
+    assert violated_otherwise(having(stays, "both", constraints=broken).summary) is None
+    rows = comparison_rows([stays, having(stays, "lost", status="aborted", reason="at t = 3 s: too far")])
+    first, lost = texts(rows, "outcome")
+    assert first.endswith(reason)
+    assert lost.startswith("lost")
+    assert lost.endswith("at t = 3 s: too far")
+    assert texts(rows, "why no optimum") == ["-", "-"]
