@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, make_dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, get_args, get_type_hints
 
-from annotated_types import Ge, Gt, Le, Len, MaxLen, doc
+from annotated_types import Ge, Gt, Le, MaxLen, doc
 from pydantic import BeforeValidator, Field
 
 from mpc.bounded import Polytope
 from mpc.indi import INDISettings
 from quadsim.errors import InputError, ParameterError
-from quadsim.fields import NonNegative, Positive, Vector
+from quadsim.fields import Positive
 from quadsim.flight.audit import FlightVerdict, Limit
 from quadsim.input_limits import MOST_ENTRIES, MOST_STEPS
 from quadsim.sim.autopilot import AutopilotSettings
@@ -25,13 +25,14 @@ from quadsim.sim.effects.load import PayloadDrop, PayloadPickup
 from quadsim.sim.physics import Integrator, inner_steps, steps_per_period
 from quadsim.space import AnyObstacle, Corridor, Fence
 from quadsim.state import STATE_NAMES
-from quadsim.vehicle import N_ROTORS, VEHICLE_UNITS, Vehicle
+from quadsim.vehicle import VEHICLE_UNITS, Vehicle
 from scenarios.catalogue import Group
 from scenarios.courses.table import ReferenceTable
 from scenarios.plugin import PluginForce
 from scenarios.schema.base import LARGEST_SEED
 from scenarios.schema.controllers import AnyController, changed
 from scenarios.schema.events import MOST_EVENTS, ControllerEvent, Event, SensorFaultEvent
+from scenarios.schema.initial import Initial
 from scenarios.schema.problems import ScenarioError, parse_table
 from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.settings import separate, set_field
@@ -75,44 +76,6 @@ else:
         "True parameters where they differ from the model: the plant uses them, the controller does not know them."
     )
     VehicleTable.__module__ = ActualTable.__module__ = __name__
-
-
-@dataclass(frozen=True, kw_only=True)
-class Initial:
-    """State at the start of the flight."""
-
-    position: Annotated[Vector, doc("[m] x, y, z in the world frame")] = (0.0, 0.0, 0.0)
-    euler: Annotated[Vector, doc("[deg] roll, pitch, yaw")] = (0.0, 0.0, 0.0)
-    velocity: Annotated[Vector, doc("[m/s] in the world frame")] = (0.0, 0.0, 0.0)
-    body_rates: Annotated[Vector, doc("[deg/s] about the body axes")] = (0.0, 0.0, 0.0)
-    rotor_speeds: Annotated[
-        Annotated[tuple[NonNegative, ...], Len(N_ROTORS, N_ROTORS)] | None,
-        doc("[rad/s] rotor speeds, and the command u(-1) before the first; absent: those of hover"),
-    ] = None
-    cold: Annotated[bool, doc("true: start on the ground with rotors at rest, u(-1) = 0; false: start from hover")] = (
-        False
-    )
-    on_reference: Annotated[
-        bool,
-        doc(
-            "true: start with the velocity, attitude and body rates of the reference at t = 0; only for courses that "
-            "define them (ramped_circle, ramped_lemniscate)"
-        ),
-    ] = False
-
-    def __post_init__(self) -> None:
-        if abs(self.euler[0]) > 180.0 or abs(self.euler[1]) >= 90.0:
-            raise ParameterError("", "euler", list(self.euler), "within +-180 deg of roll and below +-90 deg of pitch")
-        if self.on_reference and any(self.euler[:2]):
-            raise ParameterError("", "euler", list(self.euler), "of roll and pitch 0 where on_reference is true")
-        given = [name for name in ("velocity", "body_rates") if any(getattr(self, name))]
-        for states_it, names in (
-            ("on_reference", given),
-            ("cold", [*given, *(["rotor_speeds"] if self.rotor_speeds is not None else [])]),
-        ):
-            if names and getattr(self, states_it):
-                rule = f"absent where {states_it} is true, which states it"
-                raise ParameterError("", names[0], list(getattr(self, names[0])), rule)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,7 +171,7 @@ class Scenario:
     ] = 200.0
     vehicle: VehicleTable
     actual: ActualTable | None = None
-    initial: Initial = Initial()
+    initial: Initial = field(default_factory=Initial)
     plant: Simulation = Simulation()
     reference: ReferenceTable
     controller: AnyController

@@ -190,6 +190,7 @@ def tables(draw: st.DrawFn) -> dict[str, Any]:
         table["initial"] = {"cold": draw(st.booleans()), "euler": [0.0, 0.0, draw(number(-180.0, 180.0))]}
     else:
         table["initial"] = {"position": [0.0, 0.0, draw(number(0.5, 2.0))], "euler": draw(vector(44.0))}
+        table["initial"] |= {"velocity": draw(vector(5.0)), "body_rates": draw(vector(300.0))}
     return table
 
 

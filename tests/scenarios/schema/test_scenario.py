@@ -35,8 +35,9 @@ def test_defaults_are_written_out() -> None:
     assert (table["group"], table["expect"]) == ("other", "satisfied")
     assert table["log_rate"] == 200.0
     assert table["plant"] == {"timestep": 0.001, "integrator": "mujoco", "limit_speeds": False}
-    at_rest = {"position": [0.0, 0.0, 0.0], "euler": [0.0, 0.0, 0.0], "cold": False, "on_reference": False}
-    assert table["initial"] == at_rest
+    still = [0.0, 0.0, 0.0]
+    at_rest = {"position": still, "euler": still, "velocity": still, "body_rates": still}
+    assert table["initial"] == {**at_rest, "cold": False, "on_reference": False}
     assert table["controller"]["solver"] == "piqp"
 
 
