@@ -40,3 +40,10 @@ def test_the_help_of_a_command_has_two_examples(command: str, capsys: pytest.Cap
         words = shlex.split(line.partition(" > ")[0])
         assert words[:2] == ["quadsim", command]
         app.meta(words[1:], exit_on_error=False, print_error=False, result_action="return_value")  # parsed, not called
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_shows_no_option_that_takes_a_python_object(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    shown = set(re.findall(r"--[a-z-]+", capsys.readouterr().out))
+    assert not shown & {"--fields", "--vary", "--forces", "--reference", "--flown", "--progress", "--autopilot"}
