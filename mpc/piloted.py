@@ -33,7 +33,8 @@ class Piloted:
         self._hover = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
         self._slowest = np.full(4, vehicle.speed_min)
         self._target, self._fresh = self._hover, True  # the autopilot is reset before its first call
-        self._rates = np.zeros(3)  # body rates at which it starts then [rad/s]
+        # Body rates at which it starts then, with the rotors as they turn [rad/s]; None from the ground: as at hover.
+        self._rates: Array | None = np.zeros(3)
         if hasattr(law, "predict"):
             self.predict = law.predict
 
@@ -57,7 +58,7 @@ class Piloted:
         """Return the law's target, to be flown by the autopilot; on the ground the rotors stop."""
         command: Command = self.inner.step(replace(now, acting=self._target), state, reference)
         if now.phase in GROUNDED:
-            self._target, self._fresh, self._rates = self._hover, True, np.zeros(3)
+            self._target, self._fresh, self._rates = self._hover, True, None
             return stopped(self._slowest.copy(), self.horizon, now.phase)
         return replace(command, inner=self)
 
@@ -65,7 +66,7 @@ class Piloted:
         """See `quadsim.controller.InnerLoop`."""
         if self._fresh:
             self.autopilot.reset()
-            if hasattr(self.autopilot, "settle"):
+            if self._rates is not None and hasattr(self.autopilot, "settle"):
                 self.autopilot.settle(self._rates, rotors)
         self._target, self._fresh = commanded, False
         return self.autopilot.speeds(time, commanded, rates, rotors, attitude)

@@ -6,7 +6,6 @@ entries of a new scenario, or of one that was changed on purpose.
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import sys
@@ -16,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from quadsim.controller import ACCEPTED, SOLVED
-from quadsim.flight.audit import Finding
+from quadsim.flight.audit import worst_finding
 from quadsim.flight.metrics import peak_tilt, tracking
 from scenarios.catalogue import scenario_names
 from scenarios.flight import Flight, summarise
@@ -48,30 +47,15 @@ def library_entry(flight: Flight) -> dict[str, Any]:
         "flown": round(log.control.t.size * flight.scenario.control_period, 6),
     }
     if flight.outcome != "lost":
-        rmse, result = tracking(log.control)["rmse"], nearest(flight)
+        rmse, result = tracking(log.control)["rmse"], worst_finding(flight.findings)
         entry["rmse"] = [round(rmse[axis], 4) for axis in "xyz"]
         entry["tilt"] = round(peak_tilt(log.plant.state), 2)
         entry["qps"] = round(100.0 * log.control.status.count(SOLVED) / log.control.t.size, 1) if flight.solver else 0
-        entry["nearest"] = result.limit.name
-        entry["margin"] = round(min(result.worst_margin, result.worst_margin_sampled), 3)
-        entry["unit"] = result.limit.unit
+        if result is not None:
+            entry["nearest"] = result.limit.name
+            entry["margin"] = round(result.margin, 3)
+            entry["unit"] = result.limit.unit
     return entry
-
-
-def nearest(flight: Flight) -> Finding:
-    """The required constraint that is broken most, or else is held by least, as a share of its range.
-
-    Bounds on speeds and steps are left out: the controller keeps them to the last digit, or is far from them.
-    """
-    required = (finding.limit.required and finding.limit.signal not in ("speed", "slew") for finding in flight.findings)
-    return min(itertools.compress(flight.findings, required), key=_share)
-
-
-def _share(finding: Finding) -> float:
-    limit = finding.limit
-    bounds = [abs(bound) for bound in (limit.lower, limit.upper) if math.isfinite(bound)]
-    left = min(finding.worst_margin + limit.tolerance, finding.worst_margin_sampled + limit.tolerance_sampled)
-    return round(left / (max(*bounds, limit.tolerance) or 1.0), 2)  # of equals the first: rounding decides nothing
 
 
 def paper_entry(flight: Flight) -> dict[str, Any]:
@@ -84,7 +68,7 @@ def paper_entry(flight: Flight) -> dict[str, Any]:
         "bounds": {
             finding.limit.name: {
                 "satisfied": finding.satisfied,
-                "margin": round(finding.deciding_margin, 4) + 0.0,
+                "margin": round(finding.margin, 4) + 0.0,
                 "time_violated": round(finding.time_violated, 3),
             }
             for finding in flight.findings

@@ -81,4 +81,4 @@ def test_the_scenarios_of_the_pages_on_controllers_fly(tmp_path: Path, monkeypat
     for block in blocks:
         (tmp_path / "one.toml").write_text(block, encoding="utf-8")
         scenario = load_scenario(str(tmp_path / "one.toml"), ["duration=1", "constraints=[]"])
-        assert Rollout(scenario).fly().outcome == "satisfied"
+        assert Rollout(scenario).fly().outcome in ("satisfied", "unaudited")

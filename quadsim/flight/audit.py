@@ -378,12 +378,13 @@ def worst_finding(findings: Iterable[Finding]) -> Finding | None:
     """Return the finding with the smallest margin as a share of half its band, ties by name; None if none counts.
 
     Limits that were not reached do not count, and limits of the commands only once they are violated: a command at its
-    own bound is no near miss.  Of the others the required ones count, or all if none is required.
+    own bound is no near miss.  Of the others the required ones count, or all if none is required.  Shares are compared
+    to six decimals, so that no machine's rounding decides.
     """
     reached = [finding for finding in findings if math.isfinite(finding.margin)]
     counted = [finding for finding in reached if finding.verdict == "violated" or finding.limit.signal not in COMMANDED]
     required = [finding for finding in counted if finding.limit.required] or counted
-    return min(required, key=lambda finding: (finding.share, finding.limit.name), default=None)
+    return min(required, key=lambda finding: (round(finding.share, 6), finding.limit.name), default=None)
 
 
 def flight_verdict(findings: Sequence[Finding], *, aborted: bool, lost: bool, failed: bool) -> FlightVerdict:

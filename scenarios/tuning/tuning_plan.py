@@ -260,7 +260,8 @@ class SearchPlan(Plan):
         columns += [(f"search.{entry.name}", entry.unit, column_type(entry)) for entry in self.tuning.spec.search]
         first, *others = super().schema
         return pa.schema(
-            [first, *(pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in columns), *others]
+            [first, *(pa.field(name, kind, metadata={"unit": unit}) for name, unit, kind in columns), *others],
+            metadata=super().schema.metadata,
         )
 
     def of(self, flight: int) -> Scenario:

@@ -199,7 +199,7 @@ def test_a_violated_constraint_that_is_not_required_is_status_0(here: Path, caps
 
 def test_a_flight_without_constraints_says_that_nothing_was_audited() -> None:
     flight = quadsim.load("hover", {"duration": 0.5, "constraints": []}).fly(controller=lambda *_: [192.8] * 4)
-    assert flight.text().splitlines()[0] == "hover  completed, no constraint was audited  0.50 s flown"
+    assert flight.text().splitlines()[0] == "hover  unaudited, no constraint was audited  0.50 s flown"
 
 
 VIOLATED = ["--set", "constraints.speed.upper=150.0"]

@@ -77,6 +77,6 @@ def test_an_unstable_controller_ends_as_lost_with_exit_status_1(
 def test_each_criterion_is_on_unless_it_is_switched_off(unstable: str, settings: list[str], lost: str | None) -> None:
     flight = Rollout(load_scenario(unstable, settings)).fly()
     assert (flight.log.lost, summarise(flight)["lost"]) == (lost, lost)
-    assert flight.outcome == ("satisfied" if lost is None else "lost")
+    assert flight.outcome == ("unaudited" if lost is None else "lost")
     if lost is None:
         assert flight.log.plant.state[-1, 4] < -500.0

@@ -77,10 +77,10 @@ def test_tables_become_limits(crashed: Flight) -> None:
 
 
 def test_the_extent_is_the_vehicle_s_or_the_scenario_s() -> None:
-    given = scenario({"obstacles": [PILLAR], "vehicle.extent": 0.05})
-    (finding,) = cleared(Rollout(given).fly())
-    assert isinstance(finding.limit, SpaceLimit)
-    assert finding.limit.radius == 0.05
+    for extent, radius in ((0.4, 0.4), (0.05, 0.27)):  # the rotors reach 0.27 m
+        (finding,) = cleared(Rollout(scenario({"obstacles": [PILLAR], "vehicle.extent": extent})).fly())
+        assert isinstance(finding.limit, SpaceLimit)
+        assert finding.limit.radius == pytest.approx(radius)
 
 
 def test_a_touch_is_a_crash_at_the_distance_that_the_audit_measures(crashed: Flight) -> None:

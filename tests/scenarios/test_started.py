@@ -200,7 +200,7 @@ def test_margins_of_a_period_are_those_of_the_audit() -> None:
             beyond = started.violations(sample)
             for limit in started.limits:
                 margin = result[-1][limit.name]
-                assert beyond[limit.name] == (-np.inf if np.isnan(margin) else -margin - limit.tolerance)
+                assert beyond[limit.name] == (-np.inf if np.isnan(margin) else -limit.tolerances[0] - margin)
         flight = started.flight()
     for finding in flight.findings:
         per_period = np.array([margins[finding.limit.name] for margins in result])

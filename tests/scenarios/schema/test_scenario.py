@@ -34,7 +34,7 @@ def test_defaults_are_written_out() -> None:
     assert table["seed"] == 0
     assert (table["group"], table["expect"]) == ("other", "satisfied")
     assert table["log_rate"] == 200.0
-    assert table["plant"] == {"timestep": 0.001, "integrator": "mujoco", "limit_speeds": False}
+    assert table["plant"] == {"timestep": 0.001, "integrator": "mujoco", "limit_speeds": True}
     still = [0.0, 0.0, 0.0]
     at_rest = {"position": still, "euler": still, "velocity": still, "body_rates": still}
     assert table["initial"] == {**at_rest, "cold": False, "on_reference": False}
