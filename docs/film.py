@@ -29,7 +29,7 @@ HEAD, PLOT, ROW, GAP, LABEL = 28, 90, 21, 8, 66  # [pixels]: title, plot, row of
 MOST_ROWS: Final = 4
 NEAR: Final = 0.1  # share of its band below which a margin is in the colour of warnings
 GROUND, FIELD = "#14181e", "#1e232b"
-CURVES: Final = (ON_DARK.flown, ON_DARK.second)
+CURVES: Final = (ON_DARK.flown, ink.WHITE)  # of which a palette of few colours loses neither
 COLOURS: Final = 96
 
 
