@@ -39,6 +39,18 @@ def test_a_flight_by_the_target_is_the_flight_by_python(name: str) -> None:
     assert [finding.satisfied for finding in result.findings] == [finding.satisfied for finding in desired.findings]
 
 
+def test_on_the_ground_the_target_estimates_no_disturbance() -> None:
+    """From cold rotors: an observer that took the ground for a force would command otherwise for seconds."""
+    if shutil.which("cc") is None:
+        pytest.skip("cc is not installed: make firmware")
+    ground = ["duration=5.0", "initial.position=[0.0, 0.0, 0.0]", "initial.cold=true", "effects.ground.contact=true"]
+    scenario = load_scenario("robust", ["actual.mass=4.4", *ground])
+    desired = Rollout(scenario.replace({"controller.compiled": True})).fly()
+    result = fly_exported(scenario, target="posix", progress=False)
+    assert {"armed", "flying"} <= set(desired.log.control.phase)
+    assert np.abs(result.command - desired.command).max() <= 1e-6
+
+
 def test_the_command_flies_and_writes_a_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

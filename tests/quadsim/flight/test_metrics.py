@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support import small_log
 
+from quadsim.controller import Phase
 from quadsim.flight import metrics
 from quadsim.flight.log import ControlLog, TimingLog
 from quadsim.flight.metrics import CourseStep
@@ -157,6 +158,29 @@ def test_the_controllers_counts_and_times() -> None:
 def test_fallback_for_good_is_the_last_second_at_least_or_the_whole_flight(levels: list[int], expected: int) -> None:
     log = replace(small_log(len(levels)).control, fallback=np.array(levels, np.int64))
     assert metrics.unrecovered(log) == expected
+
+
+GROUND, UP = [Phase.LANDED] * 10, [Phase.ARMED] * 30
+
+
+@pytest.mark.parametrize(
+    ("phases", "expected"),
+    [
+        (GROUND + UP, 1.0),
+        (GROUND + UP[:-1], None),  # 2.9 s, too short to count
+        (GROUND + UP + [Phase.FLYING], None),
+        (GROUND + UP + [Phase.CRASHED], None),  # another failure
+        ([Phase.FLYING] * 5 + GROUND + UP, 1.5),  # not again
+        ([Phase.LANDED] * 40, None),  # not told
+        (GROUND + UP + GROUND, 1.0),  # told, and called off
+        ([Phase.FLYING] * 40, None),
+        ([], None),
+    ],
+)
+def test_no_take_off_counts_three_seconds_after_it_was_told(phases: list[Phase], expected: float | None) -> None:
+    height = [0.2 if phase is Phase.ARMED else 0.12 for phase in phases]
+    log = replace(control([0.1] * len(phases), height), phase=tuple(map(str, phases)))
+    assert metrics.never_took_off(log) == expected
 
 
 def test_a_flight_of_no_period_has_no_numbers() -> None:

@@ -11,10 +11,16 @@ from quadsim.controller import Phase
 from quadsim.errors import LostError
 from quadsim.flight.phase import (
     AIRBORNE,
+    FADING,
+    FADING_TIME,
+    LARGEST_LEAD,
+    LEAD_RATE,
     REST,
+    STANDSTILL,
     TOUCH,
     Outline,
     PhaseMonitor,
+    TakeoffLead,
     check_loss,
     clearance,
     takeoff_time,
@@ -252,3 +258,76 @@ def test_the_reason_names_which_criterion_its_value_its_limit_and_the_time() -> 
     assert str(caught.value) == reason
     assert (caught.value.criterion, caught.value.limit, caught.value.time) == ("tilt", 120.0, 1.5)
     assert caught.value.value == pytest.approx(131.0)
+
+
+def pushed(lead: TakeoffLead, periods: int, *, more: float = 0.0, thrust: float = 1.0, climb: float = 0.0) -> float:
+    """The lead after some periods on the ground, the thrust growing by a share of the first in each."""
+    for k in range(periods):
+        lead.push(0.0, climb, thrust * (1.0 + more * k))
+    return lead.lead
+
+
+WAITING = round(STANDSTILL / PERIOD)
+
+
+def test_the_lead_grows_once_the_thrust_no_longer_rises() -> None:
+    assert pushed(TakeoffLead(PERIOD), 100, more=0.02) == 0.0  # a law that spins up by itself
+    assert pushed(TakeoffLead(PERIOD), 100, climb=0.1) == 0.0  # or rises
+    lead = TakeoffLead(PERIOD)
+    assert pushed(lead, WAITING + 1) == 0.0  # the first period has more thrust than none
+    for k in range(20):
+        assert lead.push(0.0, 0.0, 1.0 + 0.02 * (k + 1)) == pytest.approx((k + 1) * LEAD_RATE * PERIOD)
+    assert lead.push(0.0, 0.1, 2.0) == pytest.approx(20 * LEAD_RATE * PERIOD)  # it rises: enough
+
+
+def test_the_lead_is_bounded_and_waits_for_thrust_that_does_not_follow() -> None:
+    lead = TakeoffLead(PERIOD)
+    pushed(lead, WAITING + 1)
+    saturated = pushed(lead, 1000)
+    assert saturated == pytest.approx(LEAD_RATE * STANDSTILL, abs=2 * LEAD_RATE * PERIOD)
+    assert pushed(lead, 1000, thrust=1.1, more=0.05) == LARGEST_LEAD
+
+
+def test_the_lead_fades_with_the_climb_and_never_grows_in_the_air() -> None:
+    slow, course = TakeoffLead(PERIOD), 2.0
+    pushed(slow, WAITING + 1)
+    first = pushed(slow, 20, thrust=1.1, more=0.02)
+    assert [slow.fade(0.0, course), slow.fade(-0.1, course)] == [first, first]
+    heights = np.linspace(0.0, FADING, 400)  # 20 s, slower than the time constant
+    leads = [slow.fade(float(z), course) for z in heights]
+    np.testing.assert_allclose(leads[:-20], first * (1.0 - heights[:-20] / FADING), atol=1e-9)
+    assert slow.fade(0.0, course) == slow.lead < 0.05 * first
+    assert slow.fade(0.2, 0.1) < 0.05 * first  # beyond its course
+    fast = TakeoffLead(PERIOD)
+    pushed(fast, WAITING + 1)
+    first = pushed(fast, 20, thrust=1.1, more=0.02)
+    steps = [fast.fade(1.0, course) for _ in range(round(FADING_TIME / PERIOD))]
+    assert steps[-1] == pytest.approx(first * np.exp(-1.0))  # no jump where it shoots up
+    assert [fast.fade(1.0, course) for _ in range(400)][-1] == 0.0
+
+
+def test_only_a_level_vehicle_under_its_course_is_raised(monitor: PhaseMonitor) -> None:
+    def raised(state: Array, course: float, periods: int = 60) -> float:
+        lead = 0.0
+        for k in range(periods):
+            monitor.advance(np.zeros(1), state[None], to(1.0))
+            lead = monitor.lead(state, course, 1.0 + 0.02 * max(k - WAITING - 1, 0))
+        return lead
+
+    assert raised(at(0.0), 0.0) == 0.0  # the course is up at the end of the preview, and not yet now
+    assert raised(at(0.0, roll=11.0), 1.0) == 0.0
+    assert raised(at(0.0), 1.0) > 1.0
+    monitor.advance(np.zeros(1), at(0.0)[None], to(0.0))
+    assert monitor.advance(np.zeros(1), at(0.0)[None], to(1.0)) is Phase.ARMED
+    assert monitor.lead(at(0.0), 1.0, 9.0) == 0.0  # a take-off that was called off is forgotten
+    assert PhaseMonitor(None, period=PERIOD).lead(at(0.0), 1.0, 1.0) == 0.0
+
+
+def test_a_vehicle_that_has_sunk_to_the_ground_is_raised_again(monitor: PhaseMonitor) -> None:
+    phases(monitor, [(at(1.0), to(1.0))])
+    leads = []
+    for k in range(60):
+        assert monitor.advance(np.zeros(1), at(0.0)[None], to(1.0)) is Phase.FLYING
+        leads.append(monitor.lead(at(0.0), 1.0, 1.0 + 0.02 * max(k - 2 * WAITING, 0)))
+    assert leads[WAITING] == 0.0
+    assert leads[-1] > 0.5

@@ -12,11 +12,12 @@ from quadsim.controller import GROUNDED, MISSED, Command, Phase, StepInputs, sto
 from quadsim.flight.log import FlightLog
 from quadsim.flight.metrics import computation, estimation, ground
 from quadsim.flight.phase import PhaseMonitor
+from quadsim.motion import Motion
 from quadsim.sim.airframe import outline
 from quadsim.sim.computation import Computation, Stall
 from quadsim.sim.effects import Effects, Ground
 from quadsim.sim.effects.rotors import RotorDynamics
-from quadsim.sim.loop import fly
+from quadsim.sim.loop import TAKEOFF_LEAD, fly
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.sim.sensing import FaultKind, Sensor, SensorFault, SensorName
@@ -261,6 +262,45 @@ def test_take_off_and_landing(vehicle: Vehicle) -> None:
     assert np.abs(log.plant.state[-1, [1, 3, 5]]).max() < 1e-6
     assert log.plant.state[-1, 4] == pytest.approx(0.0, abs=1e-4)
     assert log.plant.speeds[-1].max() < 1.0
+
+
+def test_the_controller_alone_sees_a_reference_raised_for_take_off(vehicle: Vehicle) -> None:
+    """With its motion: commands rise by 2 % of the thrust per period, after 0.6 s without more."""
+
+    @dataclass
+    class Seeing(Scripted):
+        seen: list[Array] = field(default_factory=list)
+
+        def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
+            self.seen.append(reference.copy())
+            return super().step(now, state, reference)
+
+    script = 0.7 * vehicle.hover_speed * np.ones((30, 4))
+    script[12:] *= 1.01 ** np.arange(18)[:, None]
+    reference, motion = np.zeros((32, 4)), np.zeros((32, 3))
+    reference[:, 2] = motion[:, 2] = 0.5
+    controller = Seeing(script)
+    rest = {"velocity": motion * 0.0, "acceleration": motion * 0.0, "body_rates": motion * 0.0}
+    course = Motion(position=motion, attitude=np.tile([1.0, 0, 0, 0], (32, 1)), thrusts=np.zeros((32, 4)), **rest)
+    with Plant(vehicle, effects=Effects(ground=Ground())) as plant:
+        log = fly_scripted(
+            plant,
+            controller,
+            reference=reference,
+            motion=course,
+            initial_state=make_state(),
+            initial_speeds=np.zeros(4),
+            ground=PhaseMonitor(outline(vehicle), period=PERIOD),
+        )
+    lead = np.nan_to_num(log.control.logged[TAKEOFF_LEAD][1])
+    assert lead[:12].max() == 0.0
+    assert lead[-1] > 0.5
+    np.testing.assert_allclose([rows[:, 2] - 0.5 for rows in controller.seen], np.repeat(lead[:, None], 2, axis=1))
+    for moment, raised in zip(controller.moments, lead, strict=True):
+        assert moment.motion is not None
+        np.testing.assert_allclose(moment.motion.position[:, 2], 0.5 + raised)
+    assert (log.control.reference[:, 2] == 0.5).all()
+    assert (course.position[:, 2] == 0.5).all()
 
 
 def test_a_capsized_vehicle_lies_on_the_ground_and_has_crashed(vehicle: Vehicle) -> None:
