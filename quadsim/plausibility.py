@@ -6,6 +6,7 @@ of 30 g to 30 kg with room to spare.  They are for warnings: a vehicle outside t
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -212,7 +213,12 @@ def _misfit(vehicle: Vehicle) -> float:
 
 
 def _converted(vehicle: Vehicle) -> Iterator[tuple[str, str, Vehicle]]:
-    """Yield the vehicle with one parameter taken to be in another unit."""
+    """Yield the vehicle with one parameter, or all that depend on rotor speeds, taken to be in another unit."""
+    rpm = _SPEEDS["rpm"]
+    speeds: dict[str, Any] = {"speed_min": rpm * vehicle.speed_min, "speed_max": rpm * vehicle.speed_max}
+    with contextlib.suppress(ParameterError):
+        together = replace(vehicle, thrust_coefficient=vehicle.thrust_coefficient / rpm**2, **speeds)
+        yield "speed_max", "rpm, and thrust_coefficient in N/rpm^2", together
     for name, units in UNITS.items():
         value: Any = getattr(vehicle, name)
         if value is None:
