@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _FOLDER = Path(__file__).resolve().parents[1]
 _OWN = ("mpc", "scenarios")
