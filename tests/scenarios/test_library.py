@@ -15,7 +15,10 @@ from golden_numbers import library_entry, read
 
 from mpc.answer import INFEASIBLE
 from quadsim.controller import FALLBACK, LAW, MISSED, STOPPED
+from quadsim.flight.audit import worst_finding
 from quadsim.flight.log import ControlLog, FlightLog, PlantLog
+from quadsim.report.comparison import comparison_rows
+from scenarios.campaign.rows import flown_row
 from scenarios.catalogue import CONTROLLERS, LIBRARY, scenario_names
 from scenarios.flight import Flight, summarise
 from scenarios.loading import load_scenario, parse_scenario
@@ -169,6 +172,16 @@ def test_it_has_the_verdict_that_its_file_states(flight: Flight) -> None:
     if flight.scenario.name in SHOWN:
         SHOWN[flight.scenario.name](flight)
     assert parse_scenario(tomllib.loads(flight.scenario.to_toml())) == flight.scenario
+
+
+def test_a_campaign_names_the_same_worst_constraint_and_margin_as_the_flight(flight: Flight) -> None:
+    worst = worst_finding(flight.findings)
+    row = flown_row(flight.log, flight.findings, verdict=flight.outcome, wall_s=0.0, machine="")
+    expected = (None, None) if worst is None else (worst.limit.name, worst.share)
+    assert (row.get("worst_constraint"), row.get("worst_margin")) == expected
+    shown = next(row.cells[0].text for row in comparison_rows([flight.run]) if row.label == "worst constraint")
+    assert shown.startswith("-" if worst is None else f"{worst.limit.name} ")
+    assert ("worst margin: " in repr(flight)) == (worst is not None)
 
 
 def test_every_number_in_its_log_is_finite(flight: Flight) -> None:
