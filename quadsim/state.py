@@ -92,7 +92,7 @@ class State(np.ndarray[tuple[int], np.dtype[np.float64]]):
 
 _Angle = TypeVar("_Angle", float, Array)
 TURN: Final = 2.0 * math.pi
-_TIE: Final = 1e-6  # [turns] this close to half a turn either way counts as half a turn forward
+_TIE: Final = 1e-6  # [turns] this close to -1/2 turn counts as +1/2
 KEPT: Final = math.radians(190.0)
 """Distance from the vehicle's yaw up to which a reference keeps its turn [rad]; see `ReferenceTurns`."""
 
@@ -124,10 +124,10 @@ def unwrapped(angles: Array, before: float) -> Array:
 class ReferenceTurns:
     """Changes the yaw of a reference by whole turns, to the turn of the vehicle's yaw.
 
-    A flight's first sample is at most half a turn from the vehicle, each later one at most half a turn from the one
-    before, within a preview and from period to period.  Only where the vehicle is more than `KEPT` from the reference
-    does this start from the vehicle again: half a turn away, noise does not decide anew in every period which way round
-    is the shorter.
+    A flight's first sample is at most half a turn from the vehicle (error: vehicle less reference), each later one at
+    most half a turn from the one before, within a preview and from period to period.  Only where the vehicle is more
+    than `KEPT` from the reference does this start from the vehicle again: half a turn away, noise does not decide anew
+    in every period which way round is the shorter.
     """
 
     def __init__(self) -> None:

@@ -58,7 +58,7 @@ def test_a_wrapped_angle_is_the_same_one_within_half_a_turn(angle: float) -> Non
 
 
 @pytest.mark.parametrize("turns", [-3, -1, 0, 1, 2])
-def test_half_a_turn_either_way_is_half_a_turn_forward(turns: int) -> None:
+def test_half_a_turn_either_way_counts_as_plus_half_a_turn(turns: int) -> None:
     for half in (math.pi, -math.pi, math.nextafter(math.pi, 4.0), math.nextafter(-math.pi, -4.0)):
         assert abs(wrapped(half + TURN * turns)) == pytest.approx(math.pi)
         assert nearest_turn(half + TURN * turns) == pytest.approx(math.pi)

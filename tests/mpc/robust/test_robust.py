@@ -326,8 +326,8 @@ def test_a_flight_turned_by_any_yaw_is_the_same_flight(vehicle: Vehicle) -> None
 def test_far_from_its_yaw_the_vehicle_is_commanded_a_part_of_the_turn_at_once(vehicle: Vehicle) -> None:
     """Nearly half a turn away demands no more than the largest turn does; so do jumps on the way."""
     far, near, jumping, twice = (HOLD.copy() for _ in range(4))
-    far[:, 3], near[:, 3] = 3.1, 0.02
-    jumping[0, 3], jumping[1:, 3] = 0.02, -2.0
+    far[:, 3], near[:, 3] = 3.0, 0.02
+    jumping[0, 3], jumping[1:, 3] = 0.02, -3.0
     twice[0, 3] = 0.02
     controller = robust(vehicle, heading=True, weight=0.1, largest_turn=0.02)
 
