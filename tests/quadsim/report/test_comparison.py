@@ -236,7 +236,7 @@ def test_permanent_fallback_is_no_success_and_is_reported_with_its_reason(bare_r
 def test_a_vehicle_that_never_took_off_is_violated_and_told_so(bare_run: Run) -> None:
     held, broken = ([with_margin(entry, by) for entry in bare_run.summary["constraints"]] for by in (1.0, -1.0))
     controller = {**bare_run.summary["controller"], "never_took_off": 1.0}
-    stays = having(bare_run, "stays", constraints=held, controller=controller)
+    stays = having(bare_run, "stays", verdict="violated", constraints=held, controller=controller)
     reason = "told to take off at t = 1 s, never left the ground"
     assert failure_sentences(stays.summary) == [reason]
     assert violated_otherwise(stays.summary) == "but it never took off"
