@@ -241,7 +241,9 @@ def test_a_vehicle_that_never_took_off_is_violated_and_told_so(bare_run: Run) ->
     assert failure_sentences(stays.summary) == [reason]
     assert violated_otherwise(stays.summary) == "but it never took off"
     assert violated_otherwise(having(stays, "both", constraints=broken).summary) is None
-    rows = comparison_rows([stays, having(stays, "lost", status="aborted", reason="at t = 3 s: too far")])
+    rows = comparison_rows(
+        [stays, having(stays, "lost", status="aborted", verdict="lost", reason="at t = 3 s: too far")]
+    )
     first, lost = texts(rows, "outcome")
     assert first.endswith(reason)
     assert lost.startswith("lost")
