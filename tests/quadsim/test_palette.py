@@ -98,7 +98,9 @@ def literals(path: Path) -> Iterator[tuple[str, tuple[float, ...]]]:
 
 
 def files() -> list[Path]:
-    return sorted({path for pattern in READ for path in ROOT.glob(pattern) if path.name != "palette.py"})
+    return sorted(
+        {path for pattern in READ for path in ROOT.glob(pattern) if path.is_file() and path.name != "palette.py"}
+    )
 
 
 def test_no_colour_with_a_meaning_stands_outside_the_palette() -> None:
