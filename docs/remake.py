@@ -2,7 +2,8 @@
 
 A table stands between `<!-- NAME: filled by docs/remake.py from FILE -->` and `<!-- NAME end -->`.  Golden numbers are
 in the repository, under tests/golden; all other files are made by a command, under runs/.  A table whose file is not
-there stays as it is.  The records of five benchmarks are kept as CSV, docs/data.
+there stays as it is.  What a command of this script made states its commit, its date and its solver below the table.
+The records of five benchmarks are kept as CSV, docs/data.
 
     python docs/remake.py                    # fill all tables from the files that are there
     python docs/remake.py speed mismatch     # run the commands that make these files first
@@ -18,6 +19,8 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -81,6 +84,8 @@ FILMS: Final = {
     "take-off-and-landing": "From cold rotors on the ground, up 2 m, and down again.",
 }
 """The scenarios that the gallery films, and what to see there."""
+WITHOUT_SOLVER: Final = ("film", "intervals")
+"""Tables whose numbers come from no QP."""
 Row = Sequence[object]
 
 
@@ -127,6 +132,32 @@ def make(name: str) -> None:
             done = subprocess.run(command, cwd=ROOT, check=True, text=True, stdout=stdout)
         if stdout:
             (MADE / f"{name}.json").write_text(done.stdout, encoding="utf-8")
+    _origin_file(name).write_text(json.dumps(origin()), encoding="utf-8")
+
+
+def origin() -> dict[str, str]:
+    """What numbers that are made now come from: the commit, the date, and the solver of what names no other."""
+    git = ("git", "-C", str(ROOT))
+    commit = subprocess.run([*git, "rev-parse", "--short=8", "HEAD"], check=True, text=True, capture_output=True)
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "models", "quadsim", "mpc", "scenarios"])
+    return {
+        "commit": commit.stdout.strip() + (" with changes" if changed.returncode else ""),
+        "date": datetime.now(UTC).date().isoformat(),
+        "solver": f"PIQP {version('piqp')}",
+    }
+
+
+def _origin_file(name: str) -> Path:
+    return MADE / f"{name}.origin.json"
+
+
+def stated_origin(name: str) -> str:
+    """The line below a table that this script made: its command, commit, date and solver; "" for other tables."""
+    if not (file := _origin_file(name)).is_file():
+        return ""
+    made = json.loads(file.read_text(encoding="utf-8"))
+    by = "" if name in WITHOUT_SOLVER else f"; QPs by {made['solver']} where no other solver is named"
+    return f"\n*`make numbers OPTIONS={name}`, commit {made['commit']}, {made['date']}{by}.*\n"
 
 
 def markdown(head: Sequence[str], rows: Iterable[Row]) -> str:
@@ -450,7 +481,8 @@ def filled(text: str) -> tuple[str, list[str]]:
         if data is None:
             missing.append(source)
             return block[0]
-        return f"<!-- {name}: filled by docs/remake.py from {source} -->\n\n{TABLES[name](data)}\n<!-- {name} end -->"
+        table = TABLES[name](data) + stated_origin(name)
+        return f"<!-- {name}: filled by docs/remake.py from {source} -->\n\n{table}\n<!-- {name} end -->"
 
     return BLOCK.sub(fill, text), missing
 

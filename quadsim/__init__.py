@@ -88,6 +88,14 @@ def _require_own_packages() -> None:
 
 _require_own_packages()
 
+
+def _command() -> int:
+    """The `quadsim` command: it starts here, so that it finds our own packages too; returns the exit status."""
+    from scenarios.entry import main
+
+    return main()
+
+
 _MODULES = {
     "quadsim.controller": "Command StepInputs",
     "quadsim.errors": "QuadsimError",

@@ -58,6 +58,7 @@ def test_every_table_that_is_filled_is_known_and_stays_where_its_file_is_not(
     assert len(blocks) == opened
     assert {name for name, _, _ in blocks} == set(remake.TABLES)
     monkeypatch.setattr(remake, "ROOT", tmp_path)
+    monkeypatch.setattr(remake, "MADE", tmp_path)
     page = "before\n<!-- flight: filled by docs/remake.py from made.json -->\nold\n<!-- flight end -->\nafter\n"
     assert remake.filled(page) == (page, ["made.json"])
     rows = [{"solver": "piqp", "p50_ms": 0.12345}, {"solver": "osqp", "p50_ms": None}]
@@ -66,6 +67,10 @@ def test_every_table_that_is_filled_is_known_and_stays_where_its_file_is_not(
     assert missing == []
     assert "| solver | p50 ms |\n| --- | --- |\n| piqp | 0.123 |\n| osqp | - |\n" in text
     assert (text[:7], text[-7:]) == ("before\n", "\nafter\n")
+    made = {"commit": "0123abcd", "date": "2026-01-02", "solver": "PIQP 1.2.3"}
+    (tmp_path / "flight.origin.json").write_text(json.dumps(made))
+    stated = "*`make numbers OPTIONS=flight`, commit 0123abcd, 2026-01-02; QPs by PIQP 1.2.3 where no other solver"
+    assert stated in remake.filled(page)[0]
 
 
 def test_the_examples_in_the_page_on_effects_are_a_scenario(tmp_path: Path) -> None:

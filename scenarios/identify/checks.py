@@ -48,7 +48,7 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     outputs, but for a second, never flies.
 
     Raises:
-        InputError: none is 4 s long.
+        InputError: none is 4 s long, or the motors never run.
     """
     logged = _logged(record)
     shortest = round(SHORTEST / record.period)
@@ -57,6 +57,8 @@ def spans(record: Record, vehicle: Vehicle) -> list[slice]:
     if longest >= LEAST * (1.0 - 1e-6):
         return aloft
     inputs = driver(record)[logged]
+    if len(inputs) and not inputs.any():
+        raise InputError(f"{record.name}: the motors never run: the rotors' outputs stay at 0")
     swing = float(np.ptp(inputs, axis=0).max() / max(np.abs(inputs).max(), 1e-9)) if len(inputs) else 0.0
     height = (
         ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -43,6 +43,8 @@ TIMES: Final = {
 """Columns of time, with their units [s]."""
 TIMES_OF_ANY_UNIT: Final = ("time", "timestamp")
 """Columns of time in s, ms or us: their step tells which, as a log has 10 to 1000 samples per second."""
+KNOWN: Final = {*TIMES, *TIMES_OF_ANY_UNIT, *" ".join(way for ways in SPELLINGS.values() for way in ways).split()}
+"""Every column that is read."""
 RANGES: Final = {
     "throttle": (0.0, 1.0, "throttle1..4 must be shares of full throttle, 0 to 1"),
     "commands": (0.0, math.inf, "u1..4 must be rotor speeds in rad/s, 0 or above"),
@@ -62,7 +64,10 @@ NEEDED: Final = {
 def read_table(path: Path, *, poles: int | None = None) -> dict[str, Series]:
     """Read the series of a table by field of `scenarios.identify.record.Record`; arguments and errors as there."""
     table = _read_csv(path) if path.suffix.lower() == ".csv" else read_parquet(path)
-    columns = {name.partition("[")[0].strip().lower(): table.column(name) for name in table.column_names}
+    names = [name.partition("[")[0].strip().lower() for name in table.column_names]
+    if twice := sorted({name for name in names if name in KNOWN and names.count(name) > 1}):
+        raise FileError(path, f"has two columns of one name: {_listed(twice)}; a name is what stands before its unit")
+    columns = dict(zip(names, table.columns, strict=True))
     spellings = SPELLINGS
     if b"speeds_before" in (table.schema.metadata or {}):  # quadsim's own
         spellings = {**SPELLINGS, "euler_rates": ("roll_rate pitch_rate yaw_rate",)}
@@ -97,7 +102,7 @@ def _read_csv(path: Path) -> pa.Table:
         raise FileError(path, f"is not a readable CSV table ({error})") from error
 
 
-def _listed(columns: Mapping[str, Any]) -> str:
+def _listed(columns: Iterable[str]) -> str:
     return ", ".join([*columns][:40])
 
 

@@ -208,6 +208,12 @@ def test_missing_columns_are_named(tmp_path: Path, eight: Record, without: str, 
     assert "it has" in str(error.value)
 
 
+def test_columns_of_one_name_are_refused(tmp_path: Path, eight: Record) -> None:
+    path = write_csv(tmp_path / "twice.csv", columns(eight, **{"vx [km/h]": eight.velocity[:, 0]}))
+    with pytest.raises(FileError, match="two columns of one name: vx; a name is what stands before its unit"):
+        read_record(path)
+
+
 def test_files_that_are_no_logs(tmp_path: Path, eight: Record) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "log.bin").write_bytes(b"")
@@ -310,6 +316,7 @@ SPOILT: dict[str, Spoil] = {
     "another order: try the order u4,u1,u2,u3": reordered(1, 2, 3, 0),
     "rpm taken for rad/s": lambda record: replace(record, commands=record.commands * 9.549),  # type: ignore[operator]
     "pole pairs given as poles": lambda record: replace(record, commands=record.commands * 2.0),  # type: ignore[operator]
+    "motors never run": lambda record: replace(record, commands=np.zeros_like(record.commands)),
     "never flies.*change by 0 %, its altitude by 0": lambda record: replace(
         record,
         commands=np.full_like(record.velocity[:, [0, 0, 1, 2]], 90.0),
