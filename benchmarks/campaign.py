@@ -45,7 +45,7 @@ def campaign(scenario: Scenario, solver: str, flights: int, workers: int) -> Rec
 
 def measure(quick: bool, report: Progress) -> list[Record]:
     """Campaigns by one worker and by two, by PIQP and by the core where there is one, in turns."""
-    rounds, flights = (1, 2) if quick else (3, 40)
+    rounds, flights = (1, 2) if quick else (2, 12)
     solvers = ["piqp", "core"] if why_missing() is None else ["piqp"]
     cases = (("paper-constrained", 1), ("paper-constrained", 2), ("robust", 2))
     results: list[Record] = []
