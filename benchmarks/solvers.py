@@ -63,9 +63,9 @@ class Replayed:
         self.commands.setdefault(self._period, command)
 
 
-def entries(scenario: Scenario) -> dict[str, Scenario]:
-    """The scenario with each installed solver, and with its whole law in C."""
-    entries = {name: scenario.replace({"controller.solver": name}) for name in read_catalogue().solvers}
+def entries(scenario: Scenario, solvers: Sequence[str]) -> dict[str, Scenario]:
+    """The scenario with each solver that is installed, and with its whole law in C."""
+    entries = {name: scenario.replace({"controller.solver": name}) for name in solvers}
     entries[LAW] = scenario.replace({"controller.compiled": True})
     usable = {}
     for name, changed in entries.items():
@@ -77,7 +77,7 @@ def entries(scenario: Scenario) -> dict[str, Scenario]:
     return usable
 
 
-def measure(name: str, quick: bool, report: Progress) -> list[Record]:
+def measure(name: str, solvers: Sequence[str], quick: bool, report: Progress) -> list[Record]:
     """A record of each solver on a scenario."""
     scenario = load(name)
     if not isinstance(scenario.controller, Constrained | Robust):
@@ -88,7 +88,7 @@ def measure(name: str, quick: bool, report: Progress) -> list[Record]:
     log = flight.log.control
     candidates: dict[str, Replayed] = {}
     setup: dict[str, float] = {}
-    for solver, entry in entries(scenario).items():
+    for solver, entry in entries(scenario, solvers).items():
         assembly = flight.assembly.of(entry)
         started = clock.perf_counter()
         controller = assembly.controller()  # a second time: what can be shared within a process is there
@@ -160,9 +160,13 @@ def draw(records: Sequence[Record], path: Path) -> None:
 def main() -> None:
     """Measure, print and write."""
     shipped = ["paper-constrained", "robust"]
-    chosen = options(__doc__, scenario={"nargs": "+", "default": shipped, "help": "default: %(default)s"})
+    chosen = options(
+        __doc__,
+        scenario={"nargs": "+", "default": shipped, "help": "default: %(default)s"},
+        solvers={"nargs": "+", "default": read_catalogue().solvers, "help": "default: every solver that is installed"},
+    )
     records = run(
-        lambda report: [row for name in chosen.scenario for row in measure(name, chosen.quick, report)],
+        lambda report: [row for name in chosen.scenario for row in measure(name, chosen.solvers, chosen.quick, report)],
         "QP solvers",
         chosen.json,
     )

@@ -48,6 +48,8 @@ BENCHMARKS: Final = (
 )
 KEPT: Final = ("solvers", "mismatch", "speed", "interfaces", "identification")
 """Benchmarks whose figure and records are kept in docs/."""
+SOLVERS: Final = ("piqp-multistage", "piqp-multistage-1", "piqp-dense", "daqp", "core", "clarabel")
+"""The solvers that `make setup` installs."""
 PRECISE: Final = ("thrust_coefficient", "inertia_x", "inertia_y")
 """Parameters whose median error [%] the table of intervals shows."""
 CAMPAIGNS: Final = ("paper-robustness", "paper-robustness-robust", "paper-nominal")
@@ -117,6 +119,9 @@ def commands(name: str) -> list[list[str]]:
             ]
         case "tunings":
             return [[quadsim, "tune", each, "--out", f"runs/tunings/{each}", "--resume"] for each in TUNINGS]
+        case "solvers":
+            timed = ["--json", "runs/numbers/solvers.json", "--solvers", *SOLVERS]
+            return [[python, "benchmarks/solvers.py", *timed]]
         case _:
             return [[python, f"benchmarks/{name}.py", "--json", f"runs/numbers/{name}.json"]]
 
