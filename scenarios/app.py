@@ -684,10 +684,10 @@ def view(run: File, /, *, web: Flag = False) -> None:
     recording = path / rundir.RECORDING_FILE if path.is_dir() else path
     if not path.exists():
         raise FileError(path, "no such run or recording")
-    if path.is_dir():
-        require_inside(path)
     if not recording.is_file():
         raise FileError(path, f"has no {rundir.RECORDING_FILE}; run the scenario again without --no-recording")
+    if path.is_dir():
+        require_inside(path)
     if recording.suffix != ".rrd":
         raise FileError(path, "is not a recording; give a run directory or a file ending in .rrd")
     open_viewer(recording, web=web)

@@ -86,10 +86,10 @@ def read_summary(directory: Path) -> dict[str, Any]:
     Raises:
         FileError: it is missing, was not written by quadsim, or a link leads out of the directory.
     """
-    require_inside(directory)
     path = directory / SUMMARY_FILE
     if not path.is_file():
         raise FileError(directory, f"is not a run directory: it has no {SUMMARY_FILE}")
+    require_inside(directory)
     stated = read_json(path, {}, "a run's summary")
     if {"scenario", "constraints"} <= stated.keys():
         require_format(stated.get("format"), path, f"quadsim run {shlex.quote(str(directory / SCENARIO_FILE))}")
@@ -109,8 +109,16 @@ def require_inside(directory: Path) -> None:
     home = directory.resolve()
     for folder, folders, files in os.walk(directory):  # follows no link to a folder
         for path in (Path(folder, name) for name in sorted((*folders, *files))):
-            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(home):
+            if path.is_symlink() and not _leads_into(path, home):
                 raise FileError(path, f"is a link that leads out of {directory}; nothing is read through it")
+
+
+def _leads_into(link: Path, home: Path) -> bool:
+    """Whether a link leads into a folder; not if it cannot be followed."""
+    try:
+        return Path(os.path.realpath(link)).is_relative_to(home)
+    except OSError:
+        return False
 
 
 def limit_to_json(finding: Finding) -> dict[str, Any]:

@@ -261,10 +261,10 @@ def read_manifest(directory: Path) -> dict[str, Any]:
     Raises:
         FileError: there is none, or it is not one of ours.
     """
-    require_inside(directory)
     path = directory / MANIFEST_FILE
     if not path.is_file():
         raise FileError(directory, f"is not a campaign: it has no {MANIFEST_FILE}")
+    require_inside(directory)
     manifest = _read_manifest(path)
     require_format(manifest.get("version"), path, f"quadsim campaign {shlex.quote(str(directory / CAMPAIGN_FILE))}")
     return manifest
@@ -279,6 +279,8 @@ def _read_manifest(path: Path) -> dict[str, Any]:
 
 def is_campaign(directory: Path) -> bool:
     """Whether a path is a campaign's directory, of whatever version."""
+    if not (directory / MANIFEST_FILE).is_file():
+        return False
     try:
         require_inside(directory)
         _read_manifest(directory / MANIFEST_FILE)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import math
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,9 +16,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from quadsim.errors import FileError, OutputError
+from quadsim.flight import rundir
 from quadsim.flight.audit import Finding, Limit, audit, worst_finding
 from quadsim.flight.rundir import Run
 from quadsim.outputs import Growing, growing
+from scenarios.campaign import store
 from scenarios.campaign.rows import (
     Row,
     flown_row,
@@ -233,3 +236,17 @@ def test_text_that_is_no_unicode_is_stored() -> None:
     assert table.select(["draw.kind", "reason"]).to_pylist() == [
         {"draw.kind": "\\udc80", "reason": "no file a\\udcff \u00e4\n"}
     ]
+
+
+def test_a_folder_that_is_no_output_is_not_walked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`--out /` is refused at once, and without following any link of the machine."""
+
+    def walk(folder: Path) -> None:
+        raise AssertionError(f"walks {folder}")
+
+    monkeypatch.setattr(os, "walk", walk)
+    assert not store.is_campaign(tmp_path)
+    with pytest.raises(FileError, match="is not a campaign: it has no"):
+        store.read_manifest(tmp_path)
+    with pytest.raises(FileError, match="is not a run directory: it has no"):
+        rundir.read_summary(tmp_path)
