@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers firmware betaflight check format docs build numbers reproduce pins clean
+.PHONY: help setup demo test rooms peers firmware betaflight check format docs build numbers reproduce pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -47,11 +47,14 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained --overwrite $(OPTIONS)
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite
 
-test peers firmware betaflight numbers reproduce: export OMP_NUM_THREADS := 1
-test peers firmware betaflight numbers reproduce: export OPENBLAS_NUM_THREADS := 1
-test peers firmware betaflight numbers reproduce: export MKL_NUM_THREADS := 1
+test rooms peers firmware betaflight numbers reproduce: export OMP_NUM_THREADS := 1
+test rooms peers firmware betaflight numbers reproduce: export OPENBLAS_NUM_THREADS := 1
+test rooms peers firmware betaflight numbers reproduce: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
+
+rooms: setup  ## take each feature room away, in a copy, and see the rest pass (OPTIONS=live for one)
+	@$(PY) tests/rooms.py $(OPTIONS)
 
 peers: setup $(VENV)/.peers  ## install the peers and every solver, and hold quadsim against them
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope tests/peers $(OPTIONS)
