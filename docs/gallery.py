@@ -100,7 +100,7 @@ def main() -> None:
     names = re.findall(r"films/([\w-]+)\.mp4", (DOCS / "gallery.md").read_text(encoding="utf-8"))
     for folder in (FILMS, FILES):
         folder.mkdir(exist_ok=True)
-    for file in (DOCS.parent / "scenarios" / "library").glob("*.toml"):
+    for file in (DOCS.parent / "scenarios" / "library" / "flights").glob("*.toml"):
         shutil.copy(file, FILES / f"{file.stem}.txt")  # as text, which a browser shows
     try:
         with ProcessPoolExecutor(usable_cores()) as pool, reporting(True) as report:
