@@ -29,7 +29,7 @@ ROOT: Final = Path(__file__).resolve().parent.parent
 PARTS: Final = {
     "campaign": ("scenarios/library/campaigns", "docs/campaigns.md", "docs/own-campaign.md", "docs/survive.md"),
     "design": (),
-    "export": ("mpc/export", "tests/export", "tests/firmware", "tests/exported_c.py", "docs/export.md", "docs/fly.md"),
+    "export": ("mpc/codegen", "tests/export", "tests/firmware", "tests/exported_c.py", "docs/export.md", "docs/fly.md"),
     "gym": ("quadsim/gym.py", "docs/gym.md"),
     "identify": ("docs/identify.md",),
     "live": ("docs/live.md",),

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from mpc.export.ctext import Precision
-from mpc.export.targets import TARGETS
+from mpc.codegen.ctext import Precision
+from mpc.codegen.targets import TARGETS
 from scenarios.export.exporter import export
 from scenarios.loading import load_scenario
 
