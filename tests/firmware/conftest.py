@@ -24,7 +24,7 @@ Answers = Callable[..., list[Answer]]
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Measured = Callable[..., None]
 MEASURED = Path(__file__).resolve().parents[2] / "runs" / "numbers" / "export.json"
-"""What docs/remake.py fills the table of docs/export.md from."""
+"""What docs/tools/remake.py fills the table of docs/export.md from."""
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,7 @@ from quadsim.palette import COLOUR
 from quadsim.report.film.frames import Shot, make_footage, thin
 from quadsim.state import Array
 
-DOCS: Final = Path(__file__).resolve().parent
+DOCS: Final = Path(__file__).resolve().parents[1]
 THUMBNAILS, FILMS, FILES = DOCS / "assets" / "gallery", DOCS / "films", DOCS / "scenarios"
 WIDTH, HEIGHT, MARGIN = 160, 90, 8  # of a thumbnail [pixels]
 FINEST: Final = 0.3  # how far a drawn path may be from the real one [pixels]
