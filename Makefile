@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test peers firmware betaflight check format docs build numbers reproduce pins clean
+.PHONY: help setup demo test rooms peers firmware betaflight check format docs build numbers reproduce pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -47,11 +47,14 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained --overwrite $(OPTIONS)
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite
 
-test peers firmware betaflight numbers reproduce: export OMP_NUM_THREADS := 1
-test peers firmware betaflight numbers reproduce: export OPENBLAS_NUM_THREADS := 1
-test peers firmware betaflight numbers reproduce: export MKL_NUM_THREADS := 1
+test rooms peers firmware betaflight numbers reproduce: export OMP_NUM_THREADS := 1
+test rooms peers firmware betaflight numbers reproduce: export OPENBLAS_NUM_THREADS := 1
+test rooms peers firmware betaflight numbers reproduce: export MKL_NUM_THREADS := 1
 test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
+
+rooms: setup  ## take each feature room away, in a copy, and see the rest pass (OPTIONS=live for one)
+	@$(PY) tests/rooms.py $(OPTIONS)
 
 peers: setup $(VENV)/.peers  ## install the peers and every solver, and hold quadsim against them
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope tests/peers $(OPTIONS)
@@ -79,7 +82,7 @@ build: setup  ## source archive and wheel in dist/; the wheel is installed alone
 
 docs: setup $(VENV)/.docs  ## build the documentation into site/, with films; a broken link or a missing docstring fails
 	@$(PY) -m ruff check --quiet --select D1 --ignore D105,D107 quadsim mpc scenarios
-	@$(PY) docs/gallery.py films
+	@$(PY) docs/tools/gallery.py films
 	@$(VENV)/bin/zensical build --clean
 	@sed -i 's|https://unpkg.com/iframe-worker/shim|assets/iframe-worker.js|' site/*.html
 	@! grep -lE 'src="https?:|<link[^>]*href="https?:[^"]*\.(css|js)' site/*.html || { echo "These pages need a network." >&2; false; }
@@ -87,10 +90,10 @@ docs: setup $(VENV)/.docs  ## build the documentation into site/, with films; a 
 	@echo "Done. Open site/index.html in a browser."
 
 numbers: setup  ## fill the tables of README.md and docs/ from JSON (OPTIONS="speed mismatch" measures these first)
-	@$(PY) docs/remake.py $(OPTIONS)
+	@$(PY) docs/tools/remake.py $(OPTIONS)
 
 reproduce: setup  ## fly the numbers of every paper that ships into docs/papers.md: some five minutes
-	@$(PY) docs/remake.py papers
+	@$(PY) docs/tools/remake.py papers
 
 pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constraints.txt
 	@fresh=$$(mktemp -d) && trap 'rm -rf "$$fresh"' EXIT && fresh_python="$$fresh/bin/python" && \

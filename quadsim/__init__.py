@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from quadsim.state import STATE_NAMES as STATE_NAMES
     from quadsim.state import State as State
     from quadsim.vehicle import Vehicle as Vehicle
-    from scenarios.app import campaign as campaign
     from scenarios.app import catalogue as catalogue
     from scenarios.app import check as check
     from scenarios.app import compare as compare
@@ -31,25 +30,26 @@ if TYPE_CHECKING:
     from scenarios.app import feasibility as feasibility
     from scenarios.app import film as film
     from scenarios.app import fly as fly
-    from scenarios.app import identify as identify
-    from scenarios.app import live as live
     from scenarios.app import load as load
     from scenarios.app import load_vehicle as load_vehicle
     from scenarios.app import make_controller as make_controller
     from scenarios.app import problem as problem
     from scenarios.app import read as read
-    from scenarios.app import replay as replay
-    from scenarios.app import reproduce as reproduce
     from scenarios.app import run as run
-    from scenarios.app import scenario as scenario
     from scenarios.app import start as start
-    from scenarios.app import sweep as sweep
     from scenarios.app import tune as tune
-    from scenarios.app import vehicle_report as vehicle_report
     from scenarios.app import view as view
+    from scenarios.campaign.commands import campaign as campaign
+    from scenarios.campaign.commands import replay as replay
+    from scenarios.campaign.commands import sweep as sweep
+    from scenarios.design.commands import scenario as scenario
+    from scenarios.design.commands import vehicle_report as vehicle_report
     from scenarios.export.exporter import export as export
     from scenarios.export.in_the_loop import fly_exported as fly_exported
     from scenarios.flight import Flight as Flight
+    from scenarios.identify.commands import identify as identify
+    from scenarios.live.commands import live as live
+    from scenarios.papers.commands import reproduce as reproduce
     from scenarios.rollout import Rollout as Rollout
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
@@ -101,11 +101,16 @@ _MODULES = {
     "quadsim.errors": "QuadsimError",
     "quadsim.state": "STATE_NAMES State",
     "quadsim.vehicle": "Vehicle",
-    "scenarios.app": "campaign catalogue check compare doctor feasibility film fly identify live load load_vehicle "
-    "make_controller problem read replay reproduce run scenario start sweep tune vehicle_report view",
+    "scenarios.app": "catalogue check compare doctor feasibility film fly load load_vehicle make_controller problem "
+    "read run start tune view",
+    "scenarios.campaign.commands": "campaign replay sweep",
+    "scenarios.design.commands": "scenario vehicle_report",
     "scenarios.export.exporter": "export",
     "scenarios.export.in_the_loop": "fly_exported",
     "scenarios.flight": "Flight",
+    "scenarios.identify.commands": "identify",
+    "scenarios.live.commands": "live",
+    "scenarios.papers.commands": "reproduce",
     "scenarios.rollout": "Rollout",
     "scenarios.schema.json_schema": "scenario_schema",
     "scenarios.schema.scenario": "Scenario",

@@ -12,8 +12,8 @@ from quadsim.assets import read_toml, vehicle_names, vehicle_path
 from quadsim.errors import FileError, UnknownNameError
 from scenarios.results import Result, Shown
 
-_HERE: Final = Path(__file__).resolve().parent
-LIBRARY, CAMPAIGNS, TUNINGS, PAPERS = (_HERE / name for name in ("library", "campaigns", "tunings", "papers"))
+_LIBRARY: Final = Path(__file__).resolve().parent / "library"
+FLIGHTS, CAMPAIGNS, TUNINGS, PAPERS = (_LIBRARY / name for name in ("flights", "campaigns", "tunings", "papers"))
 
 Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
 
@@ -47,7 +47,7 @@ def _path(kind: str, folder: Path, name: str) -> Path:
     return folder / f"{name}.toml"
 
 
-scenario_names, scenario_path = partial(_names, LIBRARY), partial(_path, "scenario", LIBRARY)
+scenario_names, scenario_path = partial(_names, FLIGHTS), partial(_path, "scenario", FLIGHTS)
 campaign_names, campaign_path = partial(_names, CAMPAIGNS), partial(_path, "campaign", CAMPAIGNS)
 tuning_names, tuning_path = partial(_names, TUNINGS), partial(_path, "tuning", TUNINGS)
 paper_names, paper_path = partial(_names, PAPERS), partial(_path, "paper", PAPERS)

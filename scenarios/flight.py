@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time as clock
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from html import escape
@@ -30,7 +30,7 @@ from quadsim.flight.audit import (
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FORMAT, log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
-from quadsim.outputs import absolute, adding, amend, to_json, writing
+from quadsim.outputs import absolute, adding, amend, reserving, to_json, writing
 from quadsim.plausibility import implausible
 from quadsim.sim.airframe import outline
 from quadsim.sim.estimator import Tally
@@ -43,7 +43,7 @@ from scenarios.flight_events import story
 from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
 from scenarios.mismatch import model_notes
-from scenarios.progress import Progress, silent
+from scenarios.progress import Progress, reporting, silent
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown, plot_html
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import leaves
@@ -461,6 +461,36 @@ def worst_margin(findings: Iterable[Finding]) -> str:
         return ""
     limit = worst.limit
     return f"\n worst margin: {limit.name} {worst.margin:.4g} {limit.unit}, tolerance {tolerance_text(limit)}"
+
+
+def write_run(
+    flight: Flight,
+    directory: Path,
+    products: Mapping[str, bool | None],
+    *,
+    overwrite: bool,
+    progress: Progress | bool,
+    flown: Callable[[Flight], object] | None,
+) -> None:
+    """Write the tables, call `flown`, and add the products."""
+    more = flight.write_tables(directory, overwrite=overwrite)
+    if flown is not None:
+        flown(flight)
+    if more:
+        with reporting(progress) as report:
+            try:
+                flight.add_products(directory, progress=report, **products)
+            except OutputError as error:
+                if error.path.parent == directory:  # a product that was requested explicitly
+                    error.result = flight
+                raise
+
+
+def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> contextlib.AbstractContextManager[Path]:
+    """Reserve a run directory: `out`, or `runs/NAME`, or the next free name unless `overwrite`."""
+    if out is not None:
+        return reserving(out, overwrite=overwrite)
+    return reserving(Path("runs") / name, overwrite=overwrite, free=not overwrite)
 
 
 def require_rendering() -> None:

@@ -11,14 +11,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from quadsim.errors import InputError, ParameterError, printable
+from quadsim.errors import ParameterError, printable
 from quadsim.flight import metrics, rundir
 from quadsim.flight.audit import Limit, audit, flight_verdict, limit_differences
 from quadsim.outputs import reserving
 from quadsim.report.comparison import different_audits
 from quadsim.report.table import Row
-from scenarios.campaign.store import is_campaign as is_campaign
-from scenarios.campaign.store import stored_plan
 from scenarios.flight import Flight, require_rendering, worst_margin
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, silent
@@ -29,7 +27,6 @@ from scenarios.schema.scenario import Scenario
 
 if TYPE_CHECKING:
     from quadsim.report.figure import Figure
-    from scenarios.campaign.paired import PairedComparison
 
 _log: Final = logging.getLogger("quadsim")
 _FIRST: Final = 4  # flights of which its repr has two lines
@@ -126,8 +123,8 @@ def compare_flights(
     from quadsim.report.comparison import comparison_rows, run_names
     from quadsim.report.comparison_page import write_comparison
 
-    whose = None if constraints is None else _place_of(constraints, targets)
-    _check_names(names, len(targets))
+    whose = None if constraints is None else place_of(constraints, targets)
+    check_names(names, len(targets))
     if products.get("video"):
         require_rendering()
     for target in targets:
@@ -156,7 +153,7 @@ def compare_flights(
             return replace(comparison, page=write_comparison(runs, out, notes=notes, overwrite=overwrite))
 
 
-def _place_of(target: Target, targets: Sequence[Target]) -> int:
+def place_of(target: Target, targets: Sequence[Target]) -> int:
     """Return the place of the target whose constraints are to be used."""
     for i, each in enumerate(targets):
         if each is target or (isinstance(target, str | Path) and str(each) == str(target)):
@@ -188,7 +185,7 @@ def audited_against(run: rundir.Run, limits: Sequence[Limit]) -> rundir.Run:
     return replace(run, summary={**run.summary, **again}, limits=tuple(finding.limit for finding in findings))
 
 
-def _check_names(names: Sequence[str], count: int) -> None:
+def check_names(names: Sequence[str], count: int) -> None:
     """Reject column names that do not tell the targets apart."""
     plain = {name for name in names if isinstance(name, str) and name.strip() and printable(name) == name}
     if names and (isinstance(names, str) or not len(names) == len(plain) == count):
@@ -227,49 +224,3 @@ def _saved(flight: Flight, place: Path, progress: Progress, products: Mapping[st
     video, recording, figures = (products.get(name) for name in ("video", "recording", "figures"))
     flight.save(place, video=video, recording=recording, figures=figures, progress=progress)
     return rundir.load_run(place)
-
-
-def compare_campaigns(
-    directories: Sequence[Path],
-    out: Path | None = None,
-    *,
-    overwrite: bool = False,
-    names: Sequence[str] = (),
-    constraints: Target | None = None,
-) -> PairedComparison:
-    """Compare two campaigns flight by flight, and write the report if a directory is given.
-
-    With `constraints`, one of the two, both are judged by its tolerances.
-
-    Raises:
-        InputError: they are not two finished campaigns, the names are wrong, or `constraints` is none of them or has
-            other bounds.
-        OutputError: the directory cannot be written.
-    """
-    from scenarios.campaign.again import judged_by
-    from scenarios.campaign.paired import compare_pairs
-    from scenarios.campaign.plan import plan_differences
-    from scenarios.campaign.store import FLIGHTS_FILE, read_flights
-
-    if len(directories) != 2:
-        raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")
-    first, second = directories
-    plans = (stored_plan(first), stored_plan(second))
-    _check_names(names, 2)
-    names = (names[0], names[1]) if names else (plans[0].spec.name, plans[1].spec.name)
-    failures = (plans[0].spec.failure, plans[1].spec.failure)
-    a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
-    limits = [tuple(limit.with_tolerances() for limit in plan.limits) for plan in plans]
-    if constraints is not None:
-        whose = _place_of(constraints, directories)
-        a, b = (
-            judged_by(limits[whose], of, table, plan.failure)
-            for of, table, plan in zip(limits, (a, b), plans, strict=True)
-        )
-        limits = [limits[whose]] * 2
-    differences = limit_differences(*limits)
-    comparison = compare_pairs(a, b, names, failures, plan_differences(*plans), tuple(differences))
-    if out is None:
-        return comparison
-    with after(comparison, out):
-        return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final, Protocol, TypeAlias
 from xml.etree import ElementTree
 
 from quadsim.errors import printable
@@ -14,14 +14,16 @@ from quadsim.outputs import absolute, require_file, writing_file
 from quadsim.report.comparison import failed_takeoff, failure_sentences
 from quadsim.report.table import format_number
 
-if TYPE_CHECKING:
-    from scenarios.campaign.campaign import CampaignResult
-    from scenarios.campaign.statistics import Judgement
-    from scenarios.papers.reproduction import Reproduction
-    from scenarios.reaudit import Reaudit
-
-
+Cases: TypeAlias = Sequence[tuple[str, bool | None, str]]
+"""Test cases: the name of each, whether it passes (None: skipped), and its message."""
 _HEAD: Final = b"<?xml version='1.0' encoding='utf-8'?>\n<testsuite name=\"quadsim."
+
+
+class Judged(Protocol):
+    """A result with verdicts."""
+
+    def verdicts(self) -> tuple[str, Cases]:
+        """Return the suite's name and its cases."""
 
 
 def junit_file(path: str | Path) -> Path:
@@ -38,14 +40,12 @@ def junit_file(path: str | Path) -> Path:
     return require_file(path, overwrite=ours)
 
 
-def write_junit(result: Reaudit | CampaignResult | Sequence[Reproduction], path: str | Path) -> Path:
-    """Write verdicts as JUnit XML: a test case per constraint and one for the flight; per requirement; or per number.
-
-    A constraint that is not required is a case that passes, with what was measured in its output.  One that is
-    required and was not reached is `skipped`: the flight shows neither that it holds nor that it does not.
+def write_junit(result: Judged, path: str | Path) -> Path:
+    """Write a result's verdicts as JUnit XML.
 
     Args:
-        result: of `check`, of a `campaign` with requirements, or of `reproduce`.
+        result: of `check`: a test case for the flight and one per constraint; of `campaign`: per requirement; of
+            `reproduce`: per number.
         path: an XML file; one with earlier verdicts is replaced.
 
     Returns:
@@ -54,15 +54,15 @@ def write_junit(result: Reaudit | CampaignResult | Sequence[Reproduction], path:
     Raises:
         OutputError: it cannot be written.
     """
-    if isinstance(result, Sequence):
-        numbers = [(entry.paper.name, number) for entry in result for number in entry.numbers]
-        test_cases = [(f"{paper}: {number.spec.name}", number.within, number.sentence) for paper, number in numbers]
-        return write_cases("reproduce", test_cases, Path(path))
-    summary = result.summary
-    if "campaign" in summary:
-        judged: Sequence[Judgement] = getattr(result, "judgements", ())
-        test_cases = [(entry.requirement.text, entry.holds, entry.sentence) for entry in judged]
-        return write_cases(summary["campaign"], test_cases, Path(path))
+    return write_cases(*result.verdicts(), Path(path))
+
+
+def flight_verdicts(summary: dict[str, Any]) -> tuple[str, Cases]:
+    """Suite and cases of a run's summary: one for the flight, and one per constraint.
+
+    A constraint that is not required is a case that passes, with what was measured in its output.  One that is
+    required and was not reached is `skipped`: the flight shows neither that it holds nor that it does not.
+    """
     text = "; ".join(filter(None, [summary["reason"] or "completed", *failure_sentences(summary)]))
     failed = summary["controller"].get("unrecovered") or failed_takeoff(summary)
     whole = summary["status"] == "completed" and not failed
@@ -70,10 +70,10 @@ def write_junit(result: Reaudit | CampaignResult | Sequence[Reproduction], path:
     cases = [("flight", whole, text), *map(_case, findings)]
     if not findings:
         cases.append(("audit", False, "; ".join(summary["audit_notes"])))
-    return write_cases(summary["scenario"], cases, Path(path))
+    return summary["scenario"], cases
 
 
-def write_cases(suite: str, cases: Sequence[tuple[str, bool | None, str]], path: Path) -> Path:
+def write_cases(suite: str, cases: Cases, path: Path) -> Path:
     """Write test cases of a suite: the name of each, whether it passes (None: skipped), and its message.
 
     Characters that XML forbids, and others that steer a terminal, become escapes.

@@ -9,7 +9,7 @@ from typing import Any
 
 from quadsim.errors import FileError, InputError
 from scenarios.assembly import Assembly
-from scenarios.catalogue import LIBRARY, scenario_path
+from scenarios.catalogue import FLIGHTS, scenario_path
 from scenarios.courses.csv_course import Csv
 from scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
 from scenarios.schema.problems import ScenarioError
@@ -74,7 +74,7 @@ def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data
     for name, before in types_before.items():
         if name in wrong:
             changed = f"--set changed its type from {before!r} to {data[name]['type']!r}, and all other fields stayed"
-            base = path.stem if path.parent == LIBRARY else path.name
+            base = path.stem if path.parent == FLIGHTS else path.name
             yield f'{name}: {changed}; a file with base = "{base}" and a whole [{name}] replaces them'
     missing = {problem.partition(".")[0] for problem in problems if problem.endswith(" is missing")}
     for name, before in replaced_tables(path, scenario_path).items():

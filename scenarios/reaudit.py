@@ -32,6 +32,7 @@ from quadsim.state import ANGLES, REFERENCE_NAMES, STATE_NAMES, Array, wrapped
 from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly
 from scenarios.courses.csv_course import Csv
+from scenarios.junit import Cases, flight_verdicts
 from scenarios.loading import parse_scenario
 from scenarios.plugin import is_plugin
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
@@ -73,6 +74,10 @@ class Reaudit(Result):
         from scenarios.summary_tables import summary_tables
 
         return summary_tables(self.to_json())
+
+    def verdicts(self) -> tuple[str, Cases]:
+        """See `scenarios.junit.Judged`."""
+        return flight_verdicts(self.summary)
 
     def to_json(self) -> dict[str, Any]:
         """Return the summary, with the new audit under `reaudit`."""

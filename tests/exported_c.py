@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpc.export.ctext import Precision
+from mpc.codegen.ctext import Precision
 from quadsim.state import Array
 from scenarios.export.exporter import c_controller
 from scenarios.export.record import Recording

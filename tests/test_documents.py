@@ -54,12 +54,12 @@ def test_every_table_that_is_filled_is_known_and_stays_where_its_file_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     blocks = [block for page in PAGES for block in remake.BLOCK.findall(page.read_text(encoding="utf-8"))]
-    opened = sum(page.read_text(encoding="utf-8").count("filled by docs/remake.py from") for page in PAGES)
+    opened = sum(page.read_text(encoding="utf-8").count("filled by docs/tools/remake.py from") for page in PAGES)
     assert len(blocks) == opened
     assert {name for name, _, _ in blocks} == set(remake.TABLES)
     monkeypatch.setattr(remake, "ROOT", tmp_path)
     monkeypatch.setattr(remake, "MADE", tmp_path)
-    page = "before\n<!-- flight: filled by docs/remake.py from made.json -->\nold\n<!-- flight end -->\nafter\n"
+    page = "before\n<!-- flight: filled by docs/tools/remake.py from made.json -->\nold\n<!-- flight end -->\nafter\n"
     assert remake.filled(page) == (page, ["made.json"])
     rows = [{"solver": "piqp", "p50_ms": 0.12345}, {"solver": "osqp", "p50_ms": None}]
     (tmp_path / "made.json").write_text(json.dumps({"machine": "fast", "records": rows}))
@@ -146,7 +146,7 @@ def test_documents_name_what_exists() -> None:
 @pytest.mark.parametrize("name", drawings.DRAWINGS)
 def test_drawings_are_those_of_the_code(name: str) -> None:
     drawn = (ROOT / "docs/assets" / name).read_text(encoding="utf-8")
-    assert drawn == drawings.DRAWINGS[name](), "python docs/drawings.py"
+    assert drawn == drawings.DRAWINGS[name](), "python docs/tools/drawings.py"
 
 
 def test_the_architecture_lists_the_spine_in_its_order() -> None:

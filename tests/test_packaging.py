@@ -69,7 +69,7 @@ def test_wheel_holds_every_file_of_the_packages(dist: Path) -> None:
     with zipfile.ZipFile(file) as wheel:
         held = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert held == expected
-    assert {"quadsim/models/quadrotor.xml", "quadsim/py.typed", "scenarios/library/hover.toml"} <= held
+    assert {"quadsim/models/quadrotor.xml", "quadsim/py.typed", "scenarios/library/flights/hover.toml"} <= held
     assert any(name.startswith("quadsim/report/templates/") for name in held)
 
 
@@ -78,7 +78,7 @@ def test_source_archive_can_be_built_and_tested_from(dist: Path) -> None:
     with tarfile.open(file) as sdist:
         held = {name.partition("/")[2] for name in sdist.getnames()}
     assert {"Makefile", "constraints.txt", "README.md", "LICENSE", "CITATION.cff", "tests/conftest.py"} <= held
-    assert {".ci/run", "tests/peers/conftest.py", "docs/remake.py", "docs/verification.md"} <= held
+    assert {".ci/run", "tests/peers/conftest.py", "docs/tools/remake.py", "docs/verification.md"} <= held
     assert not [name for name in held if "__pycache__" in name or name.startswith(("runs/", ".venv/"))]
 
 

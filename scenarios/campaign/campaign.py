@@ -37,6 +37,7 @@ from scenarios.campaign.store import (
     stored_plan,
 )
 from scenarios.flight import Flight, to_pandas
+from scenarios.junit import Cases
 from scenarios.many import MEMORY, TIMEOUT, count_workers
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario
@@ -74,6 +75,11 @@ class CampaignResult(Result):
     def exit_status(self) -> int:
         """See `Result.exit_status`; 1 where the flights do not support a requirement."""
         return EXIT_DONE if all(judgement.holds for judgement in self.judgements) else EXIT_FAILED
+
+    def verdicts(self) -> tuple[str, Cases]:
+        """See `scenarios.junit.Judged`."""
+        cases = [(entry.requirement.text, entry.holds, entry.sentence) for entry in self.judgements]
+        return self.summary["campaign"], cases
 
     def __repr__(self) -> str:
         from scenarios.campaign.campaign_report import verdict_sentence

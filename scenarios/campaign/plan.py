@@ -341,3 +341,14 @@ def check_ends(entries: Iterable[Varied], check: Callable[[Varied, Value], objec
             except InputError as error:
                 named = str(error).startswith(f"{table}.")
                 raise InputError(str(error) if named else f"{where}: {error}") from error
+
+
+def drawn_flights(scenario: Scenario, campaign: str) -> Plan:
+    """The draws of a campaign, with its `[set]`, for a scenario that need not be its own."""
+    data = read_campaign(campaign)
+    if data.get("set"):
+        merged = merge(tomllib.loads(scenario.to_toml()), data["set"])
+        scenario = parse_scenario(merged, source=f"{scenario.name}, as {campaign} sets it")
+    return make_plan(
+        scenario, {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
+    )

@@ -12,12 +12,12 @@ from typing import Any, Final, get_args
 import numpy as np
 
 from mpc.bounded import Weighted
+from mpc.codegen.ctext import CText, Precision
+from mpc.codegen.source import CHANGES, DATA, CController, part
+from mpc.codegen.targets import TARGETS, Target
 from mpc.core.library import MIRRORS
 from mpc.core.numbers import Exportable
 from mpc.core.solver import WAYS, CoreProblem, core_library
-from mpc.export.ctext import CText, Precision
-from mpc.export.source import CHANGES, DATA, CController, part
-from mpc.export.targets import TARGETS, Target
 from mpc.ocp import Problem
 from quadsim.controller import ROTORS
 from quadsim.errors import ExportError, ParameterError

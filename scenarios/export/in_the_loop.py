@@ -1,7 +1,7 @@
 """Processor in the loop: a flight whose controller is an exported one, on its target or in the target's emulator.
 
 The programs of an export are built with its Makefile and run; questions and answers pass the serial line of
-`mpc/export/c/serial.c`.
+`mpc/codegen/c/serial.c`.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from typing import Final, Literal, NamedTuple, Protocol
 import numpy as np
 
 from mpc.answer import ActuatorBounds
+from mpc.codegen.ctext import Precision
+from mpc.codegen.targets import EMULATOR, TARGETS, Target
 from mpc.core.law import ANSWERERS, LEVELS, STATUSES
-from mpc.export.ctext import Precision
-from mpc.export.targets import EMULATOR, TARGETS, Target
 from mpc.ocp import Problem
 from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Phase, StepInputs, stopped
 from quadsim.errors import FlightError, MissingProgramError, QuadsimError

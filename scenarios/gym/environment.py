@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,14 +22,14 @@ from quadsim.report.film.camera import Camera
 from quadsim.sim.physics import Observation, one_period
 from quadsim.state import REFERENCE_STATES, Array, wrapped
 from scenarios.assembly import Assembly, preferring_core
-from scenarios.campaign.plan import Plan, make_plan, read_campaign
 from scenarios.catalogue import scenario_names, scenario_path
 from scenarios.flight import Flight
 from scenarios.gym.spaces import USUAL, Action, Actions, Observations
-from scenarios.loading import load_scenario, parse_scenario
+from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
+from scenarios.rooms import commands_of
 from scenarios.schema.base import LARGEST_SEED
-from scenarios.schema.bases import merge, read_scenario
+from scenarios.schema.bases import read_scenario
 from scenarios.schema.scenario import Scenario
 
 Reward = Callable[[Array, Array, Array], float]
@@ -110,7 +109,7 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
             InputError: an argument is not allowed.
         """
         scenario = preferring_core(load_scenario(scenario))
-        self._plan = None if vary is None else _varying(scenario, str(vary))
+        self._plan = None if vary is None else commands_of("campaign").drawn_flights(scenario, str(vary))
         self._base = scenario if self._plan is None else self._plan.scenario
         if render_mode not in (None, "rgb_array"):
             raise ParameterError("", "render_mode", render_mode, "rgb_array or None")
@@ -344,17 +343,6 @@ def _margins(limits: Sequence[Limit], log: FlightLog, first: int = 0) -> tuple[A
         if margins.size:
             smallest[:, i] = margins.min(), margins[-1]
     return smallest[0], smallest[1]
-
-
-def _varying(scenario: Scenario, campaign: str) -> Plan:
-    """The draws of a campaign, with its `[set]`, for a scenario that need not be its own."""
-    data = read_campaign(campaign)
-    if data.get("set"):
-        merged = merge(tomllib.loads(scenario.to_toml()), data["set"])
-        scenario = parse_scenario(merged, source=f"{scenario.name}, as {campaign} sets it")
-    return make_plan(
-        scenario, {key: data[key] for key in ("name", "flights", "seed", "sampling", "vary") if key in data}
-    )
 
 
 def environment_id(name: str) -> str:

@@ -27,9 +27,8 @@ from urllib.parse import parse_qs, urlsplit
 from quadsim.controller import law_name
 from quadsim.errors import MissingPackageError, ParameterError, QuadsimError
 from scenarios import console
-from scenarios.app import run_directory
 from scenarios.catalogue import scenario_names
-from scenarios.flight import Flight
+from scenarios.flight import Flight, run_directory
 from scenarios.live.look import ADMISSION
 from scenarios.live.session import Frame, Session, read_script
 from scenarios.loading import load_scenario
@@ -194,7 +193,7 @@ def fly_live(
 ) -> Document:
     """Fly a session and save it, whatever ended it; `onward`: from where the scenario, a finished run's, ended.
 
-    The other arguments are those of `scenarios.app.live`; `place` is the port, the host and the browser.
+    The other arguments are those of `scenarios.live.commands.live`; `place` is the port, the host and the browser.
     """
     inputs = None if script is None else read_script(script)
     if inputs is None:

@@ -11,11 +11,11 @@ import pytest
 import scipy.linalg
 
 import quadsim
+from mpc.codegen.ctext import CText
+from mpc.codegen.source import CORE, DATA
 from mpc.condensing import Condensed
 from mpc.core.solver import Core
 from mpc.core.tables import AxisTables, tables
-from mpc.export.ctext import CText
-from mpc.export.source import CORE, DATA
 from mpc.ocp import Query
 from mpc.solvers import Method
 from quadsim.errors import ExportError, OutputError, ParameterError
@@ -119,7 +119,7 @@ def test_an_export_is_complete_and_replaces_an_earlier_one_on_request(tmp_path: 
 
 def test_the_licence_is_the_project_s() -> None:
     root = Path(__file__).parent.parent.parent
-    assert (root / "mpc/export/c/LICENSE").read_text() == (root / "LICENSE").read_text()
+    assert (root / "mpc/codegen/c/LICENSE").read_text() == (root / "LICENSE").read_text()
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from mpc.export.ctext import Precision
-from mpc.export.targets import TARGETS
+from mpc.codegen.ctext import Precision
+from mpc.codegen.targets import TARGETS
 from scenarios.export.exporter import export
 from scenarios.loading import load_scenario
 
@@ -24,7 +24,7 @@ Answers = Callable[..., list[Answer]]
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Measured = Callable[..., None]
 MEASURED = Path(__file__).resolve().parents[2] / "runs" / "numbers" / "export.json"
-"""What docs/remake.py fills the table of docs/export.md from."""
+"""What docs/tools/remake.py fills the table of docs/export.md from."""
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from exported_c import HOST, Host, Reply, replay
 
-from mpc.export.ctext import Precision
+from mpc.codegen.ctext import Precision
 from quadsim.state import Array
 from scenarios.export.exporter import c_controller
 from scenarios.export.record import REFUSED, Recording, record

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpc.export.targets import TARGETS
+from mpc.codegen.targets import TARGETS
 from quadsim.errors import FlightError, MissingProgramError
 from scenarios.cli import main
 from scenarios.export.in_the_loop import Program, SerialMPC, fly_exported, require_programs

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from firmware.conftest import Answer, Answers, Export, Measured, Run
 
-from mpc.export.targets import TARGETS, TICK
+from mpc.codegen.targets import TARGETS, TICK
 from scenarios.export.in_the_loop import build
 
 HERE = Path(__file__).parent

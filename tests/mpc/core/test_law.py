@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import quadsim
+from mpc.codegen.source import CController
 from mpc.core import library
 from mpc.core.law import CompiledMPC
 from mpc.core.numbers import robust_numbers
-from mpc.export.source import CController
 from quadsim.controller import CORE, FALLBACK, GAIN, Command, Phase, StepInputs
 from quadsim.errors import ExportError, MissingCoreError
 from quadsim.state import INDEX, N_STATES, Array

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 import scenarios.flight_events
 from quadsim.errors import InputError
-from scenarios.app import live
 from scenarios.cli import main
+from scenarios.live.commands import live
 from scenarios.live.knobs import knobs
 from scenarios.live.serving import LATE, Pace
 from scenarios.live.session import STRONGEST, Frame, Session, read_script

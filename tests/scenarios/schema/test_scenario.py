@@ -16,7 +16,7 @@ from support import scenario_table
 from quadsim.assets import vehicle_path
 from quadsim.errors import UnknownNameError
 from scenarios.assembly import Assembly
-from scenarios.catalogue import LIBRARY
+from scenarios.catalogue import FLIGHTS
 from scenarios.loading import load_scenario, parse_scenario
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
@@ -59,7 +59,7 @@ def test_absent_bounds_are_infinite() -> None:
 
 def test_a_vehicle_file_beside_the_scenario_is_found_and_stored_by_its_whole_path(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(vehicle_path("lopes2011").read_text().replace("value = 4.0", "value = 3.0"))
-    text = (LIBRARY / "hover.toml").read_text().replace('"lopes2011"', '"mine.toml"')
+    text = (FLIGHTS / "hover.toml").read_text().replace('"lopes2011"', '"mine.toml"')
     (tmp_path / "course.toml").write_text(text)
     scenario = load_scenario(str(tmp_path / "course.toml"))
     assert scenario.vehicle.file == str(tmp_path / "mine.toml")

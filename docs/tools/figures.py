@@ -15,7 +15,7 @@ from quadsim.report import flight_figures as figures
 from quadsim.report.figure import Figure
 from quadsim.report.to_matplotlib import STYLE, draw
 
-ASSETS: Final = Path(__file__).resolve().parent / "assets" / "figures"
+ASSETS: Final = Path(__file__).resolve().parents[1] / "assets" / "figures"
 WIDTH: Final = 6.4  # [in]
 TEXT, GRID = "#3a4152", "#3a415226"
 LOOKS: Final[dict[str, Any]] = {

@@ -21,7 +21,7 @@ from quadsim.palette import COLOUR
 from quadsim.report.film.frames import Shot, make_footage, thin
 from quadsim.state import Array
 
-DOCS: Final = Path(__file__).resolve().parent
+DOCS: Final = Path(__file__).resolve().parents[1]
 THUMBNAILS, FILMS, FILES = DOCS / "assets" / "gallery", DOCS / "films", DOCS / "scenarios"
 WIDTH, HEIGHT, MARGIN = 160, 90, 8  # of a thumbnail [pixels]
 FINEST: Final = 0.3  # how far a drawn path may be from the real one [pixels]
@@ -100,7 +100,7 @@ def main() -> None:
     names = re.findall(r"films/([\w-]+)\.mp4", (DOCS / "gallery.md").read_text(encoding="utf-8"))
     for folder in (FILMS, FILES):
         folder.mkdir(exist_ok=True)
-    for file in (DOCS.parent / "scenarios" / "library").glob("*.toml"):
+    for file in (DOCS.parent / "scenarios" / "library" / "flights").glob("*.toml"):
         shutil.copy(file, FILES / f"{file.stem}.txt")  # as text, which a browser shows
     try:
         with ProcessPoolExecutor(usable_cores()) as pool, reporting(True) as report:

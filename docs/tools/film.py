@@ -23,7 +23,7 @@ from quadsim.report.film.painter import Painter
 from quadsim.report.film.video import rendering_backend
 from quadsim.state import Array
 
-DOCS: Final = Path(__file__).resolve().parent
+DOCS: Final = Path(__file__).resolve().parents[1]
 SHARP: Final = 2  # pixels drawn for one that is shown, in each direction
 HEAD, PLOT, ROW, GAP, LABEL = 28, 90, 21, 8, 66  # [pixels]: title, plot, row of margins, gap, label left of both
 MOST_ROWS: Final = 4

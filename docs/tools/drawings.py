@@ -1,4 +1,4 @@
-"""Drawings of the pages, made from the code that they explain: `python docs/drawings.py` writes docs/assets/*.svg."""
+"""Drawings of the pages, made from the code that they explain: `python docs/tools/drawings.py` writes docs/assets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pkgutil import resolve_name
 from quadsim import load_vehicle
 from quadsim.palette import CYCLE
 
-ASSETS = Path(__file__).parent / "assets"
+ASSETS = Path(__file__).resolve().parents[1] / "assets"
 INK, SOFT = "#6b7280", "#7c8596"
 FORWARD, TURN = CYCLE[2:4]
 STYLE = "font: 13px sans-serif; fill: " + SOFT

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from mpc.export.ctext import Precision
+from mpc.codegen.ctext import Precision
 
 EMULATOR: Final = "qemu-system-arm"
 TICK: Final = 40

@@ -8,10 +8,10 @@ from functools import cached_property
 from importlib import resources
 from typing import Final
 
+from mpc.codegen.ctext import CText, Precision
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
 from mpc.core.solver import core_problem
 from mpc.core.tables import Tables, members
-from mpc.export.ctext import CText, Precision
 from mpc.robust.settings import split_delay
 from quadsim.vehicle import N_ROTORS
 
@@ -26,7 +26,7 @@ ROWS_PER_STEP: Final = 2.56
 LEAST_ROWS: Final = 64
 
 
-def part(name: str, package: str = "mpc.export") -> str:
+def part(name: str, package: str = "mpc.codegen") -> str:
     """Return a hand-written C source of a package."""
     return (resources.files(package) / "c" / name).read_text(encoding="utf-8")
 

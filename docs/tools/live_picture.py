@@ -14,7 +14,7 @@ from typing import Any, Final, Literal
 from PIL import Image
 from playwright.sync_api import Browser, sync_playwright
 
-ASSETS: Final = Path(__file__).resolve().parent / "assets"
+ASSETS: Final = Path(__file__).resolve().parents[1] / "assets"
 WIDTH, HEIGHT = 1280, 720  # of the browser's window [pixels]
 FLOWN: Final = 12.0  # s of the flight before the picture
 OPTIONS: Final = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")

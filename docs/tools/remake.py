@@ -1,12 +1,12 @@
 """Fill the tables of README.md and docs/ from JSON: `make numbers`.
 
-A table stands between `<!-- NAME: filled by docs/remake.py from FILE -->` and `<!-- NAME end -->`.  Golden numbers are
-in the repository, under tests/golden; all other files are made by a command, under runs/.  A table whose file is not
-there stays as it is.  What a command of this script made states its commit, its date and its solver below the table.
-The records of five benchmarks are kept as CSV, docs/data.
+A table stands between `<!-- NAME: filled by docs/tools/remake.py from FILE -->` and `<!-- NAME end -->`.  Golden
+numbers are in the repository, under tests/golden; all other files are made by a command, under runs/.  A table whose
+file is not there stays as it is.  What a command of this script made states its commit, its date and its solver below
+the table.  The records of five benchmarks are kept as CSV, docs/data.
 
-    python docs/remake.py                    # fill all tables from the files that are there
-    python docs/remake.py speed mismatch     # run the commands that make these files first
+    python docs/tools/remake.py                    # fill all tables from the files that are there
+    python docs/tools/remake.py speed mismatch     # run the commands that make these files first
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from scenarios.loading import load_scenario
 from scenarios.progress import reporting
 from scenarios.schema.scenario import Group
 
-ROOT: Final = Path(__file__).resolve().parent.parent
+ROOT: Final = Path(__file__).resolve().parents[2]
 MADE: Final = ROOT / "runs" / "numbers"
-BLOCK: Final = re.compile(r"<!-- (\S+): filled by docs/remake.py from (\S+) -->\n(.*?)<!-- \1 end -->", re.DOTALL)
+BLOCK: Final = re.compile(r"<!-- (\S+): filled by docs/tools/remake.py from (\S+) -->\n(.*?)<!-- \1 end -->", re.DOTALL)
 BENCHMARKS: Final = (
     "solvers",
     "flight",
@@ -108,7 +108,7 @@ def commands(name: str) -> list[list[str]]:
                 ["film.py"],
                 ["gallery.py", "thumbnails"],
             )
-            return [[python, f"docs/{script}", *rest] for script, *rest in scripts]
+            return [[python, f"docs/tools/{script}", *rest] for script, *rest in scripts]
         case "campaigns":
             return [[quadsim, "campaign", each, "--out", f"runs/campaigns/{each}", "--resume"] for each in CAMPAIGNS]
         case "battery":
@@ -487,7 +487,7 @@ def filled(text: str) -> tuple[str, list[str]]:
             missing.append(source)
             return block[0]
         table = TABLES[name](data) + stated_origin(name)
-        return f"<!-- {name}: filled by docs/remake.py from {source} -->\n\n{table}\n<!-- {name} end -->"
+        return f"<!-- {name}: filled by docs/tools/remake.py from {source} -->\n\n{table}\n<!-- {name} end -->"
 
     return BLOCK.sub(fill, text), missing
 

@@ -1,0 +1,338 @@
+"""The commands `quadsim campaign` and `quadsim replay`, and `quadsim.sweep`."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
+
+from cyclopts import Parameter
+
+from quadsim.errors import InputError, ParameterError
+from scenarios.arguments import (
+    Changes,
+    Fields,
+    File,
+    Flag,
+    Flown,
+    ScenarioName,
+    Target,
+    UserCode,
+    UserForces,
+    Watched,
+    Whole,
+)
+from scenarios.catalogue import campaign_names
+
+if TYPE_CHECKING:
+    from scenarios.campaign.campaign import CampaignResult, Replay
+    from scenarios.campaign.paired import PairedComparison
+    from scenarios.campaign.plan import Plan
+    from scenarios.campaign.sweep import Sweep
+    from scenarios.schema.scenario import Scenario
+
+    CampaignName: TypeAlias = ScenarioName
+    Draws: TypeAlias = Sequence[Mapping[str, Any]]
+else:
+    from scenarios.arguments import one_of
+
+    CampaignResult = PairedComparison = Replay = Any
+    CampaignName = one_of(campaign_names)
+    Draws = Annotated[Any, Parameter(parse=False)]
+
+_log: Final = logging.getLogger("quadsim")
+
+
+def sweep(
+    scenario: ScenarioName,
+    values: Mapping[Any, Sequence[Any]],
+    *,
+    controller: object = None,
+    forces: Sequence[object] = (),
+    workers: int | None = None,
+    progress: bool = True,
+) -> Sweep:
+    """Fly a scenario for every combination of the values of some fields, always with the scenario's seed.
+
+    Args:
+        scenario: the scenario, or its name or file.
+        values: values to try, by dotted path; the fields of a tuple of paths vary together, with one common value or a
+            tuple of one value per field.
+        controller: as in `fly`; a class or a function of a module that other processes can import.
+        forces: as in `fly`; importable, like the controller.
+        workers: number of processes (default: one per usable core).
+        progress: as in `fly`.
+
+    Returns:
+        A table with a row per flight, in the order of the combinations, the last field varying fastest.
+
+    Raises:
+        InputError: a value is not allowed, or the controller cannot be sent to other processes.
+
+    Examples:
+        >>> import quadsim
+        >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
+        >>> table = quadsim.sweep(scenario, {"controller.horizon": [20, 40]}, workers=1)
+        >>> table["controller.horizon"].tolist(), table["verdict"].tolist()
+        ([20.0, 40.0], ['satisfied', 'satisfied'])
+        >>> both = ("controller.output_bounds.roll", "controller.output_bounds.pitch")
+        >>> tilt = quadsim.sweep(scenario, {both: [[-2.0, 2.0], [-5.0, 5.0]]}, workers=1)
+        >>> tilt["controller.output_bounds.pitch.1"].tolist(), tilt["margin.roll"].round(3).tolist()
+        ([2.0, 5.0], [2.0, 5.0])
+    """
+    from scenarios.campaign.sweep import fly_sweep
+    from scenarios.loading import load_scenario
+    from scenarios.progress import reporting
+    from scenarios.user_code import importable
+
+    with reporting(progress) as report:
+        return fly_sweep(importable(load_scenario(scenario), controller, forces), values, workers, report)
+
+
+def campaign(
+    campaign: CampaignName,
+    /,
+    *,
+    out: File | None = None,
+    overwrite: Flag = False,
+    workers: Whole | None = None,
+    cluster: str | None = None,
+    resume: Flag = False,
+    flights: Whole | None = None,
+    until_width: float | None = None,
+    require: Sequence[str] = (),
+    report: bool = True,
+    junit: File | None = None,
+    changes: Changes = (),
+    seed: Whole | None = None,
+    vary: Draws = (),
+    fields: Fields = None,
+    controller: UserCode = None,
+    forces: UserForces = (),
+    progress: Watched = True,
+) -> CampaignResult:
+    """Fly a scenario many times with randomly drawn parameters.
+
+    Args:
+        campaign: campaign's name, or path to a TOML file; in Python also a scenario, with `vary` and `fields`.
+        out: campaign directory (default: runs/campaigns/NAME).
+        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
+        workers: processes (default: one per core).
+        cluster: fly on a Dask cluster: its scheduler's address, tcp://HOST:PORT.
+        resume: continue the flights in this directory.
+        flights: number of flights, in place of the file's.
+        until_width: stop once the 95 % interval of the failure probability is this narrow, e.g. 0.05.
+        require: exit 1 unless the flights support this statement, e.g. "P(violation) < 0.01 @ 95%"; may be repeated.
+        report: write the report, an HTML page.
+        junit: also write the requirements' verdicts as JUnit XML.
+        changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
+        seed: replace the seed of all draws.
+        vary: with a scenario: the quantities to draw, entries as `[[vary]]` of a campaign file.
+        fields: with a scenario: other fields of a campaign file, such as `name`, `failure` or `sampling`.
+        controller: with a scenario: as in `sweep`.
+        forces: with a scenario: as in `sweep`.
+        progress: whether to show a bar on a terminal, and elsewhere a line every ten seconds.
+
+    Returns:
+        The results: `table` (a row per flight), `summary` (estimates with their intervals), `judgements` (of the
+        requirements), and the `directory`.
+
+    Raises:
+        InputError: the campaign, or one of its flights, cannot be set up.
+        OutputError: the directory already has a campaign, or cannot be written.
+        KeyboardInterrupt: the user stopped it; the flights so far are kept, and `resume` continues it.
+
+    Examples:
+        >>> import tempfile, quadsim
+        >>> scenario = quadsim.load("hover").replace({"duration": 1.0})
+        >>> mass = {"name": "mass", "fields": ["vehicle.mass"], "distribution": "uniform", "low": 4.0, "high": 4.4}
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     result = quadsim.campaign(scenario, vary=[mass], flights=3, workers=1, out=folder + "/mass")
+        >>> result.table["verdict"].to_pylist()
+        ['satisfied', 'satisfied', 'satisfied']
+    """
+    from scenarios.campaign.campaign import fly_campaign
+    from scenarios.campaign.events import parse_event
+    from scenarios.campaign.plan import load_plan, make_plan
+    from scenarios.campaign.statistics import judge, parse_requirement
+    from scenarios.junit import junit_file, write_junit
+    from scenarios.results import after
+    from scenarios.schema.scenario import Scenario
+    from scenarios.user_code import importable
+
+    if junit is not None and not require:
+        raise ParameterError("", "--junit", junit, "given with --require, whose verdicts it writes")
+    file = None if junit is None else junit_file(junit)
+    requirements = [parse_requirement(text) for text in require]
+    if isinstance(campaign, Scenario):
+        if changes:
+            raise InputError("changes apply to a campaign file; change a scenario by its replace")
+        settings = {"vary": [dict(entry) for entry in vary], "flights": flights, "seed": seed, **(fields or {})}
+        settings = {name: value for name, value in settings.items() if value is not None}
+        plan = make_plan(importable(campaign, controller, forces), settings)
+    elif vary or fields or controller is not None or forces:
+        raise InputError("vary, controller, forces and fields apply to a scenario; a campaign file sets them itself")
+    else:
+        plan = load_plan(str(campaign), list(changes), flights=flights, seed=seed)
+    for requirement in requirements:
+        parse_event(requirement.event.text, plan.columns)
+    target = Path("runs") / "campaigns" / plan.spec.name if out is None else Path(out)
+    with _growing(target, progress, resume=resume, overwrite=overwrite) as options:
+        result = fly_campaign(plan, workers=workers, cluster=cluster, report=report, until_width=until_width, **options)
+    result = replace(result, judgements=tuple(judge(result.table, requirement) for requirement in requirements))
+    if file is not None:
+        with after(result, file):
+            write_junit(result, file)
+    return result
+
+
+def replay(
+    campaign: File,
+    /,
+    *,
+    worst: Flag = False,
+    flight: Whole | None = None,
+    out: File | None = None,
+    overwrite: Flag = False,
+    video: bool | None = None,
+    recording: bool | None = None,
+    figures: bool | None = None,
+    progress: Watched = True,
+    flown: Flown = None,
+) -> Replay:
+    """Fly one flight of a finished campaign again, with all outputs.
+
+    Args:
+        campaign: campaign directory.
+        worst: replay the worst flight (the default).
+        flight: replay the flight of this number.
+        out: run directory (default: runs/CAMPAIGN-N, or the next free name).
+        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
+        video: film the flight (default: if possible).
+        recording: write flight.rrd for the rerun viewer (default: if possible).
+        figures: plot the flight (default: if possible).
+        progress: as in `fly`.
+        flown: as in `run`.
+
+    Returns:
+        The flight, and the columns of the campaign's table in which it differs by any bit.
+
+    Raises:
+        InputError: the campaign or the flight does not exist.
+        OutputError: the directory cannot be written.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.replay("runs/campaigns/not-flown")
+        Traceback (most recent call last):
+        quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
+    """
+    from scenarios.campaign.campaign import compare_replay, recorded_flight
+    from scenarios.flight import require_rendering, run_directory, write_run
+    from scenarios.progress import reporting
+    from scenarios.rollout import Rollout
+
+    if video:
+        require_rendering()
+
+    if worst and flight is not None:
+        raise ParameterError("", "--flight", flight, "absent with --worst")
+    recorded = recorded_flight(Path(campaign), flight)
+    for note in recorded.notes:
+        _log.info(note)
+    products = {"video": video, "recording": recording, "figures": figures}
+    with run_directory(recorded.scenario.name, out, overwrite=overwrite) as directory:
+        with reporting(progress) as report:
+            again = replace(Rollout(recorded.scenario).fly(report), directory=directory)
+        write_run(again, directory, products, overwrite=overwrite, progress=progress, flown=flown)
+    return compare_replay(again, recorded)
+
+
+@contextmanager
+def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) -> Iterator[dict[str, Any]]:
+    """Yield the options of a command that adds flights to a directory; Ctrl-C says how to continue."""
+    from quadsim.outputs import absolute
+    from scenarios.progress import watching
+
+    if resume and overwrite:
+        raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
+    directory = absolute(target)
+    try:
+        with watching(bool(progress)) as watch:
+            yield {"directory": directory, "resume": resume, "overwrite": overwrite, "watch": watch}
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{directory} has the flights so far, --resume continues it") from None
+
+
+def owns(directory: Path) -> bool:
+    """Whether a directory is a campaign's."""
+    from scenarios.campaign.store import is_campaign
+
+    return is_campaign(directory)
+
+
+def drawn_flights(scenario: Scenario, campaign: str) -> Plan:
+    """Draw a campaign's flights for a scenario that need not be its own; see `scenarios.campaign.plan`."""
+    from scenarios.campaign.plan import drawn_flights as draw
+
+    return draw(scenario, campaign)
+
+
+def check_advice(directory: File) -> str:
+    """What to do with a campaign instead of `quadsim check`."""
+    return (
+        f"{directory} is a campaign, not a run: quadsim replay {directory} --worst makes a run of its worst flight; "
+        "quadsim campaign --require judges them all"
+    )
+
+
+def compare_directories(
+    directories: Sequence[Path],
+    out: Path | None = None,
+    *,
+    overwrite: bool = False,
+    names: Sequence[str] = (),
+    constraints: Target | None = None,
+) -> PairedComparison:
+    """Compare two campaigns flight by flight, and write the report if a directory is given.
+
+    With `constraints`, one of the two, both are judged by its tolerances.
+
+    Raises:
+        InputError: they are not two finished campaigns, the names are wrong, or `constraints` is none of them or has
+            other bounds.
+        OutputError: the directory cannot be written.
+    """
+    from quadsim.flight.audit import limit_differences
+    from scenarios.campaign.again import judged_by
+    from scenarios.campaign.paired import compare_pairs
+    from scenarios.campaign.plan import plan_differences
+    from scenarios.campaign.store import FLIGHTS_FILE, read_flights, stored_plan
+    from scenarios.flight_comparison import check_names, place_of
+    from scenarios.results import after
+
+    if len(directories) != 2:
+        raise InputError(f"compare takes two campaigns, each by itself, not {len(directories)}")
+    first, second = directories
+    plans = (stored_plan(first), stored_plan(second))
+    check_names(names, 2)
+    names = (names[0], names[1]) if names else (plans[0].spec.name, plans[1].spec.name)
+    failures = (plans[0].spec.failure, plans[1].spec.failure)
+    a, b = (read_flights(path / FLIGHTS_FILE, plan.schema) for path, plan in zip((first, second), plans, strict=True))
+    limits = [tuple(limit.with_tolerances() for limit in plan.limits) for plan in plans]
+    if constraints is not None:
+        whose = place_of(constraints, directories)
+        a, b = (
+            judged_by(limits[whose], of, table, plan.failure)
+            for of, table, plan in zip(limits, (a, b), plans, strict=True)
+        )
+        limits = [limits[whose]] * 2
+    differences = limit_differences(*limits)
+    comparison = compare_pairs(a, b, names, failures, plan_differences(*plans), tuple(differences))
+    if out is None:
+        return comparison
+    with after(comparison, out):
+        return replace(comparison, page=comparison.write_report(out, overwrite=overwrite))

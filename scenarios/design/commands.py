@@ -1,0 +1,158 @@
+"""The commands that start a scenario and a vehicle of one's own: `quadsim scenario` and `quadsim vehicle`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from quadsim.assets import vehicle_names
+from quadsim.errors import InputError, ParameterError
+from scenarios.arguments import Changes, File, Flag, ScenarioName, VehicleName, Whole
+from scenarios.catalogue import scenario_names
+
+if TYPE_CHECKING:
+    from scenarios.design.vehicle_report import VehicleReport
+    from scenarios.results import Document, ScenarioFile
+else:
+    Document = ScenarioFile = VehicleReport = Any
+
+
+def scenario(
+    name: ScenarioName | None = None,
+    /,
+    *,
+    changes: Changes = (),
+    seed: Whole | None = None,
+    vehicle: Annotated[VehicleName | None, Parameter(name="--for")] = None,
+    course: str | None = None,
+    controller: str | None = None,
+    tilt: float | None = None,
+    schema: Flag = False,
+) -> ScenarioFile:
+    """Print a scenario with all defaults and comments, as a start for your own.
+
+    Args:
+        name: library name, or path to a TOML file.
+        changes: replace a field of the scenario, e.g. --set controller.horizon=30; may be repeated.
+        seed: replace the seed of everything random in the scenario.
+        vehicle: print a first scenario for this vehicle instead.
+        course: its course: hover, step (of 1 m) or figure-eight, at 60 % of the vehicle's limits (default: hover).
+        controller: its controller: robust, lqr, pid or geometric, or rates for nonlinear MPC of thrust and body rates
+            through its autopilot (default: robust).
+        tilt: its tilt bound [deg] (default: by rule, at most 40).
+        schema: print the JSON Schema of scenario files instead.
+
+    Returns:
+        The `content` of the file, where every number has its unit or source, and the `scenario` itself.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.scenario("hover").scenario.vehicle.mass  # [kg]
+        4.0
+        >>> first = quadsim.scenario(vehicle="hummingbird", course="figure-eight").scenario
+        >>> first.control_period, first.reference.length  # [s], [m]
+        (0.025, 1.69)
+        >>> quadsim.fly(first).outcome
+        'satisfied'
+    """
+    import json
+
+    from quadsim.assets import vehicle_path
+    from quadsim.vehicle import load_vehicle
+    from scenarios import loading, results
+    from scenarios.courses.csv_course import Csv
+    from scenarios.design.first_scenario import first_scenario
+    from scenarios.schema.json_schema import scenario_schema
+
+    if schema:
+        return results.ScenarioFile(json.dumps(scenario_schema(), indent=2) + "\n", scenario_schema())
+    options = {"course": course, "law": controller, "tilt": tilt}
+    choice: dict[str, Any] = {option: value for option, value in options.items() if value is not None}
+    if vehicle is not None:
+        for option, value in {"a scenario": name, "--set": changes, "--seed": seed}.items():
+            if value:
+                raise ParameterError("", "--for", vehicle, f"given without {option}")
+        return results.ScenarioFile(
+            first_scenario(load_vehicle(vehicle_path(str(vehicle))), str(vehicle), **choice).to_toml()
+        )
+    for option, value in choice.items():
+        raise ParameterError("", f"--{'controller' if option == 'law' else option}", value, "given with --for alone")
+    if name is None:
+        names = ", ".join(scenario_names())
+        raise InputError(f"scenario needs a name or a TOML file, or --schema (there are: {names})")
+    whole = loading.assemble(name, changes, seed).resolved.scenario
+    if isinstance(whole.reference, Csv):  # so that you may replace the table
+        whole = whole.altered(reference=replace(whole.reference, sha256=None))
+    return results.ScenarioFile(whole.to_toml())
+
+
+def vehicle_report(
+    name: VehicleName | None = None,
+    /,
+    *,
+    template: Flag = False,
+    scenario: ScenarioName | None = None,
+    out: File | None = None,
+    overwrite: Flag = False,
+) -> VehicleReport | Document:
+    """Report a vehicle's limits and designed gains, and the sources of its parameters; draw it.
+
+    Args:
+        name: shipped vehicle's name, or path to a TOML file.
+        template: print a commented vehicle file to fill in instead.
+        scenario: scenario whose bounds the vehicle may be unable to meet; they are listed.
+        out: PNG file for a picture of the vehicle on a floor of 10 cm squares.
+        overwrite: replace an existing file.
+
+    Returns:
+        The vehicle's parameters with their sources, the `figures` derived from them, and the `shortfalls` if a scenario
+        is given; or the template.
+
+    Raises:
+        InputError: the vehicle or scenario does not exist, the vehicle cannot fly, or the file does not end in .png.
+        RenderingUnavailableError: this machine cannot render.
+
+    Examples:
+        >>> import quadsim
+        >>> report = quadsim.vehicle_report("hummingbird", scenario="paper-constrained")
+        >>> report.figures.designed.limited_by, round(report.figures.designed.time_constants["x, y"], 2)  # [s]
+        ('torque', 0.18)
+        >>> report.shortfalls[0]
+        'controller.input_bounds.speed: hover is 453.2 rad/s, the scenario allows 250'
+    """
+    from quadsim.assets import vehicle_path
+    from quadsim.report.film.video import render_portrait
+    from quadsim.sim.autopilot import AutopilotSettings
+    from quadsim.vehicle import load_vehicle, vehicle_sources
+    from scenarios import loading, results
+    from scenarios.assembly import stated_autopilot
+    from scenarios.design import shortfalls, vehicle_report
+
+    if template:
+        return results.Document((Path(__file__).with_name("vehicle_template.toml")).read_text(encoding="utf-8"))
+    if name is None:
+        names = ", ".join(vehicle_names())
+        raise InputError(f"vehicle needs a name or a TOML file, or --template (there are: {names})")
+    path = vehicle_path(str(name))
+    loaded = load_vehicle(path)
+    against = None if scenario is None else loading.load_scenario(scenario)
+    if out is not None and Path(out).suffix != ".png":
+        raise ParameterError("", "--out", str(out), "a file ending in .png")
+    autopilot = (stated_autopilot(path) or AutopilotSettings()).resolved(loaded)
+    report = vehicle_report.VehicleReport(
+        vehicle=loaded,
+        sources=vehicle_sources(path),
+        autopilot=autopilot,
+        inner_lag=vehicle_report.inner_lag_of(loaded, autopilot),
+        figures=vehicle_report.make_sheet(loaded),
+        scenario=None if against is None else against.name,
+        shortfalls=None if against is None else shortfalls.shortfalls(against, loaded),
+    )
+    if out is None:
+        return report
+    with results.after(report, Path(out)):
+        render_portrait(loaded, Path(out), overwrite=overwrite)
+    return replace(report, picture=Path(out))

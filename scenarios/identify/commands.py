@@ -1,0 +1,69 @@
+"""The command `quadsim identify`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from quadsim.errors import InputError, ParameterError
+from scenarios.arguments import File, Files, Flag, VehicleName, Whole
+
+if TYPE_CHECKING:
+    from scenarios.identify.report import IdentifiedVehicle
+else:
+    IdentifiedVehicle = Any
+
+
+def identify(
+    *logs: File,
+    vehicle: VehicleName | None = None,
+    test: Files = (),
+    out: File | None = None,
+    page: File | None = None,
+    overwrite: Flag = False,
+    poles: Whole | None = None,
+) -> IdentifiedVehicle:
+    """Identify a vehicle from flight logs: its file, with an interval for every number.
+
+    Args:
+        logs: flights of one vehicle: CSV, Parquet, ULog, or run directories.
+        vehicle: start: a vehicle's name, or path to a TOML file with its mass, arm length and rotor layout.
+        test: log to predict and not to fit; may be repeated (default: the last fifth of each log, which is not fitted).
+        out: TOML file for the identified vehicle (default: none is written).
+        page: HTML file for the page: intervals, and measured against predicted.
+        overwrite: replace existing files.
+        poles: magnets of a motor, where a log has its electrical speed.
+
+    Returns:
+        The `vehicle`; its `identification` (estimates with intervals and verdicts); the `prediction` of flight that was
+        not fitted; what to fly to learn the rest, `advice`.
+
+    Raises:
+        InputError: a log cannot be used, or the vehicle that it gives cannot fly.
+        OutputError: a file exists, or cannot be written.
+
+    Examples:
+        >>> import quadsim
+        >>> quadsim.identify("not-logged-yet.csv", vehicle="hummingbird")
+        Traceback (most recent call last):
+        quadsim.errors.FileError: not-logged-yet.csv: is missing, or not a file
+    """
+    from quadsim.assets import vehicle_path
+    from scenarios.identify.report import NEEDED, identify_logs
+
+    if not logs:
+        raise InputError("identify needs a flight log: CSV, Parquet, ULog, or a run directory")
+    if vehicle is None:
+        raise InputError(
+            "identify needs --vehicle, a start: mass and arm are in no log; quadsim vehicle --template > start.toml"
+            f" writes one; give your {NEEDED}, and estimates of the rest"
+        )
+    for name, path, ending in (("--out", out, ".toml"), ("--page", page, ".html")):
+        if path is not None and Path(path).suffix != ending:
+            raise ParameterError("", name, str(path), f"a file ending in {ending}")
+    fitted, tested = ([Path(log) for log in paths] for paths in (logs, test))
+    if both := [log for log in tested if log.resolve() in {log.resolve() for log in fitted}]:
+        raise ParameterError("", "--test", str(both[0]), "a log that is not fitted too")
+    files = {name: None if path is None else Path(path) for name, path in (("out", out), ("page", page))}
+    start = vehicle_path(str(vehicle))
+    return identify_logs(fitted, start, test=tested, poles=poles, overwrite=overwrite, **files)

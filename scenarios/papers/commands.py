@@ -1,0 +1,55 @@
+"""The command `quadsim reproduce`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from scenarios.arguments import File, Watched
+from scenarios.catalogue import paper_names
+
+if TYPE_CHECKING:
+    from scenarios.papers.reproduction import Reproductions
+
+    PaperName: TypeAlias = File
+else:
+    from scenarios.arguments import one_of
+
+    Reproductions = Any
+    PaperName = one_of(paper_names)
+
+
+def reproduce(
+    paper: PaperName | None = None, /, *, junit: File | None = None, progress: Watched = True
+) -> Reproductions:
+    """Reproduce published numbers: published, ours, difference; exit 1 if one is off.
+
+    Args:
+        paper: name, or path to a TOML file (default: every shipped paper).
+        junit: also write each number's verdict as JUnit XML.
+        progress: as in `fly`.
+
+    Returns:
+        One reproduction per paper: its `numbers` with `ours`, `difference` and `within`, and a table, `grid`.
+
+    Raises:
+        InputError: the paper does not exist, or one of its numbers cannot be flown.
+
+    Examples:
+        >>> import quadsim
+        >>> (paper,) = quadsim.reproduce("quadrotor-uav", progress=False)
+        >>> paper.within, paper.numbers[2].spec.published, round(paper.numbers[2].ours, 3)
+        (True, 250.0, 250.0)
+    """
+    from scenarios.junit import junit_file, write_junit
+    from scenarios.papers.reproduction import Reproductions, load_paper, reproduce_paper
+    from scenarios.progress import reporting
+    from scenarios.results import after
+
+    file = None if junit is None else junit_file(junit)
+    papers = [load_paper(name) for name in ([str(paper)] if paper is not None else paper_names())]
+    with reporting(progress) as report:
+        reproductions = Reproductions(reproduce_paper(spec, report) for spec in papers)
+    if file is not None:
+        with after(reproductions, file):
+            write_junit(reproductions, file)
+    return reproductions

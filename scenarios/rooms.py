@@ -1,0 +1,138 @@
+"""The rooms: folders of features beside the core, which names none of them but here.
+
+A room has its commands in its `commands.py`, imported when one is called, its tests in a folder of its name, and its
+pages.  `make rooms` takes each away, with its entry here, and sees the rest pass.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from quadsim.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoomCommand:
+    """A command of a room, as the help of `quadsim` lists it before the room is imported."""
+
+    function: str  # of the room's `commands`
+    help: str  # the first line of its docstring
+    examples: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Room:
+    """What the core knows of a room."""
+
+    commands: Mapping[str, RoomCommand] = field(default_factory=dict)  # by the word on the command line
+    owns_directories: bool = False
+    """Whether its `commands` have `owns(directory)`, `check_advice(directory)` and `compare_directories(...)`."""
+
+
+ROOMS: Final[dict[str, Room]] = {
+    "live": Room(
+        commands={
+            "live": RoomCommand(
+                function="live",
+                help="Fly interactively in the browser: push, change every setting, save the flight as a scenario.",
+                examples=("quadsim live", "quadsim live robust --against paper-constrained"),
+            )
+        }
+    ),
+    "campaign": Room(
+        commands={
+            "campaign": RoomCommand(
+                function="campaign",
+                help="Fly a scenario many times with randomly drawn parameters.",
+                examples=(
+                    "quadsim campaign paper-robustness --flights 100",
+                    "quadsim campaign mine.toml --resume --require 'P(violation) < 0.01 @ 95%'",
+                ),
+            ),
+            "replay": RoomCommand(
+                function="replay",
+                help="Fly one flight of a finished campaign again, with all outputs.",
+                examples=(
+                    "quadsim replay runs/campaigns/paper-robustness --worst",
+                    "quadsim replay runs/campaigns/paper-robustness --flight 12 --no-video",
+                ),
+            ),
+        },
+        owns_directories=True,
+    ),
+    "papers": Room(
+        commands={
+            "reproduce": RoomCommand(
+                function="reproduce",
+                help="Reproduce published numbers: published, ours, difference; exit 1 if one is off.",
+                examples=("quadsim reproduce", "quadsim reproduce torrente2021 --junit numbers.xml"),
+            )
+        }
+    ),
+    "export": Room(
+        commands={
+            "export": RoomCommand(
+                function="export",
+                help="Export a scenario's controller as self-contained C99, with recorded periods to test it.",
+                examples=(
+                    "quadsim export paper-constrained --out exported",
+                    "quadsim export paper-constrained --out small --precision float --target cortex-m7",
+                ),
+            )
+        }
+    ),
+    "identify": Room(
+        commands={
+            "identify": RoomCommand(
+                function="identify",
+                help="Identify a vehicle from flight logs: its file, with an interval for every number.",
+                examples=(
+                    "quadsim identify eight.csv --vehicle start.toml --out mine.toml --page mine.html",
+                    "quadsim identify eight.csv climb.csv --vehicle start.toml --test square.csv --poles 14",
+                ),
+            )
+        }
+    ),
+    "design": Room(
+        commands={
+            "scenario": RoomCommand(
+                function="scenario",
+                help="Print a scenario with all defaults and comments, as a start for your own.",
+                examples=(
+                    "quadsim scenario hover > mine.toml",
+                    "quadsim scenario --for hummingbird --course figure-eight > mine.toml",
+                ),
+            ),
+            "vehicle": RoomCommand(
+                function="vehicle_report",
+                help="Report a vehicle's limits and designed gains, and the sources of its parameters; draw it.",
+                examples=(
+                    "quadsim vehicle hummingbird --scenario paper-constrained",
+                    "quadsim vehicle --template > mine.toml",
+                ),
+            ),
+        }
+    ),
+    "gym": Room(),
+}
+
+
+def commands_of(room: str) -> Any:
+    """Import the commands of a room.
+
+    Raises:
+        InputError: there is no such room.
+    """
+    if room not in ROOMS:
+        raise InputError(f"this quadsim has been installed without its room {room!r}")
+    return importlib.import_module(f"scenarios.{room}.commands")
+
+
+def owner_of(directory: Path) -> Any:
+    """Import the commands of the room that made a directory; None for a run, or for what no room made."""
+    owning = (commands_of(name) for name, room in ROOMS.items() if room.owns_directories)
+    return next((commands for commands in owning if commands.owns(directory)), None)
