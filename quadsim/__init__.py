@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from scenarios.app import scenario as scenario
     from scenarios.app import start as start
     from scenarios.app import sweep as sweep
-    from scenarios.app import tune as tune
     from scenarios.app import vehicle_report as vehicle_report
     from scenarios.app import view as view
     from scenarios.export.exporter import export as export
@@ -102,7 +101,7 @@ _MODULES = {
     "quadsim.state": "STATE_NAMES State",
     "quadsim.vehicle": "Vehicle",
     "scenarios.app": "campaign catalogue check compare doctor feasibility film fly identify live load load_vehicle "
-    "make_controller problem read replay reproduce run scenario start sweep tune vehicle_report view",
+    "make_controller problem read replay reproduce run scenario start sweep vehicle_report view",
     "scenarios.export.exporter": "export",
     "scenarios.export.in_the_loop": "fly_exported",
     "scenarios.flight": "Flight",
