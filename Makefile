@@ -99,7 +99,7 @@ pins: $(VENV)/.python  ## resolve every package anew, at its newest, into constr
 	@fresh=$$(mktemp -d) && trap 'rm -rf "$$fresh"' EXIT && fresh_python="$$fresh/bin/python" && \
 	$(PYTHON) -m venv "$$fresh" && \
 	$(call quietly,"$$fresh_python" -m pip install --quiet --upgrade pip \
-		&& "$$fresh_python" -m pip install --quiet '.[gym,live,solvers,tune]' --group dev --group docs --group peers,The packages could not be resolved.) && \
+		&& "$$fresh_python" -m pip install --quiet '.[gym,live,solvers]' --group dev --group docs --group peers,The packages could not be resolved.) && \
 	{ echo "# What setup, docs and peers install, dependencies of dependencies included.  Made by 'make pins'; not edited by hand." && \
 	"$$fresh_python" -m pip freeze --all --exclude quadsim --exclude setuptools; } >"$$fresh/pins" && \
 	cp "$$fresh/pins" constraints.txt

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from scenarios.app import read as read
     from scenarios.app import run as run
     from scenarios.app import start as start
-    from scenarios.app import tune as tune
     from scenarios.app import view as view
     from scenarios.campaign.commands import campaign as campaign
     from scenarios.campaign.commands import replay as replay
@@ -102,7 +101,7 @@ _MODULES = {
     "quadsim.state": "STATE_NAMES State",
     "quadsim.vehicle": "Vehicle",
     "scenarios.app": "catalogue check compare doctor feasibility film fly load load_vehicle make_controller problem "
-    "read run start tune view",
+    "read run start view",
     "scenarios.campaign.commands": "campaign replay sweep",
     "scenarios.design.commands": "scenario vehicle_report",
     "scenarios.export.exporter": "export",

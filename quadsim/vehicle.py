@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Final, NoReturn, get_type_hints
@@ -191,11 +192,12 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
     `overrides` are parameter values that replace the file's.
 
     Raises:
-        FileError: the file is missing, is not TOML, or lacks or misnames a parameter.
-        ParameterError: a value is impossible.
-        UnknownNameError: an override names an unknown parameter.
+        FileError: the file is missing, is not TOML, lacks a parameter, or has an impossible value.
+        ParameterError: it is impossible with these overrides.
+        UnknownNameError: the file or an override names an unknown parameter.
     """
-    texts, entries = _read_entries(path)
+    with _naming(path):
+        texts, entries = _read_entries(path)
     values: dict[str, Any] = {**texts, **{key: entry["value"] for key, entry in entries.items()}}
     for key, value in (overrides or {}).items():
         if key not in VEHICLE_UNITS:
@@ -204,7 +206,17 @@ def load_vehicle(path: Path, overrides: Mapping[str, Any] | None = None) -> Vehi
     missing = [name for name in ("name", *VEHICLE_UNITS) if name not in values and name not in OPTIONAL_PARAMETERS]
     if missing:
         raise FileError(path, f"lacks {', '.join(missing)}")
-    return Vehicle(**values)
+    with nullcontext() if overrides else _naming(path):
+        return Vehicle(**values)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Name the file whose number is refused."""
+    try:
+        yield
+    except ParameterError as error:
+        raise FileError(path, str(error)) from error
 
 
 def vehicle_sources(path: Path) -> dict[str, str]:

@@ -624,67 +624,6 @@ def view(run: File, /, *, web: Flag = False) -> None:
     open_viewer(recording, web=web)
 
 
-# --- many flights --------------------------------------------------------------------------------------------------
-
-
-@app.command(help_epilogue=_examples("quadsim tune paper-robust", "quadsim tune mine.toml --trials 50 --resume"))
-def tune(
-    tuning: File,
-    /,
-    *,
-    out: File | None = None,
-    overwrite: Flag = False,
-    trials: Whole | None = None,
-    seed: Whole | None = None,
-    workers: Whole | None = None,
-    cluster: str | None = None,
-    resume: Flag = False,
-    report: bool = True,
-    progress: Watched = True,
-) -> Any:
-    """Tune fields of a scenario, and compare the result with the start on fresh draws.
-
-    Args:
-        tuning: name of a shipped tuning, or path to a TOML file.
-        out: tuning directory (default: runs/tunings/NAME).
-        overwrite: replace an earlier output, if its summary.json lists every file in the directory.
-        trials: number of candidates, in place of the file's.
-        seed: replace the seed of the search and of its draws.
-        workers: processes (default: one per core).
-        cluster: fly on a Dask cluster, as quadsim campaign does.
-        resume: continue the flights in this directory.
-        report: write the report, a set of HTML pages.
-        progress: as in `campaign`.
-
-    Returns:
-        `best` (the tuned scenario), `summary` (the search and the fresh flights), `comparison` (flight by flight),
-        `holds`, and the `directory`.
-
-    Raises:
-        InputError: the tuning, or one of its flights, cannot be set up.
-        MissingPackageError: the extra `tune` is not installed.
-        OutputError: the directory already has a tuning, or cannot be written.
-        KeyboardInterrupt: the user stopped it; the flights so far are kept, and `resume` continues it.
-
-    Examples:
-        >>> import quadsim
-        >>> quadsim.tune("paper-robust", workers=0)
-        Traceback (most recent call last):
-        quadsim.errors.ParameterError: --workers must be 1 or more; got 0
-    """
-    from scenarios.tuning.search import require_optuna
-    from scenarios.tuning.tuning import fly_tuning
-    from scenarios.tuning.tuning_plan import load_tuning
-
-    require_optuna()
-    plan = load_tuning(str(tuning), trials=trials, seed=seed)
-    target = Path("runs") / "tunings" / plan.spec.name if out is None else Path(out)
-    from scenarios.campaign.commands import _growing
-
-    with _growing(target, progress, resume=resume, overwrite=overwrite) as options:
-        return fly_tuning(plan, workers=workers, cluster=cluster, report=report, **options)
-
-
 # --- files, code, and the catalogue --------------------------------------------------------------------------------
 
 
@@ -711,11 +650,11 @@ def load_vehicle(name: VehicleName) -> Vehicle:
 
 @app.command(name="list", help_epilogue=_examples("quadsim list", "quadsim list --json"))
 def catalogue() -> Catalogue:
-    """List scenarios, campaigns, tunings, vehicles, controllers, papers and solvers, one per line.
+    """List scenarios, campaigns, vehicles, controllers, papers and solvers, one per line.
 
     Returns:
         Mappings by name: `scenarios`, with `description`, `group` and the expected verdict, `expect`; and `campaigns`,
-        `tunings`, `vehicles`, `controllers`, `papers` and `solvers`, with a sentence.
+        `vehicles`, `controllers`, `papers` and `solvers`, with a sentence.
 
     Examples:
         >>> import quadsim

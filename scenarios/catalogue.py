@@ -1,4 +1,4 @@
-"""The shipped scenarios, campaigns, tunings, papers and controllers by name; found without heavy imports."""
+"""The shipped scenarios, campaigns, papers and controllers by name; found without heavy imports."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from quadsim.errors import FileError, UnknownNameError
 from scenarios.results import Result, Shown
 
 _LIBRARY: Final = Path(__file__).resolve().parent / "library"
-FLIGHTS, CAMPAIGNS, TUNINGS, PAPERS = (_LIBRARY / name for name in ("flights", "campaigns", "tunings", "papers"))
+FLIGHTS, CAMPAIGNS, PAPERS = (_LIBRARY / name for name in ("flights", "campaigns", "papers"))
 
 Group = Literal["paper", "papers", "courses", "air", "faults", "ground", "space", "sensors", "other"]
 
@@ -49,7 +49,6 @@ def _path(kind: str, folder: Path, name: str) -> Path:
 
 scenario_names, scenario_path = partial(_names, FLIGHTS), partial(_path, "scenario", FLIGHTS)
 campaign_names, campaign_path = partial(_names, CAMPAIGNS), partial(_path, "campaign", CAMPAIGNS)
-tuning_names, tuning_path = partial(_names, TUNINGS), partial(_path, "tuning", TUNINGS)
 paper_names, paper_path = partial(_names, PAPERS), partial(_path, "paper", PAPERS)
 
 
@@ -68,7 +67,6 @@ class Catalogue(Result):
 
     scenarios: Mapping[str, LibraryScenario]  # for `load` and `fly`
     campaigns: Mapping[str, str]  # for `campaign`; the values here and below are one-line descriptions
-    tunings: Mapping[str, str]  # for `tune`
     vehicles: Mapping[str, str]  # for `load_vehicle` and `vehicle.file`
     controllers: Mapping[str, str]  # for `controller.type`
     papers: Mapping[str, str]  # for `reproduce`, by their titles
@@ -88,7 +86,7 @@ class Catalogue(Result):
                 }
             )
         }
-        others = ("campaigns", "tunings", "vehicles", "controllers", "papers", "solvers")
+        others = ("campaigns", "vehicles", "controllers", "papers", "solvers")
         return console.listing({**groups, **{title: getattr(self, title) for title in others}})
 
     def to_json(self) -> dict[str, Any]:
@@ -111,7 +109,6 @@ def read_catalogue() -> Catalogue:
     return Catalogue(
         scenarios=scenarios,
         campaigns={name: read_toml(campaign_path(name))["description"] for name in campaign_names()},
-        tunings={name: read_toml(tuning_path(name))["description"] for name in tuning_names()},
         vehicles={name: load_vehicle(vehicle_path(name)).description for name in vehicle_names()},
         controllers=CONTROLLERS,
         papers={name: read_toml(paper_path(name))["title"] for name in paper_names()},

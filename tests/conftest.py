@@ -37,7 +37,7 @@ settings.load_profile("quadsim")
 LONG = (
     *("test_benchmarks.py", "test_commands.py", "quadsim/report/test_comparison_page.py"),
     "scenarios/campaign/test_campaign_report.py",
-    *("scenarios/gym/test_environment.py", "scenarios/gym/test_learning.py", "scenarios/tuning/test_run.py"),
+    *("scenarios/gym/test_environment.py", "scenarios/gym/test_learning.py"),
     *("scenarios/test_library.py", "scenarios/test_many.py", "scenarios/campaign/test_campaign.py"),
     *("scenarios/design/test_first_flights.py", "scenarios/test_api.py", "scenarios/test_infeasibility.py"),
     *("quadsim/report/film/test_video.py", "test_documents.py", "scenarios/test_process.py", "test_refusals.py"),

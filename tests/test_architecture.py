@@ -33,7 +33,6 @@ OF_ONE_PLACE = {
     "matplotlib": "quadsim.report.to_matplotlib",
     "plotly": "quadsim.report.to_plotly",
     "distributed": "scenarios.many",
-    "optuna": "scenarios.tuning",
     "gymnasium": "scenarios.gym",
     "pyulog": "scenarios.identify",
 }

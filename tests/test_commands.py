@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from flown_logs import fly_eight, write_log
 from support import NO_PRODUCTS, fly_here
-from tuning_formula import write_tuning
 
 import quadsim
 from quadsim.errors import RenderingUnavailableError
@@ -31,7 +30,6 @@ ADDED = {
     "export": ("--set", "duration=1.0"),
     "identify": ("--overwrite",),
     "campaign": (*CAMPAIGN, "--out", "campaign"),
-    "tune": ("--no-report",),
     "live": ("--script", "push.toml"),
     "replay": ("--no-video", "--no-recording", "--no-figures"),
 }
@@ -75,9 +73,6 @@ def workplace(
     for place in (f"campaigns/{campaign.name}", "mine", "other"):
         shutil.copytree(campaign, tmp_path / "runs" / place)
     (tmp_path / "mine.toml").write_text('base = "paper-nominal"\nname = "mine"\nfailure = ["lost"]\n')
-    write_tuning(tmp_path, trials=2, batch=2, flights=[1], require="P(lost) < 0.9 @ 50%", fresh={"flights": 2}).rename(
-        tmp_path / "tuning.toml"
-    )
     for name in ("mine-vehicle", "start", "identified"):
         (tmp_path / f"{name}.toml").write_text(quadsim.vehicle_report(template=True).content)
     shutil.copy(eight, tmp_path)

@@ -1,44 +1,84 @@
-"""Wrong input is refused at the front door by one message that names the field: the table is refusals.toml."""
+"""Wrong input is refused at the front door by one message that names file, field, what was given, what is allowed.
+
+The declarations drive the test: whatever stands in any field of a scenario, campaign or vehicle file is accepted if its
+schema allows it, and otherwise refused.  A few messages are written out; they show rules between fields.
+"""
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, is_dataclass
+from datetime import date
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tomlkit
+from jsonschema import Draft202012Validator
 
 from quadsim.assets import vehicle_path
 from quadsim.errors import InputError
-from quadsim.vehicle import load_vehicle
-from scenarios.campaign.plan import load_plan
+from quadsim.vehicle import VEHICLE_UNITS, load_vehicle
+from scenarios.campaign.campaign_file import CampaignFile
+from scenarios.campaign.plan import load_plan, parse_campaign, read_campaign
+from scenarios.catalogue import campaign_names, scenario_names, scenario_path
 from scenarios.cli import main
 from scenarios.loading import load_scenario, parse_scenario
+from scenarios.schema.base import fields_of
+from scenarios.schema.bases import read_scenario
 from scenarios.schema.json_schema import scenario_schema
+from scenarios.schema.problems import adapter
+from scenarios.schema.scenario import Scenario
+from scenarios.schema.settings import apply_setting
+from scenarios.schema.writing import tables_in
 
-TABLE = tomllib.loads((Path(__file__).parent / "refusals.toml").read_text(encoding="utf-8"))
-SEED = "must be a whole number >= 0 and <= 9223372036854775807"
-NESTED = "--set must be of at most 20 tables and lists within one another@"
-LONG = [  # settings too long for the table
-    (
-        "constraints=[" + ",".join(["{}"] * 1001) + "]",
-        "constraints must be a list of 1000 or fewer entries; got [{}, {}@",
-    ),
-    ("seed=" + 5000 * "9", f"seed {SEED}; got '9999@"),
-    ("duration=" + 300 * "x", "duration must be a number > 0 and <= 86400; got '" + 196 * "x" + "..."),
-    ("duration=" + 2000 * "[" + 2000 * "]", NESTED),
-    ("seed=" + 99_999 * "[", NESTED),
-    (".".join(40_000 * "a") + "=1", NESTED),
-    ("controller={" + ".".join(40_000 * "a") + "=1}", NESTED),
-]
+FILE = "mine.toml"
+JUNK = ("junk", "", True, math.nan, -math.inf, -1, 0, 1e300, date(2024, 1, 31), [], [[["junk"]]], {}, {"junk": 1})
+LINES = (
+    re.compile(r"(?P<field>\S+) must be .+; got (?P<got>.+)"),
+    re.compile(r"(?P<field>\S+) is not a field of the \w+ file.* \(there are: .+\)"),
+    re.compile(r"(?P<field>\S+) is missing"),
+    re.compile(r"(?P<field>\S+): no \w+ named .+ \(there are .+\)"),
+)
+"""The forms of a line about a field against its declaration."""
+RULE = re.compile(r"must (not |all )?(be|have) |is missing|is not a |no \w+ named ")
+"""What a line says whose field is allowed by itself, but not with the other ones."""
+
+EVENTS = """[
+    {at=1, type='wind', velocity=[1, 0, 0]}, {at=1, type='rotor_lag', rise=0.05}, {at=1, type='mass', factor=1.1},
+    {at=1, type='push', duration=1, force=[1, 0, 0]}, {at=1, type='setpoint', x=1},
+    {at=1, type='controller', fields={horizon=21}},
+]"""
+OBSTACLES = """[
+    {type='box', name='a', position=[9, 9, 9], size=[1, 1, 1], path=[{time=1, position=[9, 9, 8]}]},
+    {type='capsule', name='b', position=[9, 9, 9], radius=1, axis=[0, 0, 1]},
+]"""
+BESIDES = (
+    ("effects.air.rotor_drag=1e-4", "effects.rotors={rise=0.05, fall=0.05}", f"events={EVENTS}"),
+    ("controller={type='pid'}", "actual.mass=4.2", "keep_in={position=[0, 0, 1], size=[9, 9, 9]}"),
+    ("controller={type='lqr', output_weights={z=1}, input_weights={speed=1}}", f"obstacles={OBSTACLES}"),
+    ("controller={type='m:Law'}", "forces=[{type='m:force'}]"),
+)
+"""Settings of `hover` for the tables that no file of the library has."""
 CAMPAIGN = """
 name = "c"
 scenario = "hover"
-flights = 3
+flights = 4
 vary = [{name = "mass", fields = ["effects.load.mass_factor"], distribution = "uniform", low = 0.9, high = 1.1}]
+"""
+DISTRIBUTIONS = """
+vary = [
+    {name = "a", fields = ["seed.a"], distribution = "log_uniform", low = 0.9, high = 1.1},
+    {name = "b", fields = ["seed.b"], distribution = "normal", mean = 1.0, deviation = 0.1, low = 0.0, high = 2.0},
+    {name = "c", fields = ["seed.c"], distribution = "integer", low = 1, high = 3},
+    {name = "d", fields = ["seed.d"], distribution = "choice", values = [1.0, 2.0], weights = [1.0, 1.0]},
+    {name = "e", fields = ["seed.e"], distribution = "grid", values = [1.0, 2.0]},
+]
 """
 
 
@@ -56,51 +96,183 @@ def matches(message: str, expected: str) -> bool:
     return re.fullmatch(".*".join(map(re.escape, expected.split("@"))), message, re.DOTALL) is not None
 
 
-def refused_settings(table: dict[str, Any]) -> Iterator[tuple[list[str], str]]:
-    """The settings of one entry of the table, and the messages for them."""
-    given = table.get("given", [])
-    for field, pairs in table.get("must_be", {}).items():
-        for value, rule in pairs:
-            yield [*given, f"{field}={value}"], f"{field} must be {rule}; got @"
-    for *settings, message in table.get("refused", []):
-        yield settings, message
+# --- any field, anything in it -------------------------------------------------------------------------------------
 
 
-ENTRIES = [*TABLE["fields"], *TABLE["settings"]]
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file: its declaration, how it is read, and the valid files in which every table occurs."""
+
+    root: type[Any]
+    schema: dict[str, Any]
+    parse: Callable[[dict[str, Any]], Any]
+    files: Sequence[dict[str, Any]]
+
+    @cached_property
+    def tables(self) -> set[type[Any]]:
+        """Every table class that such a file may have."""
+        tables: set[type[Any]] = set()
+        new = {self.root}
+        while new:
+            tables |= new
+            fields = [field for table in new for field in fields_of(table).values()]
+            new = {table for field in fields for table in tables_in(field.annotation)} - tables
+        return tables
+
+    def properties(self, table: type[Any]) -> tuple[dict[str, Any], set[str]]:
+        """The schemas of a table's fields, and those that must be there."""
+        stated = self.schema if table is self.root else self.schema["$defs"][table.__name__]
+        return stated["properties"], {*stated.get("required", ())}
 
 
-@pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: f"{entry['scenario']} {entry.get('given', [''])[0][:40]}")
-def test_a_setting_that_cannot_be_is_refused(entry: dict[str, Any]) -> None:
-    name, wrong = entry["scenario"], []
-    for settings, expected in refused_settings(entry):
-        message = refusal(lambda settings=settings: load_scenario(name, settings))  # type: ignore[misc]
-        if not matches(message.removeprefix(f"{name}.toml: "), expected):
-            wrong.append((settings, message, expected))
-    assert not wrong
+def kinds() -> Iterator[Kind]:
+    whole = scenario_schema()
+    files = [read_scenario(scenario_path(name), scenario_path) for name in scenario_names()]
+    for settings in BESIDES:
+        files.append(read_scenario(scenario_path("hover"), scenario_path))
+        for setting in settings:
+            apply_setting(files[-1], setting)
+    files.sort(key=lambda data: len(str(data)))
+    schema = {**whole["else"], "$defs": whole["$defs"]}
+    yield Kind(Scenario, schema, lambda data: parse_scenario(data, source=FILE), files)
+    campaigns = [read_campaign(name) for name in campaign_names()]
+    campaigns.append(tomllib.loads(CAMPAIGN.partition("vary")[0] + DISTRIBUTIONS))
+    schema = adapter(CampaignFile).json_schema()
+    yield Kind(CampaignFile, schema, lambda data: parse_campaign(data, source=FILE), campaigns)
 
 
-@pytest.mark.parametrize(("setting", "expected"), LONG, ids=lambda text: text[:20])
-def test_a_long_setting_is_refused_in_a_short_message(setting: str, expected: str) -> None:
-    message = refusal(lambda: load_scenario("hover", [setting]))
-    assert matches(message.removeprefix("hover.toml: "), expected)
-    assert len(message) < 1000
+KINDS = {kind.root.__name__: kind for kind in kinds()}
 
 
-def test_the_table_has_every_field_of_a_scenario() -> None:
-    schema = scenario_schema()
-    declared = {name for table in (schema, *schema["$defs"].values()) for name in table.get("properties", {})}
-    text = " ".join(" ".join(settings) for entry in ENTRIES for settings, _ in refused_settings(entry))
-    text += " ".join(TABLE["scenario_files"])
-    missing = declared - set(re.findall(r"\w+", text))
-    assert not missing, missing
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], type[Any]]]:
+    """The tables of a file that was read, with the path to each."""
+    if is_dataclass(value):
+        yield path, type(value)
+        items: Iterable[tuple[Any, Any]] = ((name, getattr(value, name)) for name in fields_of(type(value)))
+    else:
+        items = value.items() if isinstance(value, dict) else ()
+        items = enumerate(value) if isinstance(value, list | tuple) else items
+    for key, entry in items:
+        yield from places(entry, (*path, key))
 
 
-@pytest.mark.parametrize("field", ["name", "duration", "control_period", "vehicle.file", "controller.horizon"])
-def test_a_field_that_is_missing_is_named(field: str) -> None:
-    data = tomllib.loads(load_scenario("hover").to_toml())
-    table, _, name = field.rpartition(".")
-    del (data[table] if table else data)[name]
-    assert f"{field} is missing" in refusal(lambda: parse_scenario(data))
+def inside(data: dict[str, Any], path: Sequence[Any]) -> tuple[dict[str, Any], list[str]]:
+    """The table at a path, made where the file leaves it to its default, and the names that messages give the path."""
+    names = []
+    holder: Any = data
+    for part in path:
+        holder = holder.setdefault(part, {}) if isinstance(part, str) else holder[part]
+        names.append(holder.get("name", str(part)) if isinstance(part, int) else part)
+    return holder, names
+
+
+def reread(kind: Kind, data: dict[str, Any]) -> None:
+    """Read a file, and what it writes, which is the same."""
+    file = kind.parse(data)
+    assert kind.parse(tomllib.loads(file.to_toml())) == file
+
+
+def edits(table: dict[str, Any], field: str, junk: Sequence[Any]) -> Iterator[tuple[Any, bool]]:
+    """Put junk into a field, then into the first entry of its list; each with whether it is the field's own value."""
+    before = table.get(field)
+    for value in junk:
+        table[field] = value
+        yield value, True
+    if isinstance(before, list) and before:
+        for value in junk[::3]:
+            table[field] = [value, *before[1:]]
+            yield value, False
+    del table[field]
+    if before is not None:
+        table[field] = before
+
+
+def is_plain(value: Any) -> bool:
+    """Whether JSON has such a value."""
+    if isinstance(value, list | dict):
+        return all(map(is_plain, value.values() if isinstance(value, dict) else value))
+    return not isinstance(value, date) and not (isinstance(value, float) and not math.isfinite(value))
+
+
+def shown(value: Any) -> str:
+    return value.isoformat() if isinstance(value, date) else repr(value)
+
+
+def complaints(message: str, field: str, given: str | None) -> list[str]:
+    """What is wrong with a message about a field whose value its declaration does not allow."""
+    if not message.startswith(f"{FILE}: "):
+        return [f"names no file: {message}"]
+    wrong = []
+    for line in message.removeprefix(f"{FILE}: ").split("\n  "):
+        match = next(filter(None, (form.fullmatch(line) for form in LINES)), None)
+        if match is None or not match["field"].startswith(field):
+            wrong.append(line)
+        elif given is not None and match["field"] == field and "got" in match.groupdict():
+            wrong += [] if match["got"].startswith(given) else [f"does not show {given}: {line}"]
+    return wrong
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
+def test_a_field_is_accepted_as_declared_or_named_with_what_was_given_and_what_is_allowed(kind: Kind) -> None:
+    seen, declared, wrong, allowed = set(), set(), [], 0
+    for data in kind.files:
+        for path, table in places(kind.parse(data)):
+            if table in seen:
+                continue
+            seen.add(table)
+            holder, names = inside(data, path)
+            properties, required = kind.properties(table)
+            assert properties.keys() == fields_of(table).keys()
+            holder["junk"] = 1
+            wrong += complaints(refusal(partial(kind.parse, data)), ".".join([*names, "junk"]), None)
+            del holder["junk"]
+            for field, schema in properties.items():
+                allows = Draft202012Validator({**schema, "$defs": kind.schema["$defs"]}).is_valid
+                named = ".".join([*(map(str, path) if field == "name" else names), field])
+                known = (field, str(schema)) in declared  # another table has the same field
+                declared.add((field, str(schema)))
+                for junk, whole in edits(holder, field, JUNK[:1] if known else JUNK):
+                    message = refusal(partial(reread, kind, data))
+                    if not (is_plain(holder[field]) and allows(holder[field])):
+                        wrong += complaints(message, named, shown(junk) if whole else None)
+                    elif message != "accepted" and not RULE.search(message):
+                        wrong.append(message)
+                    else:
+                        allowed += 1
+                if field in required - {"type", "distribution"}:
+                    value = holder.pop(field)
+                    message = refusal(partial(kind.parse, data))
+                    wrong += [] if message == f"{FILE}: {named} is missing" else [message]
+                    holder[field] = value
+    assert not wrong, "\n".join(wrong)
+    assert seen == kind.tables
+    assert allowed > 20
+
+
+@pytest.mark.parametrize("name", VEHICLE_UNITS)
+def test_a_number_of_a_vehicle_is_accepted_as_declared_or_named_with_what_was_given(name: str, tmp_path: Path) -> None:
+    path = tmp_path / FILE
+    text = vehicle_path("lopes2011").read_text(encoding="utf-8")
+    allowed = [0] if name == "speed_min" else []
+    for junk in JUNK:
+        table = tomllib.loads(text)
+        table[name] = {"unit": VEHICLE_UNITS[name], "source": "a guess", "value": junk}
+        path.write_text(tomlkit.dumps(table), encoding="utf-8")
+        message = refusal(lambda: load_vehicle(path))
+        if junk in allowed and not isinstance(junk, bool):
+            assert message == "accepted"
+        else:
+            assert re.fullmatch(rf".*/{FILE}: vehicle\.{name}(\.\d)? must be .+; got .+", message), (junk, message)
+    for entry in ("junk", {}, {"value": 1.0, "unit": "furlong", "source": "x"}, table[name] | {"source": ""}):
+        path.write_text(tomlkit.dumps(tomllib.loads(text) | {name: entry}), encoding="utf-8")
+        assert re.match(rf".*/{FILE}: vehicle\.{name}(\.unit|\.source)? must be ", refusal(lambda: load_vehicle(path)))
+
+
+# --- messages, written out -----------------------------------------------------------------------------------------
+
+
+def vary(ends: str, field: str = "effects.load.mass_factor") -> str:
+    return f"vary = [{{name='mass', fields=['{field}'], distribution='uniform', {ends}}}]"
 
 
 def load_course(path: Path, text: str) -> None:
@@ -122,22 +294,125 @@ def load_edited(path: Path, edit: str) -> None:
     load_vehicle(path)
 
 
-def load_campaign(path: Path, changes: str) -> None:
-    """With fields of the changes instead of those of `CAMPAIGN`; `-field` leaves it out."""
-    names = {line.split(" = ")[0].lstrip("-") for line in changes.splitlines()}
-    kept = [line for line in CAMPAIGN.splitlines() if line.split(" = ")[0] not in names]
-    path.write_text("\n".join(kept + [line for line in changes.splitlines() if not line.startswith("-")]))
+def load_campaign(path: Path, change: str) -> None:
+    """With the change instead of that field of `CAMPAIGN`."""
+    kept = [line for line in CAMPAIGN.splitlines() if line.split(" = ")[0] != change.split(" = ")[0]]
+    path.write_text("\n".join([*kept, change]))
     load_plan(str(path))
 
 
-LOADERS = {"courses": load_course, "scenario_files": load_file, "vehicles": load_edited, "campaigns": load_campaign}
+SEED = "must be a whole number >= 0 and <= 9223372036854775807"
+NESTED = "--set must be of at most 20 tables and lists within one another@"
+LAWS = "'unconstrained', 'constrained', 'robust', 'nonlinear', 'lqr', 'pid', 'geometric', 'package.module:Class'"
+DRAGLESS = (
+    "effects.air.rotor_drag must be positive, or body_drag given, for the wind to push: the vehicle 'lopes2011' states "
+    "no drag; got 0.0"
+)
+MISTAKES = {
+    "controller.horizn=3": "controller.horizn is not a field of the scenario file; did you mean 'horizon'?@",
+    "controller=lqt": f"controller.type must be one of {LAWS}; got 'lqt'; did you mean 'lqr'?",
+    "controller.solver=clarabell": "controller.solver: no solver named 'clarabell'; did you mean 'clarabel'?@",
+    "vehicle.file=lopes": "no vehicle named 'lopes'; did you mean 'lopes2011'?@",
+    "vehicle.mass=40": "vehicle.speed_max must be no lower than its hover speed, 609.687 rad/s, or it cannot hover (@",
+    "vehicle.inertia=[0.03, 0.03, 0.07]": "vehicle.inertia must be such that no moment exceeds the sum of the @",
+    "actual.mas=4.4": "actual.mas is not a field of the scenario file; did you mean 'mass'?@",
+    "control_period=0.0503": "control_period must be a whole multiple of the physics step plant.timestep = 0.001 s; "
+    "got 0.0503",
+    "log_rate=3": "log_rate must have a period that is a whole multiple of the physics step plant.timestep = 0.001 s; "
+    "got 3.0",
+    "constraints=[{name='a', signal='x', lower=1, upper=0}]": "constraints.a.lower must be below upper = 0.0; got 1.0",
+    "constraints=[{name='a', signal='x'}, {name='a', signal='y'}]": "constraints must have distinct names@",
+    "controller.output_weights={q=1}": "controller.output_weights.q is not a state (there are: x, vx, @",
+    "controller.polytopes=[{name='p', of=['x'], rows=[[1]], upper=[]}]": "controller.polytopes.p.upper must have one "
+    "number per row, 1; got []",
+    "controller={type='nonlinear', tilt=90}": "controller.tilt must be a number > 0 and < 90; got 90",
+    "reference={radius=2, type='circle'}": "reference.period must be given, or speed, but not both; got {}",
+    "reference={type='csv', file='gone.csv'}": "gone.csv: cannot be read (@",
+    "reference={type='waypoints', points=[{position=[1, 2]}]}": "reference.points.0.position must be a list of 3 @",
+    "effects.air.wind=[3, 0, 0]": DRAGLESS,
+    "effects.load.mass_factor=0": "effects.load.mass_factor must be a number >= 0.05 and <= 20; got 0",
+    "effects.rotors.inertia=1e-4": "effects.rotors.inertia must be 0 where rotors change their speed at once@",
+    "events=[{type='payload_drop', at=1}]": "events.0.type must not be payload_drop at 1.0 s: nothing is carried",
+    "events=[{type='stall', at=10, duration=1}]": "events.0.at must be before the flight's end, 10.0 s; got 10.0",
+    "events=[{type='controller', at=1, fields={horizn=3}}]": "events.0.fields: controller.horizn is not a field of the "
+    "scenario file; did you mean 'horizon'?@",
+    "estimator.type=error_state": "estimator must have sensors.position to work with; got []",
+    "sensors.position.rate=300": "sensors.position.rate must be a divisor of the physics rate of 1000 Hz; got 300.0",
+    "initial.cold=true": "initial.cold must be false where effects.ground gives no floor to stand on; got true",
+    "initial.rotor_speeds=[9, 9, 9, 251]": "initial.rotor_speeds must be at most 250 rad/s each, the speed_max of @",
+    "obstacles=[{type='sphere', name='a', position=[0, 0, 1], radius=1}]": "initial.position must be clear of a, by @",
+    "effects.load.mass_factor=1.1 plant.integrator=rk4": "plant.integrator must be mujoco with a load; got 'rk4'",
+    "forces=[{type='a:b:c'}]": "forces.0.type must be of the form package.module:Class; got 'a:b:c'",
+    "seed=0x1ffffffffffffffff": f"seed {SEED}; got a whole number of 65 bits",
+    "seed=" + 5000 * "9": f"seed {SEED}; got '9999@",
+    "seed=" + 99_999 * "[": NESTED,
+    "duration=1\nseed=2": "duration must be a number > 0 and <= 86400; got '1\\nseed=2'",
+    "duration=" + 300 * "x": "duration must be a number > 0 and <= 86400; got '" + 196 * "x" + "...",
+    ".".join(40_000 * "a") + "=1": NESTED,
+    "controller={" + ".".join(40_000 * "a") + "=1}": NESTED,
+    "constraints=[" + ",".join(["{}"] * 1001) + "]": "constraints must be a list of 1000 or fewer entries; got [{}@",
+    "events.2.at=3": "events must be a list of 20000 or fewer entries; got {'2': {'at': 3}}",
+    "base=hover": "--set must be of a field other than base, which only a file can have; got 'base=hover'",
+}
 
 
-@pytest.mark.parametrize("kind", LOADERS)
-def test_a_file_that_cannot_be_is_refused(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("setting", "expected"), MISTAKES.items(), ids=lambda text: text[:40])
+def test_a_mistake_has_a_message_that_says_what_is_allowed(setting: str, expected: str) -> None:
+    message = refusal(lambda: load_scenario("hover", re.split(r" (?=plant)", setting)))
+    assert matches(message.removeprefix("hover.toml: "), expected)
+    assert len(message) < 1000
+
+
+FILES: dict[Callable[[Path, str], None], dict[str, str]] = {
+    load_file: {
+        "name = ": "is not valid TOML: @",
+        'base = "x.toml"': "is its own base: x.toml -> x.toml",
+        'base = "y.toml"': "gone.toml: no such scenario file",
+        'base = "papr-constrained"': "no scenario named 'papr-constrained'; did you mean 'paper-constrained'?@",
+        "": "name is missing@description is missing@",
+    },
+    load_course: {
+        "": "row 1: the header must be t,x,y,z,yaw or t,x,y,z,yaw,vx,vy,vz; got none",
+        "t,x,y,z,yaw\n0,0,0,1,0\n1,0,0,1,0\n1,0,0,1,0\n": "row 4, column t: must be above that of the row @",
+        "t,x,y,z,yaw\n0,0,0,1,0\n1,0,,1,0\n": "row 3, column y: is empty",
+        "t,x,y,z,yaw\n0,0,0,1,0\n1,high,0,0,0\n": "row 3, column x: must be a number; got 'high'",
+        "t,x,y,z,yaw\n0,0,0,0,nan\n1,0,0,0,0\n": "row 2, column yaw: must be a finite number within +-1e+06; got 'nan'",
+        "t,x,y,z,yaw\n0,0,0,0,0\n1,0,0,0\n": "row 3: must have 5 cells (t,x,y,z,yaw); got 4",
+        "t,x,y,z,yaw\n0,0,0,0,0\n": "must have 2 or more rows below its header; got 1",
+        't,x,y,z,yaw\n0,0,0,1,0\n1,0,0,1,0\n2,"0,0,1,0\n': "cannot be read (@)",
+    },
+    load_edited: {
+        'name = "lopes2011" => name = 3': "vehicle.name must be a text; got 3",
+        'name = "lopes2011" => ': "lacks name",
+        "[arm_length] => [rotor_lag]": "no vehicle parameter named 'rotor_lag'; did you mean 'rotor_rise' and "
+        "'rotor_fall'?@",
+        'unit = "kg" => unit = "g"': "vehicle.mass.unit must be 'kg'; got 'g'",
+        "value = 4.0 => value = 40.0": "vehicle.speed_max must be no lower than its hover speed, 609.687 rad/s, or it@",
+    },
+    load_campaign: {
+        "fligths = 4": "fligths is not a field of the campaign file; did you mean 'flights'?@",
+        "failure = ['lots']": "failure has an entry 'lots' that is no event: @; did you mean 'lost'?@",
+        "failure = ['rmse.q > 1']": "failure: no column named 'rmse.q'; did you mean 'rmse.z'?@",
+        "failure = ['status > 0']": "failure: event 'status > 0' compares with a number; the column @ holds text",
+        "set = {duration=-1.0}": "x.toml, hover.toml: duration must be a number > 0 and <= 86400; got -1.0",
+        vary("low=1.1, high=0.9"): "vary.mass.low must be below high; got 1.1 and 0.9",
+        vary("low=0.01, high=1.1"): "vary.mass at 0.01: effects.load.mass_factor must be a number >= 0.05 and <= 20; "
+        "got 0.01",
+        vary("low=0.9, high=1.1, relative=true"): "vary.mass.relative must be false where the scenario has no number @",
+        vary("low=0.9, high=1.1", "seed"): "vary.mass.fields must not have seed: every flight has one of its own",
+        vary(
+            "low=0.5, high=1.0", "duration"
+        ): "none of the first 4 flights can be flown, the first since c-0: duration @",
+    },
+}
+"""Of each kind of file, contents or edits, and the messages for them."""
+
+
+@pytest.mark.parametrize("load", FILES)
+def test_a_file_that_cannot_be_is_refused(load: Callable[[Path, str], None], tmp_path: Path) -> None:
     path, wrong = tmp_path / "x.toml", []
-    for text, expected in TABLE[kind].items():
-        message = refusal(lambda text=text: LOADERS[kind](path, text))  # type: ignore[misc]
+    for text, expected in FILES[load].items():
+        message = refusal(lambda text=text: load(path, text))  # type: ignore[misc]
         if not matches(message.removeprefix(f"{path}: ").removeprefix("x.toml: "), expected):
             wrong.append((text, message, expected))
     assert not wrong
@@ -185,7 +460,7 @@ def test_every_command_reports_it_once_and_writes_nothing(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    file = CAMPAIGN.replace("flights = 3", "flights = 0") if command == "campaign" else 'base = "hover"\nseed = -1\n'
+    file = CAMPAIGN.replace("flights = 4", "flights = 0") if command == "campaign" else 'base = "hover"\nseed = -1\n'
     Path("mine.toml").write_text(file)
     more = {"compare": ["hover", "--out", "page"], "campaign": ["--out", "out"]}.get(command, [])
     assert main([command, "mine.toml", *more]) == 2

@@ -12,7 +12,6 @@ from typing import Any, Final
 
 import figures
 import numpy as np
-import pandas as pd
 
 import quadsim
 import quadsim.gym
@@ -27,51 +26,6 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 FREE: Final[dict[str, Any]] = {"constraints": []}
 UNTIL: Final = 16.0  # what is shown of the paper's step in x, which is at 10 s
 NEAR: Final = 1.2  # of a pillar, where half-spaces are drawn [m]
-SHOWN = (0.04, 0.08)  # of the errors of a tuning [m]; candidates that crash are beyond
-TUNING: Final = """
-name = "weights"
-trials = 40
-batch = 8
-flights = [4]
-require = "P(violation) < 0.5 @ 95%"
-
-[fresh]
-flights = 4
-seed = 1
-
-[[objectives]]
-name = "error"
-unit = "m"
-expression = "sqrt(rmse.x**2 + rmse.y**2 + rmse.z**2)"
-
-[[search]]
-name = "xy"
-fields = ["controller.output_weights.x", "controller.output_weights.y"]
-distribution = "log_uniform"
-low = 3.0
-high = 300.0
-
-[[search]]
-name = "horizon"
-fields = ["controller.horizon"]
-distribution = "integer"
-low = 10
-high = 50
-
-[campaign]
-scenario = "hummingbird-real-rotors"
-
-[campaign.set.controller]
-solver = "core-or-piqp"
-
-[[campaign.vary]]
-name = "mass"
-fields = ["actual.mass"]
-distribution = "uniform"
-low = 0.98
-high = 1.02
-relative = true
-"""
 
 
 def curves(
@@ -331,29 +285,6 @@ def export() -> Figure:
     return Figure(key="export", title="", panels=panels, columns=1, end=60.0)
 
 
-def tuning() -> Figure:
-    """The error of every candidate of a search beside the best so far and the start, and over its horizon."""
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "search.toml"
-        file.write_text(TUNING, encoding="utf-8")
-        table = pd.read_parquet(quadsim.tune(file, out=f"{folder}/tuned", report=False).directory / "flights.parquet")
-    error = np.sqrt(table["rmse.x"] ** 2 + table["rmse.y"] ** 2 + table["rmse.z"] ** 2)
-    means, horizons = (
-        column.groupby(table["candidate"]).mean().to_numpy() for column in (error, table["search.horizon"])
-    )
-    numbers, best = 1.0 * np.arange(len(means)), np.minimum.accumulate(means)
-    each: dict[str, Any] = {"y": means, "colour": CYCLE[0], "style": "points", "width": 3.5, "label": "candidate"}
-    start = Series(x=numbers[:1], y=means[:1], colour=CYCLE[1], style="points", width=6.0, label="start")
-    lowest = Series(x=numbers, y=best, colour=CYCLE[2], style="steps", label="best so far")
-    panels = (
-        Panel(title="candidates", y_label="RMS error [m]", x_label="number", y_range=SHOWN,
-              series=(Series(x=numbers, **each), lowest, start)),
-        Panel(title="over one searched field", y_label="RMS error [m]", x_label="horizon", y_range=SHOWN,
-              series=(Series(x=horizons, **each), replace(start, x=horizons[:1]))),
-    )  # fmt: skip
-    return Figure(key="tuning", title="", panels=panels)
-
-
 def learning() -> Figure:
     """A random agent in turbulence, alone and behind the safety filter."""
     example = run_path(str(ROOT / "examples" / "safety_filter.py"))
@@ -426,7 +357,6 @@ FIGURES: Final[dict[str, Callable[[], Figure]]] = {
         space,
         campaigns,
         export,
-        tuning,
         learning,
         scenarios,
         identification,

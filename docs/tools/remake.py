@@ -59,7 +59,6 @@ BATTERIES: Final = {
     "battery-thrust-scale": ("the thrust's scale", ["battery-thrust-scale"]),
 }
 """Of each campaign on a battery, what the observer estimates, and the arguments of `quadsim campaign`."""
-TUNINGS: Final = ("hummingbird-figure-eight", "paper-robust")
 FIGURES: Final = {
     "campaign-paper-nominal.png": "runs/campaigns/paper-nominal/campaign.png",
     **{f"{name}.png": f"runs/numbers/{name}.png" for name in KEPT},
@@ -92,7 +91,7 @@ Row = Sequence[object]
 
 
 def commands(name: str) -> list[list[str]]:
-    """What makes the files of a name: a benchmark, `papers`, `first-flights`, `campaigns`, `battery`, `tunings`, ..."""
+    """What makes the files of a name: a benchmark, `papers`, `first-flights`, `campaigns`, `battery`, ..."""
     python, quadsim = sys.executable, str(Path(sys.executable).with_name("quadsim"))
     match name:
         case "papers":
@@ -117,8 +116,6 @@ def commands(name: str) -> list[list[str]]:
                 [quadsim, "campaign", *arguments, "--out", f"runs/campaigns/{each}", "--resume"]
                 for each, arguments in flown.items()
             ]
-        case "tunings":
-            return [[quadsim, "tune", each, "--out", f"runs/tunings/{each}", "--resume"] for each in TUNINGS]
         case "solvers":
             timed = ["--json", "runs/numbers/solvers.json", "--solvers", *SOLVERS]
             return [[python, "benchmarks/solvers.py", *timed]]
@@ -129,7 +126,7 @@ def commands(name: str) -> list[list[str]]:
 def make(name: str) -> None:
     """Run the commands of a name; what prints its JSON has it saved."""
     MADE.mkdir(parents=True, exist_ok=True)
-    tells = name in (*BENCHMARKS, "campaigns", "battery", "tunings")  # how far it is
+    tells = name in (*BENCHMARKS, "campaigns", "battery")  # how far it is
     for command in commands(name):
         with reporting(not tells) as report:
             report(name, 0, 1)
@@ -325,21 +322,6 @@ def batteries(summaries: dict[str, Any]) -> str:
     return markdown(("estimate", "failed", *beyond, "largest error of height: median", "and most"), rows)
 
 
-def tunings(summaries: dict[str, Any]) -> str:
-    """What the shipped tunings found, on fresh draws."""
-    rows = []
-    for name in TUNINGS:
-        for found in summaries[name]["objectives"]:
-            numbers = (f"{found[key]:.4g}" for key in ("fresh_start", "fresh_best"))
-            changes = (_change(found["fresh_start"], found["fresh_best"]), _change(found["start"], found["best"]))
-            rows.append((name, f"{found['name']} [{found['unit']}]", *numbers, *changes))
-    return markdown(("tuning", "objective", "start", "best", "change", "promised by the search"), rows)
-
-
-def _change(start: float, best: float) -> str:
-    return f"{100.0 * (best - start) / abs(start):+.1f} %"
-
-
 def solvers(data: Any) -> str:
     """Step times of every solver, and how they compare with the first of the scenario."""
     rows, first = [], {row["scenario"]: row for row in reversed(_records(data))}
@@ -457,7 +439,6 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
     "first-flights": first_flights,
     "campaigns": campaigns,
     "battery": batteries,
-    "tunings": tunings,
     "solvers": solvers,
     "interfaces": interfaces,
     "identification": identification,
@@ -467,8 +448,8 @@ TABLES: Final[dict[str, Callable[[Any], str]]] = {
 
 
 def read(name: str, source: str) -> Any:
-    """A file's JSON, with `*` that of each campaign or tuning, by its name; None where a file is not there."""
-    members = {"campaigns": CAMPAIGNS, "battery": tuple(BATTERIES), "tunings": TUNINGS}.get(name, (name,))
+    """A file's JSON, with `*` that of each campaign, by its name; None where a file is not there."""
+    members = {"campaigns": CAMPAIGNS, "battery": tuple(BATTERIES)}.get(name, (name,))
     paths = {each: ROOT / source.replace("*", each) for each in members}
     if not all(path.is_file() for path in paths.values()):
         return None
@@ -495,7 +476,7 @@ def filled(text: str) -> tuple[str, list[str]]:
 def main() -> None:
     """Make what was named, then fill every page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = [*BENCHMARKS, "papers", "first-flights", "campaigns", "battery", "tunings", "pictures"]
+    names = [*BENCHMARKS, "papers", "first-flights", "campaigns", "battery", "pictures"]
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(names))
     chosen = parser.parse_args().names
     if unknown := sorted({*chosen} - {*names}):

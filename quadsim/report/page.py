@@ -1,4 +1,4 @@
-"""Pages that open without a network, all from one template: of flights, campaigns, comparisons and tunings."""
+"""Pages that open without a network, all from one template: of flights, campaigns and comparisons."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ def fly_campaign(
         progress = _Progress(plan, files, until_width=until_width, watch=watch)
         manifest = records.start(plan, files, session, flying=bool(progress.missing))
         if progress.missing:
-            put_report(files, REPORT_FILES, None)  # an earlier report lacks the flights to come
+            _put_report(files, REPORT_FILES, None)  # an earlier report lacks the flights to come
         try:
             progress.fly(workers, cluster)
         except BaseException:
@@ -169,7 +169,7 @@ def fly_campaign(
 
         files.finish(summary)
         with optional("the report"):
-            put_report(files, REPORT_FILES, write if report else None)
+            _put_report(files, REPORT_FILES, write if report else None)
         files.finish(summary)  # now with the report among its files
     return CampaignResult(directory=directory, manifest=manifest, table=table, summary=summary)
 
@@ -234,7 +234,7 @@ class _Progress:
         return False
 
 
-def put_report(files: Growing, names: Sequence[str], write: Callable[[Path], object] | None) -> None:
+def _put_report(files: Growing, names: Sequence[str], write: Callable[[Path], object] | None) -> None:
     """Move the files that a function writes into a directory; without a function, remove an earlier report.
 
     Raises:

@@ -38,7 +38,7 @@ _TAIL: Final = 1e-3  # share of a distribution beyond the values taken as its en
 
 @dataclass(frozen=True, kw_only=True)
 class Varied:
-    """Common fields of the entries of `[[vary]]` and `[[search]]`."""
+    """Common fields of the entries of `[[vary]]`."""
 
     name: Annotated[Name, doc("letters, digits, _ and -; the column `draw.NAME` of the results")]
     fields: Annotated[
@@ -199,11 +199,9 @@ def _require_range(low: float, high: float) -> None:
         raise ValueError(f"low must be below high; got {low:g} and {high:g}")
 
 
-def check_fields(entries: Sequence[Varied], table: str, owners: dict[str, str]) -> None:
-    """Refuse fields that two entries replace, and fields that may not be replaced.
-
-    `table` names the entries; `owners` has who replaces a field, and gets the entries' own.
-    """
+def _require_separate_fields(entries: Sequence[Varied]) -> None:
+    """Refuse fields that two entries replace, and fields that may not be replaced."""
+    owners: dict[str, str] = {}
     for entry in entries:
         for path in entry.fields:
             why = {"seed": "seed: every flight has one of its own"}.get(path)
@@ -212,7 +210,7 @@ def check_fields(entries: Sequence[Varied], table: str, owners: dict[str, str]) 
             elif path in owners:
                 why = f"{path}, which {owners[path]} draws"
             if why is not None:
-                raise ValueError(f"{table}.{entry.name}.fields must not have {why}")
+                raise ValueError(f"vary.{entry.name}.fields must not have {why}")
             owners[path] = entry.name
 
 
@@ -266,7 +264,7 @@ class CampaignFile:
         names = [entry.name for entry in self.vary]
         if len(set(names)) < len(names):
             raise ValueError(f"vary must have distinct names; got {names}")
-        check_fields(self.vary, "vary", {})
+        _require_separate_fields(self.vary)
         grids = ", ".join(entry.name for entry in self.vary if isinstance(entry, Grid))
         if grids and self.sampling in ("sobol", "halton"):
             rule = f"random or latin_hypercube where there are grids ({grids}), whose turns go with its points"

@@ -184,15 +184,15 @@ class Plan:
         return changed(self.data, changes, parse, table=self._table)
 
 
-def read_campaign(name: str, find: Callable[[str], Path] = campaign_path) -> dict[str, Any]:
-    """The tables of a campaign's file, or of a tuning's, which `find` knows, merged over its base's.
+def read_campaign(name: str) -> dict[str, Any]:
+    """The tables of a campaign's file, merged over its base's.
 
     Raises:
         FileError, UnknownNameError: there is none, or it cannot be read.
     """
     try:
-        path = find(name)
-        data = read_scenario(path, find, locate=locate)
+        path = campaign_path(name)
+        data = read_scenario(path, campaign_path, locate=locate)
         locate(data, path.parent)
         return data
     except OSError as error:
@@ -270,13 +270,11 @@ def plan_differences(first: Plan, second: Plan) -> tuple[tuple[str, Any, Any], .
 
 
 def locate(data: dict[str, Any], directory: Path) -> None:
-    """Make the paths in a campaign's tables, or in a tuning's, independent of its folder, in place."""
+    """Make the paths in a campaign's tables independent of its folder, in place."""
     for name in ("scenario", "base"):
         file = data.get(name)
         if isinstance(file, str) and file.endswith(".toml") and (directory / file).is_file():
             data[name] = str((directory / file).resolve())
-    if isinstance(tuned := data.get("campaign"), dict):
-        locate(tuned, directory)
     if isinstance(changes := data.get("set"), dict):
         locate_files(changes, directory)
 

@@ -161,10 +161,10 @@ def paired_difference(a: Array, b: Array) -> PairedDifference:
     return PairedDifference(pairs=n, mean=mean, lower=mean - half, upper=mean + half)
 
 
-_EXACT_UP_TO: Final = 8  # pairs up to which all permutations are counted for a rank correlation's p-value; 8! = 40 320
-_PERMUTED_UP_TO: Final = (
-    40  # pairs up to which xi's p-value is from permutations; beyond, its asymptotic law is as good
-)
+_FEWEST: Final = 10
+"""Pairs from which Student's t is a good law of a rank correlation: of five in order, it claims p = 0."""
+_PERMUTED_UP_TO: Final = 40
+"""Pairs up to which xi's p-value is from permutations; beyond, its asymptotic law is as good."""
 _PERMUTATIONS: Final = 9999
 
 
@@ -175,68 +175,34 @@ class Dependence:
     rho: float  # Spearman's rank correlation, from -1 to 1
     p: float  # its two-sided p-value
     xi: float  # Chatterjee's xi: about 0 where there is no dependence, 1 where the outcome is a function of the number
-    p_xi: float  # its one-sided p-value
+    p_xi: float  # its one-sided p-value; of an event, that of the Kolmogorov-Smirnov test
     flights: int  # pairs
 
 
 def dependence(x: Array, y: Array, rng: np.random.Generator) -> Dependence | None:
     """How y depends on x, (K,) each, by two measures; ties have their mean rank.
 
-    Pairs with a NaN do not count, infinities have their rank.  rho's p-value counts all permutations of up to 8 pairs,
-    and is from Student's t beyond.  xi puts equal values of x in an order at random, as its author advises; its p-value
-    is from permutations of up to 40 pairs and from its asymptotic law beyond.  Of a y with two values, such as an
-    event, it is exact: that law is wrong for rare ones (300 flights, 2 %: p < 0.005 in 4 of 100 by chance).  None of
-    fewer than three pairs, or where one side is always the same.
+    Pairs with a NaN do not count, infinities have their rank.  xi puts equal values of x in an order at random, as its
+    author advises; its p-value is from permutations of up to 40 pairs and from its asymptotic law beyond.  That law is
+    wrong for rare events (300 flights, 2 %: p < 0.005 in 4 of 100 by chance): for a y with two values, the p-value is
+    that of the Kolmogorov-Smirnov test of x with the one and the other.  None of fewer than ten pairs, or where one
+    side is always the same.
     Source: Chatterjee, Journal of the American Statistical Association 116 (2021).
     """
     there = ~(np.isnan(x) | np.isnan(y))
     x, y = scipy.stats.rankdata(x[there]), scipy.stats.rankdata(y[there])
-    if x.size < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+    if x.size < _FEWEST or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
         return None
-    rho, p = _spearman(x, y)
-    y = y[np.lexsort((rng.random(x.size), x))]
-    permuted = scipy.stats.PermutationMethod(n_resamples=_PERMUTATIONS, rng=rng)
+    ranked = scipy.stats.spearmanr(x, y)
+    in_order = y[np.lexsort((rng.random(x.size), x))]
     event = np.unique(y).size == 2
-    method = permuted if y.size <= _PERMUTED_UP_TO and not event else "asymptotic"
-    xi = scipy.stats.chatterjeexi(np.arange(y.size), y, method=method)
-    p_xi = _p_of_few_runs(y > y.min()) if event else float(xi.pvalue)
-    return Dependence(rho=rho, p=p, xi=float(xi.statistic), p_xi=p_xi, flights=y.size)
-
-
-def _spearman(x: Array, y: Array) -> tuple[float, float]:
-    """Rank correlation of ranks, and its p-value."""
-    if x.size > _EXACT_UP_TO:
-        ranked = scipy.stats.spearmanr(x, y)
-        return float(ranked.statistic), float(ranked.pvalue)
-    y = (y - y.mean()) / (np.linalg.norm(x - x.mean()) * np.linalg.norm(y - y.mean()))
-
-    def correlation(ranks: Array, axis: int = -1) -> Any:
-        return np.sum(ranks * y, axis=axis)
-
-    test = scipy.stats.permutation_test((x,), correlation, permutation_type="pairings", n_resamples=np.inf)
-    return float(test.statistic), float(test.pvalue)
-
-
-def _p_of_few_runs(happened: Flags) -> float:
-    """Probability of as few runs of equal values, when all orders are equally likely (Wald and Wolfowitz, 1940).
-
-    Of an event, xi counts such runs.
-    """
-    ones, zeros = int(happened.sum()), int((~happened).sum())
-    runs = np.arange(2, np.count_nonzero(np.diff(happened)) + 2)
-    fewer, more = runs // 2, (runs + 1) // 2  # runs of the one value and of the other, or the reverse
-
-    def ways(of_ones: Any, of_zeros: Any) -> Array:
-        return _log_binomial(ones - 1, of_ones - 1) + _log_binomial(zeros - 1, of_zeros - 1)
-
-    either = np.logaddexp(ways(fewer, more), ways(more, fewer))
-    return float(np.exp(scipy.special.logsumexp(either) - _log_binomial(happened.size, ones)))
-
-
-def _log_binomial(n: int, k: Any) -> Array:
-    """Logarithm of n over k; minus infinity where k > n."""
-    gammaln = scipy.special.gammaln
-    return np.asarray(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
+    permuted = scipy.stats.PermutationMethod(n_resamples=_PERMUTATIONS, rng=rng)
+    law = permuted if y.size <= _PERMUTED_UP_TO and not event else "asymptotic"
+    xi = scipy.stats.chatterjeexi(np.arange(y.size), in_order, method=law)
+    p_xi = scipy.stats.ks_2samp(x[y > y.min()], x[y == y.min()]).pvalue if event else xi.pvalue
+    return Dependence(
+        rho=float(ranked.statistic), p=float(ranked.pvalue), xi=float(xi.statistic), p_xi=float(p_xi), flights=y.size
+    )
 
 
 FAILURE: Final = parse_event("failure")

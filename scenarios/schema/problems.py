@@ -158,7 +158,7 @@ def find(path: Sequence[int | str], data: Any, root: type[Any]) -> Place:
         if isinstance(part, int):
             data = data[part]
             name = data.get("name") if isinstance(data, Mapping) else None
-            names.append(name if isinstance(name, str) else str(part))
+            names.append(name if name and isinstance(name, str) else str(part))
             kinds = tuple(entry for kind in kinds for entry in kind.entries)
         elif len(kinds) > 1 and named:
             kinds = named

@@ -22,7 +22,7 @@ from quadsim.flight import rundir
 from scenarios import flight
 from scenarios.app import app
 from scenarios.campaign.plan import read_campaign
-from scenarios.catalogue import campaign_names, scenario_names, tuning_names
+from scenarios.catalogue import campaign_names, scenario_names
 from scenarios.cli import main
 from scenarios.loading import load_scenario
 from scenarios.machine import capabilities
@@ -62,7 +62,7 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert lines == {line.split()[0]: line.split(maxsplit=1)[1:] for line in printed.splitlines() if line}
     assert main(["list", "--json"]) == EXIT_DONE
     listed = json.loads(capsys.readouterr().out)
-    titles = ["scenarios", "groups", "expected", "campaigns", "tunings", "vehicles", "controllers", "papers", "solvers"]
+    titles = ["scenarios", "groups", "expected", "campaigns", "vehicles", "controllers", "papers", "solvers"]
     assert list(listed) == titles
     assert list(listed["scenarios"]) == list(listed["groups"]) == list(listed["expected"]) == scenario_names()
     checked = [load_scenario(name) for name in scenario_names()]
@@ -72,7 +72,7 @@ def test_list_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert listed["campaigns"] == {name: read_campaign(name)["description"] for name in campaign_names()}
     assert list(listed["campaigns"]) == campaign_names()
     assert list(listed["solvers"]) == list(solver_entries())
-    for name in (*scenario_names(), *campaign_names(), *tuning_names(), *vehicle_names(), *SOLVERS, "constrained"):
+    for name in (*scenario_names(), *campaign_names(), *vehicle_names(), *SOLVERS, "constrained"):
         assert len(lines[name][0]) > 10
 
 
@@ -88,7 +88,6 @@ def test_without_a_command_it_prints_help_and_fails(capsys: pytest.CaptureFixtur
     [
         (["run"], scenario_names),
         (["campaign", "--resume"], campaign_names),
-        (["tune"], tuning_names),
         (["scenario", "--for"], vehicle_names),
     ],
 )
@@ -375,7 +374,7 @@ def test_a_full_disk_is_status_2_and_leaves_nothing(
     assert left_in(here) == []
 
 
-@pytest.mark.parametrize("command", [["check"], ["campaign"], ["tune"], ["vehicle"], ["live", "hover", "--script"]])
+@pytest.mark.parametrize("command", [["check"], ["campaign"], ["vehicle"], ["live", "hover", "--script"]])
 def test_a_file_that_is_nested_too_deep_is_refused_before_it_takes_memory(
     command: list[str], here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

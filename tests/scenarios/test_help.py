@@ -23,7 +23,7 @@ COMMANDS = [
     "reproduce",
     "run",
 ]
-COMMANDS += ["scenario", "tune", "vehicle", "video", "view"]
+COMMANDS += ["scenario", "vehicle", "video", "view"]
 
 
 def test_these_are_the_commands() -> None:

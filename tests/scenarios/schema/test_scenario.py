@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support import scenario_table
 
 from quadsim.assets import vehicle_path
@@ -103,47 +99,6 @@ def test_settings_replace_add_and_reach_into_constraints() -> None:
     assert scenario.constraints[0].upper == 4.5
     assert scenario.description == "no quotes needed"
     assert scenario.controller.input_weights.speed == (1.0, 2.0, 3.0, 4.0)
-
-
-# --- any file ------------------------------------------------------------------------------------------------------
-
-
-JUNK = st.sampled_from([None, True, "", "junk", -1.0, np.nan, np.inf, -np.inf, 1e300, [], [1.0], [[]], {}, {"junk": 1}])
-
-
-def leaves(table: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Paths to everything in nested tables and lists."""
-    items = table.items() if isinstance(table, dict) else enumerate(table) if isinstance(table, list) else ()
-    return [result for key, value in items for result in [(*path, key), *leaves(value, (*path, key))]]
-
-
-@settings(max_examples=150)
-@given(data=st.data())
-def test_a_file_with_anything_anywhere_is_either_right_or_named_as_wrong(data: st.DataObject) -> None:
-    """Whatever is put wherever: a scenario that its text gives again, or one typed error that names the field."""
-    table = scenario_table()
-    path = data.draw(st.sampled_from(leaves(table)))
-    broken = copy.deepcopy(table)
-    *outer, last = path
-    inner: Any = broken
-    for key in outer:
-        inner = inner[key]
-    how = data.draw(st.sampled_from(["replace", "remove", "misname"]))
-    if how == "replace":
-        inner[last] = data.draw(JUNK)
-    else:
-        value = inner.pop(last)
-        if how == "misname" and isinstance(inner, dict):
-            inner[f"{last}_"] = value
-    try:
-        scenario = parse_scenario(broken)
-    except ScenarioError as error:
-        message = str(error)
-    else:
-        assert reread(scenario) == scenario
-        return
-    assert str(path[0]) in message
-    assert "Input should" not in message, "pydantic's own words"
 
 
 EVENT = '{type="gust", at=0.1, duration=0.2, velocity=[1.0, 0.0, 0.0]}'
