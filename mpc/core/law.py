@@ -224,7 +224,7 @@ class CompiledMPC:
         return stopped(speeds.copy(), self.horizon, phase)
 
     def _may_learn(self, now: StepInputs) -> bool:
-        """Return whether the observer may compare the state with its prediction; see `RobustMPC.query`."""
+        """Return whether the observer may compare the state with its prediction, as `RobustPreparation` does."""
         if abs(now.time - self._called_at - self._shared.nominal.period) > _SAME_TIME:
             self._measured = -math.inf
         self._called_at = now.time

@@ -32,9 +32,10 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 if TYPE_CHECKING:
     from mpc.core.numbers import Exportable
+    from mpc.linear import LinearMPC
     from mpc.obstacles import Shape
     from mpc.ocp import Problem
-    from mpc.robust.controller import RobustMPC
+    from mpc.robust.controller import RobustPreparation
     from mpc.robust.filter import SafetyFilter
 
 TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that depend on the yaw of the axes
@@ -132,7 +133,7 @@ class Robust(Bounded):
         if self.avoidance is not None:
             rule = "absent for a safety filter, which keeps no half-spaces"
             raise ParameterError("controller", "avoidance", "given", rule)
-        law = SafetyFilter(replace(self, solver=SafetyFilter.solver)._mpc(vehicle, period))
+        law = SafetyFilter(self._preparation(vehicle, period))
         return law, self.guarded(law, self.fallback, vehicle, period)
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
@@ -191,13 +192,18 @@ class Robust(Bounded):
             "estimated": self.offset_free is not None,
         }
 
-    def _mpc(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
-        from mpc.robust.controller import RobustMPC
+    def _preparation(self, vehicle: Vehicle, period: float) -> RobustPreparation:
+        from mpc.robust.controller import RobustPreparation
+
+        settings = self.settings(vehicle, period)
+        return RobustPreparation(vehicle, self._robust_problem(vehicle, period, settings), settings)
+
+    def _mpc(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
+        from mpc.linear import LinearMPC
 
         margins = None  # tightening of half-spaces along x, y, z at each predicted state, (N, 3) [m]
         if self.tightening is not None and self.avoidance is not None:
             margins = position_margins(**self._tightened(vehicle, period))
-        space, settings = self.space(shapes, vehicle, period, margins), self.settings(vehicle, period)
-        problem = self._robust_problem(vehicle, period, settings)
-        solver = self.make_solver(problem, space)
-        return RobustMPC(vehicle, problem, settings, solver, space=space, kkt_every=self.kkt_every)
+        space, preparation = self.space(shapes, vehicle, period, margins), self._preparation(vehicle, period)
+        solver = self.make_solver(preparation.problem, space)
+        return LinearMPC(preparation, solver, name=self.type, space=space, kkt_every=self.kkt_every)

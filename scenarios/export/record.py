@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.bounded import Bounded
-from mpc.constrained import ConstrainedMPC
 from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
 from mpc.fallback.completion import CompletedInputs
 from mpc.fallback.contract import Guarded
+from mpc.linear import LinearMPC
 from mpc.ocp import Query
-from mpc.robust.controller import RobustMPC
 from mpc.solvers import Method
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import ACCEPTED, CORE, GAIN, Command, Phase, StepInputs
@@ -26,7 +25,7 @@ from scenarios.assembly import Assembly
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
-MPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
+MPC = LinearMPC | UnconstrainedMPC
 WAYS: Final = {Method.FREE: 0, Method.AXES: 1, Method.WHOLE: 2}
 REFUSED: Final = 3  # least status of a period without an optimum
 

@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import fly_here
+from support import constrained_mpc, fly_here
 
 import mpc
 import quadsim
-from mpc.constrained import ConstrainedMPC
 from mpc.fallback.contract import Guarded
 from mpc.nonlinear.controller import CONVERGED
 from mpc.ocp import InfeasiblePeriod
@@ -334,7 +333,7 @@ class Keeping:
 
     def __init__(self, vehicle: Vehicle, period: float, horizon: int, largest: float = 2.0) -> None:
         law = load_scenario("paper-constrained").controller.build(vehicle, period)
-        assert isinstance(law, ConstrainedMPC)
+        assert isinstance(law, mpc.LinearMPC)
         roll = mpc.Bounds(
             C_c=np.eye(12)[[INDEX["roll"]]],
             y_min=np.radians([-largest]),
@@ -345,7 +344,7 @@ class Keeping:
             u_max=np.full(4, 250.0),
         )
         self.problem = replace(law.problem, horizon=horizon, bounds=roll)
-        self.inner = ConstrainedMPC(self.problem, mpc.QPSolver("piqp-multistage", self.problem))
+        self.inner = constrained_mpc(self.problem)
         self.infeasible_period: InfeasiblePeriod | None = None
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:

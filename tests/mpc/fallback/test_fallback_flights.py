@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from scripted_controller import PERIOD, bounds, model, problem
-from support import paper_reference
+from support import constrained_mpc, paper_reference
 
 from mpc.bounded import FallbackSettings
-from mpc.constrained import ConstrainedMPC
 from mpc.fallback.contract import Guarded
 from mpc.ocp import Query
 from mpc.solvers import Answer, QPSolver
@@ -70,7 +69,7 @@ def fly_paper(
     reference = paper_reference(first + periods + 51)[first:].copy()
     if height is not None:
         reference[:, 2] = height
-    controller: Any = ConstrainedMPC(problem(), FaultySolver(solver or {}))
+    controller: Any = constrained_mpc(problem(), FaultySolver(solver or {}))
     if guarded:
         controller = Guarded(controller, model(), bounds=bounds(), settings=LEVEL)
     rng = np.random.default_rng(0)
