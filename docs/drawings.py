@@ -125,7 +125,7 @@ def architecture() -> str:
         (left, 480, "Estimator", "quadsim.sim.navigation:Navigation"),
         (right, 480, "Controller", "mpc.linear:LinearMPC"),
         (right, 380, "QP", "mpc.solvers.piqp:Piqp"),
-        (right, 280, "Fallback", "mpc.fallback.contract:Guarded"),
+        (right, 280, "Fallback", "mpc.fallback.contract:Guard"),
     )
     for x, y, title, name in loop:
         parts += box(x, y, wide, title, name)

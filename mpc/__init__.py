@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mpc.ocp import Objective as Objective
     from mpc.ocp import Problem as Problem
     from mpc.ocp import Query as Query
+    from mpc.pilot import Pilot as Pilot
     from mpc.robust.controller import RobustPreparation as RobustPreparation
     from mpc.robust.settings import RobustSettings as RobustSettings
     from mpc.solvers import QPSolver as QPSolver
@@ -41,6 +42,7 @@ _MODULES = {
     "mpc.nonlinear.controller": ("NonlinearMPC",),
     "mpc.nonlinear.settings": ("NonlinearSettings",),
     "mpc.ocp": ("Objective", "Problem", "Query", "InfeasiblePeriod"),
+    "mpc.pilot": ("Pilot",),
     "mpc.robust.controller": ("RobustPreparation",),
     "mpc.robust.settings": ("RobustSettings",),
     "mpc.solvers": ("QPSolver",),

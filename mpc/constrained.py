@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 from annotated_types import doc
 
-from mpc.bounded import Bounded, FallbackSettings
+from mpc.bounded import Bounded
+from mpc.fallback.contract import FallbackSettings
 from mpc.linear import LinearMPC, NominalPreparation
 from mpc.obstacles import Shape
 from quadsim.controller import Controller
@@ -25,11 +26,11 @@ class Constrained(Bounded):
         doc("absent: the last plan is held, shifted, and then the flight ends"),
     ] = None
 
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.build`."""
-        law = self.in_c(vehicle, period, shapes)
-        if law is None:
-            problem, space = self.problem(vehicle, period), self.space(shapes, vehicle, period, None)
-            preparation, solver = NominalPreparation(problem), self.make_solver(problem, space)
-            law = LinearMPC(preparation, solver, name=self.type, holds=True, space=space, kkt_every=self.kkt_every)
-        return law if self.fallback is None else self.guarded(law, self.fallback, vehicle, period)
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.law`."""
+        compiled = self.in_c(vehicle, period, shapes)
+        if compiled is not None:
+            return compiled
+        problem, space = self.problem(vehicle, period), self.space(shapes, vehicle, period, None)
+        preparation, solver = NominalPreparation(problem), self.make_solver(problem, space)
+        return LinearMPC(preparation, solver, name=self.type, holds=True, space=space, kkt_every=self.kkt_every)

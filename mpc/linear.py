@@ -6,9 +6,9 @@ from typing import Protocol
 
 import numpy as np
 
-from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection, shifted
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, rejection, resized, shifted
 from mpc.equilibrium import Trim
-from mpc.handover import observed, resized, within
+from mpc.observer import disturbance_of
 from mpc.obstacles import ObstacleQP, Space
 from mpc.ocp import InfeasiblePeriod, Problem, Query
 from mpc.paper import rollout
@@ -165,10 +165,10 @@ class LinearMPC:
 
     def adopt(self, previous: object) -> None:
         """Take over what the previous law has learnt, and its plan, to hold if a QP has no answer."""
-        law = within(previous, LinearMPC)
+        law = previous if isinstance(previous, LinearMPC) else None
         if law is not None and law._plan is not None and self._holds:
             self._plan, self._held = resized(law._plan, self.horizon), law._held
-        self.preparation.adopt(None if law is None else law.preparation, observed(previous))
+        self.preparation.adopt(None if law is None else law.preparation, disturbance_of(previous))
 
     @property
     def trim(self) -> Trim | None:

@@ -20,7 +20,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mpc.bounded import by_group
 from mpc.equilibrium import Trim
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
@@ -38,6 +37,7 @@ from quadsim.state import (
     VELOCITY,
     Array,
     all_true,
+    by_group,
     read_only,
 )
 

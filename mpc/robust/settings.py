@@ -11,9 +11,7 @@ import numpy as np
 from annotated_types import Gt, Le, doc
 
 from mpc.bounded import (
-    USUAL_FALLBACK,
     Bounded,
-    FallbackSettings,
     Lag,
     Seconds,
     Soft,
@@ -22,7 +20,9 @@ from mpc.bounded import (
     resolved_lag,
 )
 from mpc.constraints import Penalty
+from mpc.fallback.contract import USUAL_FALLBACK, FallbackSettings
 from mpc.observer import ObserverSettings
+from mpc.pilot import Pilot
 from mpc.robust.tightening import TighteningSettings, margins, position_margins
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
@@ -118,15 +118,15 @@ class Robust(Bounded):
                         'heading = false, or type = "nonlinear"'
                     )
 
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.build`."""
-        law = self.in_c(vehicle, period, shapes) or self._mpc(vehicle, period, shapes)
-        return self.guarded(law, self.fallback, vehicle, period)
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.law`."""
+        return self.in_c(vehicle, period, shapes) or self._mpc(vehicle, period, shapes)
 
-    def safety_filter(self, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Controller]:
+    def safety_filter(self, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Pilot]:
         """Return the safety filter with these constraints, and the same within its fallback contract, to fly.
 
-        Raises:     InputError: no filter can be built from these numbers.
+        Raises:
+            InputError: no filter can be built from these numbers.
         """
         from mpc.robust.filter import SafetyFilter
 
@@ -134,7 +134,7 @@ class Robust(Bounded):
             rule = "absent for a safety filter, which keeps no half-spaces"
             raise ParameterError("controller", "avoidance", "given", rule)
         law = SafetyFilter(self._preparation(vehicle, period))
-        return law, self.guarded(law, self.fallback, vehicle, period)
+        return law, Pilot(law, vehicle, guard=self.guard(vehicle, period))
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
         """See `mpc.bounded.Weighted.problem`."""

@@ -13,7 +13,6 @@ from mpc.bounded import Bounded
 from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
 from mpc.fallback.completion import CompletedInputs
-from mpc.fallback.contract import Guarded
 from mpc.linear import LinearMPC
 from mpc.ocp import Query
 from mpc.solvers import Method
@@ -77,18 +76,16 @@ def record(scenario: Scenario) -> Recording:
     scenario = scenario.replace({"controller.compiled": False})
     if isinstance(scenario.controller, Bounded):
         scenario = scenario.replace({"controller.solver": CORE})
-    law = Assembly(scenario).controller()
-    inner = law.inner if isinstance(law, Guarded) else law
-    assert isinstance(inner, MPC)
-    recorder = Recorder(inner)
-    if isinstance(law, Guarded):
-        law.inner = recorder
-    Rollout(scenario, law if isinstance(law, Guarded) else recorder).fly()
+    pilot = Assembly(scenario).controller()
+    law = pilot.law
+    assert isinstance(law, MPC)
+    pilot.law = recorder = Recorder(law)
+    Rollout(scenario, pilot).fly()
     queries = recorder.queries
     if not queries:
         raise ExportError("its flight has no period in the air, with everything measured, to record")
     states, acting, windows = (np.array(column) for column in zip(*queries, strict=True))
-    status, commands = _answers(inner, scenario.control_period, acting[0], queries)
+    status, commands = _answers(law, scenario.control_period, acting[0], queries)
     known = len(status)
     return Recording(
         speeds=acting[0],

@@ -19,7 +19,6 @@ from support import constrained_mpc, fly_here
 
 import mpc
 import quadsim
-from mpc.fallback.contract import Guarded
 from mpc.nonlinear.controller import CONVERGED
 from mpc.ocp import InfeasiblePeriod
 from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
@@ -260,7 +259,7 @@ def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str)
         query_case(file, case, "controller.fallback={}").controller,
         queried.infeasible_period.problem.model,
     )  # type: ignore[union-attr]
-    assert isinstance(guarded, Guarded)
+    assert guarded.guard is not None
     state, acting = case.state, np.full(4, queried.vehicle.hover_speed)
     guarded.reset(acting)
     for k in range(50):
@@ -332,7 +331,7 @@ class Keeping:
     """A controller of one's own that keeps the problem that it could not solve."""
 
     def __init__(self, vehicle: Vehicle, period: float, horizon: int, largest: float = 2.0) -> None:
-        law = load_scenario("paper-constrained").controller.build(vehicle, period)
+        law = load_scenario("paper-constrained").controller.law(vehicle, period)
         assert isinstance(law, mpc.LinearMPC)
         roll = mpc.Bounds(
             C_c=np.eye(12)[[INDEX["roll"]]],

@@ -9,8 +9,8 @@ import piqp
 import pytest
 from scripted_controller import PERIOD, Scripted, advance, call, failing, following, guard, model, random_state
 
-from mpc.bounded import FallbackSettings
 from mpc.fallback.completion import CompletedInputs
+from mpc.fallback.contract import FallbackSettings
 from mpc.solvers.piqp import STATUS
 from quadsim.controller import ACCEPTED, Phase, StepInputs
 from quadsim.errors import CommandError

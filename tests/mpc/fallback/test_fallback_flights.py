@@ -10,9 +10,9 @@ import pytest
 from scripted_controller import PERIOD, bounds, model, problem
 from support import constrained_mpc, paper_reference
 
-from mpc.bounded import FallbackSettings
-from mpc.fallback.contract import Guarded
+from mpc.fallback.contract import FallbackSettings, Guard
 from mpc.ocp import Query
+from mpc.pilot import Pilot
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers.piqp import STATUS
 from quadsim.controller import ACCEPTED
@@ -71,7 +71,7 @@ def fly_paper(
         reference[:, 2] = height
     controller: Any = constrained_mpc(problem(), FaultySolver(solver or {}))
     if guarded:
-        controller = Guarded(controller, model(), bounds=bounds(), settings=LEVEL)
+        controller = Pilot(controller, vehicle, guard=Guard(model(), bounds=bounds(), settings=LEVEL))
     rng = np.random.default_rng(0)
     with Plant(vehicle, effects=Effects(ground=Ground(contact=contact))) as plant:
         log = fly(
