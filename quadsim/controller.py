@@ -79,6 +79,8 @@ class StepInputs:
             from the state.
         body_rates: (3,) measured body rates [rad/s]; None: derive them from the state.
         motion: the reference from t_k on, if the course defines more than x, y, z, yaw.
+        unseen: (12,) periods since each channel of the state was measured, where the fallback contract has predicted
+            those that are missing; None: all are measured now.
         signals: recorder for `log`; None if nothing is recorded.
 
     Examples:
@@ -99,6 +101,7 @@ class StepInputs:
     attitude: Array | None = None
     body_rates: Array | None = None
     motion: Motion | None = None
+    unseen: Array | None = None
     signals: Signals | None = field(default=None, repr=False, compare=False)
 
     def log(self, name: str, value: float, unit: str = "-") -> None:

@@ -68,6 +68,7 @@ _NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _STEP: Final = (
     "a class or an object with a method step(now, state, reference), or a function law(now, state, reference)"
 )
+_ROWS: Final = ("acting", "attitude", "body_rates", "unseen")  # arrays of StepInputs
 _WHOLE: Final = ("iterations", "active", "fallback")  # parts of a Command
 _REAL: Final = ("slack", *RESIDUALS, "solve_s")
 _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
@@ -209,11 +210,9 @@ class PluginController:
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError if the answer is not a command."""
-        acting, attitude, rates = (
-            None if rows is None else rows.copy() for rows in (now.acting, now.attitude, now.body_rates)
-        )
-        motion = None if now.motion is None else now.motion.read_only()
-        given = replace(now, acting=acting, attitude=attitude, body_rates=rates, motion=motion)
+        rows = {name: getattr(now, name) for name in _ROWS}
+        copied = {name: None if value is None else value.copy() for name, value in rows.items()}
+        given = replace(now, **copied, motion=None if now.motion is None else now.motion.read_only())
         named = state.copy().view(State)
         answer: Any = self.law.step(given, named, reference.copy())
         try:

@@ -12,7 +12,7 @@ unless the plan is too old or the vehicle too far from it;
 
 The law is called in every period with a known state, so it resumes automatically.  It receives the command in force, so
 that its slew bounds refer to the acting command, and the list of predicted channels
-(`mpc.fallback.completion.CompletedInputs`).
+(`StepInputs.unseen`).
 
 A law that estimates disturbances is `mpc.equilibrium.Trimmed`.  Levels 1 to 3, and predictions of missing channels,
 start from its equilibrium; it is held while nothing is measured.
@@ -31,7 +31,7 @@ from annotated_types import Gt, Lt, doc
 
 from mpc.answer import ActuatorBounds, rejection, resized, shifted
 from mpc.equilibrium import Trim, Trimmed
-from mpc.fallback.completion import PLAUSIBLE_REFERENCE, CompletedInputs, StateCompletion, completed_inputs
+from mpc.fallback.completion import PLAUSIBLE_REFERENCE, StateCompletion, completed_inputs
 from mpc.fallback.hover import HoverLaw
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
@@ -193,9 +193,7 @@ class Guard:
         trim = self.trim(law)
         return predict_in_heading_frame(anchored(self._model, trim), states, plans, trim)
 
-    def _call(
-        self, law: Controller, now: CompletedInputs, known: Array, reference: Array
-    ) -> tuple[str, Command | None]:
+    def _call(self, law: Controller, now: StepInputs, known: Array, reference: Array) -> tuple[str, Command | None]:
         """Return the law's status and, if it gave one, its answer; an accepted answer is safe to fly."""
         assert now.acting is not None
         if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:

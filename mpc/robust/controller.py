@@ -22,7 +22,7 @@ import numpy as np
 
 from mpc.constraints import Bounds, Constraint
 from mpc.equilibrium import Trim, equilibrium, twisted
-from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE, CompletedInputs
+from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE
 from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, with_limited_yaw
 from mpc.linear import Preparation
 from mpc.model import LinearModel, continuous_model, discretise, hover_model
@@ -132,9 +132,9 @@ class RobustPreparation:
         """See `mpc.linear.Preparation.prepare`.
 
         Numbers that are not finite, exceed `mpc.fallback.completion.PLAUSIBLE`, or lead to such numbers give None and
-        do not update the observer.  Nor does a state that is predicted in part
-        (`mpc.fallback.completion.CompletedInputs`), the first measured state after more than `LONGEST_SPAN` of such
-        states, or a state after a pause: `now.time` must be one period later than last time.
+        do not update the observer.  Nor does a state that is predicted in part (`StepInputs.unseen`), the first
+        measured state after more than `LONGEST_SPAN` of such states, or a state after a pause: `now.time` must be one
+        period later than last time.
         """
         ahead, before, called_at = self._ahead, self._rotors, self._called_at
         in_force, under_way, rotors, turning = self._advance_rotors(now.time, acting)
@@ -222,7 +222,7 @@ class RobustPreparation:
 
     def _span(self, now: StepInputs) -> float:
         """Time since the last measured state [s]; infinite after a pause, or if the present one is not measured."""
-        if isinstance(now, CompletedInputs) and now.unseen[_MOVING].any():
+        if now.unseen is not None and now.unseen[_MOVING].any():
             return math.inf
         span, self._measured = now.time - self._measured, now.time
         return span - _SAME_TIME

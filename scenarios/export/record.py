@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from mpc.bounded import Bounded
 from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
-from mpc.fallback.completion import CompletedInputs
 from mpc.linear import LinearMPC
 from mpc.ocp import Query
 from mpc.solvers import Method
@@ -57,7 +56,7 @@ class Recorder:
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`."""
-        flying = now.phase is Phase.FLYING and not (isinstance(now, CompletedInputs) and now.unseen.any())
+        flying = now.phase is Phase.FLYING and (now.unseen is None or not now.unseen.any())
         self._ended |= bool(self.queries) and not flying
         if flying and not self._ended:
             acting = self._before if now.acting is None else now.acting

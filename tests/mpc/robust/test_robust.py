@@ -12,7 +12,6 @@ import pytest
 from support import constrained_mpc, derivative, paper_problem, paper_reference, robust_mpc
 
 from mpc.constraints import Penalty
-from mpc.fallback.completion import CompletedInputs
 from mpc.heading import turn_horizontally
 from mpc.linear import LinearMPC
 from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model
@@ -265,14 +264,14 @@ def test_predicted_states_do_not_update_the_observer(vehicle: Vehicle, predicted
     measured, guessed = np.zeros(12), np.zeros(12)
     guessed[INDEX["vx"]] = 1.0
     times = PERIOD * np.arange(predicted + 3)
-    controller.step(CompletedInputs(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    controller.step(StepInputs(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
     for time in times[1 : predicted + 1]:
-        controller.step(CompletedInputs(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
+        controller.step(StepInputs(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
         np.testing.assert_array_equal(preparation_of(controller).disturbance, 0.0)
-    controller.step(CompletedInputs(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
+    controller.step(StepInputs(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
     assert preparation_of(controller).disturbance.any() == learned
     before = preparation_of(controller).disturbance
-    controller.step(CompletedInputs(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    controller.step(StepInputs(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
     assert np.abs(preparation_of(controller).disturbance - before).max() > 0.0
 
 
@@ -281,7 +280,7 @@ def test_a_position_that_is_predicted_hides_no_disturbance(vehicle: Vehicle) -> 
     unseen = np.zeros(12)
     unseen[list(POSITION)] = 7.0
     for k, speed in enumerate((0.0, 0.2)):
-        controller.step(CompletedInputs(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
+        controller.step(StepInputs(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
     assert preparation_of(controller).disturbance[2] > 0.1
 
 
