@@ -1,6 +1,6 @@
 """The controllers: model predictive control in numpy, scipy and PIQP, usable without a simulator.
 
-Public names are imported on first use: `mpc.ConstrainedMPC`, `mpc.paper`, ...  `docs/conventions.md` defines states,
+Public names are imported on first use: `mpc.LinearMPC`, `mpc.paper`, ...  `docs/conventions.md` defines states,
 units, frames and margins.
 """
 
@@ -13,10 +13,11 @@ if TYPE_CHECKING:
     from mpc.baselines.geometric import GeometricController as GeometricController
     from mpc.baselines.lqr import LQR as LQR
     from mpc.baselines.pid import CascadedPID as CascadedPID
-    from mpc.constrained import ConstrainedMPC as ConstrainedMPC
     from mpc.constraints import Bounds as Bounds
     from mpc.constraints import Constraint as Constraint
     from mpc.constraints import Penalty as Penalty
+    from mpc.linear import LinearMPC as LinearMPC
+    from mpc.linear import NominalPreparation as NominalPreparation
     from mpc.model import LinearModel as LinearModel
     from mpc.model import hover_model as hover_model
     from mpc.nonlinear.controller import NonlinearMPC as NonlinearMPC
@@ -25,7 +26,8 @@ if TYPE_CHECKING:
     from mpc.ocp import Objective as Objective
     from mpc.ocp import Problem as Problem
     from mpc.ocp import Query as Query
-    from mpc.robust.controller import RobustMPC as RobustMPC
+    from mpc.pilot import Pilot as Pilot
+    from mpc.robust.controller import RobustPreparation as RobustPreparation
     from mpc.robust.settings import RobustSettings as RobustSettings
     from mpc.solvers import QPSolver as QPSolver
     from mpc.unconstrained import UnconstrainedMPC as UnconstrainedMPC
@@ -34,13 +36,14 @@ _MODULES = {
     "mpc.baselines.geometric": ("GeometricController",),
     "mpc.baselines.lqr": ("LQR",),
     "mpc.baselines.pid": ("CascadedPID",),
-    "mpc.constrained": ("ConstrainedMPC",),
     "mpc.constraints": ("Bounds", "Constraint", "Penalty"),
+    "mpc.linear": ("LinearMPC", "NominalPreparation"),
     "mpc.model": ("LinearModel", "hover_model"),
     "mpc.nonlinear.controller": ("NonlinearMPC",),
     "mpc.nonlinear.settings": ("NonlinearSettings",),
     "mpc.ocp": ("Objective", "Problem", "Query", "InfeasiblePeriod"),
-    "mpc.robust.controller": ("RobustMPC",),
+    "mpc.pilot": ("Pilot",),
+    "mpc.robust.controller": ("RobustPreparation",),
     "mpc.robust.settings": ("RobustSettings",),
     "mpc.solvers": ("QPSolver",),
     "mpc.unconstrained": ("UnconstrainedMPC",),

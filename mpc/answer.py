@@ -219,6 +219,11 @@ def refused(acting: Array, horizon: int, status: str, answer: Answer | None = No
     return command_of(plan[0], plan, status, answer)
 
 
+def resized(rows: Array, count: int) -> Array:
+    """Return a plan (N, ...) cut to `count` steps, or extended by its last row."""
+    return rows[np.minimum(np.arange(count), len(rows) - 1)]
+
+
 def shifted(plan: Array, steps: int) -> Array:
     """Return a plan (N, nu) without its first `steps` rows, its last row repeated."""
     return np.concatenate([plan[steps:], np.repeat(plan[-1:], steps, axis=0)])

@@ -9,16 +9,21 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
-from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
+from annotated_types import Ge, Le, Len, MaxLen, doc
 
 from mpc.allocation import thrust_to_command
+from mpc.answer import ActuatorBounds
 from mpc.constraints import Bounds, Constraint, Penalty
-from mpc.model import SHORTEST_LAG
+from mpc.fallback.contract import FallbackSettings, Guard
+from mpc.indi import INDISettings, TorqueIncrement
+from mpc.model import SHORTEST_LAG, hover_model
 from mpc.obstacles import AvoidanceSettings, Shape, Space
 from mpc.ocp import Objective, Problem, lqr_terminal_weight
+from mpc.pilot import Pilot
 from mpc.qp import KKT_EVERY
 from mpc.solvers import ALIASES, CORE_OR_PIQP, SOLVERS, Solver, find_solver, make_solver
 from quadsim.controller import CORE, ROTORS, Controller
@@ -26,23 +31,17 @@ from quadsim.errors import ExportError, MissingCoreError, ParameterError, Unknow
 from quadsim.fields import NonNegative, Number, Pair, Positive, Weight
 from quadsim.input_limits import MOST_ENTRIES
 from quadsim.state import (
-    EULER,
-    EULER_RATE,
     INDEX,
     N_STATES,
     POSITION,
     STATE_NAMES,
     STATE_UNITS,
-    VELOCITY,
     Array,
-    read_only,
 )
 from quadsim.vehicle import N_ROTORS, Vehicle
 
 if TYPE_CHECKING:
-    from mpc.answer import ActuatorBounds
     from mpc.core.numbers import Exportable
-    from mpc.model import LinearModel
 
 IN_DEGREES: Final = frozenset(
     name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad")
@@ -51,16 +50,8 @@ IN_DEGREES: Final = frozenset(
 TERMS: Final = (*STATE_NAMES, *(f"speed_{i + 1}" for i in range(N_ROTORS)))
 """The quantities that the rows of a polytope may combine."""
 LARGEST_HORIZON: Final = 1000
-USUAL_TILT: Final = 10.0
-"""Default limit of the fallback's tilt [deg], for a controller without a bound on tilt."""
 LEAST_THRUST, MOST_THRUST = 0.5, 0.9
 """Default bounds on a target of collective thrust: shares of the weight, and of the largest; see `TargetBounds`."""
-_FALLBACK_SHARE: Final = 0.8
-"""Fallback tilt as a share of the tightest bound on it, so that the controller resumes within its bounds."""
-_SMALLEST_TILT: Final = (
-    0.5  # smallest fallback tilt [deg], whatever the bounds; below it the fallback has no lateral authority
-)
-
 Range = tuple[float, float]
 Horizon = Annotated[int, Ge(1), Le(LARGEST_HORIZON)]
 KktEvery = Annotated[
@@ -77,22 +68,44 @@ Law = Annotated[str, doc("the control law, by its name in `quadsim list`")]
 
 
 class ControllerTable:
-    """A table `[controller]`, which builds the controller it describes."""
+    """A table `[controller]`, which builds the controller it describes; tables without these fields have none."""
 
     any_attitude: ClassVar = False  # whether the controller reads attitudes as quaternions
+    type: str
     polytopes: tuple[Polytope, ...] = ()
+    commands: str = ROTORS
+    inner_lag: tuple[float, ...] | None = None
+    indi: INDISettings | None = None
+    fallback: FallbackSettings | None = None
+    iterations: int = 1
+    output_bounds: Mapping[str, Sequence[float]] = MappingProxyType({})
 
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """Return its hard and soft bounds on audited signals, in file units."""
         return {}
 
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Pilot:
         """Return the controller for a control `period` [s], with obstacles and regions `shapes`.
+
+        Where it commands targets, it flies once it has an autopilot.
 
         Raises:
             InputError: no controller can be built from these numbers.
         """
+        law = self.law(vehicle, period, shapes)
+        return Pilot(law, vehicle, guard=self.guard(vehicle, period), inner=self.inner_loop(vehicle))
+
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """Return its law; see `build`."""
         raise NotImplementedError
+
+    def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
+        """Return the fallback contract around the law; None without one."""
+        return None
+
+    def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
+        """Return the inner loop that corrects the rotor speeds it commands; None without one."""
+        return None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,8 +139,6 @@ class RotorBounds:
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """Return the same bounds for the actuators."""
-        from mpc.answer import ActuatorBounds
-
         return ActuatorBounds.alike(**self.audited(vehicle))
 
 
@@ -163,8 +174,6 @@ class TargetBounds:
 
     def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """Return the same bounds on targets (4,) [N], [rad/s], with unbounded steps."""
-        from mpc.answer import ActuatorBounds
-
         thrust, *rates = self.audited(vehicle).values()
         lower, upper = np.array([thrust, *np.radians(rates)]).T
         steps = np.full(N_ROTORS, math.inf)
@@ -338,65 +347,6 @@ class Avoidance(AvoidanceSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FallbackSettings:
-    """The fallback contract: the shifted plan with an LQR correction, then level hover, then descent.
-
-    A plan lasts at most its horizon; its own tilt adds to `tilt`.
-    """
-
-    enabled: Annotated[bool, doc("false: the controller handles missing answers itself")] = True
-    unseen: Annotated[Positive, doc("[s] longest time that predictions may replace a missing measurement")] = 1.5
-    plan_age: Annotated[Positive, doc("[s] longest time that one shifted plan is flown")] = 1.0
-    position: Annotated[Positive, doc("[m] largest distance from the plan")] = 0.5
-    velocity: Annotated[Positive, doc("[m/s] largest velocity deviation from the plan")] = 1.0
-    angle: Annotated[Positive, doc("[deg] largest deviation of roll, pitch and yaw from the plan")] = 11.5
-    rate: Annotated[Positive, doc("[deg/s] largest deviation of their rates from the plan")] = 57.3
-    hover: Annotated[Positive, doc("[s] longest time in level hover, before the descent")] = 5.0
-    sink: Annotated[Positive, doc("[m/s] speed of the descent")] = 0.5
-    tilt: Annotated[
-        Annotated[float, Gt(0.0), Lt(90.0)] | None,
-        doc(
-            "[deg] largest tilt commanded; absent: 0.8 of the tightest bound on roll or pitch, so that the controller "
-            f"takes over again within its bounds, or {USUAL_TILT:g} where there is none"
-        ),
-    ] = None
-    settled: Annotated[Positive, doc("[m/s] above this horizontal speed it brakes without going back to a place")] = 0.3
-
-    @property
-    def distance(self) -> Array:
-        """Return (12,) the largest deviations from a plan's states [m], [m/s], [rad], [rad/s]."""
-        return by_group(self.position, self.velocity, math.radians(self.angle), math.radians(self.rate))
-
-    def around(
-        self,
-        law: Controller,
-        bounds: ActuatorBounds,
-        vehicle: Vehicle,
-        period: float,
-        output_bounds: Mapping[str, Sequence[float]] | None = None,
-        model: LinearModel | None = None,
-    ) -> Controller:
-        """Return the law inside the fallback contract, with the tilt of `output_bounds`; the law itself if disabled.
-
-        `model` is the hover model whose inputs are the law's commands; None for that of rotor speeds.
-        """
-        from mpc.fallback.contract import Guarded
-        from mpc.model import hover_model
-
-        if not self.enabled:
-            return law
-        settings = self
-        if output_bounds is not None and self.tilt is None:
-            pairs = (output_bounds[name] for name in ("roll", "pitch") if name in output_bounds)
-            tightest = min((_FALLBACK_SHARE * min(-lower, upper) for lower, upper in pairs), default=USUAL_TILT)
-            settings = replace(self, tilt=min(max(tightest, _SMALLEST_TILT), USUAL_TILT))
-        return Guarded(law, hover_model(vehicle, period) if model is None else model, bounds=bounds, settings=settings)
-
-
-USUAL_FALLBACK: Final = FallbackSettings()
-
-
-@dataclass(frozen=True, kw_only=True)
 class Weighted(ControllerTable):
     """An MPC with constant matrices, which minimises a weighted sum over a horizon."""
 
@@ -423,8 +373,6 @@ class Weighted(ControllerTable):
         Raises:
             InputError: no problem can be built from these numbers.
         """
-        from mpc.model import hover_model
-
         model, objective = hover_model(vehicle, period), objective_of(self.output_weights, self.input_weights)
         if self.terminal == "lqr":
             objective = replace(objective, P=lqr_terminal_weight(model, objective))
@@ -531,9 +479,12 @@ class Bounded(Weighted):
             raise ParameterError("controller", "solver", CORE, rule)
         return make_solver("piqp" if space is not None and self.solver == CORE_OR_PIQP else self.solver, problem)
 
-    def guarded(self, law: Controller, fallback: FallbackSettings, vehicle: Vehicle, period: float) -> Controller:
-        """Return the law inside the fallback contract."""
-        return fallback.around(law, self.input_bounds.actuators(vehicle), vehicle, period, self.output_bounds)
+    def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
+        """See `ControllerTable.guard`."""
+        if self.fallback is None:
+            return None
+        bounds = self.input_bounds.actuators(vehicle)
+        return self.fallback.guard(hover_model(vehicle, period), bounds, self.output_bounds)
 
 
 def rows_of(polytopes: Sequence[Polytope]) -> tuple[Constraint, ...]:
@@ -559,14 +510,6 @@ def objective_of(output_weights: Mapping[str, float], input_weights: InputWeight
 def selection(names: Sequence[str]) -> Array:
     """Return the rows of the identity that select states by name."""
     return np.eye(N_STATES)[[INDEX[name] for name in names]]
-
-
-def by_group(position: float, velocity: float, angle: float, rate: float) -> Array:
-    """Return (12,) one value each for positions, velocities, Euler angles and their rates."""
-    channels = np.empty(N_STATES)
-    for group, value in ((POSITION, position), (VELOCITY, velocity), (EULER, angle), (EULER_RATE, rate)):
-        channels[list(group)] = value
-    return read_only(channels)
 
 
 def resolved_lag(lag: float | str, vehicle: Vehicle) -> float:

@@ -19,15 +19,13 @@ vehicle that matches its model flies the law's speeds unchanged.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 from annotated_types import doc
 
 from mpc.allocation import allocate, make_allocation
-from mpc.handover import hand_over, within
-from quadsim.controller import GROUNDED, Command, Controller, StepInputs
 from quadsim.fields import Positive
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -99,40 +97,3 @@ class TorqueIncrement:
             1.0 + 2.0 * DAMPING * omega * step + (omega * step) ** 2
         )
         self._filtered, self._slope = self._filtered + step * slope, slope
-
-
-class Incremental:
-    """A controller whose commands pass through the inner loop."""
-
-    def __init__(self, inner: Controller, vehicle: Vehicle, settings: INDISettings, bounds: ActuatorBounds) -> None:
-        self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
-        self._loop = TorqueIncrement(vehicle, settings, bounds)
-
-    def reset(self, speeds: Array) -> None:
-        """Restart after the command u(-1) (4,) [rad/s]."""
-        self.inner.reset(speeds)
-        self._loop.reset()
-
-    def adopt(self, previous: object) -> None:
-        """Take over the state of the previous law, and of its filter."""
-        hand_over(self.inner, previous)
-        law = within(previous, Incremental)
-        if law is not None:
-            self._loop.adopt(law._loop)
-
-    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
-        """Return the law's command with its inner loop, which is off on the ground."""
-        command = self.inner.step(now, state, reference)
-        if now.phase in GROUNDED:
-            self._loop.reset()
-            return command
-        return replace(command, inner=self._loop)
-
-    @property
-    def infeasible_period(self) -> object:
-        """The law's first period since `reset` whose QP had no answer; None if the law has none."""
-        return getattr(self.inner, "infeasible_period", None)
-
-    def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`."""
-        return self.inner.predict(states, plans)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Final, Protocol, runtime_checkable
 
 import numpy as np
 import scipy.linalg
@@ -49,6 +49,21 @@ class ObserverSettings:
     torque_walk: Annotated[Positive, doc("[rad/s^2] change of the torque's angular acceleration per period")] = 0.2
     largest_force: Annotated[Positive, doc("[m/s^2] larger estimates are clipped")] = 5.0
     largest_torque: Annotated[Positive, doc("[rad/s^2] larger estimates are clipped")] = 30.0
+
+
+@runtime_checkable
+class Observing(Protocol):
+    """A law that estimates the disturbance."""
+
+    @property
+    def disturbance(self) -> Array | None:
+        """(6,) accelerations [m/s^2] and angular accelerations [rad/s^2]; None where it estimates none."""
+        ...
+
+
+def disturbance_of(law: object) -> Array | None:
+    """Return (6,) the disturbance that a law estimates; None if it estimates none."""
+    return law.disturbance if isinstance(law, Observing) else None
 
 
 def observer_gain(period: float, *, noise: float, walk: float, change: float) -> tuple[float, float]:

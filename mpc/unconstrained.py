@@ -85,8 +85,8 @@ class Unconstrained(Weighted):
 
     type: Annotated[Literal["unconstrained"], doc("the control law, by its name in `quadsim list`")] = "unconstrained"
 
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.build`."""
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.law`."""
         try:
             return self.in_c(vehicle, period) or UnconstrainedMPC(self.problem(vehicle, period))
         except np.linalg.LinAlgError as error:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -79,6 +79,8 @@ class StepInputs:
             from the state.
         body_rates: (3,) measured body rates [rad/s]; None: derive them from the state.
         motion: the reference from t_k on, if the course defines more than x, y, z, yaw.
+        unseen: (12,) periods since each channel of the state was measured, where the fallback contract has predicted
+            those that are missing; None: all are measured now.
         signals: recorder for `log`; None if nothing is recorded.
 
     Examples:
@@ -99,6 +101,7 @@ class StepInputs:
     attitude: Array | None = None
     body_rates: Array | None = None
     motion: Motion | None = None
+    unseen: Array | None = None
     signals: Signals | None = field(default=None, repr=False, compare=False)
 
     def log(self, name: str, value: float, unit: str = "-") -> None:
@@ -119,8 +122,7 @@ class StepInputs:
 class InnerLoop(Protocol):
     """A faster loop inside the control period, from the command in force to the rotor speeds applied.
 
-    One with an attribute `takes_targets` that is true is an autopilot: commands are targets, not rotor speeds; see
-    `quadsim.sim.autopilot`.
+    An autopilot `takes_targets` instead (`AutopilotLoop`).
     """
 
     @property
@@ -141,11 +143,35 @@ class InnerLoop(Protocol):
         ...
 
 
-class AutopilotLoop(InnerLoop, Protocol):
+@runtime_checkable
+class TargetLoop(Protocol):
+    """What an inner loop may say: that its commands are targets, not rotor speeds; see `quadsim.sim.autopilot`."""
+
+    @property
+    def takes_targets(self) -> bool:
+        """Whether they are."""
+        ...
+
+
+def takes_targets(inner: object) -> bool:
+    """Return whether an inner loop takes targets; one that does not say so takes rotor speeds."""
+    return isinstance(inner, TargetLoop) and inner.takes_targets
+
+
+class AutopilotLoop(InnerLoop, TargetLoop, Protocol):
     """An autopilot: an inner loop that takes targets; built in, or a firmware's."""
 
     def reset(self) -> None:
         """Start anew, as before a flight."""
+        ...
+
+
+@runtime_checkable
+class Settling(Protocol):
+    """An autopilot that can start on a vehicle that turns."""
+
+    def settle(self, rates: Array, rotors: Array) -> None:
+        """Start at body rates (3,) and rotor speeds (4,) [rad/s], after `reset`."""
         ...
 
 
@@ -222,32 +248,38 @@ def stopped(speeds: Array, horizon: int, phase: Phase) -> Command:
     return Command(speeds=speeds, plan=np.tile(speeds, (horizon, 1)), status=str(phase), answered_by=STOPPED)
 
 
-class Controller(Protocol):
-    """A feedback law run once per control period.
-
-    A controller that takes over in flight may have a method `adopt(previous)`, called after `reset`, which can copy
-    estimates and the plan from the previous controller.  One with an autopilot may have a method `begin(rates)`, called
-    after `reset` with the body rates (3,) [rad/s] of that moment.
-    """
+@runtime_checkable
+class Named(Protocol):
+    """A law with a name."""
 
     @property
     def name(self) -> str:
         """Short name of the law."""
         ...
 
+
+@runtime_checkable
+class Solving(Protocol):
+    """A law that names its solver."""
+
     @property
     def solver(self) -> str:
         """Name of the QP solver; empty for a closed form."""
         ...
 
-    @property
-    def horizon(self) -> int:
-        """N, number of preview samples passed to `step`."""
-        ...
+
+@runtime_checkable
+class Resetting(Protocol):
+    """A law with a state."""
 
     def reset(self, speeds: Array) -> None:
         """Restart: the next step is the first, after `speeds` u(-1) (4,) [rad/s]."""
         ...
+
+
+@runtime_checkable
+class Stepping(Protocol):
+    """What a user's law is at least."""
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the command for the period that starts now, from the measured state xi(k) (12,).
@@ -260,11 +292,67 @@ class Controller(Protocol):
         """
         ...
 
-    def predict(self, states: Array, plans: Array) -> Array:
-        """Return the predicted states (K, N, 12) from K measured states (K, 12) and plans (K, N, 4).
 
-        Only for pictures.  Optional: without it the run has no `horizon.parquet`.
+class Controller(Named, Solving, Resetting, Stepping, Protocol):
+    """A feedback law run once per control period.
+
+    These are the parts that every controller has.  Those that it may have are the protocols below: a controller has
+    one by having its member.  A user's law need only be `Stepping`; `scenarios.plugin` makes it a controller.
+    """
+
+    @property
+    def horizon(self) -> int:
+        """N, number of preview samples passed to `step`."""
+        ...
+
+
+@runtime_checkable
+class Predicting(Protocol):
+    """A controller with a model; without one, the run has no `horizon.parquet`."""
+
+    def predict(self, states: Array, plans: Array) -> Array | None:
+        """Return the predicted states (K, N, 12) from K measured states (K, 12) and plans (K, N, 4), for pictures.
+
+        None where there is no model after all, as where a law without one is wrapped.
         """
+        ...
+
+
+@runtime_checkable
+class Adopting(Protocol):
+    """A controller that can take over in flight."""
+
+    def adopt(self, previous: object) -> None:
+        """Copy estimates, plan and the like from the law in command before; called after `reset`."""
+        ...
+
+
+@runtime_checkable
+class Beginning(Protocol):
+    """A controller that wants to know how the vehicle turns when it begins."""
+
+    def begin(self, rates: Array) -> None:
+        """Begin at body rates (3,) [rad/s]; called after `reset`."""
+        ...
+
+
+@runtime_checkable
+class Diagnosable(Protocol):
+    """A controller that keeps its first problem without an answer."""
+
+    @property
+    def infeasible_period(self) -> object:
+        """An `mpc.InfeasiblePeriod`, of the first such period since `reset`; None if there is none."""
+        ...
+
+
+@runtime_checkable
+class Commanding(Protocol):
+    """A controller that says what it commands; one that does not commands rotor speeds."""
+
+    @property
+    def commands(self) -> str:
+        """One of `TARGET_SIZES`."""
         ...
 
 

@@ -191,6 +191,14 @@ def make_state(
     return state
 
 
+def by_group(position: float, velocity: float, angle: float, rate: float) -> Array:
+    """Return (12,) one value each for positions, velocities, Euler angles and their rates."""
+    channels = np.empty(N_STATES)
+    for group, value in ((POSITION, position), (VELOCITY, velocity), (EULER, angle), (EULER_RATE, rate)):
+        channels[list(group)] = value
+    return read_only(channels)
+
+
 def all_true(flags: NDArray[np.bool_]) -> bool:
     """Return `flags.all()`; for few flags in a third of the time."""
     return np.count_nonzero(flags) == flags.size

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 
 from mpc.baselines.geometric import Geometric
-from mpc.bounded import Bounded, FallbackSettings, Weighted
+from mpc.bounded import Bounded, Weighted
 from mpc.flatness import motion_along
 from mpc.nonlinear.settings import Nonlinear
-from mpc.piloted import Piloted
+from mpc.pilot import Pilot
 from mpc.solvers import CORE_OR_PIQP
 from quadsim.assets import vehicle_path
 from quadsim.border import user_code
@@ -71,7 +71,7 @@ from scenarios.schema.writing import plain
 
 if TYPE_CHECKING:
     from mpc.ocp import Problem
-    from quadsim.controller import AutopilotLoop, Controller
+    from quadsim.controller import AutopilotLoop
     from quadsim.flight.audit import Limit
     from quadsim.motion import Motion
     from scenarios.schema.controllers import AnyController
@@ -322,29 +322,25 @@ class Assembly:
 
     # --- controller --------------------------------------------------------------------------------------------------
 
-    def controller(self, spec: AnyController | None = None) -> Controller:
+    def controller(self, spec: AnyController | None = None) -> Pilot:
         """Return the controller, or the one of another table, ready to fly.
 
         Raises:
             InputError: it cannot be built from these numbers, or its code cannot be found or called.
         """
         spec = self.scenario.controller if spec is None else spec
-        commands, shapes = None, (*self.scenario.obstacles, *self.regions)
-        if isinstance(spec, Nonlinear | Geometric):
-            commands = spec.commands
-            if commands != ROTORS and spec.inner_lag is None:
-                spec = replace(spec, inner_lag=self.inner_lag)
-        return self.piloted(spec.build(self.vehicle, self.scenario.control_period, shapes), commands)
+        if isinstance(spec, Nonlinear | Geometric) and spec.commands != ROTORS and spec.inner_lag is None:
+            spec = replace(spec, inner_lag=self.inner_lag)
+        shapes = (*self.scenario.obstacles, *self.regions)
+        return self.with_autopilot(spec.build(self.vehicle, self.scenario.control_period, shapes))
 
-    def piloted(self, law: Controller, commands: str | None = None) -> Controller:
-        """Return a law with the autopilot that flies its commands, unless these are rotor speeds.
-
-        `commands` is the law's attribute of that name by default.
-        """
-        if (getattr(law, "commands", ROTORS) if commands is None else commands) == ROTORS:
-            return law
+    def with_autopilot(self, pilot: Pilot) -> Pilot:
+        """Return a pilot with the autopilot that flies its law's commands; itself where these are rotor speeds."""
+        if pilot.commands == ROTORS:
+            return pilot
         with self._calling_autopilot():
-            return Piloted(law, self.user_autopilot or Autopilot(self.vehicle, self.autopilot), self.vehicle)
+            autopilot = self.user_autopilot or Autopilot(self.vehicle, self.autopilot)
+            return Pilot(pilot.law, self.vehicle, guard=pilot.guard, inner=autopilot)
 
     @cached_property
     def inner_lag(self) -> tuple[float, ...]:
@@ -363,7 +359,7 @@ class Assembly:
     def autopilot_flown(self) -> dict[str, Any]:
         """What flew the targets: the class of an autopilot passed in, or `built-in`, and the lags that the law knew."""
         name = "built-in" if self.user_autopilot is None else type(self.user_autopilot).__name__
-        lag = getattr(self.scenario.controller, "inner_lag", None) or vars(self).get("inner_lag")
+        lag = self.scenario.controller.inner_lag or vars(self).get("inner_lag")
         return {"name": name, **({} if lag is None else {"inner_lag": [*lag]})}
 
     def problem(self) -> Problem:
@@ -397,8 +393,8 @@ class Assembly:
         settings = self.scenario.computation
         if settings is None and not stalls:
             return None
-        fallback = getattr(self.scenario.controller if spec is None else spec, "fallback", None)
-        guarded = isinstance(fallback, FallbackSettings) and fallback.enabled  # within the fallback contract
+        fallback = (self.scenario.controller if spec is None else spec).fallback
+        guarded = fallback is not None and fallback.enabled  # within the fallback contract
         return Computation(**vars(filled(settings or ComputationTime(), plan=guarded)), stalls=stalls)
 
     # --- plant -------------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, get_args
 
 from mpc.ocp import InfeasiblePeriod
-from quadsim.controller import Controller
+from quadsim.controller import Controller, Diagnosable
 from quadsim.errors import InputError, ParameterError, printable
 from quadsim.sim.computation import Stall
 from quadsim.sim.effects import LOADING, Push
@@ -245,7 +245,7 @@ class FlightEvents:
 
 def infeasible_period_of(controller: Controller) -> InfeasiblePeriod | None:
     """Return the first period whose QP had no answer; None if there is none."""
-    period = getattr(controller, "infeasible_period", None)  # not every controller has it
+    period = controller.infeasible_period if isinstance(controller, Diagnosable) else None
     return period if isinstance(period, InfeasiblePeriod) else None
 
 

@@ -19,7 +19,6 @@ import numpy as np
 from mpc.bounded import IN_DEGREES, Bounded, Polytope
 from mpc.constrained import Constrained
 from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
-from mpc.fallback.contract import Guarded
 from mpc.model import SHORTEST_LAG
 from mpc.ocp import InfeasiblePeriod
 from mpc.robust.settings import Robust
@@ -77,9 +76,7 @@ def diagnose(infeasible_period: InfeasiblePeriod, scenario: Scenario, vehicle: V
     how much a single one would have to be wider.
     """
     if infeasible_period.converges is not None:
-        return _unconverged(
-            infeasible_period, infeasible_period.converges, getattr(scenario.controller, "iterations", 1)
-        )
+        return _unconverged(infeasible_period, infeasible_period.converges, scenario.controller.iterations)
     spec = scenario.controller
     case = (_Case if isinstance(spec, Bounded) else _OwnCase)(infeasible_period, scenario, spec, vehicle)
     conflict = find_conflict(infeasible_period)
@@ -371,18 +368,21 @@ class _Case:
 
     def _fallback(self) -> Iterator[dict[str, Any]]:
         """Yield the fallback, if there is none yet, with the time in level hover until the problem has an answer."""
-        fallback = getattr(self._spec, "fallback", None)
+        fallback = self._spec.fallback
         if fallback is not None and fallback.enabled:
             return
         settings: Settings = {"controller.fallback": {}}
         changed, query = self._changed(settings), self._infeasible_period.query
         assert changed is not None
-        law = changed.build(self._vehicle, self._period)
-        assert isinstance(law, Guarded)
+        pilot = changed.build(self._vehicle, self._period)
+        guard = pilot.guard
+        assert guard is not None
         target = np.zeros(N_STATES)
         target[[*REFERENCE_STATES]] = query.state[[*REFERENCE_STATES]]
         bounds = changed.input_bounds.actuators(self._vehicle)
-        plan = law.law.plan(query.state[:N_STATES], target, query.u_before, bounds, changed.horizon, law.trim)
+        plan = guard.hover.plan(
+            query.state[:N_STATES], target, query.u_before, bounds, changed.horizon, guard.trim(pilot.law)
+        )
         periods = recovery(self._infeasible_period, plan)
         if periods is not None:
             yield {"settings": settings, "after": round(periods * self._period, 9)}

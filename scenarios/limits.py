@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from mpc.bounded import Range
-from mpc.handover import within
+from mpc.pilot import Pilot
 from quadsim.controller import Controller
 from quadsim.flight.audit import SUM, UNAUDITED_ADVICE, Limit, SpaceLimit
 from quadsim.report.table import format_number
@@ -44,8 +44,8 @@ def with_bounds_stated(assembly: Assembly) -> Scenario:
 
 def with_law_bounds(assembly: Assembly, controller: Controller) -> Assembly:
     """Return the assembly with the bounds of a user's controller as constraints of its scenario; see `law_limits`."""
-    adapted = within(controller, PluginController)
-    if adapted is None:
+    adapted = controller.law if isinstance(controller, Pilot) else controller
+    if not isinstance(adapted, PluginController):
         return assembly
     scenario, named = assembly.scenario, _named(assembly.scenario)
     limits = [

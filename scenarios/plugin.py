@@ -26,11 +26,25 @@ import numpy as np
 from annotated_types import doc
 
 from mpc.bounded import ControllerTable, Horizon
-from mpc.handover import hand_over, within
 from mpc.obstacles import Shape
 from quadsim import border
 from quadsim.border import numbers_of, user_code
-from quadsim.controller import ROTORS, SQP, TARGET_SIZES, Command, Controller, StepInputs
+from quadsim.controller import (
+    ROTORS,
+    SQP,
+    TARGET_SIZES,
+    Adopting,
+    Command,
+    Commanding,
+    Controller,
+    Diagnosable,
+    Named,
+    Predicting,
+    Resetting,
+    Solving,
+    StepInputs,
+    Stepping,
+)
 from quadsim.errors import (
     OUR_FOLDERS,
     CommandError,
@@ -54,6 +68,7 @@ _NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _STEP: Final = (
     "a class or an object with a method step(now, state, reference), or a function law(now, state, reference)"
 )
+_ROWS: Final = ("acting", "attitude", "body_rates", "unseen")  # arrays of StepInputs
 _WHOLE: Final = ("iterations", "active", "fallback")  # parts of a Command
 _REAL: Final = ("slack", *RESIDUALS, "solve_s")
 _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
@@ -88,8 +103,8 @@ class Plugin(ControllerTable, _Code):
     def __post_init__(self) -> None:
         _check_code(self.type, self.settings, ("vehicle", "period", "horizon"))
 
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.build`."""
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.law`."""
         return make_law(import_plugin(self), self, vehicle, period)
 
 
@@ -154,45 +169,50 @@ class PluginController:
     def __init__(self, law: Any, horizon: int) -> None:
         self.law, self.horizon, kind = law, horizon, type(law).__name__
         with user_code(lambda error: InputError(f"controller: {kind} cannot be used: {reason_of(error)}")):
-            self.name = printable(str(getattr(law, "name", kind)))[:200]
-            self.solver = printable(str(getattr(law, "solver", "")))[:200]
-            self.commands, predicts = getattr(law, "commands", ROTORS), hasattr(law, "predict")
+            self.name = printable(str(law.name if isinstance(law, Named) else kind))[:200]
+            self.solver = printable(str(law.solver if isinstance(law, Solving) else ""))[:200]
+            self.commands = law.commands if isinstance(law, Commanding) else ROTORS
+            self._predicting = law if isinstance(law, Predicting) else None
         if not isinstance(self.commands, str) or self.commands not in TARGET_SIZES:
             raise ParameterError("controller", f"{self.name}.commands", self.commands, f"one of {[*TARGET_SIZES]}")
-        self._size = TARGET_SIZES[self.commands]
-        if predicts:
-            self.predict = lambda states, plans: _numbers(
-                law.predict(states.copy(), plans.copy()), (*plans.shape[:2], states.shape[1]), f"{self.name}.predict"
-            )
+        self._size, self._warned = TARGET_SIZES[self.commands], False
 
     @property
     def infeasible_period(self) -> object:
         """The first problem without an answer, an `mpc.InfeasiblePeriod`, if the law keeps one."""
         try:
             with user_code(lambda error: InputError(reason_of(error))):
-                return getattr(self.law, "infeasible_period", None)
+                return self.law.infeasible_period if isinstance(self.law, Diagnosable) else None
         except InputError as error:  # the flight is complete and must not be lost
-            _log.warning("no diagnosis: infeasible_period raised %s", error)
+            if not self._warned:
+                _log.warning("no diagnosis: infeasible_period raised %s", error)
+            self._warned = True
             return None
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`; raises InputError if the law's raises."""
         what = f"controller: {self.name}.reset cannot be called"
         with user_code(lambda error: InputError(f"{what}: {reason_of(error)}")):
-            getattr(self.law, "reset", np.copy)(speeds.copy())
+            if isinstance(self.law, Resetting):
+                self.law.reset(speeds.copy())
 
     def adopt(self, previous: object) -> None:
-        """See `quadsim.controller.Controller`."""
-        law = within(previous, PluginController)  # perhaps with an autopilot
-        hand_over(self.law, previous if law is None else law.law)
+        """See `quadsim.controller.Adopting`; from another user's law to the law itself."""
+        if isinstance(self.law, Adopting):
+            self.law.adopt(previous.law if isinstance(previous, PluginController) else previous)
+
+    def predict(self, states: Array, plans: Array) -> Array | None:
+        """See `quadsim.controller.Predicting`; raises InputError if the law's answer has another shape."""
+        if self._predicting is None:
+            return None
+        predicted = self._predicting.predict(states.copy(), plans.copy())
+        return _numbers(predicted, (*plans.shape[:2], states.shape[1]), f"{self.name}.predict")
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError if the answer is not a command."""
-        acting, attitude, rates = (
-            None if rows is None else rows.copy() for rows in (now.acting, now.attitude, now.body_rates)
-        )
-        motion = None if now.motion is None else now.motion.read_only()
-        given = replace(now, acting=acting, attitude=attitude, body_rates=rates, motion=motion)
+        rows = {name: getattr(now, name) for name in _ROWS}
+        copied = {name: None if value is None else value.copy() for name, value in rows.items()}
+        given = replace(now, **copied, motion=None if now.motion is None else now.motion.read_only())
         named = state.copy().view(State)
         answer: Any = self.law.step(given, named, reference.copy())
         try:
@@ -240,8 +260,8 @@ def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginC
                 raise InputError(f"controller must be {_STEP}; got {given}: {error}") from error
             law = SimpleNamespace(step=functools.partial(code, **spec.settings), name=code.__name__)
     with user_code(lambda error: InputError(f"{_table(spec)}: {spec.type} cannot be used: {reason_of(error)}")):
-        step = getattr(law, "step", None)
-    if not callable(step):
+        steps = isinstance(law, Stepping) and callable(law.step)
+    if not steps:
         raise ParameterError("controller", "type", f"{spec.type} ({law!r:.100})", _STEP)
     return PluginController(law, spec.horizon)
 
@@ -347,7 +367,8 @@ def refer_to(law: object, horizon: int = 1) -> Plugin:
     if file is not None and not file.startswith(_INSTALLED):
         folder = str(Path(file).resolve().parents[code.__module__.count(".") + file.endswith("__init__.py")])
     place = f"{code.__module__}:{code.__qualname__.replace('<locals>.', '').replace('<lambda>', 'law')}"
-    return Plugin(type=place, horizon=horizon, folder=folder, settings=getattr(law, "keywords", {}))
+    settings = law.keywords if isinstance(law, functools.partial) else {}
+    return Plugin(type=place, horizon=horizon, folder=folder, settings=settings)
 
 
 def require_importable(law: object, what: str = "controller") -> None:
@@ -364,7 +385,7 @@ def require_importable(law: object, what: str = "controller") -> None:
 def _code_of(law: Any) -> Any:
     """Return the class or function of a law, directly or in a partial; the class of an object."""
     code = law.func if isinstance(law, functools.partial) else law
-    if getattr(law, "args", ()) and code is not law:
+    if isinstance(law, functools.partial) and law.args:
         raise ParameterError("", "controller", law, "a partial with keyword arguments only")
     return code if isinstance(code, type) or inspect.isroutine(code) else type(code)
 

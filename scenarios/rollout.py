@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from mpc.piloted import Piloted
 from quadsim.border import numbers_of
-from quadsim.controller import Command, Controller
+from quadsim.controller import Command, Controller, takes_targets
 from quadsim.errors import InputError, ParameterError
 from quadsim.flight.audit import audit, smallest_margins
 from quadsim.input_limits import MOST_STEPS
@@ -140,7 +139,7 @@ class Rollout:
         assembly = with_law_bounds(assembly, controller)
         self.vehicle, self.actual, self.limits = assembly.vehicle, assembly.actual, assembly.limits
         self._started = scenario = assembly.scenario
-        if assembly.user_autopilot is not None and not isinstance(controller, Piloted):
+        if assembly.user_autopilot is not None and not takes_targets(controller):
             rule = 'given with a controller that commands thrust and body rates, e.g. commands = "rates"'
             raise ParameterError("", "autopilot", type(assembly.user_autopilot).__name__, rule)
         for _, spec in scenario.controller_changes:

@@ -17,7 +17,7 @@ from scenarios.schema.scenario import Scenario
 def scenario_html(scenario: Scenario) -> str:
     """A table of its parts, and its course; where the course cannot be built, why."""
     controller = scenario.controller
-    bounds = {name: f"{low:g} to {high:g}" for name, (low, high) in getattr(controller, "output_bounds", {}).items()}
+    bounds = {name: f"{low:g} to {high:g}" for name, (low, high) in controller.output_bounds.items()}
     rows = {
         "duration": f"{scenario.duration:g} s, {scenario.periods} periods of {scenario.control_period:g} s",
         "vehicle": str(scenario.vehicle.file),

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mpc.pilot import Pilot
 from quadsim.border import numbers_of, user_code
 from quadsim.controller import AutopilotLoop, Controller
 from quadsim.errors import InputError, ParameterError
@@ -92,7 +93,8 @@ def set_up(
     flown = named(scenario, controller, forces)
     if controller is not None and not isinstance(controller, str):
         spec = refer_to(controller, scenario.controller.horizon)
-        law = assembly.piloted(make_law(controller, spec, assembly.vehicle, scenario.control_period))
+        own = make_law(controller, spec, assembly.vehicle, scenario.control_period)
+        law = assembly.with_autopilot(Pilot(own, assembly.vehicle))
     if forces:
         rng = assembly.generator("forces")
         pairs = [(import_plugin(spec), spec) for spec in scenario.forces]

@@ -12,13 +12,17 @@ from support import paper_problem
 
 from mpc.answer import ActuatorBounds
 from mpc.equilibrium import Trim
-from mpc.fallback.contract import Guarded
+from mpc.fallback.contract import Guard
 from mpc.heading import advance as advance_from
 from mpc.heading import turn
 from mpc.model import LinearModel
 from mpc.ocp import Problem
+from mpc.pilot import Pilot
 from quadsim.controller import SOLVED, Command, StepInputs
 from quadsim.state import INDEX, Array
+from quadsim.vehicle import Vehicle
+from scenarios.assembly import Assembly
+from scenarios.loading import load_scenario
 
 PERIOD = 0.05
 
@@ -26,6 +30,11 @@ PERIOD = 0.05
 @cache
 def problem() -> Problem:
     return paper_problem()
+
+
+@cache
+def vehicle() -> Vehicle:
+    return Assembly(load_scenario("paper-constrained")).vehicle
 
 
 @cache
@@ -96,13 +105,13 @@ class Scripted:
         return predicted
 
 
-def guard(inner: Any, **options: Any) -> Guarded:
-    guarded = Guarded(inner, model(), **{"bounds": bounds(), **options})
+def guard(inner: Any, **options: Any) -> Pilot:
+    guarded = Pilot(inner, vehicle(), guard=Guard(model(), **{"bounds": bounds(), **options}))
     guarded.reset(model().u_bar)
     return guarded
 
 
-def call(guarded: Guarded, state: Array | None = None, **now: Any) -> Command:
+def call(guarded: Pilot, state: Array | None = None, **now: Any) -> Command:
     return guarded.step(StepInputs(**now), np.zeros(12) if state is None else state, np.zeros((guarded.horizon, 4)))
 
 
@@ -110,7 +119,7 @@ def failing(periods: Sequence[int], **answer: Any) -> dict[int, dict[str, Any] |
     return dict.fromkeys(periods, answer or {"status": "numerics"})
 
 
-def following(guarded: Guarded, periods: int) -> list[Command]:
+def following(guarded: Pilot, periods: int) -> list[Command]:
     """Commands while the vehicle moves as the model predicts."""
     state, commands = np.zeros(12), []
     for _ in range(periods):

@@ -12,9 +12,13 @@ from ocp_peer import Period
 from scipy.linalg import block_diag
 
 from mpc.constraints import Bounds, Constraint, Penalty
+from mpc.linear import LinearMPC, NominalPreparation
 from mpc.model import LinearModel
 from mpc.nonlinear.model import NonlinearModel, advance
 from mpc.ocp import Equilibrium, Objective, Problem, Query
+from mpc.robust.controller import RobustPreparation
+from mpc.robust.settings import RobustSettings
+from mpc.solvers import Solver, make_solver
 from quadsim.controller import Controller
 from quadsim.errors import described
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog
@@ -22,7 +26,7 @@ from quadsim.sim.loop import complete
 from quadsim.sim.navigation import Navigation
 from quadsim.sim.plant import Plant
 from quadsim.state import INDEX, N_STATES, Array
-from quadsim.vehicle import N_ROTORS
+from quadsim.vehicle import N_ROTORS, Vehicle
 from scenarios import many
 from scenarios.assembly import Assembly
 from scenarios.campaign.rows import Row
@@ -52,6 +56,18 @@ def fly_here(patch: pytest.MonkeyPatch) -> None:
 def draw_nothing(patch: pytest.MonkeyPatch) -> None:
     """Leave the files of figures empty, for tests of all else."""
     patch.setattr("quadsim.report.to_matplotlib.to_png", lambda *_, **__: b"")
+
+
+def constrained_mpc(problem: Problem, solver: Solver | None = None) -> LinearMPC:
+    """The paper's law for a problem, by default with PIQP."""
+    solver = solver or make_solver("piqp", problem)
+    return LinearMPC(NominalPreparation(problem), solver, name="constrained", holds=True)
+
+
+def robust_mpc(vehicle: Vehicle, problem: Problem, settings: RobustSettings, solver: str = "piqp") -> LinearMPC:
+    """The robust law for a `robust_problem`."""
+    preparation = RobustPreparation(vehicle, problem, settings)
+    return LinearMPC(preparation, make_solver(solver, problem), name="robust")
 
 
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:

@@ -173,6 +173,32 @@ def test_help_loads_little_and_list_no_simulator() -> None:
     assert not loaded & {"mujoco", "pydantic", "pyarrow", "pandas"}
 
 
+OF_CONTROLLERS = re.compile(
+    r"(?:^|[._])(law|controller|pilot|guard|spec|table|inner|autopilot|previous|agent|successor)\w*$"
+)
+"""Names of what flies: controllers, their laws, guards and inner loops, and the tables that describe them."""
+
+
+def unwritten(source: str) -> Iterator[str]:
+    """Attributes asked for by a literal name of what may lack them: an optional part of a protocol written nowhere.
+
+    It counts `getattr` and `hasattr` on `OF_CONTROLLERS`.  Optional parts are protocols of `quadsim.controller` and its
+    like in `mpc`, asked for by `isinstance`, and class attributes of `mpc.bounded.ControllerTable`.
+    """
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("getattr", "hasattr"):
+            owner, name = map(ast.unparse, node.args[:2])
+            if isinstance(node.args[1], ast.Constant) and OF_CONTROLLERS.search(owner):
+                yield f"{owner}.{ast.literal_eval(name)}"
+
+
+def test_the_protocol_of_a_controller_is_written_down() -> None:
+    asked = "getattr(self._law, 'trim', None)\nhasattr(spec, 'indi')\ngetattr(law, source)\ngetattr(force, 'reset')"
+    assert [*unwritten(asked)] == ["self._law.trim", "spec.indi"]
+    result = {name: [*unwritten(path.read_text())] for name, path in modules().items()}
+    assert {name: asked for name, asked in result.items() if asked} == {}
+
+
 REMOVING = {"unlink", "rmdir", "rmtree", "rename", "renames", "remove", "removedirs", "move"}
 OUTPUTS = "quadsim.outputs"
 

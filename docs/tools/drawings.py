@@ -123,9 +123,9 @@ def architecture() -> str:
     loop = (
         (left, 280, "Plant", "quadsim.sim.plant:Plant"),
         (left, 480, "Estimator", "quadsim.sim.navigation:Navigation"),
-        (right, 480, "Controller", "mpc.constrained:ConstrainedMPC"),
+        (right, 480, "Controller", "mpc.linear:LinearMPC"),
         (right, 380, "QP", "mpc.solvers.piqp:Piqp"),
-        (right, 280, "Fallback", "mpc.fallback.contract:Guarded"),
+        (right, 280, "Fallback", "mpc.fallback.contract:Guard"),
     )
     for x, y, title, name in loop:
         parts += box(x, y, wide, title, name)

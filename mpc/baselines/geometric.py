@@ -32,8 +32,7 @@ from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import PREVIEW_DEGREE, Target, differentiator, target_of, target_of_motion
 from mpc.bounded import USUAL_TARGETS, Range, Seconds, TargetBounds, require_lags, require_space
 from mpc.disturbance import RampObserver, RampSettings
-from mpc.handover import within
-from mpc.indi import Incremental, INDISettings, require_one_scale
+from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
 from mpc.model import target_model
 from mpc.nonlinear.model import zero
 from mpc.obstacles import Shape
@@ -160,7 +159,7 @@ class GeometricController(FeedbackLaw):
 
     def __init__(self, vehicle: Vehicle, settings: GeometricSettings) -> None:
         self.settings, self._vehicle, self._drag = settings, vehicle, np.array(settings.drag)
-        self._targets, half = settings.commands != "rotors", 0.5 * settings.period
+        self.commands, self._targets, half = settings.commands, settings.commands != "rotors", 0.5 * settings.period
         self._ahead = half + (settings.inner_lag[0] if self._targets else 0.0)  # of the thrust that is fed forward
         self._lead = np.array(settings.inner_lag[1:]) + (half if settings.feedforward else 0.0)
         self._observer = None
@@ -189,11 +188,10 @@ class GeometricController(FeedbackLaw):
 
     def adopt(self, previous: object) -> None:
         """Take over the integrals and the observer of the previous law."""
-        law = within(previous, GeometricController)
-        if law is not None:
-            self._integrals = law._integrals
-            if self._observer is not None and law._observer is not None:
-                self._observer.adopt(law._observer)
+        if isinstance(previous, GeometricController):
+            self._integrals = previous._integrals
+            if self._observer is not None and previous._observer is not None:
+                self._observer.adopt(previous._observer)
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """Return the law's wrench as rotor speeds, or its targets; the integrals hold while bounds limit it."""
@@ -408,8 +406,8 @@ class Geometric(Tuned):
         """See `mpc.bounded.ControllerTable.audited`."""
         return super().audited(vehicle) if self.commands == "rotors" else self.target_bounds.audited(vehicle)
 
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.build`."""
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.law`."""
         shared = self.shared(vehicle, period)
         if self.commands != "rotors":
             shared |= {"inner_lag": require_lags(self.inner_lag), "bounds": self.target_bounds.actuators(vehicle)}
@@ -423,5 +421,12 @@ class Geometric(Tuned):
             disturbance=self.disturbance,
             **shared,
         )
-        law = GeometricController(vehicle, settings)
-        return law if self.indi is None else Incremental(law, vehicle, self.indi, law.bounds)
+        return GeometricController(vehicle, settings)
+
+    def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
+        """See `mpc.bounded.ControllerTable.inner_loop`."""
+        if self.indi is None:
+            return None
+        own = self.input_bounds
+        bounds = ActuatorBounds.of_vehicle(vehicle) if own is None else own.actuators(vehicle)
+        return TorqueIncrement(vehicle, self.indi, bounds)

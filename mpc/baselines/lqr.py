@@ -190,8 +190,8 @@ class LQRTable(Baseline):
             raise ValueError("input_weights must be given where output_weights are, and nowhere else")
         require_states(self.output_weights or {}, "output_weights")
 
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.build`."""
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.law`."""
         if self.output_weights is None or self.input_weights is None:
             objective = bryson_objective(vehicle, period)
         else:

@@ -19,7 +19,6 @@ from mpc.baselines.attitude import LEAST_LIFT, Measured, attitude_for, limit_for
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import Target, target_of
-from mpc.handover import within
 from mpc.obstacles import Shape
 from quadsim.controller import Command, Controller, Phase, StepInputs
 from quadsim.fields import Positive
@@ -91,9 +90,8 @@ class CascadedPID(FeedbackLaw):
 
     def adopt(self, previous: object) -> None:
         """Take over the integrals of the previous PID."""
-        law = within(previous, CascadedPID)
-        if law is not None:
-            self._memory = law._memory
+        if isinstance(previous, CascadedPID):
+            self._memory = previous._memory
 
     def _command(self, now: StepInputs, state: Array, reference: Array, before: Array) -> Command:
         """Run all loops for one period; the integrals hold until the vehicle flies."""
@@ -188,7 +186,7 @@ class PID(Tuned):
     type: Annotated[Literal["pid"], doc("the control law, by its name in `quadsim list`")] = "pid"
     velocity: Annotated[Positive, doc("[m/s] largest velocity commanded")] = 12.0
 
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.build`."""
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.law`."""
         shared = self.shared(vehicle, period)
         return CascadedPID(vehicle, pid_settings(vehicle, lag=self.lag, velocity_max=self.velocity, **shared))

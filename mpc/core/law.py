@@ -15,7 +15,6 @@ from mpc.core.library import check_mirrors
 from mpc.core.numbers import Exportable, controller_numbers, robust_numbers
 from mpc.core.solver import PROBLEMS, Key, Work, core_library, core_problem
 from mpc.equilibrium import Trim
-from mpc.fallback.completion import CompletedInputs
 from mpc.heading import predict_in_heading_frame
 from mpc.model import hover_model
 from mpc.nonlinear.model import SUBSTEPS
@@ -224,11 +223,11 @@ class CompiledMPC:
         return stopped(speeds.copy(), self.horizon, phase)
 
     def _may_learn(self, now: StepInputs) -> bool:
-        """Return whether the observer may compare the state with its prediction; see `RobustMPC.query`."""
+        """Return whether the observer may compare the state with its prediction, as `RobustPreparation` does."""
         if abs(now.time - self._called_at - self._shared.nominal.period) > _SAME_TIME:
             self._measured = -math.inf
         self._called_at = now.time
-        if isinstance(now, CompletedInputs) and now.unseen[_MOVING].any():
+        if now.unseen is not None and now.unseen[_MOVING].any():
             return False
         span, self._measured = now.time - self._measured, now.time
         return span - _SAME_TIME <= LONGEST_SPAN and now.phase is Phase.FLYING

@@ -14,13 +14,12 @@ away from them.  A sensor slower than the controller repeats its numbers between
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpc.bounded import by_group
 from mpc.equilibrium import Trim
 from mpc.heading import advance, turn
 from mpc.model import LinearModel
@@ -38,6 +37,7 @@ from quadsim.state import (
     VELOCITY,
     Array,
     all_true,
+    by_group,
     read_only,
 )
 
@@ -63,25 +63,16 @@ UNKNOWN: Final = by_group(100.0, 10.0, 1.0, 1.0)
 """Standard deviations before the first measurement [m, m/s, rad, rad/s]."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class CompletedInputs(StepInputs):
-    """The inputs of a step, with a state that may be predicted in part."""
-
-    unseen: Array  # (12,) periods since each channel was measured; 0 for a measured one
-
-
-def completed_inputs(now: StepInputs, acting: Array, unseen: Array, known: Array) -> CompletedInputs:
-    """Return a step's inputs with the command in force (4,), and the state `known` (12,) of ages `unseen` (12,).
+def completed_inputs(now: StepInputs, acting: Array, unseen: Array, known: Array) -> StepInputs:
+    """Return a step's inputs with the command in force (4,), for the state `known` (12,) of ages `unseen` (12,).
 
     Attitude and body rates are omitted where those of the state are predicted.  Near a pitch of 90 deg, Euler rates are
     implausibly large, but body rates are not.
     """
-    values = {**vars(now), "acting": acting, "unseen": unseen}
-    if unseen[ANGLES].any():
-        values["attitude"] = None
-    if unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT:
-        values["body_rates"] = None
-    return CompletedInputs(**values)
+    attitude = None if unseen[ANGLES].any() else now.attitude
+    turned = unseen[ANGLE_RATES].any() and abs(float(known[INDEX["pitch"]])) < UPRIGHT
+    rates = None if turned else now.body_rates
+    return replace(now, acting=acting, unseen=unseen, attitude=attitude, body_rates=rates)
 
 
 class StateCompletion:

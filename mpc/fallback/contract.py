@@ -2,7 +2,7 @@
 
 Each period flies the first of these that is available:
 
-0. the inner controller's answer, if its status is one of `ACCEPTED` and it is finite and within the actuators' bounds;
+0. the law's answer, if its status is one of `ACCEPTED` and it is finite and within the actuators' bounds;
 1. its last good plan, shifted by the periods since, with an LQR correction towards the states that the plan predicted,
 unless the plan is too old or the vehicle too far from it;
 
@@ -10,33 +10,31 @@ unless the plan is too old or the vehicle too far from it;
 
 3. descent: the same, sinking at a constant speed, after level 2 has lasted too long.
 
-The inner controller is called in every period with a known state, so it resumes automatically.  It receives the command
-in force, so that its slew bounds refer to the acting command, and the list of predicted channels
-(`mpc.fallback.completion.CompletedInputs`).
+The law is called in every period with a known state, so it resumes automatically.  It receives the command in force, so
+that its slew bounds refer to the acting command, and the list of predicted channels
+(`StepInputs.unseen`).
 
-A controller that estimates disturbances provides its equilibrium as an attribute `trim` (`mpc.equilibrium.Trim`).
-Levels 1 to 3, and predictions of missing channels, start from it; it is held while nothing is measured.
+A law that estimates disturbances is `mpc.equilibrium.Trimmed`.  Levels 1 to 3, and predictions of missing channels,
+start from its equilibrium; it is held while nothing is measured.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Final
 
 import numpy as np
+from annotated_types import Gt, Lt, doc
 
-from mpc.answer import ActuatorBounds, rejection, shifted
-from mpc.bounded import USUAL_TILT, FallbackSettings
-from mpc.equilibrium import Trim
-from mpc.fallback.completion import PLAUSIBLE_REFERENCE, CompletedInputs, StateCompletion, completed_inputs
+from mpc.answer import ActuatorBounds, rejection, resized, shifted
+from mpc.equilibrium import Trim, Trimmed
+from mpc.fallback.completion import PLAUSIBLE_REFERENCE, StateCompletion, completed_inputs
 from mpc.fallback.hover import HoverLaw
-from mpc.handover import hand_over, resized, within
 from mpc.heading import anchored, predict_in_heading_frame
 from mpc.model import LinearModel
-from mpc.ocp import InfeasiblePeriod
 from quadsim.controller import (
     ACCEPTED,
     FALLBACK,
@@ -44,45 +42,103 @@ from quadsim.controller import (
     Command,
     Controller,
     Phase,
+    Predicting,
     StepInputs,
     check_command,
     stopped,
 )
 from quadsim.errors import FlightError
-from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, all_true
+from quadsim.fields import Positive
+from quadsim.state import INDEX, N_STATES, POSITION, REFERENCE_STATES, Array, all_true, by_group
 from quadsim.vehicle import N_ROTORS
 
 FAILURES: Final[tuple[type[Exception], ...]] = (FlightError, np.linalg.LinAlgError, ArithmeticError, RuntimeError)
 """Exceptions of numerics and compiled back ends.  Programming errors (`TypeError`, `KeyError`, ...) end the run."""
 _MISTAKES: Final = (NotImplementedError, RecursionError)  # subclasses of `RuntimeError` that are programming errors
-_USUAL: Final = FallbackSettings()
+USUAL_TILT: Final = 10.0
+"""Default limit of the tilt [deg], for a controller without a bound on tilt."""
+_SHARE: Final = 0.8
+"""Tilt as a share of the tightest bound on it, so that the controller resumes within its bounds."""
+_SMALLEST_TILT: Final = 0.5  # [deg] whatever the bounds; below it there is no lateral authority
 
 
-class Guarded:
-    """A controller that keeps the fallback contract, whatever the inner controller does.
+@dataclass(frozen=True, kw_only=True)
+class FallbackSettings:
+    """The fallback contract: the shifted plan with an LQR correction, then level hover, then descent.
 
-    It never sends a command that is not finite or not within the bounds.  It passes the inner controller's usable
-    commands unchanged; an inner controller may have its own fallback.
+    A plan lasts at most its horizon; its own tilt adds to `tilt`.
+    """
+
+    enabled: Annotated[bool, doc("false: the controller handles missing answers itself")] = True
+    unseen: Annotated[Positive, doc("[s] longest time that predictions may replace a missing measurement")] = 1.5
+    plan_age: Annotated[Positive, doc("[s] longest time that one shifted plan is flown")] = 1.0
+    position: Annotated[Positive, doc("[m] largest distance from the plan")] = 0.5
+    velocity: Annotated[Positive, doc("[m/s] largest velocity deviation from the plan")] = 1.0
+    angle: Annotated[Positive, doc("[deg] largest deviation of roll, pitch and yaw from the plan")] = 11.5
+    rate: Annotated[Positive, doc("[deg/s] largest deviation of their rates from the plan")] = 57.3
+    hover: Annotated[Positive, doc("[s] longest time in level hover, before the descent")] = 5.0
+    sink: Annotated[Positive, doc("[m/s] speed of the descent")] = 0.5
+    tilt: Annotated[
+        Annotated[float, Gt(0.0), Lt(90.0)] | None,
+        doc(
+            "[deg] largest tilt commanded; absent: 0.8 of the tightest bound on roll or pitch, so that the controller "
+            f"takes over again within its bounds, or {USUAL_TILT:g} where there is none"
+        ),
+    ] = None
+    settled: Annotated[Positive, doc("[m/s] above this horizontal speed it brakes without going back to a place")] = 0.3
+
+    @property
+    def distance(self) -> Array:
+        """Return (12,) the largest deviations from a plan's states [m], [m/s], [rad], [rad/s]."""
+        return by_group(self.position, self.velocity, math.radians(self.angle), math.radians(self.rate))
+
+    def guard(
+        self, model: LinearModel, bounds: ActuatorBounds, output_bounds: Mapping[str, Sequence[float]] | None = None
+    ) -> Guard | None:
+        """Return the contract, with the tilt of `output_bounds` [deg]; None if it is disabled.
+
+        `model` is the hover model whose inputs are the law's commands, and `bounds` are theirs.
+        """
+        if not self.enabled:
+            return None
+        settings = self
+        if output_bounds is not None and self.tilt is None:
+            pairs = (output_bounds[name] for name in ("roll", "pitch") if name in output_bounds)
+            tightest = min((_SHARE * min(-lower, upper) for lower, upper in pairs), default=USUAL_TILT)
+            settings = replace(self, tilt=min(max(tightest, _SMALLEST_TILT), USUAL_TILT))
+        return Guard(model, bounds=bounds, settings=settings)
+
+
+USUAL_FALLBACK: Final = FallbackSettings()
+
+
+class Guard:
+    """The fallback contract around a law, which `mpc.pilot.Pilot` passes to it, whatever that law does.
+
+    It never sends a command that is not finite or not within the bounds.  It passes the law's usable commands
+    unchanged; a law may have its own fallback.
+
+    Attributes:
+        hover: the law of levels 2 and 3, and of the correction on level 1.
     """
 
     def __init__(
-        self, inner: Controller, model: LinearModel, *, bounds: ActuatorBounds, settings: FallbackSettings = _USUAL
+        self, model: LinearModel, *, bounds: ActuatorBounds, settings: FallbackSettings = USUAL_FALLBACK
     ) -> None:
-        self.inner, self.name, self.solver, self.horizon = inner, inner.name, inner.solver, inner.horizon
-        self.law = HoverLaw(model, tilt=math.radians(USUAL_TILT if settings.tilt is None else settings.tilt))
+        self.hover = HoverLaw(model, tilt=math.radians(USUAL_TILT if settings.tilt is None else settings.tilt))
         self._model, self._bounds, self._settings = model, bounds, settings
         self._distance = settings.distance
         self._completion = StateCompletion(model)
         self._level = Trim(speeds=model.u_bar, lift=np.array([0.0, 0.0, 1.0]))
         self.reset(model.u_bar)
 
-    def reset(self, speeds: Array) -> None:
-        """Restart after the command u(-1) (4,) [rad/s]."""
+    def reset(self, speeds: Array) -> Array:
+        """Restart after the command u(-1) (4,) [rad/s]; return it, or hover's if it is not usable, for the law."""
         usable = check_command(speeds) is None
         self._before = np.array(speeds, float) if usable else self._model.u_bar.copy()
         self._completion.reset()
         self._forget()
-        self.inner.reset(self._before.copy())
+        return self._before.copy()
 
     def _forget(self) -> None:
         """Leave all fallback levels."""
@@ -91,105 +147,95 @@ class Guarded:
         self._target: Array | None = None
         self._age = self._hovered = 0  # periods in fallback, and periods of these on level 2 or 3
 
-    def adopt(self, previous: object) -> None:
-        """Take over the previous contract's level, state and plan, and hand over between the inner controllers."""
-        hand_over(self.inner, previous)
-        law = within(previous, Guarded)
-        if law is None:
-            return
-        self._completion.adopt(law._completion)
-        self._age, self._target, self._hovered = law._age, law._target, law._hovered
-        if law._good is not None and law._model.targets is self._model.targets:
-            state, plan = law._good
-            self._good = state, resized(plan, self.horizon)
+    def adopt(self, previous: Guard, horizon: int) -> None:
+        """Take over the previous contract's level, state and plan, for a law of N = `horizon`."""
+        self._completion.adopt(previous._completion)
+        self._age, self._target, self._hovered = previous._age, previous._target, previous._hovered
+        if previous._good is not None and previous._model.targets is self._model.targets:
+            state, plan = previous._good
+            self._good = state, resized(plan, horizon)
 
-    def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
+    def step(self, law: Controller, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the command of the first available level; see `quadsim.controller.Controller.step`.
 
-        It catches the `FAILURES` of the inner controller; their names become the status.  While grounded, the rotors
-        slow down to their lowest speed as fast as the bounds allow.
+        It catches the `FAILURES` of the law; their names become the status.  While grounded, the rotors slow down to
+        their lowest speed as fast as the bounds allow.
         """
         acting = self._before if now.acting is None or check_command(now.acting) is not None else now.acting
-        known = self._completion.complete(state, acting, self.trim, free=now.phase is Phase.FLYING)
+        known = self._completion.complete(state, acting, self.trim(law), free=now.phase is Phase.FLYING)
         completed = completed_inputs(now, acting.copy(), self._completion.unseen.copy(), known)
-        status, answer = self._call(completed, known, reference)
+        status, answer = self._call(law, completed, known, reference)
         if now.phase in GROUNDED:
             self._forget()
-            command = stopped(self._bounds.lowest(acting), self.horizon, now.phase)
+            command = stopped(self._bounds.lowest(acting), law.horizon, now.phase)
         elif answer is None or status not in ACCEPTED:
-            command = self._fall_back(status, answer, known, acting)
+            command = self._fall_back(law, status, answer, known, acting)
         else:
             self._forget()
             # Moved onto its bounds, and so is the rest of the plan, which may act without a call.
             speeds = self._bounds.clip(answer.speeds, acting)
-            later = self._bounds.clip_plan(answer.plan[1:], speeds) if self.horizon > 1 else answer.plan[1:]
+            later = self._bounds.clip_plan(answer.plan[1:], speeds) if law.horizon > 1 else answer.plan[1:]
             command = replace(answer, speeds=speeds, plan=np.concatenate([speeds[None], later]), fallback=0)
             self._good = known, command.plan
         self._before = command.speeds.copy()
         return command
 
-    @property
-    def trim(self) -> Trim:
-        """The equilibrium that the inner controller estimates; level hover if it estimates none."""
-        trim = _tried(lambda: getattr(self.inner, "trim", None))
+    def trim(self, law: Controller) -> Trim:
+        """Return the equilibrium that the law estimates; level hover if it estimates none."""
+        trim = _tried(lambda: law.trim if isinstance(law, Trimmed) else None)
         return trim if isinstance(trim, Trim) else self._level
 
-    @property
-    def infeasible_period(self) -> InfeasiblePeriod | None:
-        """The first period since `reset` whose QP had no answer; None if there was none, or there is no QP."""
-        period = getattr(self.inner, "infeasible_period", None)
-        return period if isinstance(period, InfeasiblePeriod) else None
-
-    def predict(self, states: Array, plans: Array) -> Array:
-        """See `quadsim.controller.Controller.predict`; by the hover model where the inner controller cannot."""
-        predicted = _tried(lambda: self.inner.predict(states, plans))
-        if np.shape(predicted) == (*plans.shape[:2], N_STATES):
+    def predict(self, law: Controller, states: Array, plans: Array) -> Array:
+        """See `quadsim.controller.Predicting`; by the hover model where the law cannot."""
+        predicted = _tried(lambda: law.predict(states, plans) if isinstance(law, Predicting) else None)
+        if isinstance(predicted, np.ndarray) and predicted.shape == (*plans.shape[:2], N_STATES):
             return predicted
-        return predict_in_heading_frame(anchored(self._model, self.trim), states, plans, self.trim)
+        trim = self.trim(law)
+        return predict_in_heading_frame(anchored(self._model, trim), states, plans, trim)
 
-    def _call(self, now: CompletedInputs, known: Array, reference: Array) -> tuple[str, Command | None]:
-        """Return the inner controller's status and, if it gave one, its answer; an accepted answer is safe to fly."""
+    def _call(self, law: Controller, now: StepInputs, known: Array, reference: Array) -> tuple[str, Command | None]:
+        """Return the law's status and, if it gave one, its answer; an accepted answer is safe to fly."""
         assert now.acting is not None
         if self._model.period * float(self._completion.unseen.max()) > self._settings.unseen:
             return "state_unknown", None
-        shape = (self.horizon, len(REFERENCE_STATES))
+        shape = (law.horizon, len(REFERENCE_STATES))
         if np.shape(reference) != shape or not all_true(np.abs(reference) <= PLAUSIBLE_REFERENCE):
             return "invalid_reference", None
-        answer: Command | Exception = _tried(lambda: self.inner.step(now, known.copy(), reference))
+        answer: Command | Exception = _tried(lambda: law.step(now, known.copy(), reference))
         if isinstance(answer, Exception):  # e.g. `PlanExhaustedError` as `plan_exhausted_error`
             return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", type(answer).__name__).lower(), None
         if answer.status in ACCEPTED and (
-            np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (self.horizon, N_ROTORS)
+            np.shape(answer.speeds) != (N_ROTORS,) or np.shape(answer.plan) != (law.horizon, N_ROTORS)
         ):
             return "wrong_shape", answer
         return rejection(answer.status, answer.speeds, answer.plan, self._bounds, now.acting) or answer.status, answer
 
-    def _fall_back(self, status: str, answer: Command | None, known: Array, acting: Array) -> Command:
+    def _fall_back(self, law: Controller, status: str, answer: Command | None, known: Array, acting: Array) -> Command:
         self._age += 1
-        plan, level = self._shifted(known, acting, lost=status == "state_unknown"), 1
+        plan, level = self._shifted(law, known, acting, lost=status == "state_unknown"), 1
         if plan is None:
-            plan, level = self._hover(known, acting)
+            plan, level = self._hover(law, known, acting)
         spent = answer or Command(speeds=plan[0], plan=plan)
         spent = replace(spent, status=status, answered_by=FALLBACK, fallback=level, sqp=None)
         return replace(spent, speeds=plan[0].copy(), plan=plan, active=0, slack=0.0)
 
-    def _shifted(self, known: Array, acting: Array, *, lost: bool) -> Array | None:
+    def _shifted(self, law: Controller, known: Array, acting: Array, *, lost: bool) -> Array | None:
         """Return the rest of the last good plan (N, 4), corrected; None from when it becomes unusable."""
         if self._good is None:
             return None
         (state, plan), age = self._good, self._age
         if self._foreseen is None:
-            self._foreseen = self.predict(state[None], plan[None])[0]
-        deviation = known - self._foreseen[min(age, self.horizon) - 1]  # row i is the state i + 1 periods later
-        old = age >= self.horizon or age * self._model.period > self._settings.plan_age + 1e-9
+            self._foreseen = self.predict(law, state[None], plan[None])[0]
+        deviation = known - self._foreseen[min(age, law.horizon) - 1]  # row i is the state i + 1 periods later
+        old = age >= law.horizon or age * self._model.period > self._settings.plan_age + 1e-9
         if lost or old or not (np.abs(deviation) <= self._distance).all():
             self._good = None
             return None
         plan = shifted(plan, age)
-        plan[0] += self.law.correction(deviation, float(known[INDEX["yaw"]]))
+        plan[0] += self.hover.correction(deviation, float(known[INDEX["yaw"]]))
         return self._bounds.clip_plan(plan, acting)
 
-    def _hover(self, known: Array, acting: Array) -> tuple[Array, int]:
+    def _hover(self, law: Controller, known: Array, acting: Array) -> tuple[Array, int]:
         """Return the plan (N, 4) of level hover or descent, and its level."""
         settings, period = self._settings, self._model.period
         if self._target is None:
@@ -204,7 +250,7 @@ class Guarded:
             self._target[INDEX["vz"]] = -settings.sink
             self._target[z] -= settings.sink * period
         self._hovered += 1
-        plan = self.law.plan(known, self._target, acting, self._bounds, self.horizon, self.trim)
+        plan = self.hover.plan(known, self._target, acting, self._bounds, law.horizon, self.trim(law))
         return plan, 3 if sinking else 2
 
 

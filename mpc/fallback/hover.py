@@ -21,11 +21,10 @@ from typing import Final
 import numpy as np
 
 from mpc.answer import ActuatorBounds
-from mpc.bounded import by_group
 from mpc.equilibrium import Trim
 from mpc.heading import anchored, slope, turn_horizontally
 from mpc.model import LinearModel, lqr
-from quadsim.state import INDEX, POSITION, VELOCITY, Array, read_only
+from quadsim.state import INDEX, POSITION, VELOCITY, Array, by_group, read_only
 from quadsim.vehicle import N_ROTORS
 
 ACCEPTABLE_ACCELERATION: Final = (2.0, 8.0, 8.0, 2.0)  # along z [m/s^2], about x, y and z [rad/s^2]

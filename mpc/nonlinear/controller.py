@@ -21,12 +21,11 @@ from typing import Final
 import numpy as np
 import scipy.linalg
 
-from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused
+from mpc.answer import ActuatorBounds, AnswerCheck, command_of, refused, resized
 from mpc.bounded import USUAL_TARGETS
 from mpc.constraints import Constraint, Penalty
 from mpc.disturbance import RampObserver
 from mpc.equilibrium import LEAST_LIFT, Trim
-from mpc.handover import observed, resized, within
 from mpc.model import LinearModel
 from mpc.nonlinear.reference import Nodes, nodes_of_motion, nodes_of_preview
 from mpc.nonlinear.rigidbody import (
@@ -44,12 +43,12 @@ from mpc.nonlinear.rigidbody import (
     thrust_axis,
 )
 from mpc.nonlinear.settings import AttitudeError, NonlinearSettings
-from mpc.observer import DisturbanceObserver
+from mpc.observer import DisturbanceObserver, disturbance_of
 from mpc.obstacles import ObstacleQP, Space
 from mpc.ocp import Equilibrium, InfeasiblePeriod, Objective, Problem, Query, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
 from mpc.solvers import INVALID_DATA, Answer, QPSolver
-from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, SQP, Command, Phase, StepInputs, stopped
+from quadsim.controller import ACCEPTED, GROUNDED, NOT_CONVERGED, ROTORS, SQP, Command, Phase, StepInputs, stopped
 from quadsim.errors import ParameterError
 from quadsim.rotation import (
     body_to_euler_rates,
@@ -133,6 +132,7 @@ class NonlinearMPC:
         self.settings, self._vehicle, self._period = settings, vehicle, period
         self._again = partial(NonlinearMPC, vehicle, period=period, bounds=bounds, constraints=constraints, space=space)
         self._targets = settings.inputs is Inputs.RATES
+        self.commands = "rates" if self._targets else ROTORS
         usual = USUAL_TARGETS.actuators if self._targets else ActuatorBounds.of_vehicle
         self._bounds = usual(vehicle) if bounds is None else bounds
         self._nodes = settings.horizon
@@ -316,13 +316,15 @@ class NonlinearMPC:
 
     def adopt(self, previous: object) -> None:
         """Take over disturbance, rotor speeds and plan of the previous law, these only from one with like commands."""
-        law = within(previous, NonlinearMPC)
+        law = previous if isinstance(previous, NonlinearMPC) else None
         if law is not None:
             alike = self.settings.inputs is law.settings.inputs
             same_space = self._targets is law._targets
-            for name in ("_rotors", "_rotors_before") if same_space else ():
-                shares = getattr(law, name)
-                setattr(self, name, shares if alike else self._shares(law._speeds(shares)))
+            if same_space:
+                shares = law._rotors, law._rotors_before
+                self._rotors, self._rotors_before = (
+                    share if alike else self._shares(law._speeds(share)) for share in shares
+                )
             self._quaternion, self._side, self._called_at = law._quaternion, law._side, law._called_at
             if law._last is not None and same_space:
                 time, x = law._last
@@ -333,7 +335,7 @@ class NonlinearMPC:
             if self._ramp is not None and law._ramp is not None:
                 self._ramp.adopt(law._ramp)
         observer = None if law is None else law._observer
-        estimate = observed(previous) if observer is None else observer.estimate
+        estimate = disturbance_of(previous) if observer is None else observer.estimate
         if self._observer is not None and estimate is not None:
             self._observer.adopt(estimate)
             self._update_disturbance(self._observer.estimate)

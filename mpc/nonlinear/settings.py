@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
 import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
 
+from mpc.answer import ActuatorBounds
 from mpc.bounded import (
-    USUAL_FALLBACK,
     USUAL_TARGETS,
     Avoidance,
     ControllerTable,
-    FallbackSettings,
     Horizon,
     KktEvery,
     Lag,
@@ -39,8 +38,9 @@ from mpc.bounded import (
 )
 from mpc.constraints import Constraint
 from mpc.disturbance import RampSettings
-from mpc.indi import INDISettings, require_one_scale
-from mpc.model import target_model
+from mpc.fallback.contract import USUAL_FALLBACK, FallbackSettings, Guard
+from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
+from mpc.model import hover_model, target_model
 from mpc.nonlinear.rigidbody import RATE_SCALE, Inputs
 from mpc.observer import ObserverSettings
 from mpc.qp import KKT_EVERY
@@ -276,9 +276,8 @@ class Nonlinear(ControllerTable):
         tightest = {name: min(bounds.get(name, pair), pair, key=lambda side: side[1]) for name, pair in targets.items()}
         return bounds | tightest
 
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.build`."""
-        from mpc.indi import Incremental
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.law`."""
         from mpc.nonlinear.controller import NonlinearMPC
 
         stride, space = self._stride(period), None
@@ -291,21 +290,33 @@ class Nonlinear(ControllerTable):
                 positions=(0, 1, 2),
                 largest=True,
             )
-        targets = self.commands == "rates"
-        lag = require_lags(self.inner_lag) if targets else None
-        bounds = (self.target_bounds if targets else self.input_bounds).actuators(vehicle)
-        mpc = NonlinearMPC(
+        if self.commands != ROTORS:
+            require_lags(self.inner_lag)
+        return NonlinearMPC(
             vehicle,
             period=period,
             settings=self.settings(vehicle, stride),
-            bounds=bounds,
+            bounds=self._actuators(vehicle),
             constraints=self._rows(),
             space=space,
             kkt_every=self.kkt_every,
         )
-        hover = None if lag is None else target_model(vehicle, period, lag)
-        law = self.fallback.around(mpc, bounds, vehicle, period, model=hover)
-        return law if self.indi is None else Incremental(law, vehicle, self.indi, bounds)
+
+    def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
+        """See `mpc.bounded.ControllerTable.guard`."""
+        if self.commands == ROTORS:
+            model = hover_model(vehicle, period)
+        else:
+            model = target_model(vehicle, period, require_lags(self.inner_lag))
+        return self.fallback.guard(model, self._actuators(vehicle))
+
+    def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
+        """See `mpc.bounded.ControllerTable.inner_loop`."""
+        return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self._actuators(vehicle))
+
+    def _actuators(self, vehicle: Vehicle) -> ActuatorBounds:
+        """Return the bounds on its commands."""
+        return (self.input_bounds if self.commands == ROTORS else self.target_bounds).actuators(vehicle)
 
     def settings(self, vehicle: Vehicle, stride: int) -> NonlinearSettings:
         """Return the same in SI units, for nodes of `stride` periods."""

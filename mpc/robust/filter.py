@@ -29,11 +29,11 @@ from mpc.equilibrium import Trim
 from mpc.ocp import Objective, Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QPRows
-from mpc.robust.controller import RobustMPC
+from mpc.robust.controller import RobustPreparation
 from mpc.robust.tightening import observed
-from mpc.solvers import Answer
+from mpc.solvers import INVALID_DATA, Answer
 from mpc.solvers.piqp import Piqp
-from quadsim.controller import ACCEPTED, UNCONSTRAINED, Command, StepInputs
+from quadsim.controller import ACCEPTED, GROUNDED, UNCONSTRAINED, Command, StepInputs, stopped
 from quadsim.state import Array
 
 LATER: Final = 1e-6
@@ -57,39 +57,45 @@ class SafetyFilter:
     states and solves the QP once more.  If that fails too, the status reports it, and `mpc.fallback.contract.Guarded`
     flies the last good plan.
 
-    The robust MPC, without half-spaces, provides model, observer and constraints; it solves nothing itself.  Set
-    `requested` (4,) to the command of the next period [rad/s].
+    The robust MPC's preparation provides model, observer and constraints.  Set `requested` (4,) to the command of the
+    next period [rad/s].
     """
 
     name: Final = "safety-filter"
     solver: Final = "piqp-multistage"
 
-    def __init__(self, mpc: RobustMPC) -> None:
-        self._mpc, self.horizon = mpc, mpc.horizon
-        steady_rows = _steady_rows(mpc.problem)
-        self.problem = _feasibility(mpc.problem, steady_rows)
+    def __init__(self, preparation: RobustPreparation) -> None:
+        self._preparation, self.horizon = preparation, preparation.problem.horizon
+        steady_rows = _steady_rows(preparation.problem)
+        self.problem = _feasibility(preparation.problem, steady_rows)
         self._actuators = ActuatorBounds.of_problem(self.problem)
         # The same with soft constraints on states, except for the terminal one.
         parts = self.problem.constraints
         soft = replace(self.problem, constraints=tuple(p if p.C is None or p.name == END else _soft(p) for p in parts))
         self._nearest, self._softened = _Nearest(self.problem, steady_rows), _Nearest(soft, steady_rows)
-        self.requested = self.problem.model.u_bar.copy()
+        self._acting = self.requested = self.problem.model.u_bar.copy()
 
     @property
     def trim(self) -> Trim:
         """The equilibrium under the estimated disturbance."""
-        return self._mpc.trim
+        return self._preparation.trim
 
     def reset(self, speeds: Array) -> None:
         """See `quadsim.controller.Controller.reset`."""
-        self._mpc.reset(speeds)
-        self.requested = np.array(speeds, float)
+        self._acting = self.requested = np.array(speeds, float)
+        self._preparation.reset(speeds)
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """The command closest to `requested` that keeps the constraints feasible; `unconstrained` if unchanged."""
-        query = self._mpc.query(now, state, reference)
-        if isinstance(query, Command):
-            return query
+        if now.acting is not None:
+            self._acting = np.array(now.acting, float)
+        if now.phase in GROUNDED:
+            self._preparation.stand(now, self._acting)
+            self._acting = self._actuators.lowest(self._acting)
+            return stopped(self._acting.copy(), self.horizon, now.phase)
+        query = self._preparation.prepare(now, state, reference, self._acting)
+        if query is None:
+            return refused(self._acting, self.horizon, INVALID_DATA)
         answer = self._nearest.solve(query, self.requested)
         if answer.status not in ACCEPTED:
             answer = self._softened.solve(query, self.requested)
@@ -104,7 +110,7 @@ class SafetyFilter:
 
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
-        return self._mpc.predict(states, plans)
+        return self._preparation.predict(states, plans)
 
 
 class _Nearest:

@@ -11,9 +11,7 @@ import numpy as np
 from annotated_types import Gt, Le, doc
 
 from mpc.bounded import (
-    USUAL_FALLBACK,
     Bounded,
-    FallbackSettings,
     Lag,
     Seconds,
     Soft,
@@ -22,7 +20,9 @@ from mpc.bounded import (
     resolved_lag,
 )
 from mpc.constraints import Penalty
+from mpc.fallback.contract import USUAL_FALLBACK, FallbackSettings
 from mpc.observer import ObserverSettings
+from mpc.pilot import Pilot
 from mpc.robust.tightening import TighteningSettings, margins, position_margins
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
@@ -32,9 +32,10 @@ from quadsim.vehicle import N_ROTORS, Vehicle
 
 if TYPE_CHECKING:
     from mpc.core.numbers import Exportable
+    from mpc.linear import LinearMPC
     from mpc.obstacles import Shape
     from mpc.ocp import Problem
-    from mpc.robust.controller import RobustMPC
+    from mpc.robust.controller import RobustPreparation
     from mpc.robust.filter import SafetyFilter
 
 TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that depend on the yaw of the axes
@@ -117,23 +118,23 @@ class Robust(Bounded):
                         'heading = false, or type = "nonlinear"'
                     )
 
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.build`."""
-        law = self.in_c(vehicle, period, shapes) or self._mpc(vehicle, period, shapes)
-        return self.guarded(law, self.fallback, vehicle, period)
+    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+        """See `mpc.bounded.ControllerTable.law`."""
+        return self.in_c(vehicle, period, shapes) or self._mpc(vehicle, period, shapes)
 
-    def safety_filter(self, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Controller]:
+    def safety_filter(self, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Pilot]:
         """Return the safety filter with these constraints, and the same within its fallback contract, to fly.
 
-        Raises:     InputError: no filter can be built from these numbers.
+        Raises:
+            InputError: no filter can be built from these numbers.
         """
         from mpc.robust.filter import SafetyFilter
 
         if self.avoidance is not None:
             rule = "absent for a safety filter, which keeps no half-spaces"
             raise ParameterError("controller", "avoidance", "given", rule)
-        law = SafetyFilter(replace(self, solver=SafetyFilter.solver)._mpc(vehicle, period))
-        return law, self.guarded(law, self.fallback, vehicle, period)
+        law = SafetyFilter(self._preparation(vehicle, period))
+        return law, Pilot(law, vehicle, guard=self.guard(vehicle, period))
 
     def problem(self, vehicle: Vehicle, period: float) -> Problem:
         """See `mpc.bounded.Weighted.problem`."""
@@ -191,13 +192,18 @@ class Robust(Bounded):
             "estimated": self.offset_free is not None,
         }
 
-    def _mpc(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> RobustMPC:
-        from mpc.robust.controller import RobustMPC
+    def _preparation(self, vehicle: Vehicle, period: float) -> RobustPreparation:
+        from mpc.robust.controller import RobustPreparation
+
+        settings = self.settings(vehicle, period)
+        return RobustPreparation(vehicle, self._robust_problem(vehicle, period, settings), settings)
+
+    def _mpc(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
+        from mpc.linear import LinearMPC
 
         margins = None  # tightening of half-spaces along x, y, z at each predicted state, (N, 3) [m]
         if self.tightening is not None and self.avoidance is not None:
             margins = position_margins(**self._tightened(vehicle, period))
-        space, settings = self.space(shapes, vehicle, period, margins), self.settings(vehicle, period)
-        problem = self._robust_problem(vehicle, period, settings)
-        solver = self.make_solver(problem, space)
-        return RobustMPC(vehicle, problem, settings, solver, space=space, kkt_every=self.kkt_every)
+        space, preparation = self.space(shapes, vehicle, period, margins), self._preparation(vehicle, period)
+        solver = self.make_solver(preparation.problem, space)
+        return LinearMPC(preparation, solver, name=self.type, space=space, kkt_every=self.kkt_every)

@@ -15,7 +15,18 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from quadsim.border import user_code
-from quadsim.controller import GROUNDED, Command, Controller, InnerLoop, Phase, StepInputs
+from quadsim.controller import (
+    GROUNDED,
+    Adopting,
+    Beginning,
+    Command,
+    Controller,
+    InnerLoop,
+    Phase,
+    Predicting,
+    StepInputs,
+    takes_targets,
+)
 from quadsim.errors import FlightError, InputError, InterruptedFlightError, LostError, RaisedError, described
 from quadsim.flight.log import FlightLog, LoggedSignals
 from quadsim.flight.phase import check_loss
@@ -23,7 +34,7 @@ from quadsim.motion import Motion
 from quadsim.sim.computation import Computation, physics_steps
 from quadsim.sim.physics import FlownPeriod, Observation, Segment, flight_log, inner_steps, physics_to_state
 from quadsim.sim.plant import Plant
-from quadsim.state import INDEX, REFERENCE_NAMES, Array, ReferenceTurns
+from quadsim.state import INDEX, POSITION, REFERENCE_NAMES, Array, ReferenceTurns
 from quadsim.vehicle import N_ROTORS
 
 if TYPE_CHECKING:
@@ -175,8 +186,8 @@ class ClosedLoop:
     def switch(self, controller: Controller) -> None:
         """Let another controller fly from the period that starts now on.
 
-        It is reset, and then given the one before it where it has a method `adopt(previous)`: an observer, a plan
-        and the state of a fallback go on by it.
+        It is reset, and then given the one before it where it is `Adopting`: an observer, a plan and the state of a
+        fallback go on by it.
 
         Raises:
             InputError: the period that starts now is observed already, by the preview of the one before.
@@ -187,9 +198,8 @@ class ClosedLoop:
         with _ending_flight(self.time):
             controller.reset(self._speeds.copy())
             _begin(controller, self._plant)
-            adopt = getattr(controller, "adopt", None)
-            if adopt is not None:
-                adopt(self.controller)
+            if isinstance(controller, Adopting):
+                controller.adopt(self.controller)
         if self.k > self._switched:
             self._predicted.append(self._predict())
         self.controller, self._switched = controller, self.k
@@ -292,15 +302,14 @@ class ClosedLoop:
 
     def _predict(self) -> Array | None:
         """Predicted positions (K, N, 3) [m] of the controller's periods; None where it has no model, or raised."""
-        predict = getattr(self.controller, "predict", None)
-        samples = (self._samples or [])[self._switched :]
-        if predict is None or not samples:
+        controller, samples = self.controller, (self._samples or [])[self._switched :]
+        if not isinstance(controller, Predicting) or not samples:
             return None
         states = np.stack([sample.observation.state for sample in samples])
         try:
             with user_code(lambda error: InputError(described(error))):
-                positions: Array = predict(states, np.stack([sample.command.plan for sample in samples]))
-                return positions[:, :, [0, 2, 4]]
+                predicted = controller.predict(states, np.stack([sample.command.plan for sample in samples]))
+                return None if predicted is None else predicted[:, :, list(POSITION)]
         except InputError as error:  # after the flight, which is not to be lost by it
             _log.warning("no predictions are kept: predict raised %s", error)
             return None
@@ -354,7 +363,7 @@ class ClosedLoop:
                     self._navigation.advance(segment.physics, held, on_ground=on_ground)
                 segments.append(segment)
         self._acting = acting
-        piloted = getattr(self._inner, "takes_targets", False)
+        piloted = takes_targets(self._inner)
         self._speeds = speeds if piloted else acting
         return FlownPeriod(
             observation=observed,
@@ -382,7 +391,7 @@ class ClosedLoop:
             return
         with _ending_flight(plant.time):
             stride = inner_steps(inner.rate, plant.timestep)
-        measured = self._navigation if getattr(inner, "takes_targets", False) else None
+        measured = self._navigation if takes_targets(inner) else None
         while steps > 0:
             if self._called is not inner or self._until_call == 0:
                 attitude, rates = plant.attitude if measured is None else measured.sensed()
@@ -430,10 +439,9 @@ def complete(loop: ClosedLoop, *, periods: int, progress: Callable[[int], None] 
 
 
 def _begin(controller: Controller, plant: Plant) -> None:
-    """Tell a controller with an autopilot how the vehicle turns now."""
-    begin = getattr(controller, "begin", None)
-    if begin is not None:
-        begin(plant.attitude[1])
+    """Tell a controller that wants to know how the vehicle turns now."""
+    if isinstance(controller, Beginning):
+        controller.begin(plant.attitude[1])
 
 
 def _ending_flight(time: float) -> AbstractContextManager[None]:

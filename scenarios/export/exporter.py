@@ -183,8 +183,7 @@ def exported_law(scenario: Scenario) -> Exportable:
     """
     controller, shapes = scenario.controller, (*scenario.obstacles, *scenario.regions)
     if not isinstance(controller, Weighted):
-        commands = getattr(controller, "commands", ROTORS)
-        how = "" if commands == ROTORS else f' with commands = "{commands}"'
+        how = "" if controller.commands == ROTORS else f' with commands = "{controller.commands}"'
         exported = "exported are unconstrained, constrained and robust, whose matrices are fixed"
         raise ExportError(f"it is {controller.type!r}{how}; {exported}")
     return controller.exportable(Assembly(scenario).vehicle, scenario.control_period, shapes)

@@ -10,13 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpc.bounded import Bounded
-from mpc.constrained import ConstrainedMPC
 from mpc.core.solver import Core
 from mpc.core.tables import with_constraints
-from mpc.fallback.completion import CompletedInputs
-from mpc.fallback.contract import Guarded
+from mpc.linear import LinearMPC
 from mpc.ocp import Query
-from mpc.robust.controller import RobustMPC
 from mpc.solvers import Method
 from mpc.unconstrained import UnconstrainedMPC
 from quadsim.controller import ACCEPTED, CORE, GAIN, Command, Phase, StepInputs
@@ -26,7 +23,7 @@ from scenarios.assembly import Assembly
 from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 
-MPC = ConstrainedMPC | RobustMPC | UnconstrainedMPC
+MPC = LinearMPC | UnconstrainedMPC
 WAYS: Final = {Method.FREE: 0, Method.AXES: 1, Method.WHOLE: 2}
 REFUSED: Final = 3  # least status of a period without an optimum
 
@@ -59,7 +56,7 @@ class Recorder:
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`."""
-        flying = now.phase is Phase.FLYING and not (isinstance(now, CompletedInputs) and now.unseen.any())
+        flying = now.phase is Phase.FLYING and (now.unseen is None or not now.unseen.any())
         self._ended |= bool(self.queries) and not flying
         if flying and not self._ended:
             acting = self._before if now.acting is None else now.acting
@@ -78,18 +75,16 @@ def record(scenario: Scenario) -> Recording:
     scenario = scenario.replace({"controller.compiled": False})
     if isinstance(scenario.controller, Bounded):
         scenario = scenario.replace({"controller.solver": CORE})
-    law = Assembly(scenario).controller()
-    inner = law.inner if isinstance(law, Guarded) else law
-    assert isinstance(inner, MPC)
-    recorder = Recorder(inner)
-    if isinstance(law, Guarded):
-        law.inner = recorder
-    Rollout(scenario, law if isinstance(law, Guarded) else recorder).fly()
+    pilot = Assembly(scenario).controller()
+    law = pilot.law
+    assert isinstance(law, MPC)
+    pilot.law = recorder = Recorder(law)
+    Rollout(scenario, pilot).fly()
     queries = recorder.queries
     if not queries:
         raise ExportError("its flight has no period in the air, with everything measured, to record")
     states, acting, windows = (np.array(column) for column in zip(*queries, strict=True))
-    status, commands = _answers(inner, scenario.control_period, acting[0], queries)
+    status, commands = _answers(law, scenario.control_period, acting[0], queries)
     known = len(status)
     return Recording(
         speeds=acting[0],

@@ -18,6 +18,7 @@ from annotated_types import Ge, Gt, Le, doc
 from pydantic import Field
 
 from quadsim.assets import read_toml
+from quadsim.controller import Predicting
 from quadsim.errors import FlightError, InputError, ParameterError
 from quadsim.fields import Fraction, Vector
 from quadsim.flight.audit import COMMANDED, Limit
@@ -362,9 +363,11 @@ def read_script(path: str | Path) -> Script:
 
 
 def _horizon(flight: Rollout, sample: FlownPeriod) -> Array | None:
-    predict = getattr(flight.loop.controller, "predict", None)
-    if predict is None or len(sample.command.plan) < 1:
+    controller, state = flight.loop.controller, sample.observation.state
+    if not isinstance(controller, Predicting) or len(sample.command.plan) < 1:
         return None
-    state = sample.observation.state
-    path: Array = predict(state[None], sample.command.plan[None])[0][:, list(POSITION)]
+    predicted = controller.predict(state[None], sample.command.plan[None])
+    if predicted is None:
+        return None
+    path = predicted[0][:, list(POSITION)]
     return np.concatenate([sample.segment.physics[-1:, 1:4], path[1:]])  # the period that is shown is over

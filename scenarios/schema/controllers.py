@@ -11,6 +11,7 @@ from pydantic import Discriminator, Tag
 from mpc.baselines.geometric import Geometric
 from mpc.baselines.lqr import LQRTable
 from mpc.baselines.pid import PID
+from mpc.bounded import ControllerTable
 from mpc.constrained import Constrained
 from mpc.nonlinear.settings import Nonlinear
 from mpc.robust.settings import Robust
@@ -23,7 +24,9 @@ from scenarios.schema.writing import plain
 
 def _law(controller: object) -> str | None:
     """Return the tag of a table's law; an unknown law is left for the message."""
-    law_name = controller.get("type") if isinstance(controller, Mapping) else getattr(controller, "type", None)
+    law_name = controller.get("type") if isinstance(controller, Mapping) else None
+    if isinstance(controller, ControllerTable):
+        law_name = controller.type
     if not isinstance(law_name, str):
         return None
     return law_name if law_name in LAWS or not is_plugin(law_name) else FORM

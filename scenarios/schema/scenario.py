@@ -13,7 +13,6 @@ from annotated_types import Ge, Gt, Le, MaxLen, doc
 from pydantic import BeforeValidator, Field
 
 from mpc.bounded import Polytope
-from mpc.indi import INDISettings
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Positive
 from quadsim.flight.audit import FlightVerdict, Limit
@@ -268,12 +267,11 @@ class Scenario:
         self._check_events()
         specs = [self.controller, *(spec for _, spec in self.controller_changes)]
         for spec in specs:
-            indi: INDISettings | None = getattr(spec, "indi", None)
-            if indi is not None:
+            if spec.indi is not None:
                 try:
-                    inner_steps(indi.rate, self.plant.timestep)
+                    inner_steps(spec.indi.rate, self.plant.timestep)
                 except ParameterError as error:
-                    raise ValueError(f"controller.indi.rate must be {error.rule}; got {indi.rate}") from error
+                    raise ValueError(f"controller.indi.rate must be {error.rule}; got {spec.indi.rate}") from error
         if self.autopilot is not None and self.autopilot.rate is not None:
             try:
                 inner_steps(self.autopilot.rate, self.plant.timestep)

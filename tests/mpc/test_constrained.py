@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support import paper_problem, paper_reference
+from support import constrained_mpc, paper_problem, paper_reference
 
-from mpc.constrained import ConstrainedMPC
 from mpc.ocp import Query
 from mpc.solvers import Answer, QPSolver
 from quadsim.controller import Command, StepInputs
@@ -41,7 +40,7 @@ class FaultySolver(QPSolver):
 
 def fly(faults: dict[int, str], periods: int, horizon: int = 50) -> list[Command]:
     solver = FaultySolver(faults, horizon)
-    controller = ConstrainedMPC(solver.problem, solver)
+    controller = constrained_mpc(solver.problem, solver)
     controller.reset(solver.problem.model.u_bar)
     reference = paper_reference(periods + horizon + 1)
     return [
@@ -91,7 +90,7 @@ def test_a_failure_in_the_first_period_has_no_plan_to_hold() -> None:
 
 def test_reset_forgets_the_plan() -> None:
     solver = FaultySolver({1: "numerics"})
-    controller = ConstrainedMPC(solver.problem, solver)
+    controller = constrained_mpc(solver.problem, solver)
     reference = paper_reference(60)[1:51]
     controller.reset(solver.problem.model.u_bar)
     controller.step(StepInputs(), STATE, reference)
@@ -103,7 +102,7 @@ def test_reset_forgets_the_plan() -> None:
 def test_slews_count_from_the_command_that_acts() -> None:
     """Where an earlier command was dropped, the next one is bound to what acts, not to what was commanded."""
     problem = paper_problem()
-    controller = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem))
+    controller = constrained_mpc(problem)
     reference = paper_reference(51)[1:]
     controller.reset(problem.model.u_bar)
     commanded = controller.step(StepInputs(), STATE, reference).speeds

@@ -54,7 +54,7 @@ def test_the_same_numbers_make_no_bump(law: str) -> None:
 
 def test_without_what_was_learnt_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """The test above if nothing were handed over: the observer restarts."""
-    monkeypatch.setattr("mpc.fallback.contract.Guarded.adopt", lambda self, previous: None)
+    monkeypatch.setattr("mpc.pilot.Pilot.adopt", lambda self, previous: None)
     name, changes, fields = LAWS["robust"]
     assert jump(flown(name, fields, changes), unchanged("robust"))[40:].max() > 0.5
 
@@ -65,10 +65,10 @@ def test_another_kind_of_controller_takes_over_the_disturbance() -> None:
     with Rollout(load_scenario("robust", changes)) as started:
         while started.k < 60:
             started.step()
-        learnt = started.loop.controller.inner.disturbance  # type: ignore[attr-defined]
+        learnt = started.loop.controller.law.disturbance  # type: ignore[attr-defined]
         started.apply({"type": "controller", "fields": {"type": "nonlinear", "offset_free": {}, "horizon": 10}})
         started.step()
-        taken = started.loop.controller.inner.disturbance  # type: ignore[attr-defined]
+        taken = started.loop.controller.law.disturbance  # type: ignore[attr-defined]
         np.testing.assert_allclose(taken, learnt, atol=0.1)
         assert np.abs(learnt).max() > 0.05
         started.apply({"type": "controller", "fields": {"type": "pid", "horizon": 12}})

@@ -9,7 +9,8 @@ import pytest
 
 from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import GeometricController, geometric_settings
-from mpc.indi import Incremental, INDISettings, TorqueIncrement
+from mpc.indi import INDISettings, TorqueIncrement
+from mpc.pilot import Pilot
 from quadsim.controller import Phase, StepInputs
 from quadsim.flight.log import FlightLog
 from quadsim.sim.effects import Disturbance, Effects
@@ -56,7 +57,8 @@ def test_an_unknown_torque_is_made_up_for_within_the_filter_s_time(vehicle: Vehi
 
 def flown(vehicle: Vehicle, effects: Effects, settings: INDISettings | None, periods: int = 50) -> FlightLog:
     law = GeometricController(vehicle, geometric_settings(vehicle, period=0.05))
-    controller = law if settings is None else Incremental(law, vehicle, settings, law.bounds)
+    inner = None if settings is None else TorqueIncrement(vehicle, settings, law.bounds)
+    controller = Pilot(law, vehicle, inner=inner)
     with Plant(vehicle, effects=effects, limit_speeds=True) as plant:
         return fly(
             plant,
@@ -98,7 +100,7 @@ def test_an_undisturbed_flight_is_nearly_the_one_without(vehicle: Vehicle) -> No
 
 def test_on_the_ground_there_is_no_inner_loop(vehicle: Vehicle) -> None:
     law = GeometricController(vehicle, geometric_settings(vehicle, period=0.05))
-    controller = Incremental(law, vehicle, INDISettings(), law.bounds)
+    controller = Pilot(law, vehicle, inner=TorqueIncrement(vehicle, INDISettings(), law.bounds))
     preview = np.zeros((law.horizon, 4))
     assert controller.step(StepInputs(phase=Phase.LANDED), make_state(), preview).inner is None
     assert controller.step(StepInputs(), make_state(), preview).inner is not None

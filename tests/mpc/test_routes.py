@@ -14,12 +14,13 @@ import numpy as np
 import ocp_peer
 import pytest
 from ocp_peer import Optimum, Period
-from support import changing_period, paper_problem, random_problem, random_rows
+from support import changing_period, paper_problem, random_problem, random_rows, robust_mpc
 
 from mpc.constraints import Constraint, Penalty, tightened
 from mpc.model import LinearModel, continuous_model, discretise
 from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
-from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
+from mpc.robust.controller import robust_problem
+from mpc.robust.settings import RobustSettings
 from mpc.solvers import SOLVERS, Method, QPSolver, find_solver, make_solver, solver_entries
 from quadsim.controller import ACCEPTED, CORE, SOLVED, UNCONSTRAINED, StepInputs
 from quadsim.state import Array, make_state
@@ -279,7 +280,7 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
         settings=settings,
         constraints=(row,),
     )
-    controller = RobustMPC(vehicle, posed, settings, make_solver(CORE, posed))
+    controller = robust_mpc(vehicle, posed, settings, CORE)
     controller.reset(hover)
     command = controller.step(StepInputs(acting=hover), state, reference)
     assert command.status == SOLVED

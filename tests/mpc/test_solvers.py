@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import qpsolvers
 from scipy.sparse import csc_matrix
-from support import flight_queries, paper_problem, paper_reference, random_problem
+from support import constrained_mpc, flight_queries, paper_problem, paper_reference, random_problem
 
 from mpc.condensing import Condensed
-from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Penalty
 from mpc.ocp import Query
 from mpc.partial_condensing import PartiallyCondensed
@@ -68,7 +67,7 @@ def test_data_that_is_not_finite_reaches_no_back_end(place: int, corrupted: floa
     answer = solver.solve(Query(*query))
     assert answer.status == "invalid_data"
     assert np.isnan(answer.plan).all()
-    controller = ConstrainedMPC(problem, solver)
+    controller = constrained_mpc(problem, solver)
     controller.reset(problem.model.u_bar)
     with pytest.raises(PlanExhaustedError, match="invalid_data"):
         controller.step(StepInputs(), np.full(12, np.nan), paper_reference(51)[1:])

@@ -15,12 +15,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import fly_here
+from support import constrained_mpc, fly_here
 
 import mpc
 import quadsim
-from mpc.constrained import ConstrainedMPC
-from mpc.fallback.contract import Guarded
 from mpc.nonlinear.controller import CONVERGED
 from mpc.ocp import InfeasiblePeriod
 from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
@@ -261,7 +259,7 @@ def test_the_fallback_is_suggested_with_the_time_after_which_it_helps(file: str)
         query_case(file, case, "controller.fallback={}").controller,
         queried.infeasible_period.problem.model,
     )  # type: ignore[union-attr]
-    assert isinstance(guarded, Guarded)
+    assert guarded.guard is not None
     state, acting = case.state, np.full(4, queried.vehicle.hover_speed)
     guarded.reset(acting)
     for k in range(50):
@@ -333,8 +331,8 @@ class Keeping:
     """A controller of one's own that keeps the problem that it could not solve."""
 
     def __init__(self, vehicle: Vehicle, period: float, horizon: int, largest: float = 2.0) -> None:
-        law = load_scenario("paper-constrained").controller.build(vehicle, period)
-        assert isinstance(law, ConstrainedMPC)
+        law = load_scenario("paper-constrained").controller.law(vehicle, period)
+        assert isinstance(law, mpc.LinearMPC)
         roll = mpc.Bounds(
             C_c=np.eye(12)[[INDEX["roll"]]],
             y_min=np.radians([-largest]),
@@ -345,7 +343,7 @@ class Keeping:
             u_max=np.full(4, 250.0),
         )
         self.problem = replace(law.problem, horizon=horizon, bounds=roll)
-        self.inner = ConstrainedMPC(self.problem, mpc.QPSolver("piqp-multistage", self.problem))
+        self.inner = constrained_mpc(self.problem)
         self.infeasible_period: InfeasiblePeriod | None = None
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:

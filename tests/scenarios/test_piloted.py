@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import quadsim
-from mpc.handover import hand_over
+from mpc.pilot import Pilot
 from quadsim.assets import vehicle_path
 from quadsim.controller import StepInputs
 from quadsim.errors import InputError
@@ -273,8 +273,11 @@ def test_a_law_of_targets_takes_over_from_the_law_and_not_from_its_autopilot(sce
     assembly = Assembly(scenario)
     spec = Plugin(type="tests:Heir")
     laws = [Rates(assembly.vehicle, 0.02, 50), Heir(assembly.vehicle, 0.02, 50)]
-    first, second = (assembly.piloted(make_law(law, spec, assembly.vehicle, 0.02)) for law in laws)
-    hand_over(second, first)
+    first, second = (
+        assembly.with_autopilot(Pilot(make_law(law, spec, assembly.vehicle, 0.02), assembly.vehicle)) for law in laws
+    )
+    assert first.takes_targets
+    second.adopt(first)
     assert Heir.seen is laws[0]
 
 

@@ -260,7 +260,7 @@ def test_on_the_ground_it_asks_for_the_least_thrust_and_no_rates(vehicle: Vehicl
 
 def test_the_table_builds_the_law_and_audits_its_targets(vehicle: Vehicle) -> None:
     table = Geometric(commands="rates", inner_lag=SLOW, target_bounds=TargetBounds(body_rate=100.0), lag=0.05)
-    law = table.build(vehicle, PERIOD)
+    law = table.law(vehicle, PERIOD)
     assert isinstance(law, GeometricController)
     assert law.settings.inner_lag == SLOW
     assert law.settings.k_attitude[0] == pytest.approx(1.0 / 0.18)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scripted_controller import Scripted, bounds, guard, model
 
-from mpc.bounded import FallbackSettings
+from mpc.fallback.contract import FallbackSettings
 from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import CommandError
 from quadsim.state import Array

@@ -74,8 +74,10 @@ def test_a_controller_without_a_valid_trim_hovers_level(trim: Any) -> None:
             return trim
 
     guarded = guard(Silent())
-    np.testing.assert_array_equal(guarded.trim.speeds, model().u_bar)
-    assert guarded.trim.lean(0.0) == (0.0, 0.0)
+    assert guarded.guard is not None
+    estimate = guarded.guard.trim(guarded.law)
+    np.testing.assert_array_equal(estimate.speeds, model().u_bar)
+    assert estimate.lean(0.0) == (0.0, 0.0)
 
 
 def test_its_own_predictions_turn_with_the_heading() -> None:

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from scripted_controller import PERIOD, bounds, model, problem
-from support import paper_reference
+from support import constrained_mpc, paper_reference
 
-from mpc.bounded import FallbackSettings
-from mpc.constrained import ConstrainedMPC
-from mpc.fallback.contract import Guarded
+from mpc.fallback.contract import FallbackSettings, Guard
 from mpc.ocp import Query
+from mpc.pilot import Pilot
 from mpc.solvers import Answer, QPSolver
 from mpc.solvers.piqp import STATUS
 from quadsim.controller import ACCEPTED
@@ -70,9 +69,9 @@ def fly_paper(
     reference = paper_reference(first + periods + 51)[first:].copy()
     if height is not None:
         reference[:, 2] = height
-    controller: Any = ConstrainedMPC(problem(), FaultySolver(solver or {}))
+    controller: Any = constrained_mpc(problem(), FaultySolver(solver or {}))
     if guarded:
-        controller = Guarded(controller, model(), bounds=bounds(), settings=LEVEL)
+        controller = Pilot(controller, vehicle, guard=Guard(model(), bounds=bounds(), settings=LEVEL))
     rng = np.random.default_rng(0)
     with Plant(vehicle, effects=Effects(ground=Ground(contact=contact))) as plant:
         log = fly(

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from mpc.bounded import Avoidance, FallbackSettings, Polytope, RotorBounds, Soft, TargetBounds
+from mpc.bounded import Avoidance, Polytope, RotorBounds, Soft, TargetBounds
 from mpc.constraints import Constraint
 from mpc.disturbance import RampSettings
+from mpc.fallback.contract import FallbackSettings
 from mpc.fallback.hover import HoverLaw
 from mpc.indi import INDISettings
 from mpc.model import target_model
@@ -235,7 +236,7 @@ def test_bounds_of_targets_follow_the_vehicle() -> None:
 def test_grounded_it_turns_nowhere_with_the_least_thrust() -> None:
     made = table().build(VEHICLE, 0.02)
     least = [TargetBounds().actuators(VEHICLE).u_min[0], 0.0, 0.0, 0.0]
-    for controller in (made, made.inner):  # type: ignore[attr-defined]
+    for controller in (made, made.law):  # type: ignore[attr-defined]
         now = StepInputs(phase=Phase.LANDED)
         np.testing.assert_allclose(
             controller.step(now, np.zeros(N_STATES), np.zeros((controller.horizon, 4))).speeds, least
@@ -259,14 +260,14 @@ def test_the_observer_of_forces_finds_the_thrust_that_holds_the_height(scaled: b
     made = table(disturbance=RampSettings(thrust_scale=scaled), horizon=20, node=0.05)
     controller = made.build(VEHICLE, 0.05)
     states, commands = fly(controller, 0.05, 4.0, step_of(0.0, 0.0, 0.0, 0.0), thrust_scale=0.8)
-    model = controller.inner._model  # type: ignore[attr-defined]
+    model = controller.law._model  # type: ignore[attr-defined]
     np.testing.assert_allclose(states[-1, P], 0.0, atol=2e-3)
     assert commands[-1].speeds[0] == pytest.approx(LEVEL[0] / 0.8, rel=2e-3)
     assert model.thrust_scale == pytest.approx(0.8 if scaled else 1.0, abs=2e-3)
     assert model.acceleration[2] == pytest.approx(0.0 if scaled else -0.2 * LEVEL[0] / 0.8 / VEHICLE.mass, abs=0.05)
     np.testing.assert_array_equal(model.angular_acceleration, 0.0)
     controller.step(StepInputs(phase=Phase.LANDED), np.zeros(N_STATES), np.zeros((controller.horizon, 4)))
-    assert controller.inner._model.thrust_scale == 1.0  # type: ignore[attr-defined]
+    assert controller.law._model.thrust_scale == 1.0  # type: ignore[attr-defined]
 
 
 def test_a_law_of_rotor_speeds_divides_by_the_thrust_scale_too() -> None:
@@ -282,7 +283,7 @@ def test_a_law_of_rotor_speeds_divides_by_the_thrust_scale_too() -> None:
         x = advance_nodes(model, x, command.speeds / VEHICLE.speed_max)
     assert abs(x[2]) < 2e-3
     np.testing.assert_allclose(command.speeds, VEHICLE.hover_speed / math.sqrt(0.8), rtol=1e-3)
-    assert controller.inner._model.thrust_scale == pytest.approx(0.8, abs=2e-3)  # type: ignore[attr-defined]
+    assert controller.law._model.thrust_scale == pytest.approx(0.8, abs=2e-3)  # type: ignore[attr-defined]
 
 
 def test_it_predicts_its_own_flight() -> None:
@@ -300,15 +301,15 @@ def test_it_predicts_its_own_flight() -> None:
 
 def test_it_takes_over_from_a_law_that_commands_rotors_without_a_jump() -> None:
     rotors = Nonlinear(offset_free=ObserverSettings()).build(VEHICLE, 0.02)
-    rotors.inner._observer.adopt(np.array([0.3, 0.0, 0.5, 1.0, 0.0, 0.0]))  # type: ignore[attr-defined]
+    rotors.law._observer.adopt(np.array([0.3, 0.0, 0.5, 1.0, 0.0, 0.0]))  # type: ignore[attr-defined]
     rotors.step(StepInputs(), np.zeros(N_STATES), np.zeros((rotors.horizon, 4)))
     rates = table(offset_free=ObserverSettings()).build(VEHICLE, 0.02)
     for law, previous, row in ((rates, rotors, LEVEL), (rotors, rates, np.full(4, VEHICLE.hover_speed))):
         law.reset(row)
         law.adopt(previous)  # type: ignore[attr-defined]
-        np.testing.assert_allclose(law.inner.disturbance[:3], [0.3, 0.0, 0.5])  # type: ignore[attr-defined]
-        np.testing.assert_allclose(law.inner._acting, row)  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(rates.inner.disturbance[3:], 0.0)  # type: ignore[attr-defined]
+        np.testing.assert_allclose(law.law.disturbance[:3], [0.3, 0.0, 0.5])  # type: ignore[attr-defined]
+        np.testing.assert_allclose(law.law._acting, row)  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(rates.law.disturbance[3:], 0.0)  # type: ignore[attr-defined]
     command = rates.step(StepInputs(), np.zeros(N_STATES), np.zeros((rates.horizon, 4)))
     assert command.fallback == 0
     assert command.speeds[0] == pytest.approx(LEVEL[0] * (1.0 - 0.5 / VEHICLE.gravity), rel=0.05)
@@ -345,7 +346,7 @@ def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tup
     law = HoverLaw(model, tilt=math.radians(10.0))
     assert np.abs(np.linalg.eigvals(model.A - model.B @ np.linalg.solve(law.slope, law.gain))).max() < 1.0
     made = table(inner_lag=lag, horizon=1, node=None).build(VEHICLE, period)
-    made.inner.step = _fails  # type: ignore[attr-defined]
+    made.law.step = _fails  # type: ignore[attr-defined]
     x = at_rest()
     x[Q] = euler_to_quaternion(np.radians([20.0, -8.0, 0.0]))
     states, commands = fly(made, period, 5.0, step_of(0.0, 0.0, 0.0, 0.0), x, lag=lag)
@@ -360,8 +361,8 @@ def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tup
 def test_level_hover_holds_its_height_by_the_thrust_scale_that_is_estimated(known: bool) -> None:
     made = table().build(VEHICLE, 0.02)
     if known:
-        made.inner._model = replace(made.inner._model, thrust_scale=0.7)  # type: ignore[attr-defined]
-    made.inner.step = _fails  # type: ignore[attr-defined]
+        made.law._model = replace(made.law._model, thrust_scale=0.7)  # type: ignore[attr-defined]
+    made.law.step = _fails  # type: ignore[attr-defined]
     states, commands = fly(made, 0.02, 4.0, step_of(0.0, 0.0, 0.0, 0.0), thrust_scale=0.7)
     assert {command.fallback for command in commands} == {2}
     assert bool(abs(states[:, 2]).max() < 0.02) is known

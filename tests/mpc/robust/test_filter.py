@@ -12,9 +12,10 @@ from support import paper_problem
 from mpc.condensing import Condensed
 from mpc.constraints import Bounds
 from mpc.ocp import Objective, Query
-from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
+from mpc.robust.controller import RobustPreparation, robust_problem
 from mpc.robust.filter import TERMINAL_TOLERANCE, SafetyFilter
-from mpc.solvers import make_backend, make_solver
+from mpc.robust.settings import RobustSettings
+from mpc.solvers import make_backend
 from quadsim.controller import UNCONSTRAINED, Command, StepInputs
 from quadsim.state import INDEX, Array
 from scenarios.assembly import Assembly
@@ -40,7 +41,7 @@ def make_filter() -> SafetyFilter:
     posed = robust_problem(
         VEHICLE, period=PERIOD, horizon=HORIZON, objective=objective(), bounds=bounds(), settings=settings
     )
-    return SafetyFilter(RobustMPC(VEHICLE, posed, settings, make_solver("piqp", posed)))
+    return SafetyFilter(RobustPreparation(VEHICLE, posed, settings))
 
 
 def filtered(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER) -> Command:

@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import derivative, paper_problem, paper_reference
+from support import constrained_mpc, derivative, paper_problem, paper_reference, robust_mpc
 
-from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Penalty
-from mpc.fallback.completion import CompletedInputs
 from mpc.heading import turn_horizontally
+from mpc.linear import LinearMPC
 from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model
 from mpc.observer import ObserverSettings
-from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
-from mpc.solvers import QPSolver, make_solver
+from mpc.robust.controller import RobustPreparation, robust_problem
+from mpc.robust.settings import RobustSettings
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Phase, StepInputs
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
@@ -44,24 +43,24 @@ def moving(velocity: tuple[float, float, float], **place: Any) -> Array:
     return state
 
 
-def robust(vehicle: Vehicle, *, horizon: int = 50, weight: float = 0.01, **settings: Any) -> RobustMPC:
+def robust(vehicle: Vehicle, *, horizon: int = 50, weight: float = 0.01, **settings: Any) -> LinearMPC:
     problem = paper_problem()
     assert problem.bounds is not None
     objective, parts = replace(problem.objective, Q_u=weight * np.eye(4)), RobustSettings(**settings)
     posed = robust_problem(
         vehicle, period=PERIOD, horizon=horizon, objective=objective, bounds=problem.bounds, settings=parts
     )
-    return RobustMPC(vehicle, posed, parts, make_solver("piqp", posed))
+    return robust_mpc(vehicle, posed, parts)
 
 
 def flown(
-    controller: RobustMPC, plant: NonlinearModel, state: Array, reference: Array, periods: int
+    controller: LinearMPC, plant: NonlinearModel, state: Array, reference: Array, periods: int
 ) -> Iterator[tuple[Array, Array]]:
     """States (12,) at the samples and the commands given there; the plant's commands act the stated delay later."""
-    hover = np.full(4, controller._nominal.u_bar)
+    hover = controller.problem.model.u_bar.copy()
     controller.reset(hover)
     x = np.concatenate([state, hover])[: plant.n]
-    whole, late = divmod(controller.settings.delay, PERIOD)
+    whole, late = divmod(controller.preparation.delay, PERIOD)
     sent = [hover] * (1 + round(whole))
     for k in range(periods):
         command = controller.step(
@@ -75,11 +74,17 @@ def flown(
                 x = advance(replace(plant, period=duration), x, speeds)
 
 
-def believing(controller: RobustMPC, estimate: Array) -> None:
+def preparation_of(controller: LinearMPC) -> RobustPreparation:
+    assert isinstance(controller.preparation, RobustPreparation)
+    return controller.preparation
+
+
+def believing(controller: LinearMPC, estimate: Array) -> None:
     """Let it have estimated (6,)."""
-    assert controller._observer is not None
-    controller._observer.estimate = estimate
-    controller._update_trim()
+    preparation = preparation_of(controller)
+    assert preparation._observer is not None
+    preparation._observer.estimate = estimate
+    preparation._update_trim()
 
 
 def moments(flight: Flight, first: int, periods: int) -> Iterator[tuple[StepInputs, Array, Array]]:
@@ -93,7 +98,7 @@ def moments(flight: Flight, first: int, periods: int) -> Iterator[tuple[StepInpu
 def test_without_optional_parts_it_is_the_papers_controller(constrained_flight: Flight, vehicle: Vehicle) -> None:
     """100 periods in which the tilt bound is active at times, with yaw on its way from 30 deg to 0."""
     problem = paper_problem()
-    paper, ours = ConstrainedMPC(problem, QPSolver("piqp-multistage", problem)), robust(vehicle)
+    paper, ours = constrained_mpc(problem), robust(vehicle)
     active = 0
     for moment, state, reference in moments(constrained_flight, 180, 100):
         expected, command = paper.step(moment, state, reference), ours.step(moment, state, reference)
@@ -132,7 +137,7 @@ def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle, delay: floa
         # Since the last call's end, `before` has acted to the end of its period, as has `acting` since its beginning.
         controller.step(StepInputs(acting=acting, phase=phase), state, HOLD)
         speeds = rotors.respond(speeds, acting, np.array([PERIOD]))[0][0]
-        np.testing.assert_allclose(controller._turning, speeds, atol=1e-9)
+        np.testing.assert_allclose(preparation_of(controller)._turning, speeds, atol=1e-9)
         before = acting
     assert np.abs(speeds - before).max() > 0.1
 
@@ -145,10 +150,11 @@ def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float
     """Also of the controller: at rest at its set-point, it commands what holds it there."""
     controller = robust(vehicle, rotor_lag=0.03, heading=True, observer=ObserverSettings())
     believing(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
-    force, torque = np.split(controller.disturbance, 2)
+    force, torque = np.split(preparation_of(controller).disturbance, 2)
     model = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
     model = replace(model, acceleration=force, angular_acceleration=torque)
-    world, u = turn_horizontally(controller.trim.state(yaw, 16), np.array(yaw)), controller.trim.speeds
+    trim = preparation_of(controller).trim
+    world, u = turn_horizontally(trim.state(yaw, 16), np.array(yaw)), trim.speeds
     world[INDEX["yaw"]] = yaw
     np.testing.assert_allclose(derivative(model, world, u), 0.0, atol=1e-9)
     controller.reset(u)
@@ -167,7 +173,7 @@ def test_constant_forces_torques_and_mass_leave_no_steady_error(vehicle: Vehicle
     controller = robust(vehicle, horizon=25, weight=0.01, **settings)
     *_, (end, _) = flown(controller, disturbed, start, reference, 200)
     np.testing.assert_allclose(end[[0, 2, 4, 10]], reference[0], atol=1e-3)
-    np.testing.assert_allclose(controller.disturbance, np.concatenate([force, torque]), atol=1e-3)
+    np.testing.assert_allclose(preparation_of(controller).disturbance, np.concatenate([force, torque]), atol=1e-3)
     *_, (end, _) = flown(controller, heavy, start, reference, 200)
     np.testing.assert_allclose(end[[0, 2, 4, 10]], reference[0], atol=1e-3)
     *_, (end, _) = flown(
@@ -183,7 +189,7 @@ def test_stated_mismatch_is_not_attributed_to_a_disturbance(vehicle: Vehicle, de
     controller = robust(vehicle, **{**EVERYTHING, "delay": delay})
     start = moving((0.3, -0.2, 0.1), euler=(0.05, -0.03, 2.0))
     moved = [state for state, _ in flown(controller, plant, start, np.zeros((80, 4)), 20)]
-    np.testing.assert_allclose(controller.disturbance, 0.0, atol=1e-4)
+    np.testing.assert_allclose(preparation_of(controller).disturbance, 0.0, atol=1e-4)
     assert np.abs(np.diff(moved, axis=0)[:, [7, 9, 11]]).max() > 0.05
 
 
@@ -198,10 +204,10 @@ def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> N
     tilts, sideways = [], []
     for state, _ in flown(controller, heavy, make_state(), reference, 150):
         tilts.append(abs(state[INDEX["pitch"]]))
-        sideways.append(np.abs(controller.disturbance[:2]).max())
+        sideways.append(np.abs(preparation_of(controller).disturbance[:2]).max())
     assert max(tilts) > math.radians(3.0)
     assert max(sideways) < 0.02
-    assert controller.disturbance[2] == pytest.approx(vehicle.gravity * (1.0 - factor), abs=0.05)
+    assert preparation_of(controller).disturbance[2] == pytest.approx(vehicle.gravity * (1.0 - factor), abs=0.05)
 
 
 def test_the_effect_of_a_worn_rotor_is_predicted_at_any_thrust(vehicle: Vehicle) -> None:
@@ -215,9 +221,9 @@ def test_the_effect_of_a_worn_rotor_is_predicted_at_any_thrust(vehicle: Vehicle)
     torques, thrusts = [], []
     for k, (_, speeds) in enumerate(flown(controller, worn, make_state(), reference, 200)):
         if k >= 140:
-            assert controller._observer is not None
-            torques.append(controller._observer.estimate[3])
-            thrusts.append(np.sum(speeds**2) / np.sum(controller.trim.speeds**2))
+            assert preparation_of(controller)._observer is not None
+            torques.append(preparation_of(controller)._observer.estimate[3])
+            thrusts.append(np.sum(speeds**2) / np.sum(preparation_of(controller).trim.speeds ** 2))
     assert np.ptp(thrusts) > 0.5
     assert np.ptp(torques) < 0.05 * np.mean(torques)
 
@@ -235,11 +241,11 @@ def test_nothing_is_learned_on_the_ground_or_from_what_is_no_number(vehicle: Veh
         )
     ):
         controller.step(StepInputs(time=k * PERIOD, acting=acting, phase=phase), state, HOLD)
-        np.testing.assert_array_equal(controller.disturbance, 0.0)
+        np.testing.assert_array_equal(preparation_of(controller).disturbance, 0.0)
     controller.step(StepInputs(time=4 * PERIOD, acting=acting), np.zeros(12), HOLD)
-    assert controller.disturbance[2] < -0.1
+    assert preparation_of(controller).disturbance[2] < -0.1
     controller.step(StepInputs(time=5 * PERIOD, acting=acting, phase=Phase.LANDED), pushed, HOLD)
-    np.testing.assert_array_equal(controller.disturbance, 0.0)
+    np.testing.assert_array_equal(preparation_of(controller).disturbance, 0.0)
 
 
 @pytest.mark.parametrize("gap", [0, 2, 40])
@@ -248,7 +254,7 @@ def test_the_observer_skips_pauses(vehicle: Vehicle, gap: int) -> None:
     controller, acting = robust(vehicle, **EVERYTHING), np.full(4, vehicle.hover_speed)
     controller.step(StepInputs(time=1.0, acting=acting), np.zeros(12), HOLD)
     controller.step(StepInputs(time=1.0 + gap * PERIOD, acting=acting), moving((0.0, 0.0, 0.2)), HOLD)
-    np.testing.assert_array_equal(controller.disturbance, 0.0)
+    np.testing.assert_array_equal(preparation_of(controller).disturbance, 0.0)
 
 
 @pytest.mark.parametrize(("predicted", "learned"), [(0, True), (4, True), (5, False), (30, False)])
@@ -258,15 +264,15 @@ def test_predicted_states_do_not_update_the_observer(vehicle: Vehicle, predicted
     measured, guessed = np.zeros(12), np.zeros(12)
     guessed[INDEX["vx"]] = 1.0
     times = PERIOD * np.arange(predicted + 3)
-    controller.step(CompletedInputs(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    controller.step(StepInputs(time=times[0], acting=acting, unseen=measured), np.zeros(12), HOLD)
     for time in times[1 : predicted + 1]:
-        controller.step(CompletedInputs(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
-        np.testing.assert_array_equal(controller.disturbance, 0.0)
-    controller.step(CompletedInputs(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
-    assert controller.disturbance.any() == learned
-    before = controller.disturbance
-    controller.step(CompletedInputs(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
-    assert np.abs(controller.disturbance - before).max() > 0.0
+        controller.step(StepInputs(time=time, acting=acting, unseen=guessed), moving((0.3, 0.0, 0.0)), HOLD)
+        np.testing.assert_array_equal(preparation_of(controller).disturbance, 0.0)
+    controller.step(StepInputs(time=times[-2], acting=acting, unseen=measured), moving((0.1, 0.0, 0.0)), HOLD)
+    assert preparation_of(controller).disturbance.any() == learned
+    before = preparation_of(controller).disturbance
+    controller.step(StepInputs(time=times[-1], acting=acting, unseen=measured), np.zeros(12), HOLD)
+    assert np.abs(preparation_of(controller).disturbance - before).max() > 0.0
 
 
 def test_a_position_that_is_predicted_hides_no_disturbance(vehicle: Vehicle) -> None:
@@ -274,22 +280,22 @@ def test_a_position_that_is_predicted_hides_no_disturbance(vehicle: Vehicle) -> 
     unseen = np.zeros(12)
     unseen[list(POSITION)] = 7.0
     for k, speed in enumerate((0.0, 0.2)):
-        controller.step(CompletedInputs(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
-    assert controller.disturbance[2] > 0.1
+        controller.step(StepInputs(time=k * PERIOD, acting=acting, unseen=unseen), moving((0.0, 0.0, speed)), HOLD)
+    assert preparation_of(controller).disturbance[2] > 0.1
 
 
 def test_predictions_and_trim_are_of_what_is_believed(vehicle: Vehicle) -> None:
     controller = robust(vehicle, observer=ObserverSettings(), heading=True)
-    np.testing.assert_allclose(controller.trim.speeds, vehicle.hover_speed, rtol=1e-12)
+    np.testing.assert_allclose(preparation_of(controller).trim.speeds, vehicle.hover_speed, rtol=1e-12)
     estimate = np.array([0.0, 0.0, -2.9, 0.5, 0.0, 0.0])
     believing(controller, estimate)
-    controller.reset(controller.trim.speeds)
+    controller.reset(preparation_of(controller).trim.speeds)
     believing(controller, estimate)
-    plan = np.tile(controller.trim.speeds, (1, 50, 1))
+    plan = np.tile(preparation_of(controller).trim.speeds, (1, 50, 1))
     np.testing.assert_allclose(controller.predict(np.zeros((1, 12)), plan), 0.0, atol=1e-9)
-    assert controller.trim.speeds.min() > vehicle.hover_speed + 15.0
+    assert preparation_of(controller).trim.speeds.min() > vehicle.hover_speed + 15.0
     controller.reset(np.full(4, vehicle.hover_speed))
-    np.testing.assert_allclose(controller.trim.speeds, vehicle.hover_speed, rtol=1e-12)
+    np.testing.assert_allclose(preparation_of(controller).trim.speeds, vehicle.hover_speed, rtol=1e-12)
 
 
 # Heading
@@ -386,7 +392,7 @@ def test_numbers_out_of_hand_are_refused_and_forgotten(vehicle: Vehicle, value: 
         np.testing.assert_array_equal(command.plan, np.tile(acting, (50, 1)))
         after = controller.step(StepInputs(acting=acting), np.zeros(12), HOLD)
         assert after.status in ACCEPTED
-        assert np.isfinite(controller.disturbance).all()
+        assert np.isfinite(preparation_of(controller).disturbance).all()
     wrong = HOLD.copy()
     wrong[7, 2] = value
     assert controller.step(StepInputs(acting=acting), np.zeros(12), wrong).status == "invalid_data"
@@ -403,7 +409,7 @@ def test_overflow_has_no_side_effects(vehicle: Vehicle, delay: float) -> None:
         for state in (np.zeros(12), spun, np.zeros(12)):
             last = controller.step(StepInputs(acting=acting), state, HOLD)
         assert last.status in ACCEPTED
-        assert np.isfinite(controller.disturbance).all()
+        assert np.isfinite(preparation_of(controller).disturbance).all()
 
 
 def test_without_a_solution_the_command_in_force_is_held(vehicle: Vehicle) -> None:

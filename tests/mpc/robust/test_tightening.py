@@ -11,14 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.linalg
-from support import derivative, fly_once, paper_problem, paper_reference
+from support import derivative, fly_once, paper_problem, paper_reference, robust_mpc
 
 from mpc.bounded import SHORTEST_LAG
 from mpc.constraints import Bounds, Penalty
+from mpc.linear import LinearMPC
 from mpc.model import discretise
 from mpc.nonlinear.model import advance, nonlinear_model
 from mpc.observer import ObserverSettings
-from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
+from mpc.robust.controller import robust_problem
+from mpc.robust.settings import RobustSettings
 from mpc.robust.tightening import (
     ERROR_SHARE,
     SPEED_SHARE,
@@ -30,7 +32,6 @@ from mpc.robust.tightening import (
     margins,
     observed,
 )
-from mpc.solvers import make_solver
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
@@ -288,7 +289,7 @@ LAG = 0.05
 LAGGING = (f"effects.rotors.rise={LAG}", f"effects.rotors.fall={LAG}")
 
 
-def robust(vehicle: Vehicle, drawn_in: Array | None, *, rotor_lag: float = 0.0, delay: float = 0.0) -> RobustMPC:
+def robust(vehicle: Vehicle, drawn_in: Array | None, *, rotor_lag: float = 0.0, delay: float = 0.0) -> LinearMPC:
     """The paper's optimisation with every part."""
     problem = paper_problem()
     assert problem.bounds is not None
@@ -305,7 +306,7 @@ def robust(vehicle: Vehicle, drawn_in: Array | None, *, rotor_lag: float = 0.0, 
     posed = robust_problem(
         vehicle, period=PERIOD, horizon=HORIZON, objective=objective, bounds=problem.bounds, settings=settings
     )
-    return RobustMPC(vehicle, posed, settings, make_solver("piqp", posed))
+    return robust_mpc(vehicle, posed, settings)
 
 
 def peak_tilt(vehicle: Vehicle, *sets: str, tight: bool = True, rotor_lag: float = 0.0) -> float:

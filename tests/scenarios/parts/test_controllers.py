@@ -16,14 +16,15 @@ from mpc.answer import ActuatorBounds
 from mpc.baselines.geometric import GeometricController
 from mpc.baselines.lqr import LQR, bryson_objective
 from mpc.baselines.pid import PID, CascadedPID
-from mpc.constrained import ConstrainedMPC
 from mpc.constraints import Bounds
-from mpc.fallback.contract import Guarded
+from mpc.linear import LinearMPC
 from mpc.nonlinear.controller import NonlinearMPC
 from mpc.nonlinear.settings import Weights
 from mpc.observer import ObserverSettings
 from mpc.ocp import Objective
-from mpc.robust.controller import RobustMPC, RobustSettings
+from mpc.pilot import Pilot
+from mpc.robust.controller import RobustPreparation
+from mpc.robust.settings import RobustSettings
 from mpc.robust.tightening import TighteningSettings, margins
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
@@ -57,15 +58,19 @@ def scenario(controller: Any, vehicle: str = "lopes2011") -> Scenario:
     )
 
 
-def built(controller: Any, vehicle: str = "lopes2011") -> Controller:
+def built(controller: Any, vehicle: str = "lopes2011") -> Pilot:
     one = scenario(controller, vehicle)
     return Assembly(one).controller()
 
 
-def robust(**parts: Any) -> RobustMPC:
-    law = built({**ROBUST, "fallback": {"enabled": False}, **parts})
-    assert isinstance(law, RobustMPC)
-    return law
+def preparation_of(law: Controller) -> RobustPreparation:
+    assert isinstance(law, LinearMPC)
+    assert isinstance(law.preparation, RobustPreparation)
+    return law.preparation
+
+
+def robust(**parts: Any) -> RobustPreparation:
+    return preparation_of(built({**ROBUST, "fallback": {"enabled": False}, **parts}).law)
 
 
 def same(left: object, right: object) -> bool:
@@ -143,8 +148,7 @@ def test_the_vehicles_lag_is_its_rotor_rise() -> None:
     lag = {"rotor_lag": "vehicle", "fallback": {"enabled": False}}
     law = built({**ROBUST, **lag, "input_bounds": {"speed": [0.0, 800.0], "slew": [-50.0, 50.0]}}, "hummingbird")
     vehicle = Assembly(scenario(ROBUST, "hummingbird")).vehicle
-    assert isinstance(law, RobustMPC)
-    assert law.settings.rotor_lag == vehicle.rotor_rise
+    assert preparation_of(law.law).settings.rotor_lag == vehicle.rotor_rise
     assert vehicle.rotor_rise
 
 
@@ -165,17 +169,18 @@ def test_the_fallback_is_on_and_keeps_well_within_the_bounds_on_tilt(
     bounds: dict[str, Any], given: dict[str, Any], tilt: float
 ) -> None:
     law = built({**ROBUST, "output_bounds": bounds, "fallback": given})
-    assert isinstance(law, Guarded)
-    assert isinstance(law.inner, RobustMPC)
-    assert law.law.tilt == pytest.approx(math.radians(tilt), rel=1e-12)
+    assert law.guard is not None
+    preparation_of(law.law)
+    assert law.guard.hover.tilt == pytest.approx(math.radians(tilt), rel=1e-12)
     assert law.name == "robust"
 
 
 def test_the_fallback_of_the_constrained_one_is_off_unless_given() -> None:
     table = {**ROBUST, "type": "constrained"}
-    assert isinstance(built(table), ConstrainedMPC)
-    assert isinstance(built({**table, "fallback": {"enabled": False}}), ConstrainedMPC)
-    assert isinstance(built({**table, "fallback": {}}), Guarded)
+    assert isinstance(built(table).law, LinearMPC)
+    assert built(table).guard is None
+    assert built({**table, "fallback": {"enabled": False}}).guard is None
+    assert built({**table, "fallback": {}}).guard is not None
 
 
 # --- baselines -----------------------------------------------------------------------------------------------------
@@ -239,9 +244,9 @@ def test_fields_of_nonlinear_mpc_arrive() -> None:
 
 def test_nonlinear_mpc_needs_no_field_and_is_within_the_fallback_contract() -> None:
     law = built("nonlinear")
-    assert isinstance(law, Guarded)
-    assert isinstance(law.inner, NonlinearMPC)
-    assert not isinstance(built({"type": "nonlinear", "fallback": {"enabled": False}}), Guarded)
+    assert law.guard is not None
+    assert isinstance(law.law, NonlinearMPC)
+    assert built({"type": "nonlinear", "fallback": {"enabled": False}}).guard is None
 
 
 NARROW = (

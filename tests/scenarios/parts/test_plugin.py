@@ -56,9 +56,9 @@ def written(tmp_path: Path) -> Iterator[Write]:
 
 def build(path: str, *settings: str) -> PluginController:
     scenario = load_scenario(path, settings)
-    controller = Assembly(scenario).controller()
-    assert isinstance(controller, PluginController)
-    return controller
+    law = Assembly(scenario).controller().law
+    assert isinstance(law, PluginController)
+    return law
 
 
 def message(path: str) -> str:
