@@ -211,7 +211,7 @@ class PluginController:
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError if the answer is not a command."""
         rows = {name: getattr(now, name) for name in _ROWS}
-        copied = {name: None if value is None else value.copy() for name, value in rows.items()}
+        copied: dict[str, Any] = {name: None if value is None else value.copy() for name, value in rows.items()}
         given = replace(now, **copied, motion=None if now.motion is None else now.motion.read_only())
         named = state.copy().view(State)
         answer: Any = self.law.step(given, named, reference.copy())

@@ -64,10 +64,10 @@ NEEDED: Final = {
 def read_table(path: Path, *, poles: int | None = None) -> dict[str, Series]:
     """Read the series of a table by field of `scenarios.identify.record.Record`; arguments and errors as there."""
     table = _read_csv(path) if path.suffix.lower() == ".csv" else read_parquet(path)
-    names = [name.partition("[")[0].strip().lower() for name in table.column_names]
-    if twice := sorted({name for name in names if name in KNOWN and names.count(name) > 1}):
+    listed = [name.partition("[")[0].strip().lower() for name in table.column_names]
+    if twice := sorted({name for name in listed if name in KNOWN and listed.count(name) > 1}):
         raise FileError(path, f"has two columns of one name: {_listed(twice)}; a name is what stands before its unit")
-    columns = dict(zip(names, table.columns, strict=True))
+    columns = dict(zip(listed, table.columns, strict=True))
     spellings = SPELLINGS
     if b"speeds_before" in (table.schema.metadata or {}):  # quadsim's own
         spellings = {**SPELLINGS, "euler_rates": ("roll_rate pitch_rate yaw_rate",)}
