@@ -1,4 +1,4 @@
-"""Flights through an autopilot: own controllers of targets, logs, audit, late commands, sensors, vehicle files."""
+"""Flights through an autopilot: one contract for any law of any target; late commands, sensors, vehicle files."""
 
 from __future__ import annotations
 
@@ -31,6 +31,10 @@ START = {
     "reference.response_time": 0.0,
     "constraints": [],
 }
+AUDITED = [
+    {"name": "thrust", "signal": "thrust", "lower": 2.0, "upper": 15.0},
+    {"name": "rate", "signal": "body_rate_x", "lower": -200.0, "upper": 200.0},
+]
 
 
 def home(t: float) -> list[float]:
@@ -68,55 +72,110 @@ class Attitude(Rates):
         return [self.mass * size, 0.0, 0.0, 0.0, *(tilted / np.linalg.norm(tilted))]
 
 
+THRUST, BODY_RATES = (3.5, 12.0), (150.0, 140.0, 60.0)
+TABLES: dict[str, dict[str, Any]] = {
+    "nonlinear of rates": {"type": "nonlinear", "commands": "rates", "horizon": 20, "terminal": "lqr"},
+    "geometric of rates": {"type": "geometric", "commands": "rates"},
+    "geometric of attitudes": {"type": "geometric", "commands": "attitude"},
+}
+LAWS: dict[str, Any] = {**TABLES, "own of rates": Rates, "own of attitudes": Attitude}
+OTHER_SPACE = {
+    "indi": ({}, "indi must be absent where commands = "),
+    "input_bounds": ({"speed": [0.0, 250.0], "slew": [-9.0, 9.0]}, "input_bounds@ must be absent where commands = "),
+    "disturbance": ({"rotor_lag": 0.02}, "disturbance.rotor_lag must be absent where commands = "),
+}
+OF_TARGETS = {"inner_lag": [0.02, 0.035, 0.035, 0.1], "target_bounds": {"body_rate": 100.0}}
+
+
 @pytest.fixture(scope="module")
 def scenario() -> quadsim.Scenario:
     return quadsim.load("hover").replace(START)
 
 
+@pytest.fixture(scope="module", params=LAWS)
+def law(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
 @pytest.fixture(scope="module")
-def flight(scenario: quadsim.Scenario) -> quadsim.Flight:
-    limits = [
-        {"name": "thrust", "signal": "thrust", "lower": 2.0, "upper": 15.0},
-        {"name": "rate", "signal": "body_rate_x", "lower": -200.0, "upper": 200.0},
-    ]
-    return quadsim.fly(scenario.replace({"constraints": limits}), controller=Rates, reference=home, progress=False)
+def flight(scenario: quadsim.Scenario, law: str) -> quadsim.Flight:
+    audited = scenario.replace({"constraints": AUDITED})
+    if law not in TABLES:
+        return quadsim.fly(audited, controller=LAWS[law], reference=home, progress=False)
+    table = TABLES[law] | {"target_bounds": {"thrust": [*THRUST], "body_rate": [*BODY_RATES]}}
+    return quadsim.fly(audited.replace({"controller": table}), reference=home, progress=False)
 
 
-@pytest.mark.parametrize("law", [Rates, Attitude])
-def test_an_own_controller_of_targets_comes_to_its_set_point(scenario: quadsim.Scenario, law: type) -> None:
-    flight = quadsim.fly(scenario, controller=law, reference=home, progress=False)
+def test_it_comes_to_its_set_point_with_the_thrust_of_the_weight(law: str, flight: quadsim.Flight) -> None:
+    target, attitude = flight.log.control.target, flight.log.control.target_attitude
     assert flight.log.reason is None
     assert [abs(flight.state[axis][-1]) for axis in "xyz"] == pytest.approx([0.0] * 3, abs=0.03)
-    assert (flight.log.control.target_attitude is not None) == (law is Attitude)
+    assert target is not None
+    assert target.shape == (150, 4)
+    np.testing.assert_allclose(target[-1], [0.716 * 9.81, 0.0, 0.0, 0.0], atol=0.1)
+    assert (attitude is not None) == law.endswith("attitudes")
+    if attitude is not None:
+        np.testing.assert_allclose(np.linalg.norm(attitude, axis=1), 1.0)
 
 
-def test_targets_and_what_was_flown_are_logged(flight: quadsim.Flight, tmp_path: Path) -> None:
-    control, plant = flight.log.control, flight.log.plant
-    assert control.target is not None
-    assert plant.thrust is not None
-    assert control.target.shape == (150, 4)
-    np.testing.assert_allclose(control.target[-1], [0.716 * 9.81, 0, 0, 0], atol=0.1)
-    # Rotor speeds are those that the autopilot commanded last in a period; thrust is that of the rotors between steps.
-    b = Assembly(flight.scenario).vehicle.thrust_coefficient
-    mid = b * np.square(0.5 * (plant.speeds[1:] + plant.speeds[:-1])).sum(axis=1)
-    np.testing.assert_allclose(plant.thrust[:-1], mid, rtol=2e-3)
-    read = quadsim.read(flight.save(tmp_path / "run", video=False, recording=True, figures=True))
-    assert read.log.control.target is not None
-    assert read.log.plant.thrust is not None
-    np.testing.assert_array_equal(read.log.control.target, control.target)
-    np.testing.assert_array_equal(read.log.plant.thrust, plant.thrust[::5])
-    assert (tmp_path / "run" / "figures" / "targets.png").is_file()
-    assert reaudit(tmp_path / "run").satisfied
+def test_its_targets_hold_the_bounds_that_it_has(law: str, flight: quadsim.Flight) -> None:
+    if law not in TABLES:
+        assert {finding.limit.name for finding in flight.findings} == {"thrust", "rate"}
+        return
+    target = flight.log.control.target
+    assert target is not None
+    assert np.all((target[:, 0] >= THRUST[0] - 1e-9) & (target[:, 0] <= THRUST[1] + 1e-9))
+    assert np.all(np.abs(target[:, 1:]) <= np.radians(BODY_RATES) + 1e-9)
+    assert {"body_rate_y", "body_rate_z"} <= {finding.limit.signal for finding in flight.findings}
 
 
 def test_thrust_is_audited_as_commanded_and_as_flown(flight: quadsim.Flight) -> None:
-    finding = {finding.limit.name: finding for finding in flight.findings}["thrust"]
     control, plant = flight.log.control, flight.log.plant
     assert control.target is not None
     assert plant.thrust is not None
+    mid = 0.5 * (plant.speeds[1:] + plant.speeds[:-1])  # flown thrust is that of the rotors between steps
+    b = Assembly(flight.scenario).vehicle.thrust_coefficient
+    np.testing.assert_allclose(plant.thrust[:-1], b * np.square(mid).sum(axis=1), rtol=2e-3)
+    finding = {finding.limit.name: finding for finding in flight.findings}["thrust"]
     commanded, flown = (min((v - 2.0).min(), (15.0 - v).min()) for v in (control.target[:, 0], plant.thrust))
     assert finding.worst_margin_sampled == pytest.approx(commanded)
     assert finding.worst_margin == pytest.approx(flown)
+
+
+def test_a_saved_flight_keeps_its_targets(flight: quadsim.Flight, tmp_path: Path) -> None:
+    read = quadsim.read(flight.save(tmp_path / "run", video=False, recording=False, figures=False))
+    for name in ("target", "target_attitude"):
+        np.testing.assert_array_equal(getattr(read.log.control, name), getattr(flight.log.control, name))
+    assert reaudit(tmp_path / "run").satisfied == flight.satisfied
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_what_it_asks_for_on_the_ground_reaches_nobody_and_is_not_bounded(table: str) -> None:
+    take_off = quadsim.load("take-off-and-landing").replace({"controller": TABLES[table], "duration": 2.0})
+    log = (flight := quadsim.fly(take_off, progress=False)).log
+    assert log.control.target is not None
+    assert log.plant.thrust is not None
+    landed = np.array([phase == "landed" for phase in log.control.phase])
+    assert landed.any()
+    np.testing.assert_array_equal(np.isnan(log.control.target).all(axis=1), landed)
+    assert np.isnan(log.plant.thrust).any()
+    finding = {finding.limit.signal: finding for finding in flight.findings}["thrust"]
+    assert finding.worst_margin > -5.0  # not the whole weight
+
+
+@pytest.mark.parametrize("field", OTHER_SPACE)
+@pytest.mark.parametrize("table", TABLES)
+def test_fields_of_rotor_speeds_are_refused(table: str, field: str) -> None:
+    value, rule = OTHER_SPACE[field]
+    with pytest.raises(InputError, match=rule.replace("@", ".*")):
+        quadsim.load("hover").replace({**START, "controller": {**TABLES[table], field: value}})
+
+
+@pytest.mark.parametrize("field", OF_TARGETS)
+@pytest.mark.parametrize("kind", sorted({table["type"] for table in TABLES.values()}))
+def test_fields_of_targets_are_refused_where_it_commands_rotors(kind: str, field: str) -> None:
+    with pytest.raises(InputError, match=rf'{field} must be absent where commands = "rotors"'):
+        quadsim.load("hover").replace({**START, "controller": {"type": kind, field: OF_TARGETS[field]}})
 
 
 def test_thrust_has_no_bound_where_nothing_commands_it(scenario: quadsim.Scenario) -> None:
@@ -246,7 +305,7 @@ class Counting(Autopilot):
         return super().speeds(time, commanded, rates, rotors, attitude)
 
 
-MPC = {"type": "nonlinear", "commands": "rates", "horizon": 20, "terminal": "lqr"}
+MPC = TABLES["nonlinear of rates"]
 
 
 def test_a_controller_that_takes_over_leaves_the_autopilot_flying(scenario: quadsim.Scenario) -> None:
@@ -284,15 +343,6 @@ def test_a_law_of_targets_takes_over_from_the_law_and_not_from_its_autopilot(sce
 def test_an_autopilot_of_ones_own_needs_a_controller_of_targets(scenario: quadsim.Scenario) -> None:
     with pytest.raises(InputError, match="autopilot must be given with a controller that commands thrust"):
         quadsim.fly(scenario, autopilot=Counting(quadsim.load_vehicle("hummingbird")), progress=False)
-
-
-def test_thrust_is_not_bounded_on_the_ground() -> None:
-    take_off = quadsim.load("take-off-and-landing").replace({"controller": MPC})
-    flight = quadsim.fly(take_off, progress=False)
-    assert flight.log.plant.thrust is not None
-    assert np.isnan(flight.log.plant.thrust).any()
-    finding = {finding.limit.signal: finding for finding in flight.findings}["thrust"]
-    assert finding.worst_margin > -5.0  # not the whole weight
 
 
 def test_the_autopilot_is_called_at_its_rate_also_where_commands_are_late(scenario: quadsim.Scenario) -> None:

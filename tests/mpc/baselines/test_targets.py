@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 from mpc.baselines.attitude import attitude_error, motion_of
 from mpc.baselines.geometric import Geometric, GeometricController, Integrals, geometric_settings
 from mpc.baselines.preview import Target, target_of
-from mpc.bounded import InputBounds, TargetBounds
+from mpc.bounded import TargetBounds
 from mpc.disturbance import RampSettings
-from mpc.indi import INDISettings
 from mpc.model import continuous_model
 from quadsim.controller import Phase, StepInputs
 from quadsim.errors import ParameterError
@@ -220,13 +219,6 @@ def test_targets_stay_within_their_bounds_and_integrals_hold_there(vehicle: Vehi
     assert not law._integrals.translation.any()
 
 
-@COMMANDS
-def test_without_bounds_targets_have_the_usual_ones(vehicle: Vehicle, commands: str) -> None:
-    np.testing.assert_array_equal(
-        geometric(vehicle, FAST, commands).bounds.u_max, TargetBounds().actuators(vehicle).u_max
-    )
-
-
 def test_the_commanded_attitude_is_that_in_the_middle_of_the_period(vehicle: Vehicle) -> None:
     """With feed-forward; on the circle it turns by half a period's rates more."""
     state, rows = make_state(position=(2.0, 0.0, 1.0)), []
@@ -269,24 +261,3 @@ def test_the_table_builds_the_law_and_audits_its_targets(vehicle: Vehicle) -> No
     assert "thrust" not in Geometric().audited(vehicle)
     with pytest.raises(ParameterError, match=r"controller\.inner_lag must be four time constants .*; got None"):
         Geometric(commands="attitude").build(vehicle, PERIOD)
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"commands": "rates", "indi": INDISettings()}, r'indi must be absent where commands = "rates": the autopilot'),
-        (
-            {"commands": "attitude", "input_bounds": InputBounds(speed=(0.0, 250.0), slew=(-9.0, 9.0))},
-            r'input_bounds must be absent where commands = "attitude": .* target_bounds describe it',
-        ),
-        (
-            {"commands": "rates", "disturbance": RampSettings(rotor_lag=0.02)},
-            r'disturbance\.rotor_lag must be absent where commands = "rates": the autopilot turns the rotors',
-        ),
-        ({"inner_lag": FAST}, r'inner_lag must be absent where commands = "rotors": rotor speeds pass no autopilot'),
-        ({"target_bounds": TargetBounds(body_rate=1.0)}, r'target_bounds must be absent where commands = "rotors"'),
-    ],
-)
-def test_fields_of_the_other_space_are_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Geometric(**fields)
