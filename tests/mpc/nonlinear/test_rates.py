@@ -12,11 +12,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-<<<<<<< HEAD
-from mpc.bounded import Avoidance, Polytope, RotorBounds, Soft, TargetBounds
-=======
-from mpc.bounded import Avoidance, FallbackSettings, Polytope, Soft, TargetBounds
->>>>>>> cuts
+from mpc.bounded import Avoidance, Polytope, Soft, TargetBounds
 from mpc.constraints import Constraint
 from mpc.disturbance import RampSettings
 from mpc.fallback.contract import FallbackSettings
