@@ -175,9 +175,9 @@ def test_help_loads_little_and_list_no_simulator() -> None:
 
 
 OF_CONTROLLERS = re.compile(
-    r"(?:^|[._])(law|controller|pilot|guard|spec|table|inner|autopilot|previous|agent|successor)\w*$"
+    r"(?:^|[._])(law|controller|pilot|guard|spec|inner|autopilot|previous|agent|successor)\w*$"
 )
-"""Names of what flies: controllers, their laws, guards and inner loops, and the tables that describe them."""
+"""Names of what flies: controllers, their laws, guards and inner loops, and of their tables (`spec`)."""
 
 
 def unwritten(source: str) -> Iterator[str]:
