@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mpc.ocp import Query as Query
     from mpc.pilot import Pilot as Pilot
     from mpc.robust.controller import RobustPreparation as RobustPreparation
-    from mpc.robust.settings import RobustSettings as RobustSettings
+    from mpc.robust.settings import Robust as Robust
     from mpc.solvers import QPSolver as QPSolver
     from mpc.unconstrained import UnconstrainedMPC as UnconstrainedMPC
 
@@ -44,7 +44,7 @@ _MODULES = {
     "mpc.ocp": ("Objective", "Problem", "Query", "InfeasiblePeriod"),
     "mpc.pilot": ("Pilot",),
     "mpc.robust.controller": ("RobustPreparation",),
-    "mpc.robust.settings": ("RobustSettings",),
+    "mpc.robust.settings": ("Robust",),
     "mpc.solvers": ("QPSolver",),
     "mpc.unconstrained": ("UnconstrainedMPC",),
 }

@@ -1,6 +1,6 @@
 """The fields that all MPC tables `[controller]` share: weights, bounds, polytopes, avoidance and fallback.
 
-Fields are in file units, angles in degrees; `build`, `bounds` and other methods convert them to SI units.
+Fields are in file units, angles in degrees; `problem`, `bounds` and other methods convert them to SI units.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 from annotated_types import Ge, Le, Len, MaxLen, doc
@@ -23,11 +23,10 @@ from mpc.indi import INDISettings, TorqueIncrement
 from mpc.model import SHORTEST_LAG, hover_model
 from mpc.obstacles import AvoidanceSettings, Shape, Space
 from mpc.ocp import Objective, Problem, lqr_terminal_weight
-from mpc.pilot import Pilot
 from mpc.qp import KKT_EVERY
 from mpc.solvers import ALIASES, CORE_OR_PIQP, SOLVERS, Solver, find_solver, make_solver
-from quadsim.controller import CORE, ROTORS, Controller
-from quadsim.errors import ExportError, MissingCoreError, ParameterError, UnknownNameError
+from quadsim.controller import CORE, ROTORS
+from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number, Pair, Positive, Weight
 from quadsim.input_limits import MOST_ENTRIES
 from quadsim.state import (
@@ -39,9 +38,6 @@ from quadsim.state import (
     Array,
 )
 from quadsim.vehicle import N_ROTORS, Vehicle
-
-if TYPE_CHECKING:
-    from mpc.core.numbers import Exportable
 
 IN_DEGREES: Final = frozenset(
     name for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True) if unit.startswith("rad")
@@ -68,7 +64,7 @@ Law = Annotated[str, doc("the control law, by its name in `quadsim list`")]
 
 
 class ControllerTable:
-    """A table `[controller]`, which builds the controller it describes; tables without these fields have none."""
+    """A table `[controller]`, from which `mpc.builders` builds a controller; what it has no field for is absent."""
 
     any_attitude: ClassVar = False  # whether the controller reads attitudes as quaternions
     type: str
@@ -83,21 +79,6 @@ class ControllerTable:
     def audited(self, vehicle: Vehicle) -> dict[str, Range]:
         """Return its hard and soft bounds on audited signals, in file units."""
         return {}
-
-    def build(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Pilot:
-        """Return the controller for a control `period` [s], with obstacles and regions `shapes`.
-
-        Where it commands targets, it flies once it has an autopilot.
-
-        Raises:
-            InputError: no controller can be built from these numbers.
-        """
-        law = self.law(vehicle, period, shapes)
-        return Pilot(law, vehicle, guard=self.guard(vehicle, period), inner=self.inner_loop(vehicle))
-
-    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """Return its law; see `build`."""
-        raise NotImplementedError
 
     def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
         """Return the fallback contract around the law; None without one."""
@@ -378,34 +359,6 @@ class Weighted(ControllerTable):
             objective = replace(objective, P=lqr_terminal_weight(model, objective))
         return Problem(model=model, horizon=self.horizon, objective=objective)
 
-    def exportable(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
-        """Return the data of its C implementation.
-
-        Raises:
-            ExportError: the controller cannot be exported.
-            InputError: no controller can be built from these numbers.
-        """
-        from mpc.core.numbers import Exportable
-
-        return Exportable(name=self.type, problem=self.problem(vehicle, period), vehicle=vehicle, settings=None)
-
-    def in_c(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller | None:
-        """Return the law in C; None if it runs in Python.
-
-        Raises:
-            MissingCoreError: the library is missing.
-            ExportError: C does not implement this law.
-        """
-        if not self.compiled:
-            return None
-        from mpc.core.law import CompiledMPC
-        from mpc.core.library import why_missing
-
-        reason = why_missing()
-        if reason is not None:
-            raise MissingCoreError(reason, instead="leave out controller.compiled")
-        return CompiledMPC(self.exportable(vehicle, period, shapes))
-
 
 @dataclass(frozen=True, kw_only=True)
 class Bounded(Weighted):
@@ -459,18 +412,16 @@ class Bounded(Weighted):
         problem = super().problem(vehicle, period)
         return replace(problem, bounds=self.bounds(), constraints=self.constraints())
 
-    def exportable(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
-        """See `Weighted.exportable`."""
-        if self.avoidance is not None and shapes:
-            rule = "its half-spaces around obstacles are others in each period: leave out controller.avoidance"
-            raise ExportError(rule)
-        return super().exportable(vehicle, period)
-
-    def space(self, shapes: Sequence[Shape], vehicle: Vehicle, period: float, margins: Array | None) -> Space | None:
-        """Return the half-spaces of obstacles and regions, tightened by margins (N, 3) [m]; None without any."""
+    def space(self, shapes: Sequence[Shape], vehicle: Vehicle, period: float) -> Space | None:
+        """Return the half-spaces of obstacles and regions; None without any."""
         if self.avoidance is None:
             return None
+        margins = self.position_margins(vehicle, period)
         return self.avoidance.space(shapes, vehicle, period=period, horizon=self.horizon, margins=margins)
+
+    def position_margins(self, vehicle: Vehicle, period: float) -> Array | None:
+        """Return (N, 3) the tightening of half-spaces along x, y, z at each predicted state [m]; None for none."""
+        return None
 
     def make_solver(self, problem: Problem, space: Space | None) -> Solver:
         """Return the problem's solver."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
@@ -13,13 +12,10 @@ from annotated_types import doc
 
 from mpc.bounded import Weighted
 from mpc.condensing import condensed_cost
-from mpc.obstacles import Shape
 from mpc.ocp import Problem
 from mpc.paper import prediction, rollout
-from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, Controller, StepInputs, stopped
-from quadsim.errors import InputError
+from quadsim.controller import GAIN, GROUNDED, UNCONSTRAINED, Command, StepInputs, stopped
 from quadsim.state import INDEX, Array, ReferenceTurns
-from quadsim.vehicle import Vehicle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,13 +80,3 @@ class Unconstrained(Weighted):
     """The paper's unconstrained MPC, a constant gain (Sec. 4)."""
 
     type: Annotated[Literal["unconstrained"], doc("the control law, by its name in `quadsim list`")] = "unconstrained"
-
-    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.law`."""
-        try:
-            return self.in_c(vehicle, period) or UnconstrainedMPC(self.problem(vehicle, period))
-        except np.linalg.LinAlgError as error:
-            raise InputError(
-                "the controller's gain cannot be computed: its weights and the vehicle's numbers are too many orders "
-                f"of magnitude apart ({error})"
-            ) from error

@@ -16,6 +16,7 @@ import numpy as np
 
 from mpc.baselines.geometric import Geometric
 from mpc.bounded import Bounded, Weighted
+from mpc.builders import build
 from mpc.flatness import motion_along
 from mpc.nonlinear.settings import Nonlinear
 from mpc.pilot import Pilot
@@ -332,7 +333,7 @@ class Assembly:
         if isinstance(spec, Nonlinear | Geometric) and spec.commands != ROTORS and spec.inner_lag is None:
             spec = replace(spec, inner_lag=self.inner_lag)
         shapes = (*self.scenario.obstacles, *self.regions)
-        return self.with_autopilot(spec.build(self.vehicle, self.scenario.control_period, shapes))
+        return self.with_autopilot(build(spec, self.vehicle, self.scenario.control_period, shapes))
 
     def with_autopilot(self, pilot: Pilot) -> Pilot:
         """Return a pilot with the autopilot that flies its law's commands; itself where these are rotor speeds."""

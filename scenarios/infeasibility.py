@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from mpc.bounded import IN_DEGREES, Bounded, Polytope
+from mpc.builders import build
 from mpc.constrained import Constrained
 from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
 from mpc.model import SHORTEST_LAG
@@ -374,7 +375,7 @@ class _Case:
         settings: Settings = {"controller.fallback": {}}
         changed, query = self._changed(settings), self._infeasible_period.query
         assert changed is not None
-        pilot = changed.build(self._vehicle, self._period)
+        pilot = build(changed, self._vehicle, self._period)
         guard = pilot.guard
         assert guard is not None
         target = np.zeros(N_STATES)

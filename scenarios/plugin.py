@@ -26,6 +26,7 @@ import numpy as np
 from annotated_types import doc
 
 from mpc.bounded import ControllerTable, Horizon
+from mpc.builders import law_of
 from mpc.obstacles import Shape
 from quadsim import border
 from quadsim.border import numbers_of, user_code
@@ -68,7 +69,6 @@ _NAME: Final = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _STEP: Final = (
     "a class or an object with a method step(now, state, reference), or a function law(now, state, reference)"
 )
-_ROWS: Final = ("acting", "attitude", "body_rates", "unseen")  # arrays of StepInputs
 _WHOLE: Final = ("iterations", "active", "fallback")  # parts of a Command
 _REAL: Final = ("slack", *RESIDUALS, "solve_s")
 _INSTALLED: Final = tuple(map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")))
@@ -102,10 +102,6 @@ class Plugin(ControllerTable, _Code):
 
     def __post_init__(self) -> None:
         _check_code(self.type, self.settings, ("vehicle", "period", "horizon"))
-
-    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.law`."""
-        return make_law(import_plugin(self), self, vehicle, period)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,9 +206,11 @@ class PluginController:
 
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """See `quadsim.controller.Controller.step`; raises CommandError if the answer is not a command."""
-        rows = {name: getattr(now, name) for name in _ROWS}
-        copied: dict[str, Any] = {name: None if value is None else value.copy() for name, value in rows.items()}
-        given = replace(now, **copied, motion=None if now.motion is None else now.motion.read_only())
+        acting, attitude, rates, unseen = (
+            None if rows is None else rows.copy() for rows in (now.acting, now.attitude, now.body_rates, now.unseen)
+        )
+        motion = None if now.motion is None else now.motion.read_only()
+        given = replace(now, acting=acting, attitude=attitude, body_rates=rates, motion=motion, unseen=unseen)
         named = state.copy().view(State)
         answer: Any = self.law.step(given, named, reference.copy())
         try:
@@ -244,6 +242,11 @@ def _numbers(numbers: Any, shape: tuple[int, ...], name: str) -> Array:
     if array.shape != shape:
         raise InputError(f"{name} must have shape {shape}; got {array.shape}")
     return array
+
+
+@law_of.register(Plugin)
+def _imported_law(spec: Plugin, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
+    return make_law(import_plugin(spec), spec, vehicle, period)
 
 
 def make_law(law: Any, spec: Plugin, vehicle: Vehicle, period: float) -> PluginController:

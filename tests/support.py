@@ -11,13 +11,14 @@ import pytest
 from ocp_peer import Period
 from scipy.linalg import block_diag
 
+from mpc.constrained import Constrained
 from mpc.constraints import Bounds, Constraint, Penalty
 from mpc.linear import LinearMPC, NominalPreparation
 from mpc.model import LinearModel
 from mpc.nonlinear.model import NonlinearModel, advance
 from mpc.ocp import Equilibrium, Objective, Problem, Query
 from mpc.robust.controller import RobustPreparation
-from mpc.robust.settings import RobustSettings
+from mpc.robust.settings import Robust
 from mpc.solvers import Solver, make_solver
 from quadsim.controller import Controller
 from quadsim.errors import described
@@ -64,10 +65,18 @@ def constrained_mpc(problem: Problem, solver: Solver | None = None) -> LinearMPC
     return LinearMPC(NominalPreparation(problem), solver, name="constrained", holds=True)
 
 
-def robust_mpc(vehicle: Vehicle, problem: Problem, settings: RobustSettings, solver: str = "piqp") -> LinearMPC:
-    """The robust law for a `robust_problem`."""
-    preparation = RobustPreparation(vehicle, problem, settings)
-    return LinearMPC(preparation, make_solver(solver, problem), name="robust")
+def robust_table(**fields: Any) -> Robust:
+    """The robust controller's table with the paper's weights and bounds, and other fields."""
+    paper = load_scenario("paper-constrained").controller
+    assert isinstance(paper, Constrained)
+    names = ("horizon", "output_weights", "input_weights", "output_bounds", "input_bounds")
+    return Robust(**{name: getattr(paper, name) for name in names} | fields)
+
+
+def robust_mpc(vehicle: Vehicle, table: Robust, problem: Problem | None = None, solver: str = "piqp") -> LinearMPC:
+    """The robust law of a table, with another problem where one is given; its period is the paper's."""
+    problem = table.problem(vehicle, 0.05) if problem is None else problem
+    return LinearMPC(RobustPreparation(vehicle, problem, table), make_solver(solver, problem), name="robust")
 
 
 def paper_problem(name: str = "paper-constrained", *settings: str) -> Problem:

@@ -173,10 +173,8 @@ def test_help_loads_little_and_list_no_simulator() -> None:
     assert not loaded & {"mujoco", "pydantic", "pyarrow", "pandas"}
 
 
-OF_CONTROLLERS = re.compile(
-    r"(?:^|[._])(law|controller|pilot|guard|spec|table|inner|autopilot|previous|agent|successor)\w*$"
-)
-"""Names of what flies: controllers, their laws, guards and inner loops, and the tables that describe them."""
+OF_CONTROLLERS = re.compile(r"(?:^|[._])(law|controller|pilot|guard|spec|inner|autopilot|previous|agent|successor)\w*$")
+"""Names of what flies: controllers, their laws, guards and inner loops, and of their tables (`spec`)."""
 
 
 def unwritten(source: str) -> Iterator[str]:

@@ -35,8 +35,7 @@ from mpc.disturbance import RampObserver, RampSettings
 from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
 from mpc.model import target_model
 from mpc.nonlinear.model import zero
-from mpc.obstacles import Shape
-from quadsim.controller import Command, Controller, Phase, StepInputs
+from quadsim.controller import Command, Phase, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative
 from quadsim.rotation import multiply
@@ -406,12 +405,12 @@ class Geometric(Tuned):
         """See `mpc.bounded.ControllerTable.audited`."""
         return super().audited(vehicle) if self.commands == "rotors" else self.target_bounds.audited(vehicle)
 
-    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.law`."""
+    def settings(self, vehicle: Vehicle, period: float) -> GeometricSettings:
+        """Return the law's settings."""
         shared = self.shared(vehicle, period)
         if self.commands != "rotors":
             shared |= {"inner_lag": require_lags(self.inner_lag), "bounds": self.target_bounds.actuators(vehicle)}
-        settings = geometric_settings(
+        return geometric_settings(
             vehicle,
             lag=self.lag,
             commands=self.commands,
@@ -421,7 +420,6 @@ class Geometric(Tuned):
             disturbance=self.disturbance,
             **shared,
         )
-        return GeometricController(vehicle, settings)
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
         """See `mpc.bounded.ControllerTable.inner_loop`."""

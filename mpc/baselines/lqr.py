@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
@@ -16,9 +15,8 @@ from mpc.baselines.law import Baseline, FeedbackLaw
 from mpc.bounded import InputWeights, objective_of, require_states
 from mpc.heading import turn_horizontally
 from mpc.model import LinearModel, continuous_model, discretise, hover_model, lqr
-from mpc.obstacles import Shape
 from mpc.ocp import Objective
-from quadsim.controller import Command, Controller, StepInputs
+from quadsim.controller import Command, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
 from quadsim.state import INDEX, N_STATES, REFERENCE_STATES, STATE_NAMES, VELOCITY, Array, read_only
@@ -190,11 +188,10 @@ class LQRTable(Baseline):
             raise ValueError("input_weights must be given where output_weights are, and nowhere else")
         require_states(self.output_weights or {}, "output_weights")
 
-    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.law`."""
+    def settings(self, vehicle: Vehicle, period: float) -> LQRSettings:
+        """Return the law's settings."""
         if self.output_weights is None or self.input_weights is None:
             objective = bryson_objective(vehicle, period)
         else:
             objective = objective_of(self.output_weights, self.input_weights)
-        settings = LQRSettings(objective=objective, heading_frame=self.heading, **self.shared(vehicle, period))
-        return LQR(vehicle, settings)
+        return LQRSettings(objective=objective, heading_frame=self.heading, **self.shared(vehicle, period))

@@ -6,7 +6,6 @@ The structure is PX4's (PositionControl, AttitudeControl, RateControl); ArduPilo
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Final, Literal
 
@@ -19,8 +18,7 @@ from mpc.baselines.attitude import LEAST_LIFT, Measured, attitude_for, limit_for
 from mpc.baselines.bandwidths import Bandwidths, bandwidths, lag_to_allow_for
 from mpc.baselines.law import FeedbackLaw, Tuned
 from mpc.baselines.preview import Target, target_of
-from mpc.obstacles import Shape
-from quadsim.controller import Command, Controller, Phase, StepInputs
+from quadsim.controller import Command, Phase, StepInputs
 from quadsim.fields import Positive
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
@@ -186,7 +184,7 @@ class PID(Tuned):
     type: Annotated[Literal["pid"], doc("the control law, by its name in `quadsim list`")] = "pid"
     velocity: Annotated[Positive, doc("[m/s] largest velocity commanded")] = 12.0
 
-    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.law`."""
+    def settings(self, vehicle: Vehicle, period: float) -> PIDSettings:
+        """Return the law's settings."""
         shared = self.shared(vehicle, period)
-        return CascadedPID(vehicle, pid_settings(vehicle, lag=self.lag, velocity_max=self.velocity, **shared))
+        return pid_settings(vehicle, lag=self.lag, velocity_max=self.velocity, **shared)

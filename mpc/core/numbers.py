@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from mpc.answer import ActuatorBounds
+from mpc.bounded import Bounded, Weighted, resolved_lag
 from mpc.core.tables import NO_BOUND
 from mpc.equilibrium import LEAST_LIFT
 from mpc.fallback.completion import PLAUSIBLE
@@ -14,8 +17,10 @@ from mpc.heading import slope
 from mpc.model import hover_model
 from mpc.nonlinear.model import SUBSTEPS, nonlinear_model
 from mpc.observer import UPRIGHT, DisturbanceObserver
+from mpc.obstacles import Shape
 from mpc.ocp import Problem
-from mpc.robust.settings import RobustSettings, split_delay
+from mpc.robust.settings import Robust, split_delay
+from quadsim.errors import ExportError
 from quadsim.state import REFERENCE_STATES, Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -27,7 +32,21 @@ class Exportable:
     name: str
     problem: Problem
     vehicle: Vehicle  # the modelled vehicle
-    settings: RobustSettings | None = None  # parts of the robust controller; None for the paper's controllers
+    settings: Robust | None = None  # the table of the robust controller; None for the paper's controllers
+
+
+def exportable(table: Weighted, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
+    """Return the data of a table's law in C.
+
+    Raises:
+        ExportError: the controller cannot be exported.
+        InputError: no controller can be built from these numbers.
+    """
+    if isinstance(table, Bounded) and table.avoidance is not None and shapes:
+        rule = "its half-spaces around obstacles are others in each period: leave out controller.avoidance"
+        raise ExportError(rule)
+    settings = table if isinstance(table, Robust) else None
+    return Exportable(name=table.type, problem=table.problem(vehicle, period), vehicle=vehicle, settings=settings)
 
 
 def controller_numbers(law: Exportable) -> dict[str, Array]:
@@ -45,9 +64,10 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
     """Return the members of a `quadsim_robust`; `modes` (4, 4) as in `mpc.core.tables.Tables`."""
     settings, vehicle, period = law.settings, law.vehicle, law.problem.model.period
     assert settings is not None
-    lag, (whole, late) = settings.rotor_lag, split_delay(settings.delay, period)
+    lag, (whole, late) = resolved_lag(settings.rotor_lag, vehicle), split_delay(settings.delay, period)
     model = nonlinear_model(vehicle, period, rotor_lag=lag or None)
-    observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
+    observing = settings.offset_free
+    observer = None if observing is None else DisturbanceObserver(observing, period)
     instants = (np.arange(SUBSTEPS)[:, None] + [0.0, 0.5, 0.5, 1.0]).ravel() / SUBSTEPS
 
     def decay(time: Array | float) -> Array:
@@ -68,7 +88,7 @@ def robust_numbers(law: Exportable, modes: Array) -> dict[str, float | Array]:
         "spun_period": float(decay(period)),
         "spun_delay": float(decay(late)),
         "spun_before": float(decay(period - late)),
-        "largest_turn": settings.largest_turn,
+        "largest_turn": math.radians(settings.largest_turn),
         "effectiveness": np.asarray(model.effectiveness, float),
         "allocation": np.asarray(model.allocation, float),
         "gyration": np.asarray(model.gyration, float),

@@ -141,6 +141,8 @@ def _content(value: object) -> object:
         return value.shape, value.tobytes()
     if is_dataclass(value):
         return tuple(_content(getattr(value, item.name)) for item in fields(value))
+    if isinstance(value, dict):
+        return tuple(value.items())
     return tuple(map(_content, value)) if isinstance(value, tuple) else value
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Annotated, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le, Len, Lt, MaxLen, doc
@@ -43,17 +43,15 @@ from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
 from mpc.model import hover_model, target_model
 from mpc.nonlinear.rigidbody import RATE_SCALE, Inputs
 from mpc.observer import ObserverSettings
+from mpc.obstacles import Shape, Space
 from mpc.qp import KKT_EVERY
 from mpc.solvers import CORE_OR_PIQP, SOLVERS
-from quadsim.controller import CORE, ROTORS, Controller
+from quadsim.controller import CORE, ROTORS
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Positive, Weight
 from quadsim.input_limits import MOST_ENTRIES
 from quadsim.state import Array
 from quadsim.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from mpc.obstacles import Shape
 
 LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states in which the quaternion model is linear, too
 VEHICLES_SPEEDS: Final = RotorBounds()
@@ -276,31 +274,13 @@ class Nonlinear(ControllerTable):
         tightest = {name: min(bounds.get(name, pair), pair, key=lambda side: side[1]) for name, pair in targets.items()}
         return bounds | tightest
 
-    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.law`."""
-        from mpc.nonlinear.controller import NonlinearMPC
-
-        stride, space = self._stride(period), None
-        if self.avoidance is not None:
-            space = self.avoidance.space(
-                shapes,
-                vehicle,
-                period=stride * period,
-                horizon=self.horizon // stride,
-                positions=(0, 1, 2),
-                largest=True,
-            )
-        if self.commands != ROTORS:
-            require_lags(self.inner_lag)
-        return NonlinearMPC(
-            vehicle,
-            period=period,
-            settings=self.settings(vehicle, stride),
-            bounds=self._actuators(vehicle),
-            constraints=self._rows(),
-            space=space,
-            kkt_every=self.kkt_every,
-        )
+    def space(self, shapes: Sequence[Shape], vehicle: Vehicle, period: float) -> Space | None:
+        """Return the half-spaces of obstacles and regions; None without any."""
+        if self.avoidance is None:
+            return None
+        stride = self.stride(period)
+        step, nodes = stride * period, self.horizon // stride
+        return self.avoidance.space(shapes, vehicle, period=step, horizon=nodes, positions=(0, 1, 2), largest=True)
 
     def guard(self, vehicle: Vehicle, period: float) -> Guard | None:
         """See `mpc.bounded.ControllerTable.guard`."""
@@ -308,13 +288,13 @@ class Nonlinear(ControllerTable):
             model = hover_model(vehicle, period)
         else:
             model = target_model(vehicle, period, require_lags(self.inner_lag))
-        return self.fallback.guard(model, self._actuators(vehicle))
+        return self.fallback.guard(model, self.actuators(vehicle))
 
     def inner_loop(self, vehicle: Vehicle) -> TorqueIncrement | None:
         """See `mpc.bounded.ControllerTable.inner_loop`."""
-        return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self._actuators(vehicle))
+        return None if self.indi is None else TorqueIncrement(vehicle, self.indi, self.actuators(vehicle))
 
-    def _actuators(self, vehicle: Vehicle) -> ActuatorBounds:
+    def actuators(self, vehicle: Vehicle) -> ActuatorBounds:
         """Return the bounds on its commands."""
         return (self.input_bounds if self.commands == ROTORS else self.target_bounds).actuators(vehicle)
 
@@ -342,7 +322,7 @@ class Nonlinear(ControllerTable):
             solver=self.solver,
         )
 
-    def _stride(self, period: float) -> int:
+    def stride(self, period: float) -> int:
         """Return the number of periods per node."""
         if self.node is None:
             return 1
@@ -355,7 +335,7 @@ class Nonlinear(ControllerTable):
             raise ParameterError("controller", "horizon", self.horizon, rule)
         return stride
 
-    def _rows(self) -> tuple[Constraint, ...]:
+    def constraints(self) -> tuple[Constraint, ...]:
         """Return `output_bounds` and `polytopes` as rows over the 12 states and four rotor speeds."""
         polytopes = rows_of(self.polytopes)
         if not self.output_bounds:

@@ -20,18 +20,17 @@ from typing import Final
 
 import numpy as np
 
-from mpc.constraints import Bounds, Constraint
+from mpc.bounded import resolved_lag
 from mpc.equilibrium import Trim, equilibrium, twisted
 from mpc.fallback.completion import PLAUSIBLE, PLAUSIBLE_REFERENCE
 from mpc.heading import predict_in_heading_frame, seen_from, slope, turn_horizontally, with_limited_yaw
 from mpc.linear import Preparation
-from mpc.model import LinearModel, continuous_model, discretise, hover_model
+from mpc.model import hover_model
 from mpc.nonlinear.model import Triple, advance_disturbed, nonlinear_model, spun
 from mpc.observer import DisturbanceObserver, thrust_axis
-from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
-from mpc.robust.settings import LONGEST_SPAN, RobustSettings, split_delay
+from mpc.ocp import Equilibrium, Problem, Query
+from mpc.robust.settings import LONGEST_SPAN, Robust, split_delay
 from quadsim.controller import Phase, StepInputs
-from quadsim.errors import ParameterError
 from quadsim.state import EULER, EULER_RATE, INDEX, N_STATES, VELOCITY, Array, ReferenceTurns, all_true
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -40,59 +39,27 @@ _YAW: Final = INDEX["yaw"]
 _MOVING: Final = [*VELOCITY, *EULER, *EULER_RATE]
 
 
-def robust_problem(
-    vehicle: Vehicle,
-    *,
-    period: float,
-    horizon: int,
-    objective: Objective,
-    bounds: Bounds,
-    settings: RobustSettings,
-    constraints: tuple[Constraint, ...] = (),
-) -> Problem:
-    """Return the optimisation of the hover model, with rotor speeds as states if they lag; see `RobustPreparation`.
-
-    Objective, bounds and constraints refer to the paper's 12 states.
-    """
-    if settings.delay > horizon * period:
-        rule = f"at most the horizon of {horizon} periods, {horizon * period:g} s"
-        raise ParameterError("controller", "delay", settings.delay, rule)
-    A, B = discretise(*continuous_model(vehicle, settings.rotor_lag), period)
-    model = LinearModel(A=A, B=B, u_bar=hover_model(vehicle, period).u_bar, period=period)
-    objective = replace(objective, C_r=_widened(objective.C_r, model.n), Q_d=settings.move_weight)
-    if settings.terminal:
-        objective = replace(objective, P=lqr_terminal_weight(model, objective))
-    return Problem(
-        model=model,
-        horizon=horizon,
-        objective=objective,
-        bounds=replace(bounds, C_c=_widened(bounds.C_c, model.n), penalty=settings.penalty, margins=settings.margins),
-        constraints=tuple(
-            part if part.C is None else replace(part, C=_widened(part.C, model.n)) for part in constraints
-        ),
-    )
-
-
 class RobustPreparation:
-    """The query of a `robust_problem`; see the module and `mpc.linear.Preparation`.
+    """The query of the robust MPC; see the module and `mpc.linear.Preparation`.
 
     Attributes:
-        problem: the optimal control problem.
-        settings: its parts.
+        problem: the optimal control problem, that of the table `settings` (`Robust.problem`).
         delay: from t_k to the instant of x(k) [s].
         yaw: angle by which the axes of the last query are turned about world z [rad].
         trim: the equilibrium under the estimated disturbance.
     """
 
-    def __init__(self, vehicle: Vehicle, problem: Problem, settings: RobustSettings) -> None:
-        self.problem, self.settings, self.delay, self.yaw = problem, settings, settings.delay, 0.0
+    def __init__(self, vehicle: Vehicle, problem: Problem, settings: Robust) -> None:
+        self.problem, self.delay, self.yaw = problem, settings.delay, 0.0
+        self._heading, self._largest_turn = settings.heading, math.radians(settings.largest_turn)
         self._period = period = problem.model.period
         whole, self._late = split_delay(settings.delay, period)
         self._sent: deque[Array] = deque(maxlen=whole + 1)  # u(k-1-n) .. u(k-1): the command in force, and under way
         self._nominal = hover_model(vehicle, period)
-        self._model = nonlinear_model(vehicle, period, rotor_lag=settings.rotor_lag or None)
+        self._model = nonlinear_model(vehicle, period, rotor_lag=resolved_lag(settings.rotor_lag, vehicle) or None)
         self._of_twist = np.ascontiguousarray(np.linalg.inv(slope(self._nominal))[:, 1:])
-        self._observer = None if settings.observer is None else DisturbanceObserver(settings.observer, period)
+        observing = settings.offset_free
+        self._observer = None if observing is None else DisturbanceObserver(observing, period)
         self._turns = ReferenceTurns()
         self.reset(np.full(N_ROTORS, vehicle.hover_speed))
 
@@ -153,7 +120,7 @@ class RobustPreparation:
             x0 = self._after(self._period, x0, speeds, command)
         if not all_true(np.isfinite(x0)):
             return None
-        self.yaw = float(x0[_YAW]) if self.settings.heading else 0.0
+        self.yaw = float(x0[_YAW]) if self._heading else 0.0
         if now.phase is Phase.FLYING:  # before, the ground holds the vehicle, so its motion shows no disturbance
             self._ahead = following
         reference = self._turns.follow(reference, float(state[_YAW]))
@@ -162,8 +129,8 @@ class RobustPreparation:
             later = np.concatenate([reference[1:], reference[-1:]])
             reference = reference + self._late / self._period * (later - reference)
         x0 = np.concatenate([x0, self._turning])[: self._model.n]
-        if self.settings.heading:
-            reference = with_limited_yaw(reference, self.yaw, self.settings.largest_turn)
+        if self._heading:
+            reference = with_limited_yaw(reference, self.yaw, self._largest_turn)
             x0 = turn_horizontally(x0, -self.yaw)
             x0[_YAW] = 0.0
         u_s = self._balanced()
@@ -240,8 +207,3 @@ class RobustPreparation:
         thrust = self._model.effectiveness[0]
         excess = np.dot(thrust, np.square(self._turning) - np.square(self.trim.speeds))
         return np.asarray(self.trim.speeds - np.dot(self._of_twist, excess * self.trim.twist))
-
-
-def _widened(matrix: Array, n: int) -> Array:
-    """Extend rows over 12 states to n states."""
-    return np.hstack([matrix, np.zeros((len(matrix), n - matrix.shape[1]))])

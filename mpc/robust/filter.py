@@ -28,13 +28,17 @@ from mpc.constraints import Constraint, Penalty
 from mpc.equilibrium import Trim
 from mpc.ocp import Objective, Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
+from mpc.pilot import Pilot
 from mpc.qp import QPRows
 from mpc.robust.controller import RobustPreparation
+from mpc.robust.settings import Robust
 from mpc.robust.tightening import observed
 from mpc.solvers import INVALID_DATA, Answer
 from mpc.solvers.piqp import Piqp
 from quadsim.controller import ACCEPTED, GROUNDED, UNCONSTRAINED, Command, StepInputs, stopped
+from quadsim.errors import ParameterError
 from quadsim.state import Array
+from quadsim.vehicle import Vehicle
 
 LATER: Final = 1e-6
 """epsilon: weight of the later inputs' distance from trim, relative to the first input's from the request."""
@@ -111,6 +115,19 @@ class SafetyFilter:
     def predict(self, states: Array, plans: Array) -> Array:
         """See `quadsim.controller.Controller.predict`."""
         return self._preparation.predict(states, plans)
+
+
+def safety_filter(table: Robust, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Pilot]:
+    """Return the safety filter with a table's constraints, and the same within its fallback contract, to fly.
+
+    Raises:
+        InputError: no filter can be built from these numbers.
+    """
+    if table.avoidance is not None:
+        rule = "absent for a safety filter, which keeps no half-spaces"
+        raise ParameterError("controller", "avoidance", "given", rule)
+    law = SafetyFilter(RobustPreparation(vehicle, table.problem(vehicle, period), table))
+    return law, Pilot(law, vehicle, guard=table.guard(vehicle, period))
 
 
 class _Nearest:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from annotated_types import Gt, Le, doc
@@ -19,48 +18,20 @@ from mpc.bounded import (
     require_lag,
     resolved_lag,
 )
-from mpc.constraints import Penalty
 from mpc.fallback.contract import USUAL_FALLBACK, FallbackSettings
+from mpc.model import LinearModel, continuous_model, discretise, hover_model
 from mpc.observer import ObserverSettings
-from mpc.pilot import Pilot
+from mpc.ocp import Problem, lqr_terminal_weight
 from mpc.robust.tightening import TighteningSettings, margins, position_margins
-from quadsim.controller import Controller
 from quadsim.errors import ParameterError
 from quadsim.fields import Weight
 from quadsim.state import Array
 from quadsim.vehicle import N_ROTORS, Vehicle
 
-if TYPE_CHECKING:
-    from mpc.core.numbers import Exportable
-    from mpc.linear import LinearMPC
-    from mpc.obstacles import Shape
-    from mpc.ocp import Problem
-    from mpc.robust.controller import RobustPreparation
-    from mpc.robust.filter import SafetyFilter
-
 TURNED: Final = frozenset({"x", "vx", "y", "vy", "yaw"})  # states that depend on the yaw of the axes
 
 LONGEST_SPAN: Final = 0.25
 """Longest time between two measured states [s] that the observer compares; a sensor of 4 Hz."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RobustSettings:
-    """The parts of the robust controller; each is off by default."""
-
-    penalty: Penalty | None = None  # penalty for violating an output bound; None for hard output bounds
-    rotor_lag: float = 0.0  # rotor time constant in the prediction [s]; 0 for none
-    delay: float = 0.0  # delay from measurement to command that the prediction bridges, see `split_delay` [s]
-    observer: ObserverSettings | None = None  # settings of the disturbance observer; None for no offset-free tracking
-    heading: bool = False
-    """Whether the hover model is turned by the yaw.  The weights of x and y then apply forward and to the left; if they
-    differ, so do flights at different headings."""
-    largest_turn: float = 0.5
-    """Largest predicted step of the yaw [rad], from the measured yaw or from one period to the next.  Without effect on
-    the hover model unless `heading` is set."""
-    move_weight: Array | None = None  # Q_d (4, 4), weight of command changes from period to period; None for none
-    margins: Array | None = None  # (N, n_c) tightening of the output bounds; None for none
-    terminal: bool = False  # whether the last state has the hover model's LQR weight
 
 
 def split_delay(delay: float, period: float) -> tuple[int, float]:
@@ -89,6 +60,7 @@ class Robust(Bounded):
     offset_free: ObserverSettings | None = None
     tightening: TighteningSettings | None = None
     heading: Annotated[bool, doc("whether the hover model is turned by the measured yaw")] = False
+    """The weights of x and y then apply forward and to the left: if they differ, a flight depends on its heading."""
     largest_turn: Annotated[
         float,
         Gt(0.0),
@@ -118,67 +90,46 @@ class Robust(Bounded):
                         'heading = false, or type = "nonlinear"'
                     )
 
-    def law(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Controller:
-        """See `mpc.bounded.ControllerTable.law`."""
-        return self.in_c(vehicle, period, shapes) or self._mpc(vehicle, period, shapes)
-
-    def safety_filter(self, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Pilot]:
-        """Return the safety filter with these constraints, and the same within its fallback contract, to fly.
+    def problem(self, vehicle: Vehicle, period: float) -> Problem:
+        """Return the optimisation of the hover model, with rotor speeds as states if they lag.
 
         Raises:
-            InputError: no filter can be built from these numbers.
+            InputError: no problem can be built from these numbers.
         """
-        from mpc.robust.filter import SafetyFilter
-
-        if self.avoidance is not None:
-            rule = "absent for a safety filter, which keeps no half-spaces"
-            raise ParameterError("controller", "avoidance", "given", rule)
-        law = SafetyFilter(self._preparation(vehicle, period))
-        return law, Pilot(law, vehicle, guard=self.guard(vehicle, period))
-
-    def problem(self, vehicle: Vehicle, period: float) -> Problem:
-        """See `mpc.bounded.Weighted.problem`."""
-        return self._robust_problem(vehicle, period, self.settings(vehicle, period))
-
-    def exportable(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> Exportable:
-        """See `mpc.bounded.Weighted.exportable`."""
-        return replace(super().exportable(vehicle, period, shapes), settings=self.settings(vehicle, period))
-
-    def settings(self, vehicle: Vehicle, period: float) -> RobustSettings:
-        """Return the same parts in SI units."""
-        return RobustSettings(
-            penalty=None if self.soft is None else self.soft.penalty(len(self.output_bounds)),
-            rotor_lag=resolved_lag(self.rotor_lag, vehicle),
-            delay=self.delay,
-            observer=self.offset_free,
-            heading=self.heading,
-            largest_turn=math.radians(self.largest_turn),
-            move_weight=None if self.move_weight is None else self.move_weight * np.eye(N_ROTORS),
-            terminal=self.terminal == "lqr",
-            margins=self.margins(vehicle, period),
+        if self.delay > self.horizon * period:
+            rule = f"at most the horizon of {self.horizon} periods, {self.horizon * period:g} s"
+            raise ParameterError("controller", "delay", self.delay, rule)
+        A, B = discretise(*continuous_model(vehicle, resolved_lag(self.rotor_lag, vehicle)), period)
+        model = LinearModel(A=A, B=B, u_bar=hover_model(vehicle, period).u_bar, period=period)
+        objective, bounds, n = objective_of(self.output_weights, self.input_weights), self.bounds(), model.n
+        moves = None if self.move_weight is None else self.move_weight * np.eye(N_ROTORS)
+        objective = replace(objective, C_r=_widened(objective.C_r, n), Q_d=moves)
+        if self.terminal == "lqr":
+            objective = replace(objective, P=lqr_terminal_weight(model, objective))
+        penalty = None if self.soft is None else self.soft.penalty(len(self.output_bounds))
+        return Problem(
+            model=model,
+            horizon=self.horizon,
+            objective=objective,
+            bounds=replace(bounds, C_c=_widened(bounds.C_c, n), penalty=penalty, margins=self.margins(vehicle, period)),
+            constraints=tuple(
+                part if part.C is None else replace(part, C=_widened(part.C, n)) for part in self.constraints()
+            ),
         )
 
     def margins(self, vehicle: Vehicle, period: float) -> Array | None:
         """Return the tightening of the output bounds at each predicted state, (N, n_c); None without tightening.
 
-        Raises:     ParameterError: the bounds are too narrow for it.
+        Raises:
+            ParameterError: the bounds are too narrow for it.
         """
         if self.tightening is None:
             return None
         return margins(bounds=self.bounds(), **self._tightened(vehicle, period))
 
-    def _robust_problem(self, vehicle: Vehicle, period: float, settings: RobustSettings) -> Problem:
-        from mpc.robust.controller import robust_problem
-
-        return robust_problem(
-            vehicle,
-            period=period,
-            horizon=self.horizon,
-            objective=objective_of(self.output_weights, self.input_weights),
-            bounds=self.bounds(),
-            settings=settings,
-            constraints=self.constraints(),
-        )
+    def position_margins(self, vehicle: Vehicle, period: float) -> Array | None:
+        """See `mpc.bounded.Bounded.position_margins`."""
+        return None if self.tightening is None else position_margins(**self._tightened(vehicle, period))
 
     def _tightened(self, vehicle: Vehicle, period: float) -> dict[str, Any]:
         """Return the inputs of the tightening."""
@@ -192,18 +143,7 @@ class Robust(Bounded):
             "estimated": self.offset_free is not None,
         }
 
-    def _preparation(self, vehicle: Vehicle, period: float) -> RobustPreparation:
-        from mpc.robust.controller import RobustPreparation
 
-        settings = self.settings(vehicle, period)
-        return RobustPreparation(vehicle, self._robust_problem(vehicle, period, settings), settings)
-
-    def _mpc(self, vehicle: Vehicle, period: float, shapes: Sequence[Shape] = ()) -> LinearMPC:
-        from mpc.linear import LinearMPC
-
-        margins = None  # tightening of half-spaces along x, y, z at each predicted state, (N, 3) [m]
-        if self.tightening is not None and self.avoidance is not None:
-            margins = position_margins(**self._tightened(vehicle, period))
-        space, preparation = self.space(shapes, vehicle, period, margins), self._preparation(vehicle, period)
-        solver = self.make_solver(preparation.problem, space)
-        return LinearMPC(preparation, solver, name=self.type, space=space, kkt_every=self.kkt_every)
+def _widened(matrix: Array, n: int) -> Array:
+    """Extend rows over 12 states to n states."""
+    return np.hstack([matrix, np.zeros((len(matrix), n - matrix.shape[1]))])

@@ -16,7 +16,7 @@ from mpc.codegen.ctext import CText, Precision
 from mpc.codegen.source import CHANGES, DATA, CController, part
 from mpc.codegen.targets import TARGETS, Target
 from mpc.core.library import MIRRORS
-from mpc.core.numbers import Exportable
+from mpc.core.numbers import Exportable, exportable
 from mpc.core.solver import WAYS, CoreProblem, core_library
 from mpc.ocp import Problem
 from quadsim.controller import ROTORS
@@ -186,7 +186,7 @@ def exported_law(scenario: Scenario) -> Exportable:
         how = "" if controller.commands == ROTORS else f' with commands = "{controller.commands}"'
         exported = "exported are unconstrained, constrained and robust, whose matrices are fixed"
         raise ExportError(f"it is {controller.type!r}{how}; {exported}")
-    return controller.exportable(Assembly(scenario).vehicle, scenario.control_period, shapes)
+    return exportable(controller, Assembly(scenario).vehicle, scenario.control_period, shapes)
 
 
 def _facts(controller: CController) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 from gymnasium.error import ResetNeeded
 
+from mpc.robust.filter import safety_filter
 from mpc.robust.settings import Robust
 from quadsim.controller import UNCONSTRAINED
 from quadsim.errors import ParameterError
@@ -70,7 +71,7 @@ class MPCSafetyFilter(gymnasium.Wrapper):  # type: ignore[misc]
         observed = self.env.reset(seed=seed, options=options)
         started = self._base.started
         if started.vehicle != self._vehicle:
-            self._filter, self._law = self._spec.safety_filter(started.vehicle, started.scenario.control_period)
+            self._filter, self._law = safety_filter(self._spec, started.vehicle, started.scenario.control_period)
             self._vehicle = started.vehicle
         acting = started.observation.moment.acting
         assert acting is not None

@@ -14,13 +14,13 @@ import numpy as np
 import ocp_peer
 import pytest
 from ocp_peer import Optimum, Period
-from support import changing_period, paper_problem, random_problem, random_rows, robust_mpc
+from support import changing_period, paper_problem, random_problem, random_rows, robust_mpc, robust_table
 
+from mpc.bounded import Soft
 from mpc.constraints import Constraint, Penalty, tightened
 from mpc.model import LinearModel, continuous_model, discretise
 from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
-from mpc.robust.controller import robust_problem
-from mpc.robust.settings import RobustSettings
+from mpc.robust.settings import Robust
 from mpc.solvers import SOLVERS, Method, QPSolver, find_solver, make_solver, solver_entries
 from quadsim.controller import ACCEPTED, CORE, SOLVED, UNCONSTRAINED, StepInputs
 from quadsim.state import Array, make_state
@@ -211,24 +211,23 @@ def margins(row: Constraint, level: Array) -> Array:
     return np.asarray(np.linspace(0.0, 0.5, N)[:, None] * room)
 
 
-def modelled(vehicle: Vehicle, settings: RobustSettings, constraints: tuple[Constraint, ...]) -> Problem:
+def modelled(vehicle: Vehicle, table: Robust, drawn_in: Array | None, constraints: tuple[Constraint, ...]) -> Problem:
     """What the controller is to solve at hover, built once more."""
     problem = paper_problem("paper-constrained", f"controller.horizon={N}")
     assert problem.bounds is not None
-    A, B = discretise(*continuous_model(vehicle, settings.rotor_lag), PERIOD)
+    A, B = discretise(*continuous_model(vehicle, table.rotor_lag), PERIOD)
     more = ((0, 0), (0, len(A) - 12))
     model = LinearModel(A=A, B=B, u_bar=problem.model.u_bar, period=PERIOD)
     objective = Objective(
         C_r=np.pad(problem.objective.C_r, more),
         Q_y=problem.objective.Q_y,
         Q_u=problem.objective.Q_u,
-        Q_d=settings.move_weight,
+        Q_d=None if table.move_weight is None else table.move_weight * np.eye(4),
     )
-    if settings.terminal:
+    if table.terminal:
         objective = replace(objective, P=lqr_terminal_weight(model, objective))
-    bounds = replace(
-        problem.bounds, C_c=np.pad(problem.bounds.C_c, more), penalty=settings.penalty, margins=settings.margins
-    )
+    penalty = None if table.soft is None else table.soft.penalty(2)
+    bounds = replace(problem.bounds, C_c=np.pad(problem.bounds.C_c, more), penalty=penalty, margins=drawn_in)
     widened = tuple(
         part if part.C is None else replace(part, C=np.pad(part.C, ((0, 0), (0, len(A) - part.C.shape[1]))))
         for part in constraints
@@ -236,24 +235,24 @@ def modelled(vehicle: Vehicle, settings: RobustSettings, constraints: tuple[Cons
     return Problem(model=model, horizon=N, objective=objective, bounds=bounds, constraints=widened)
 
 
-SETTINGS: dict[str, dict[str, Any]] = {
-    "plain": {},
-    "everything": {
-        "penalty": Penalty(l1=np.full(2, 2e5), l2=np.full(2, 1e4)),
-        "rotor_lag": 0.03,
-        "move_weight": 0.5 * np.eye(4),
-        "margins": np.linspace(0.0, 0.02, N)[:, None] * np.ones(2),
-    },
-    "terminal": {"terminal": True},
+SETTINGS: dict[str, tuple[dict[str, Any], Array | None]] = {
+    "plain": ({}, None),
+    "everything": (
+        {"soft": Soft(linear=2e5, quadratic=1e4), "rotor_lag": 0.03, "move_weight": 0.5},
+        np.linspace(0.0, 0.02, N)[:, None] * np.ones(2),
+    ),
+    "terminal": ({"terminal": "lqr"}, None),
 }
+"""Fields of the table, and the tightening of its output bounds."""
 
 
 @pytest.mark.parametrize("parts", SETTINGS)
 @pytest.mark.parametrize("kind", ["hard", "soft", "tightened"])
 def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str) -> None:
     """From hover with a little tilt and speed."""
-    settings = RobustSettings(**SETTINGS[parts])
-    base = modelled(vehicle, settings, ())
+    fields, drawn_in = SETTINGS[parts]
+    table = robust_table(horizon=N, **fields)
+    base = modelled(vehicle, table, drawn_in, ())
     hover, reference = np.full(4, vehicle.hover_speed), np.tile([3.0, -2.0, 2.0, 0.3], (N, 1))
     state = make_state(euler=(0.01, -0.02, 0.0))
     state[1] = 0.05
@@ -266,21 +265,13 @@ def test_the_robust_controller_holds_it(vehicle: Vehicle, parts: str, kind: str)
     if kind == "tightened":
         assert row.D is not None
         row = tightened(row, margins(row, row.D @ hover))
-    problem = modelled(vehicle, settings, (row,))
+    problem = modelled(vehicle, table, drawn_in, (row,))
     peer = ocp_peer.optimum(problem, given)
     assert peer.solution.status == SOLVED
-    small = paper_problem()
-    assert small.bounds is not None
-    posed = robust_problem(
-        vehicle,
-        period=PERIOD,
-        horizon=N,
-        objective=small.objective,
-        bounds=small.bounds,
-        settings=settings,
-        constraints=(row,),
-    )
-    controller = robust_mpc(vehicle, posed, settings, CORE)
+    posed = table.problem(vehicle, PERIOD)
+    assert posed.bounds is not None
+    posed = replace(posed, bounds=replace(posed.bounds, margins=drawn_in), constraints=problem.constraints)
+    controller = robust_mpc(vehicle, table, posed, CORE)
     controller.reset(hover)
     command = controller.step(StepInputs(acting=hover), state, reference)
     assert command.status == SOLVED

@@ -19,6 +19,7 @@ from support import constrained_mpc, fly_here
 
 import mpc
 import quadsim
+from mpc.builders import law_of
 from mpc.nonlinear.controller import CONVERGED
 from mpc.ocp import InfeasiblePeriod
 from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
@@ -331,7 +332,7 @@ class Keeping:
     """A controller of one's own that keeps the problem that it could not solve."""
 
     def __init__(self, vehicle: Vehicle, period: float, horizon: int, largest: float = 2.0) -> None:
-        law = load_scenario("paper-constrained").controller.law(vehicle, period)
+        law = law_of(load_scenario("paper-constrained").controller, vehicle, period)
         assert isinstance(law, mpc.LinearMPC)
         roll = mpc.Bounds(
             C_c=np.eye(12)[[INDEX["roll"]]],

@@ -15,6 +15,7 @@ from mpc.baselines.attitude import attitude_error, motion_of
 from mpc.baselines.geometric import Geometric, GeometricController, Integrals, geometric_settings
 from mpc.baselines.preview import Target, target_of
 from mpc.bounded import TargetBounds
+from mpc.builders import build, law_of
 from mpc.disturbance import RampSettings
 from mpc.model import continuous_model
 from quadsim.controller import Phase, StepInputs
@@ -252,7 +253,7 @@ def test_on_the_ground_it_asks_for_the_least_thrust_and_no_rates(vehicle: Vehicl
 
 def test_the_table_builds_the_law_and_audits_its_targets(vehicle: Vehicle) -> None:
     table = Geometric(commands="rates", inner_lag=SLOW, target_bounds=TargetBounds(body_rate=100.0), lag=0.05)
-    law = table.law(vehicle, PERIOD)
+    law = law_of(table, vehicle, PERIOD)
     assert isinstance(law, GeometricController)
     assert law.settings.inner_lag == SLOW
     assert law.settings.k_attitude[0] == pytest.approx(1.0 / 0.18)
@@ -260,4 +261,4 @@ def test_the_table_builds_the_law_and_audits_its_targets(vehicle: Vehicle) -> No
     assert table.audited(vehicle)["body_rate_y"] == (-100.0, 100.0)
     assert "thrust" not in Geometric().audited(vehicle)
     with pytest.raises(ParameterError, match=r"controller\.inner_lag must be four time constants .*; got None"):
-        Geometric(commands="attitude").build(vehicle, PERIOD)
+        build(Geometric(commands="attitude"), vehicle, PERIOD)

@@ -13,6 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from mpc.bounded import Avoidance, Polytope, Soft, TargetBounds
+from mpc.builders import build
 from mpc.constraints import Constraint
 from mpc.disturbance import RampSettings
 from mpc.fallback.contract import FallbackSettings
@@ -183,7 +184,7 @@ def tilts(states: Array) -> Array:
 def test_it_follows_a_previewed_step_quickly_with_small_overshoot(axis: int) -> None:
     target = np.zeros(4)
     target[axis] = 1.0
-    states, commands = fly(table().build(VEHICLE, 0.02), 0.02, 2.5, step_of(*target))
+    states, commands = fly(build(table(), VEHICLE, 0.02), 0.02, 2.5, step_of(*target))
     way = states[:, axis]
     assert 5e-3 * np.argmax(way > 0.9) - 0.5 < 0.3
     assert way.max() < 1.06
@@ -202,7 +203,7 @@ def test_a_stiff_soft_tilt_does_not_turn_it_over(
     """On an unfiltered step in all directions; with single SQP steps alone, some of these flights turned over."""
     soft = Soft(linear=linear, quadratic=10.0)
     made = table(horizon=horizon, node=node, tilt=tilt, soft=soft)
-    states, _ = fly(made.build(VEHICLE, period), period, 3.5, step_of(1.0, 1.0, 1.0, math.radians(45.0)))
+    states, _ = fly(build(made, VEHICLE, period), period, 3.5, step_of(1.0, 1.0, 1.0, math.radians(45.0)))
     assert tilts(states).max() < tilt + 0.5
     np.testing.assert_allclose(states[-1, P], 1.0, atol=0.02)
 
@@ -210,7 +211,7 @@ def test_a_stiff_soft_tilt_does_not_turn_it_over(
 def test_targets_and_body_rates_hold_their_bounds() -> None:
     bounds = TargetBounds(thrust=(3.5, 8.0), body_rate=(120.0, 90.0, 60.0))
     made = table(target_bounds=bounds, body_rate=100.0, soft=Soft(linear=1e4, quadratic=10.0))
-    states, commands = fly(made.build(VEHICLE, 0.02), 0.02, 2.5, step_of(1.0, 1.0, 1.0, math.radians(45.0)))
+    states, commands = fly(build(made, VEHICLE, 0.02), 0.02, 2.5, step_of(1.0, 1.0, 1.0, math.radians(45.0)))
     rows = np.array([command.speeds for command in commands])
     largest = np.radians([120.0, 90.0, 60.0])
     assert rows[:, 0].min() >= 3.5
@@ -234,7 +235,7 @@ def test_bounds_of_targets_follow_the_vehicle() -> None:
 
 
 def test_grounded_it_turns_nowhere_with_the_least_thrust() -> None:
-    made = table().build(VEHICLE, 0.02)
+    made = build(table(), VEHICLE, 0.02)
     least = [TargetBounds().actuators(VEHICLE).u_min[0], 0.0, 0.0, 0.0]
     for controller in (made, made.law):  # type: ignore[attr-defined]
         now = StepInputs(phase=Phase.LANDED)
@@ -247,9 +248,9 @@ def test_offset_free_it_finds_the_thrust_that_holds_the_height() -> None:
     weak = {"thrust_scale": 0.8}
     still: Course = step_of(0.0, 0.0, 0.0, 0.0)
     coarse = {"horizon": 20, "node": 0.05}
-    sagging, _ = fly(table(**coarse).build(VEHICLE, 0.05), 0.05, 3.0, still, **weak)
+    sagging, _ = fly(build(table(**coarse), VEHICLE, 0.05), 0.05, 3.0, still, **weak)
     made = table(offset_free=ObserverSettings(), **coarse)
-    states, commands = fly(made.build(VEHICLE, 0.05), 0.05, 6.0, still, **weak)
+    states, commands = fly(build(made, VEHICLE, 0.05), 0.05, 6.0, still, **weak)
     assert sagging[-1, 2] < -0.03
     assert abs(states[-1, 2]) < 1e-3
     assert commands[-1].speeds[0] == pytest.approx(LEVEL[0] / 0.8, rel=1e-3)
@@ -258,7 +259,7 @@ def test_offset_free_it_finds_the_thrust_that_holds_the_height() -> None:
 @pytest.mark.parametrize("scaled", [True, False])
 def test_the_observer_of_forces_finds_the_thrust_that_holds_the_height(scaled: bool) -> None:
     made = table(disturbance=RampSettings(thrust_scale=scaled), horizon=20, node=0.05)
-    controller = made.build(VEHICLE, 0.05)
+    controller = build(made, VEHICLE, 0.05)
     states, commands = fly(controller, 0.05, 4.0, step_of(0.0, 0.0, 0.0, 0.0), thrust_scale=0.8)
     model = controller.law._model  # type: ignore[attr-defined]
     np.testing.assert_allclose(states[-1, P], 0.0, atol=2e-3)
@@ -272,7 +273,7 @@ def test_the_observer_of_forces_finds_the_thrust_that_holds_the_height(scaled: b
 
 def test_a_law_of_rotor_speeds_divides_by_the_thrust_scale_too() -> None:
     made = Nonlinear(disturbance=RampSettings(thrust_scale=True), inputs="speed", horizon=20, terminal="lqr")
-    controller = made.build(VEHICLE, 0.05)
+    controller = build(made, VEHICLE, 0.05)
     model, x = rigid_body(VEHICLE, 0.05, inputs=Inputs.SPEED, thrust_scale=0.8), np.zeros(N_BODY)
     x[3] = 1.0
     for k in range(80):
@@ -287,7 +288,7 @@ def test_a_law_of_rotor_speeds_divides_by_the_thrust_scale_too() -> None:
 
 
 def test_it_predicts_its_own_flight() -> None:
-    controller = table(fallback=FallbackSettings(enabled=False)).build(VEHICLE, 0.02)
+    controller = build(table(fallback=FallbackSettings(enabled=False)), VEHICLE, 0.02)
     x = at_rest()
     x[W] = 0.3, -0.2, 0.1
     states, commands = fly(controller, 0.02, 0.02, step_of(0.2, 0.1, 0.3, 0.0, at=0.0), x)
@@ -300,10 +301,10 @@ def test_it_predicts_its_own_flight() -> None:
 
 
 def test_it_takes_over_from_a_law_that_commands_rotors_without_a_jump() -> None:
-    rotors = Nonlinear(offset_free=ObserverSettings()).build(VEHICLE, 0.02)
+    rotors = build(Nonlinear(offset_free=ObserverSettings()), VEHICLE, 0.02)
     rotors.law._observer.adopt(np.array([0.3, 0.0, 0.5, 1.0, 0.0, 0.0]))  # type: ignore[attr-defined]
     rotors.step(StepInputs(), np.zeros(N_STATES), np.zeros((rotors.horizon, 4)))
-    rates = table(offset_free=ObserverSettings()).build(VEHICLE, 0.02)
+    rates = build(table(offset_free=ObserverSettings()), VEHICLE, 0.02)
     for law, previous, row in ((rates, rotors, LEVEL), (rotors, rates, np.full(4, VEHICLE.hover_speed))):
         law.reset(row)
         law.adopt(previous)  # type: ignore[attr-defined]
@@ -318,7 +319,7 @@ def test_it_takes_over_from_a_law_that_commands_rotors_without_a_jump() -> None:
 def test_it_goes_around_an_obstacle() -> None:
     ball = Sphere(name="ball", position=(0.0, 0.8, 0.05), radius=0.2)
     made = table(avoidance=Avoidance(soft=Soft()), horizon=20, node=0.05)
-    states, commands = fly(made.build(VEHICLE, 0.05, (ball,)), 0.05, 3.5, step_of(0.0, 1.6, 0.0, 0.0))
+    states, commands = fly(build(made, VEHICLE, 0.05, (ball,)), 0.05, 3.5, step_of(0.0, 1.6, 0.0, 0.0))
     clearance = np.linalg.norm(states[:, P] - np.array(ball.position), axis=1) - ball.radius
     assert clearance.min() > VEHICLE.enclosing_radius - 0.01
     np.testing.assert_allclose(states[-1, P], [0.0, 1.6, 0.0], atol=0.02)
@@ -326,7 +327,7 @@ def test_it_goes_around_an_obstacle() -> None:
 
 
 def test_it_keeps_the_first_period_that_its_steps_did_not_make_converge() -> None:
-    controller = table(horizon=20, node=0.05, fallback=FallbackSettings(enabled=False)).build(VEHICLE, 0.05)
+    controller = build(table(horizon=20, node=0.05, fallback=FallbackSettings(enabled=False)), VEHICLE, 0.05)
     state = np.zeros(N_STATES)
     upside_down = StepInputs(attitude=np.array([0.0, 1.0, 0.0, 0.0]))
     command = controller.step(upside_down, state, np.zeros((controller.horizon, 4)))
@@ -345,7 +346,7 @@ def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tup
     model = target_model(VEHICLE, period, lag)
     law = HoverLaw(model, tilt=math.radians(10.0))
     assert np.abs(np.linalg.eigvals(model.A - model.B @ np.linalg.solve(law.slope, law.gain))).max() < 1.0
-    made = table(inner_lag=lag, horizon=1, node=None).build(VEHICLE, period)
+    made = build(table(inner_lag=lag, horizon=1, node=None), VEHICLE, period)
     made.law.step = _fails  # type: ignore[attr-defined]
     x = at_rest()
     x[Q] = euler_to_quaternion(np.radians([20.0, -8.0, 0.0]))
@@ -359,7 +360,7 @@ def test_level_hover_returns_from_a_tilt_in_target_space(period: float, lag: tup
 
 @pytest.mark.parametrize("known", [True, False])
 def test_level_hover_holds_its_height_by_the_thrust_scale_that_is_estimated(known: bool) -> None:
-    made = table().build(VEHICLE, 0.02)
+    made = build(table(), VEHICLE, 0.02)
     if known:
         made.law._model = replace(made.law._model, thrust_scale=0.7)  # type: ignore[attr-defined]
     made.law.step = _fails  # type: ignore[attr-defined]
@@ -407,7 +408,7 @@ def test_it_refuses_fields_of_the_other_space_of_commands(fields: dict[str, Any]
 
 def test_it_is_not_built_without_the_lag_of_its_inner_loop() -> None:
     with pytest.raises(ParameterError, match="inner_lag must be four time constants"):
-        table(inner_lag=None).build(VEHICLE, 0.02)
+        build(table(inner_lag=None), VEHICLE, 0.02)
 
 
 @pytest.mark.parametrize("thrust", [(5.0, 4.0), (-1.0, 4.0)])

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support import paper_problem
+from support import paper_problem, robust_table
 
+from mpc.bounded import InputBounds
 from mpc.condensing import Condensed
 from mpc.constraints import Bounds
 from mpc.ocp import Objective, Query
-from mpc.robust.controller import RobustPreparation, robust_problem
+from mpc.robust.controller import RobustPreparation
 from mpc.robust.filter import TERMINAL_TOLERANCE, SafetyFilter
-from mpc.robust.settings import RobustSettings
 from mpc.solvers import make_backend
 from quadsim.controller import UNCONSTRAINED, Command, StepInputs
 from quadsim.state import INDEX, Array
@@ -37,11 +37,10 @@ def objective() -> Objective:
 
 
 def make_filter() -> SafetyFilter:
-    settings = RobustSettings(heading=True)
-    posed = robust_problem(
-        VEHICLE, period=PERIOD, horizon=HORIZON, objective=objective(), bounds=bounds(), settings=settings
+    table = robust_table(
+        horizon=HORIZON, heading=True, input_bounds=InputBounds(speed=(0.0, 250.0), slew=(-10.0, 10.0))
     )
-    return SafetyFilter(RobustPreparation(VEHICLE, posed, settings))
+    return SafetyFilter(RobustPreparation(VEHICLE, table.problem(VEHICLE, PERIOD), table))
 
 
 def filtered(filter_: SafetyFilter, state: Array, wanted: Array, acting: Array = HOVER) -> Command:

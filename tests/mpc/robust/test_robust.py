@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import constrained_mpc, derivative, paper_problem, paper_reference, robust_mpc
+from support import constrained_mpc, derivative, paper_problem, paper_reference, robust_mpc, robust_table
 
-from mpc.constraints import Penalty
+from mpc.bounded import InputWeights, Soft
 from mpc.heading import turn_horizontally
 from mpc.linear import LinearMPC
 from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model
 from mpc.observer import ObserverSettings
-from mpc.robust.controller import RobustPreparation, robust_problem
-from mpc.robust.settings import RobustSettings
+from mpc.robust.controller import RobustPreparation
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Phase, StepInputs
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state
@@ -25,14 +24,14 @@ from quadsim.vehicle import Vehicle
 from scenarios.flight import Flight
 
 PERIOD = 0.05
-SOFT = Penalty(l1=np.full(2, 2e5), l2=np.full(2, 1e4))
+SOFT = Soft(linear=2e5, quadratic=1e4)
 EVERYTHING: dict[str, Any] = {
-    "penalty": SOFT,
+    "soft": SOFT,
     "rotor_lag": 0.03,
     "delay": 0.02,
-    "observer": ObserverSettings(force_walk=0.25, torque_walk=0.5),
+    "offset_free": ObserverSettings(force_walk=0.25, torque_walk=0.5),
     "heading": True,
-    "move_weight": np.eye(4),
+    "move_weight": 1.0,
 }
 HOLD = np.zeros((50, 4))
 
@@ -44,13 +43,7 @@ def moving(velocity: tuple[float, float, float], **place: Any) -> Array:
 
 
 def robust(vehicle: Vehicle, *, horizon: int = 50, weight: float = 0.01, **settings: Any) -> LinearMPC:
-    problem = paper_problem()
-    assert problem.bounds is not None
-    objective, parts = replace(problem.objective, Q_u=weight * np.eye(4)), RobustSettings(**settings)
-    posed = robust_problem(
-        vehicle, period=PERIOD, horizon=horizon, objective=objective, bounds=problem.bounds, settings=parts
-    )
-    return robust_mpc(vehicle, posed, parts)
+    return robust_mpc(vehicle, robust_table(horizon=horizon, input_weights=InputWeights(speed=weight), **settings))
 
 
 def flown(
@@ -107,7 +100,7 @@ def test_without_optional_parts_it_is_the_papers_controller(constrained_flight: 
     assert active > 100
 
 
-@pytest.mark.parametrize("parts", [{}, {"penalty": SOFT}, EVERYTHING])
+@pytest.mark.parametrize("parts", [{}, {"soft": SOFT}, EVERYTHING])
 def test_a_period_without_an_active_constraint_has_its_status(vehicle: Vehicle, parts: dict[str, Any]) -> None:
     """And one with some is solved."""
     now, shifted = StepInputs(acting=np.full(4, vehicle.hover_speed)), np.tile([5.0, 0.0, 0.0, 0.0], (50, 1))
@@ -148,7 +141,7 @@ def test_rotors_are_followed_as_the_plants_own_lag(vehicle: Vehicle, delay: floa
 @pytest.mark.parametrize("yaw", [0.0, 2.0])
 def test_rest_under_a_disturbance_is_an_equilibrium(vehicle: Vehicle, yaw: float) -> None:
     """Also of the controller: at rest at its set-point, it commands what holds it there."""
-    controller = robust(vehicle, rotor_lag=0.03, heading=True, observer=ObserverSettings())
+    controller = robust(vehicle, rotor_lag=0.03, heading=True, offset_free=ObserverSettings())
     believing(controller, np.array([0.4, -0.3, 0.5, 0.5, -0.3, 0.1]))
     force, torque = np.split(preparation_of(controller).disturbance, 2)
     model = nonlinear_model(vehicle, PERIOD, rotor_lag=0.03)
@@ -177,7 +170,7 @@ def test_constant_forces_torques_and_mass_leave_no_steady_error(vehicle: Vehicle
     *_, (end, _) = flown(controller, heavy, start, reference, 200)
     np.testing.assert_allclose(end[[0, 2, 4, 10]], reference[0], atol=1e-3)
     *_, (end, _) = flown(
-        robust(vehicle, horizon=25, weight=0.01, **{**settings, "observer": None}), disturbed, start, reference, 40
+        robust(vehicle, horizon=25, weight=0.01, **{**settings, "offset_free": None}), disturbed, start, reference, 40
     )
     assert np.abs(end[[0, 2, 4]]).max() > 0.05
 
@@ -199,7 +192,7 @@ def test_a_wrong_mass_is_no_force_sideways(vehicle: Vehicle, factor: float) -> N
     heavy = nonlinear_model(replace(vehicle, mass=factor * vehicle.mass), PERIOD)
     reference = np.zeros((200, 4))
     reference[60:120, 0] = 2.0
-    controller = robust(vehicle, weight=0.1, penalty=SOFT, observer=ObserverSettings(), move_weight=20.0 * np.eye(4))
+    controller = robust(vehicle, weight=0.1, soft=SOFT, offset_free=ObserverSettings(), move_weight=20.0)
     believing(controller, np.zeros(6))
     tilts, sideways = [], []
     for state, _ in flown(controller, heavy, make_state(), reference, 150):
@@ -216,7 +209,7 @@ def test_the_effect_of_a_worn_rotor_is_predicted_at_any_thrust(vehicle: Vehicle)
     worn = replace(worn, effectiveness=worn.effectiveness * [1.0, 0.8, 1.0, 1.0])
     reference = np.zeros((260, 4))
     reference[180:, 2] = 10.0
-    settings: dict[str, Any] = {"penalty": SOFT, "observer": ObserverSettings()}
+    settings: dict[str, Any] = {"soft": SOFT, "offset_free": ObserverSettings()}
     controller = robust(vehicle, weight=0.1, heading=True, **settings)
     torques, thrusts = [], []
     for k, (_, speeds) in enumerate(flown(controller, worn, make_state(), reference, 200)):
@@ -285,7 +278,7 @@ def test_a_position_that_is_predicted_hides_no_disturbance(vehicle: Vehicle) -> 
 
 
 def test_predictions_and_trim_are_of_what_is_believed(vehicle: Vehicle) -> None:
-    controller = robust(vehicle, observer=ObserverSettings(), heading=True)
+    controller = robust(vehicle, offset_free=ObserverSettings(), heading=True)
     np.testing.assert_allclose(preparation_of(controller).trim.speeds, vehicle.hover_speed, rtol=1e-12)
     estimate = np.array([0.0, 0.0, -2.9, 0.5, 0.0, 0.0])
     believing(controller, estimate)
@@ -335,7 +328,7 @@ def test_far_from_its_yaw_the_vehicle_is_commanded_a_part_of_the_turn_at_once(ve
     far[:, 3], near[:, 3] = 3.0, 0.02
     jumping[0, 3], jumping[1:, 3] = 0.02, -3.0
     twice[0, 3] = 0.02
-    controller = robust(vehicle, heading=True, weight=0.1, largest_turn=0.02)
+    controller = robust(vehicle, heading=True, weight=0.1, largest_turn=math.degrees(0.02))
 
     def commanded(reference: Array) -> Array:
         controller.reset(np.full(4, vehicle.hover_speed))

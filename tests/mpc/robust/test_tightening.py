@@ -11,16 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.linalg
-from support import derivative, fly_once, paper_problem, paper_reference, robust_mpc
+from support import derivative, fly_once, paper_problem, paper_reference, robust_mpc, robust_table
 
-from mpc.bounded import SHORTEST_LAG
-from mpc.constraints import Bounds, Penalty
+from mpc.bounded import SHORTEST_LAG, InputWeights, Soft
+from mpc.constraints import Bounds
 from mpc.linear import LinearMPC
 from mpc.model import discretise
 from mpc.nonlinear.model import advance, nonlinear_model
 from mpc.observer import ObserverSettings
-from mpc.robust.controller import robust_problem
-from mpc.robust.settings import RobustSettings
 from mpc.robust.tightening import (
     ERROR_SHARE,
     SPEED_SHARE,
@@ -291,22 +289,19 @@ LAGGING = (f"effects.rotors.rise={LAG}", f"effects.rotors.fall={LAG}")
 
 def robust(vehicle: Vehicle, drawn_in: Array | None, *, rotor_lag: float = 0.0, delay: float = 0.0) -> LinearMPC:
     """The paper's optimisation with every part."""
-    problem = paper_problem()
-    assert problem.bounds is not None
-    settings = RobustSettings(
-        penalty=Penalty(l1=np.full(2, 1e8), l2=np.full(2, 1e4)),
+    table = robust_table(
+        horizon=HORIZON,
+        input_weights=InputWeights(speed=0.1),
+        soft=Soft(linear=1e8, quadratic=1e4),
         rotor_lag=rotor_lag,
         delay=delay,
-        observer=ObserverSettings(),
+        offset_free=ObserverSettings(),
         heading=True,
-        move_weight=20.0 * np.eye(4),
-        margins=drawn_in,
+        move_weight=20.0,
     )
-    objective = replace(problem.objective, Q_u=0.1 * np.eye(4))
-    posed = robust_problem(
-        vehicle, period=PERIOD, horizon=HORIZON, objective=objective, bounds=problem.bounds, settings=settings
-    )
-    return robust_mpc(vehicle, posed, settings)
+    problem = table.problem(vehicle, PERIOD)
+    assert problem.bounds is not None
+    return robust_mpc(vehicle, table, replace(problem, bounds=replace(problem.bounds, margins=drawn_in)))
 
 
 def peak_tilt(vehicle: Vehicle, *sets: str, tight: bool = True, rotor_lag: float = 0.0) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from first_flights import vehicles
 
+from mpc.builders import build
 from mpc.model import continuous_model, discretise
 from quadsim.controller import StepInputs
 from quadsim.errors import ParameterError
@@ -46,7 +47,7 @@ def test_a_baselines_loop_tolerates_a_quarter_to_three_quarters_of_that_delay(ve
     for i in range(N_STATES):
         state, answers = np.zeros(N_STATES), []
         for state[i] in (step, -step):
-            controller = scenario.controller.build(vehicle, tuning.period)
+            controller = build(scenario.controller, vehicle, tuning.period)
             answers.append(controller.step(StepInputs(), state, np.zeros((controller.horizon, 4))).speeds)
         K[:, i] = (answers[1] - answers[0]) / (2.0 * step)
     margin = delay_margin(vehicle, tuning)

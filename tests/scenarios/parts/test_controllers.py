@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import tomllib
-from dataclasses import fields, replace
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,10 @@ from mpc.constraints import Bounds
 from mpc.linear import LinearMPC
 from mpc.nonlinear.controller import NonlinearMPC
 from mpc.nonlinear.settings import Weights
-from mpc.observer import ObserverSettings
+from mpc.observer import DisturbanceObserver, ObserverSettings
 from mpc.ocp import Objective
 from mpc.pilot import Pilot
 from mpc.robust.controller import RobustPreparation
-from mpc.robust.settings import RobustSettings
 from mpc.robust.tightening import TighteningSettings, margins
 from quadsim.controller import Controller
 from quadsim.errors import ParameterError
@@ -86,8 +86,12 @@ def same(left: object, right: object) -> bool:
 
 
 def test_of_the_robust_controller_every_part_is_absent_unless_given() -> None:
-    usual = replace(RobustSettings(), largest_turn=math.radians(30.0))
-    assert same(robust().settings, usual)
+    """It then asks what the constrained controller asks; a turn of the heading has its limit, without effect."""
+    law = robust()
+    constrained = Assembly(scenario({**ROBUST, "type": "constrained"})).problem()
+    assert same(law.problem, constrained)
+    assert (law.delay, law._heading, law._observer) == (0.0, False, None)
+    assert law._largest_turn == math.radians(30.0)
 
 
 BOUNDS = Bounds(
@@ -99,30 +103,39 @@ BOUNDS = Bounds(
     u_min=np.zeros(4),
     u_max=np.full(4, 250.0),
 )
-PARTS: dict[str, tuple[Any, dict[str, Any]]] = {
-    "rotor_lag": (0.03, {"rotor_lag": 0.03}),
-    "delay": (0.02, {"delay": 0.02}),
-    "offset_free": ({"force_walk": 0.7}, {"observer": ObserverSettings(force_walk=0.7)}),
-    "heading": (True, {"heading": True}),
-    "largest_turn": (90.0, {"largest_turn": math.radians(90.0)}),
-    "move_weight": (2.0, {"move_weight": 2.0 * np.eye(4)}),
+PARTS: dict[str, tuple[Any, Callable[[RobustPreparation], object], Any]] = {
+    "rotor_lag": (0.03, lambda law: law._model.rotor_lag, 0.03),
+    "delay": (0.02, lambda law: law.delay, 0.02),
+    "offset_free": (
+        {"force_walk": 0.7},
+        lambda law: law._observer and law._observer.gain,
+        DisturbanceObserver(ObserverSettings(force_walk=0.7), 0.05).gain,
+    ),
+    "heading": (True, lambda law: law._heading, True),
+    "largest_turn": (90.0, lambda law: law._largest_turn, math.radians(90.0)),
+    "move_weight": (2.0, lambda law: law.problem.objective.Q_d, 2.0 * np.eye(4)),
 }
 
 
 @pytest.mark.parametrize("part", PARTS)
 def test_a_part_is_switched_on_alone(part: str) -> None:
-    given, expected = PARTS[part]
-    assert same(robust(**{part: given}).settings, replace(robust().settings, **expected))
+    given, _, expected = PARTS[part]
+    law = robust(**{part: given})
+    for name, (_, value_of, _) in PARTS.items():
+        assert same(value_of(law), expected if name == part else value_of(robust()))
 
 
 def test_soft_bounds_have_their_penalties() -> None:
-    penalty = robust(soft={"linear": 3.0}).settings.penalty
-    assert penalty is not None
-    np.testing.assert_array_equal([penalty.l1, penalty.l2], [[3.0, 3.0], [1e4, 1e4]])
+    bounds = robust(soft={"linear": 3.0}).problem.bounds
+    assert bounds is not None
+    assert bounds.penalty is not None
+    np.testing.assert_array_equal([bounds.penalty.l1, bounds.penalty.l2], [[3.0, 3.0], [1e4, 1e4]])
 
 
 def test_tightening_is_that_of_the_stated_bounds_lag_and_delay() -> None:
-    drawn_in = robust(tightening={"acceleration": 0.2, "turning": 1.0}, rotor_lag=0.02, delay=0.01).settings.margins
+    law = robust(tightening={"acceleration": 0.2, "turning": 1.0}, rotor_lag=0.02, delay=0.01)
+    assert law.problem.bounds is not None
+    drawn_in = law.problem.bounds.margins
     expected = margins(
         Assembly(scenario(ROBUST)).vehicle,
         period=0.05,
@@ -148,7 +161,7 @@ def test_the_vehicles_lag_is_its_rotor_rise() -> None:
     lag = {"rotor_lag": "vehicle", "fallback": {"enabled": False}}
     law = built({**ROBUST, **lag, "input_bounds": {"speed": [0.0, 800.0], "slew": [-50.0, 50.0]}}, "hummingbird")
     vehicle = Assembly(scenario(ROBUST, "hummingbird")).vehicle
-    assert preparation_of(law.law).settings.rotor_lag == vehicle.rotor_rise
+    assert preparation_of(law.law)._model.rotor_lag == vehicle.rotor_rise
     assert vehicle.rotor_rise
 
 
@@ -189,7 +202,7 @@ def test_the_fallback_of_the_constrained_one_is_off_unless_given() -> None:
 def test_the_baselines_need_no_more_than_their_names() -> None:
     kinds = {"lqr": LQR, "pid": CascadedPID, "geometric": GeometricController}
     for name, kind in kinds.items():
-        law = built(name)
+        law = built(name).law
         assert type(law) is kind
         assert (law.name, law.horizon) == (name, 10)
 
@@ -223,7 +236,7 @@ NONLINEAR: dict[str, Any] = {
 
 
 def test_fields_of_nonlinear_mpc_arrive() -> None:
-    law = built(NONLINEAR)
+    law = built(NONLINEAR).law
     assert isinstance(law, NonlinearMPC)
     made, x = law.settings, math.radians(1.0)
     assert (law.horizon, made.horizon, made.stride, law.solver) == (12, 4, 3, "daqp")
@@ -287,7 +300,7 @@ def test_what_vehicle_period_and_bounds_do_not_allow_is_refused(controller: Any,
 def test_fields_of_the_baselines_arrive() -> None:
     bounds = {"speed": [1.0, 300.0], "slew": [-20.0, 30.0]}
     lqr, pid, geometric = (
-        built({"type": name, "horizon": 7, "tilt": 12.0, "input_bounds": bounds, **more})
+        built({"type": name, "horizon": 7, "tilt": 12.0, "input_bounds": bounds, **more}).law
         for name, more in {
             "lqr": {"heading": False},
             "pid": {"lag": 0.2, "velocity": 3.0},
@@ -306,7 +319,7 @@ def test_fields_of_the_baselines_arrive() -> None:
     assert pid.settings.velocity_max == 3.0
     assert pid.settings.bandwidths.rate == pytest.approx(1.0 / (2.0 * 0.225))
     assert geometric.settings.k_i > 0.0
-    weighted = built({"type": "lqr", "output_weights": ROBUST["output_weights"], "input_weights": {"speed": 0.1}})
+    weighted = built({"type": "lqr", "output_weights": ROBUST["output_weights"], "input_weights": {"speed": 0.1}}).law
     assert isinstance(weighted, LQR)
     assert same(weighted.settings.objective.Q_u, 0.1 * np.eye(4))
 
