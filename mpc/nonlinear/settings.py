@@ -37,7 +37,7 @@ from mpc.bounded import (
     rows_of,
     selection,
 )
-from mpc.constraints import Constraint
+from mpc.constraints import Constraint, origin_of_state
 from mpc.disturbance import RampSettings
 from mpc.indi import INDISettings, require_one_scale
 from mpc.model import target_model
@@ -49,7 +49,7 @@ from quadsim.controller import CORE, ROTORS, Controller
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Positive, Weight
 from quadsim.input_limits import MOST_ENTRIES
-from quadsim.state import Array
+from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -352,4 +352,6 @@ class Nonlinear(ControllerTable):
         lower, upper = np.array([*self.output_bounds.values()], float).T
         penalty = None if self.soft is None else self.soft.penalty(lower.size)
         rows = selection([*self.output_bounds])
-        return Constraint(name="outputs", lower=lower, upper=upper, C=rows, penalty=penalty), *polytopes
+        origins = tuple(origin_of_state(INDEX[name]) for name in self.output_bounds)
+        outputs = Constraint(name="outputs", lower=lower, upper=upper, C=rows, penalty=penalty, origins=origins)
+        return outputs, *polytopes
