@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 
 from mpc.condensing import states_rows
-from mpc.constraints import Bounds
 from mpc.ocp import Problem, Query, predicted
 from mpc.paper import prediction
 from mpc.qp import kkt_residuals
@@ -63,21 +62,14 @@ class ActuatorBounds:
         return cls(u_min=u_min, u_max=u_max, delta_min=down, delta_max=up)
 
     @classmethod
-    def of(cls, bounds: Bounds) -> ActuatorBounds:
-        """Return the bounds of an optimisation."""
-        return cls(u_min=bounds.u_min, u_max=bounds.u_max, delta_min=bounds.delta_min, delta_max=bounds.delta_max)
-
-    @classmethod
     def of_problem(cls, problem: Problem) -> ActuatorBounds:
         """Return the hard rows on single inputs and single steps, as bounds that hold in every period."""
         rows, nu = problem.rows, problem.model.nu
-        hard = np.isinf(rows.l1) & ~rows.on_states
         sides = []
-        for rate, other in ((rows.D, rows.E), (rows.E, rows.D)):
-            alone = hard & (np.count_nonzero(rate, axis=1) == 1) & ~other.any(axis=1)
+        for at in (rows.input, rows.step):
             lower, upper = np.full(nu, -math.inf), np.full(nu, math.inf)
-            for i in np.flatnonzero(alone & (rate.max(axis=1, initial=0.0) == 1.0)):
-                j = int(np.argmax(rate[i]))
+            for i in np.flatnonzero(at >= 0):
+                j = at[i]
                 lower[j], upper[j] = max(lower[j], rows.lower[0, i]), min(upper[j], rows.upper[0, i])
             sides += [lower, upper]
         return cls(u_min=sides[0], u_max=sides[1], delta_min=sides[2], delta_max=sides[3])

@@ -17,7 +17,7 @@ from annotated_types import Ge, Le, Len, MaxLen, doc
 
 from mpc.allocation import thrust_to_command
 from mpc.answer import ActuatorBounds
-from mpc.constraints import Bounds, Constraint, Penalty
+from mpc.constraints import Bounds, Constraint, Origin, Penalty
 from mpc.fallback.contract import FallbackSettings, Guard
 from mpc.indi import INDISettings, TorqueIncrement
 from mpc.model import SHORTEST_LAG, hover_model
@@ -36,6 +36,7 @@ from quadsim.state import (
     STATE_NAMES,
     STATE_UNITS,
     Array,
+    shown_unit,
 )
 from quadsim.vehicle import N_ROTORS, Vehicle
 
@@ -291,7 +292,19 @@ class Polytope:
             C=C,
             D=D,
             penalty=None if self.soft is None else self.soft.penalty(count),
+            origins=tuple(map(self._origin, range(count))),
         )
+
+    def _origin(self, row: int) -> Origin:
+        units = {_unit(name) for name, factor in zip(self.of, self.rows[row], strict=True) if factor}
+        field = f"controller.polytopes.{self.name}"
+        unit = units.pop() if len(units) == 1 else "-"
+        return Origin(self.row_names[row], unit, field=field, row=row, soft=f"{field}.soft")
+
+
+def _unit(term: str) -> str:
+    """Return the unit in which files state a term of a polytope."""
+    return shown_unit(STATE_UNITS[INDEX[term]])[0] if term in INDEX else "rad/s"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,14 +2,34 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from quadsim.errors import ParameterError
-from quadsim.state import N_STATES, STATE_NAMES, STATE_UNITS, Array, Indices
+from quadsim.state import N_STATES, STATE_NAMES, STATE_UNITS, Array, Indices, shown_unit
+
+_INPUTS: Final = "controller.input_bounds"
+
+
+class Origin(NamedTuple):
+    """Where a row comes from, in words and units of scenario files."""
+
+    name: str  # in reports
+    unit: str = "-"  # in which files state its bounds
+    factor: float = 1.0  # file units per unit of the row
+    rotor: int = 0  # the rotor, 1 to 4, where files state the bound for all alike; 0 for other rows
+    field: str = ""  # field of the file that states its bounds; empty if none does
+    row: int | None = None  # index in the lists `lower` and `upper` of that field; None if the field is a pair
+    soft: str = ""  # table of the file that makes it soft; empty if none does
+
+    def place(self, *, upper: bool) -> tuple[str, int]:
+        """Return the list of numbers in the file with one side of its bounds, and the entry; no list if none has it."""
+        if not self.field or self.row is None:
+            return self.field, int(upper)
+        return f"{self.field}.{('lower', 'upper')[upper]}", self.row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +69,7 @@ class Constraint:
     D: Array | None = None  # (m, nu); same
     E: Array | None = None  # (m, nu); same
     penalty: Penalty | None = None  # penalty of a violation; None for a hard constraint
+    origins: tuple[Origin, ...] = ()  # (m,) where the rows come from; empty if only the matrices are known
 
     def __post_init__(self) -> None:
         _check_order(f"{self.name}.lower", self.lower, "upper", self.upper)
@@ -62,6 +83,14 @@ class Constraint:
             raise ParameterError("controller", self.name, self.C.shape, "rows of states alone where they differ")
         if self.penalty is not None and self.penalty.l1.size != m:
             raise ParameterError("controller", "l1", self.penalty.l1.shape, f"of shape ({m},)")
+        if self.origins and len(self.origins) != m:
+            raise ParameterError("controller", f"{self.name}.origins", len(self.origins), f"one per row, {m}")
+
+    def origin(self, row: int) -> Origin:
+        """Return where a row comes from; by default its own name, with the row's number if there are several."""
+        if self.origins:
+            return self.origins[row]
+        return Origin(self.name if self.lower.shape[-1] == 1 else f"{self.name}, row {row + 1},")
 
 
 def _check_order(low: str, lower: Array, high: str, upper: Array) -> None:
@@ -105,23 +134,40 @@ class Bounds:
         for low, high in (("y_min", "y_max"), ("delta_min", "delta_max"), ("u_min", "u_max")):
             _check_order(low, getattr(self, low), high, getattr(self, high))
 
-    def output(self, i: int) -> tuple[str, float, str]:
-        """Return a constrained output as scenario files name it: its state, file units per SI unit, file unit."""
-        (states,) = np.nonzero(self.C_c[i])
-        if states.size != 1 or self.C_c[i, states[0]] != 1.0 or states[0] >= N_STATES:
-            return f"row {i} of C_c", 1.0, ""
-        name, unit = STATE_NAMES[states[0]], STATE_UNITS[states[0]]
-        return (name, math.degrees(1.0), unit.replace("rad", "deg")) if unit.startswith("rad") else (name, 1.0, unit)
-
     @property
     def constraints(self) -> tuple[Constraint, ...]:
         """The same as constraints: outputs, slews, inputs."""
-        outputs = Constraint(name="outputs", lower=self.y_min, upper=self.y_max, C=self.C_c, penalty=self.penalty)
+        outputs = Constraint(
+            name="outputs",
+            lower=self.y_min,
+            upper=self.y_max,
+            C=self.C_c,
+            penalty=self.penalty,
+            origins=tuple(map(self.output, range(len(self.C_c)))),
+        )
+        each, rotors = np.eye(self.u_min.size), range(1, self.u_min.size + 1)
+        slews, speeds = (
+            tuple(Origin(name, "rad/s", rotor=rotor, field=f"{_INPUTS}.{name}") for rotor in rotors)
+            for name in ("slew", "speed")
+        )
         return (
             outputs if self.margins is None else tightened(outputs, self.margins),
-            Constraint(name="slews", lower=self.delta_min, upper=self.delta_max, E=np.eye(self.delta_min.size)),
-            Constraint(name="inputs", lower=self.u_min, upper=self.u_max, D=np.eye(self.u_min.size)),
+            Constraint(name="slews", lower=self.delta_min, upper=self.delta_max, E=each, origins=slews),
+            Constraint(name="inputs", lower=self.u_min, upper=self.u_max, D=each, origins=speeds),
         )
+
+    def output(self, i: int) -> Origin:
+        """Return the origin of a constrained output: a state, as scenario files name it, or a row of C_c."""
+        (states,) = np.nonzero(self.C_c[i])
+        if states.size != 1 or self.C_c[i, states[0]] != 1.0 or states[0] >= N_STATES:
+            return Origin(f"row {i} of C_c")
+        return origin_of_state(int(states[0]))
+
+
+def origin_of_state(index: int) -> Origin:
+    """Return the origin of a bound on one of the paper's states."""
+    name, (unit, factor) = STATE_NAMES[index], shown_unit(STATE_UNITS[index])
+    return Origin(name, unit, factor, field=f"controller.output_bounds.{name}", soft="controller.soft")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +185,7 @@ class Rows:
     # (m,) whether a row is on the state alone: entry i is then for x(k+i+1), otherwise for x(k+i), u(k+i)
     of_states: np.ndarray[tuple[int], np.dtype[np.bool_]]
     input: Indices  # (m,) the input that a hard row bounds alone; -1 otherwise
+    step: Indices  # (m,) the input whose step a hard row bounds alone; -1 otherwise
     names: tuple[str, ...]  # (m,) names of their constraints
 
     @cached_property

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -164,7 +164,7 @@ def _sides(problem: Problem) -> dict[Side, Constraint]:
     sides = {}
     for place, (part, scales) in enumerate(zip(problem.every_constraint, _scales(problem), strict=True)):
         for row in range(scales.size if part.penalty is None else 0):
-            matrices = {
+            matrices: dict[str, Any] = {
                 name: None if matrix is None else matrix[..., [row], :] / scales[row]
                 for name, matrix in (("C", part.C), ("D", part.D), ("E", part.E))
             }

@@ -26,7 +26,7 @@ from typing import Annotated, Final, TypeAlias
 import numpy as np
 from annotated_types import Ge, Le, doc
 
-from mpc.constraints import Constraint, Penalty
+from mpc.constraints import Constraint, Origin, Penalty
 from mpc.ocp import Problem, Query, predicted
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.solvers import Answer, Solver
@@ -41,6 +41,8 @@ Shape: TypeAlias = AnyObstacle | Corridor | Fence
 LOOSE: Final = 1e3
 """Bound [m] of a half-space that is switched off."""
 SOLVER: Final = "piqp-multistage"  # solves QPs with half-spaces; the problem's own solver solves the others
+SOFT_SPACE: Final = "controller.avoidance.soft"
+"""Table of a scenario file that makes half-spaces soft (`mpc.constraints.Origin.soft`)."""
 ROUNDING: Final = 1e-6
 """Violation of a half-space [m] attributed to rounding."""
 NEAR: Final = 1e-2
@@ -133,6 +135,7 @@ class Space:
             upper=np.full_like(lower, np.inf),
             C=C,
             penalty=None if self.penalty is None else penalty,
+            origins=(Origin(name, "m", soft=SOFT_SPACE),) * len(bounds),
         )
 
     def constraints(self, normals: Array, bounds: Array, states: int) -> tuple[Constraint, ...]:

@@ -22,7 +22,7 @@ import scipy.linalg
 from mpc.constraints import Bounds, Constraint, Rows, renumbered
 from mpc.model import LinearModel
 from quadsim.errors import ParameterError
-from quadsim.state import N_STATES, REFERENCE_STATES, Array
+from quadsim.state import N_STATES, REFERENCE_STATES, Array, Indices
 
 if TYPE_CHECKING:
     from mpc.condensing import Condensed, CondensedQP
@@ -233,7 +233,13 @@ class Problem:
             ]
         )
         of_states = C.any(axis=-1) if C.ndim == 2 else C.any(axis=(0, 2))
-        of_input = ~of_states & ~E.any(1) & (np.count_nonzero(D, axis=1) == 1) & (D.max(axis=1, initial=0.0) == 1.0)
+
+        def alone(of: Array, other: Array) -> Indices:
+            single = (
+                ~of_states & ~other.any(1) & (np.count_nonzero(of, axis=1) == 1) & (of.max(axis=1, initial=0.0) == 1.0)
+            )
+            return np.where(np.isinf(l1) & single, np.argmax(of, axis=1), -1)
+
         bounded = np.flatnonzero((np.isfinite(lower) | np.isfinite(upper)).any(axis=0))
         return Rows(
             C=C[..., bounded, :],
@@ -245,7 +251,8 @@ class Problem:
             l2=l2[bounded],
             slack=renumbered(slack[bounded]),
             of_states=np.asarray(~D[bounded].any(axis=1) & ~E[bounded].any(axis=1)).reshape(bounded.size),
-            input=np.where(np.isinf(l1) & of_input, np.argmax(D, axis=1), -1)[bounded],
+            input=alone(D, E)[bounded],
+            step=alone(E, D)[bounded],
             names=tuple(names[i] for i in bounded),
         )
 

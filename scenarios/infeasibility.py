@@ -16,18 +16,19 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from mpc.bounded import IN_DEGREES, Bounded, Polytope
+from mpc.bounded import Bounded
 from mpc.builders import build
 from mpc.constrained import Constrained
+from mpc.constraints import Origin
 from mpc.diagnosis import Conflict, Side, find_conflict, has_answer, recovery, smallest_widening
 from mpc.model import SHORTEST_LAG
+from mpc.obstacles import SOFT_SPACE
 from mpc.ocp import InfeasiblePeriod
 from mpc.robust.settings import Robust
 from quadsim.errors import InputError
-from quadsim.flight.audit import TERMS, sum_signal
 from quadsim.flight.metrics import unrecovered
-from quadsim.state import N_STATES, REFERENCE_STATES, STATE_NAMES, Array
-from quadsim.vehicle import N_ROTORS, Vehicle
+from quadsim.state import N_STATES, REFERENCE_STATES, Array
+from quadsim.vehicle import Vehicle
 from scenarios.feasibility_check import hover_notes, hover_speed
 from scenarios.schema.base import fields_of
 from scenarios.schema.scenario import Scenario
@@ -53,21 +54,6 @@ LEAVING_FROM, LEAVING_FOR = 1.0, 1.0
 RETURNING: Final = 0.9  # violation at the end of a flight, over its largest, up to which it is passing
 HOVER_RESERVE: Final = 0.1  # distance of the advised bound on rotor speeds from hover, over hover
 _SPEED: Final = "controller.input_bounds.speed"
-_ROTORS: Final = {1: "slew", 2: "speed"}
-"""Fields of `input_bounds` by the index of their constraint in `mpc.constraints.Bounds.constraints`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Bound:
-    """A side of a row, in terms of the file."""
-
-    name: str  # name in reports, without its rotor
-    side: str  # `lower` or `upper`
-    entry: int  # index in its field
-    rotor: int = 0  # 1 to 4, or 0
-    unit: str = "-"  # unit of the bound in the file
-    factor: float = 1.0  # file units per unit of the row
-    field: str = ""  # field of the file, a list of numbers
 
 
 def diagnose(infeasible_period: InfeasiblePeriod, scenario: Scenario, vehicle: Vehicle) -> dict[str, Any]:
@@ -248,62 +234,44 @@ class _Case:
         self._infeasible_period, self._spec, self._vehicle = infeasible_period, spec, vehicle
         self._period, self._scenario = scenario.control_period, scenario
 
-    def bound(self, side: Side) -> _Bound:
-        """Return a side in terms of the file."""
-        which, entry = ("lower", "upper")[side.upper], int(side.upper)
-        if side.place in _ROTORS:
-            name = _ROTORS[side.place]
-            field, rotor = f"controller.input_bounds.{name}", side.row + 1
-            return _Bound(name=name, rotor=rotor, side=which, unit="rad/s", field=field, entry=entry)
-        if side.place == 0:
-            name = [state for state in STATE_NAMES if state in self._spec.output_bounds][side.row]
-            factor, field = math.degrees(1.0) if name in IN_DEGREES else 1.0, f"controller.output_bounds.{name}"
-            return _Bound(name=name, side=which, unit=TERMS[name].unit, factor=factor, field=field, entry=entry)
-        polytope, name = self._polytope(side), self._infeasible_period.problem.every_constraint[side.place].name
-        if self._is_space(side):
-            return _Bound(name=name, side=which, unit="m", entry=side.row)
-        if polytope is None:  # of an unknown kind
-            return _Bound(name=f"{name}, row {side.row + 1},", side=which, entry=side.row)
-        row = zip(polytope.of, polytope.rows[side.row], strict=True)
-        unit = sum_signal({of: factor for of, factor in row if factor}).unit
-        name, field = polytope.row_names[side.row], f"controller.polytopes.{polytope.name}.{which}"
-        return _Bound(name=name, side=which, unit=unit, field=field, entry=side.row)
+    def origin(self, side: Side) -> Origin:
+        """Return where a side comes from."""
+        return self._infeasible_period.problem.every_constraint[side.place].origin(side.row)
 
-    def _polytope(self, side: Side) -> Polytope | None:
-        name = self._infeasible_period.problem.every_constraint[side.place].name
-        return next((polytope for polytope in self._spec.polytopes if polytope.name == name), None)
+    def _together(self, side: Side) -> set[Side]:
+        """Return the sides of its constraint that have one name, and where a file states them, one number in it."""
+        rows = self._infeasible_period.problem.every_constraint[side.place].lower.shape[-1]
+        sides = [side._replace(row=row) for row in range(rows)]
+        return {other for other in sides if self.origin(other)._replace(rotor=0) == self.origin(side)._replace(rotor=0)}
 
-    def _is_space(self, side: Side) -> bool:
-        """Return whether it is a half-space of an obstacle or region."""
-        C = self._infeasible_period.problem.every_constraint[side.place].C
-        return C is not None and C.ndim == 3
+    def _field(self, side: Side) -> str:
+        return self.origin(side).place(upper=side.upper)[0]
 
     def entries(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """Yield the violated bounds, the largest share first, and the blocking ones, with times and amounts."""
         delay, period = self._infeasible_period.delay, self._period
         for side, violation in sorted(conflict.violated.items(), key=lambda item: -item[1].share):
-            bound = self.bound(side)
             first, last = (round(delay + steps * period, 9) for steps in (violation.first, violation.last))
-            yield {**_named(bound), "by": violation.amount * bound.factor, "start": first, "stop": last}
+            origin = self.origin(side)
+            yield {**_named(origin, side), "by": violation.amount * origin.factor, "start": first, "stop": last}
         for side in conflict.blocking:
-            yield {**_named(self.bound(side)), "by": 0.0, "start": None, "stop": None}
+            yield {**_named(self.origin(side), side), "by": 0.0, "start": None, "stop": None}
 
     def suggestions(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """Yield changes of the file that make the period feasible: single bounds, smallest first; softness."""
-        giving = {self.bound(side).field for side in conflict.violated}
+        giving = {self._field(side) for side in conflict.violated}
         fields: dict[str, set[Side]] = {}
         for side in (*conflict.violated, *conflict.blocking):
-            field = self.bound(side).field
+            field = self._field(side)
             if field and (side in conflict.violated or field not in giving):
-                rotors = range(N_ROTORS) if side.place in _ROTORS else (side.row,)
-                fields.setdefault(field, set()).update(side._replace(row=row) for row in rotors)
+                fields.setdefault(field, set()).update(self._together(side))
         least = {field: smallest_widening(self._infeasible_period, sides) for field, sides in fields.items()}
         changes = [{field: (fields[field], amount)} for field, amount in least.items() if amount is not None]
         alone = [settings for change in changes if (settings := self._widened(change))]
         if not alone:
             most: dict[str, float] = {}
             for side, violation in conflict.violated.items():
-                field = self.bound(side).field
+                field = self._field(side)
                 most[field] = max(violation.amount, most.get(field, 0.0))
             together = self._widened({field: (sides, most[field]) for field, sides in fields.items() if field in most})
             alone = [together] if together else []
@@ -313,10 +281,7 @@ class _Case:
 
     def _softened(self, conflict: Conflict) -> list[Settings]:
         """Return changes that soften one violated constraint, or all of them, at the largest penalty that works."""
-        polytopes = (self._polytope(side) for side in conflict.violated if side.place not in (0, *_ROTORS))
-        tables = ["controller.soft"] if any(side.place == 0 for side in conflict.violated) else []
-        tables += dict.fromkeys(f"controller.polytopes.{each.name}.soft" for each in polytopes if each is not None)
-        tables += ["controller.avoidance.soft"] if any(map(self._is_space, conflict.violated)) else []
+        tables = [*dict.fromkeys(table for side in conflict.violated if (table := self.origin(side).soft))]
         softened = [settings for table in tables if (settings := self._soft([table]))]
         if not softened and len(tables) > 1 and (settings := self._soft(tables)):
             softened = [settings]
@@ -334,9 +299,10 @@ class _Case:
             settings: Settings = {}
             for field, (sides, amount) in amounts.items():
                 numbers = [*(before := get_field(table, field))]
-                for bound in map(self.bound, sides):  # several rotors share an entry
-                    moved = more * amount * bound.factor
-                    numbers[bound.entry] = _outwards(before[bound.entry], moved, upper=bound.side == "upper")
+                for side in sides:  # several rotors share an entry
+                    origin = self.origin(side)
+                    _, entry = origin.place(upper=side.upper)
+                    numbers[entry] = _outwards(before[entry], more * amount * origin.factor, upper=side.upper)
                 settings[field] = numbers
             if self._helps(settings):
                 return settings
@@ -351,9 +317,7 @@ class _Case:
             problem = spec.problem(self._vehicle, self._period)
         except InputError:
             return False
-        space = tuple(
-            part for part in self._infeasible_period.problem.constraints if part.C is not None and part.C.ndim == 3
-        )
+        space = tuple(part for part in self._infeasible_period.problem.constraints if part.origin(0).soft == SOFT_SPACE)
         if spec.avoidance is not None and (soft := spec.avoidance.soft) is not None:
             space = tuple(replace(part, penalty=soft.penalty(part.lower.shape[1])) for part in space)
         return has_answer(replace(problem, constraints=(*problem.constraints, *space)), self._infeasible_period.query)
@@ -392,18 +356,9 @@ class _Case:
 class _OwnCase(_Case):
     """The same for a user's own controller, which no file describes."""
 
-    def bound(self, side: Side) -> _Bound:
-        """Return a side in terms of the problem."""
-        problem = self._infeasible_period.problem
-        name, rotor, factor, unit = problem.every_constraint[side.place].name, 0, 1.0, "-"
-        if problem.bounds is not None and side.place in _ROTORS:
-            name, rotor, unit = _ROTORS[side.place], side.row + 1, "rad/s"
-        elif problem.bounds is not None and side.place == 0:
-            name, factor, unit = problem.bounds.output(side.row)
-        elif len(problem.every_constraint[side.place].lower.T) > 1:
-            name = f"{name}, row {side.row + 1},"
-        which = ("lower", "upper")[side.upper]
-        return _Bound(name=name, rotor=rotor, side=which, unit=unit, factor=factor, entry=side.row)
+    def origin(self, side: Side) -> Origin:
+        """Return where a side comes from, in no file."""
+        return super().origin(side)._replace(field="", row=None, soft="")
 
     def suggestions(self, conflict: Conflict) -> Iterator[dict[str, Any]]:
         """Yield nothing: there is no file to change."""
@@ -413,23 +368,29 @@ class _OwnCase(_Case):
         """Return by how much each single side, for all rotors together, would have to be wider."""
         if conflict is None or conflict.feasible:
             return ""
-        sides: dict[tuple[str, str], set[Side]] = {}
-        for side in (*conflict.violated, *conflict.blocking):
-            rows = range(N_ROTORS) if self.bound(side).rotor else (side.row,)
-            key = (self.bound(side).name, self.bound(side).side)
-            sides.setdefault(key, set()).update(side._replace(row=row) for row in rows)
+        alike = dict.fromkeys(frozenset(self._together(side)) for side in (*conflict.violated, *conflict.blocking))
         widenings = []
-        for (name, which), alike in sides.items():
-            least, bound = smallest_widening(self._infeasible_period, alike), self.bound(next(iter(alike)))
+        for sides in alike:
+            side = next(iter(sides))
+            least, origin = smallest_widening(self._infeasible_period, sides), self.origin(side)
             if least is not None:
-                amount = f"{least * bound.factor:.3g} {bound.unit.replace('-', '')}".rstrip()
-                widenings.append(f"{name} {which} wider by {amount}")
+                amount = f"{least * origin.factor:.3g} {origin.unit.replace('-', '')}".rstrip()
+                widenings.append(f"{origin.name} {_which(side)} wider by {amount}")
         return f"has an answer with {'; or '.join(widenings)}" if widenings else "no bound alone gives it an answer"
 
 
-def _named(bound: _Bound) -> dict[str, Any]:
-    rotors = [bound.rotor] if bound.rotor else []
-    return {"name": bound.name, "rotors": rotors, "side": bound.side, "unit": bound.unit, "field": bound.field}
+def _which(side: Side) -> str:
+    return "upper" if side.upper else "lower"
+
+
+def _named(origin: Origin, side: Side) -> dict[str, Any]:
+    return {
+        "name": origin.name,
+        "rotors": [origin.rotor] if origin.rotor else [],
+        "side": _which(side),
+        "unit": origin.unit,
+        "field": origin.place(upper=side.upper)[0],
+    }
 
 
 def _merged(entries: list[dict[str, Any]]) -> list[dict[str, Any]]:

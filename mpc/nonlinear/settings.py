@@ -36,7 +36,7 @@ from mpc.bounded import (
     rows_of,
     selection,
 )
-from mpc.constraints import Constraint
+from mpc.constraints import Constraint, origin_of_state
 from mpc.disturbance import RampSettings
 from mpc.fallback.contract import USUAL_FALLBACK, FallbackSettings, Guard
 from mpc.indi import INDISettings, TorqueIncrement, require_one_scale
@@ -50,7 +50,7 @@ from quadsim.controller import CORE, ROTORS
 from quadsim.errors import ParameterError
 from quadsim.fields import NonNegative, Pair, Positive, Weight
 from quadsim.input_limits import MOST_ENTRIES
-from quadsim.state import Array
+from quadsim.state import INDEX, Array
 from quadsim.vehicle import Vehicle
 
 LINEAR: Final = ("x", "vx", "y", "vy", "z", "vz")  # states in which the quaternion model is linear, too
@@ -343,4 +343,6 @@ class Nonlinear(ControllerTable):
         lower, upper = np.array([*self.output_bounds.values()], float).T
         penalty = None if self.soft is None else self.soft.penalty(lower.size)
         rows = selection([*self.output_bounds])
-        return Constraint(name="outputs", lower=lower, upper=upper, C=rows, penalty=penalty), *polytopes
+        origins = tuple(origin_of_state(INDEX[name]) for name in self.output_bounds)
+        outputs = Constraint(name="outputs", lower=lower, upper=upper, C=rows, penalty=penalty, origins=origins)
+        return outputs, *polytopes

@@ -98,7 +98,8 @@ def margins(
         raise ParameterError("controller", "rotor_lag", rotor_lag, f"0, or at least {SHORTEST_LAG:g} s")
     room = 0.5 * (bounds.y_max - bounds.y_min)
     for i in np.flatnonzero(~np.isfinite(room)):
-        name, scale, _ = bounds.output(int(i))
+        output = bounds.output(int(i))
+        name, scale = output.name, output.factor
         sides = [scale * float(bounds.y_min[i]), scale * float(bounds.y_max[i])]
         raise ParameterError("controller.output_bounds", name, sides, "finite on both sides, to be tightened")
     A, B, C, E, K = _corrected(vehicle, rotor_lag, period, bounds.C_c, ERROR_SHARE * room, settings, estimated)
@@ -114,7 +115,8 @@ def margins(
             "turning": passed,
         }
         most = max(shares, key=lambda name: float(shares[name]))
-        name, scale, unit = bounds.output(worst)
+        output = bounds.output(worst)
+        name, scale, unit = output.name, output.factor, output.unit
         rule = (
             f"smaller, or the bounds on {name} wider: these leave {scale * room[worst]:.3g} {unit} on either side of "
             f"their middle, of which {scale * margins[-1, worst]:.3g} {unit} would be given up and at most "
