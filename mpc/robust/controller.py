@@ -85,9 +85,10 @@ class RobustMPC:
     It keeps no earlier plan: without a solution, it reports the status with the command in force, and
     `mpc.fallback.contract.Guarded` acts on it.
 
-    Attributes:     trim: the equilibrium under the estimated disturbance.     infeasible_period: the first period since
-    `reset` whose QP had no answer; None if there was none.     answer: the answer of the last period that solved a QP;
-    None before the first.
+    Attributes:
+        trim: the equilibrium under the estimated disturbance.
+        infeasible_period: the first period since `reset` whose QP had no answer; None if there was none.
+        answer: the answer of the last period that solved a QP; None before the first.
     """
 
     name: Final = "robust"

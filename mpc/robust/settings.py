@@ -125,7 +125,8 @@ class Robust(Bounded):
     def safety_filter(self, vehicle: Vehicle, period: float) -> tuple[SafetyFilter, Controller]:
         """Return the safety filter with these constraints, and the same within its fallback contract, to fly.
 
-        Raises:     InputError: no filter can be built from these numbers.
+        Raises:
+            InputError: no filter can be built from these numbers.
         """
         from mpc.robust.filter import SafetyFilter
 
@@ -160,7 +161,8 @@ class Robust(Bounded):
     def margins(self, vehicle: Vehicle, period: float) -> Array | None:
         """Return the tightening of the output bounds at each predicted state, (N, n_c); None without tightening.
 
-        Raises:     ParameterError: the bounds are too narrow for it.
+        Raises:
+            ParameterError: the bounds are too narrow for it.
         """
         if self.tightening is None:
             return None
