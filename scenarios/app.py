@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from glob import escape, glob
@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
 from cyclopts import App, Parameter
 
-from quadsim import __version__
 from quadsim.assets import vehicle_names
 from quadsim.errors import FileError, InputError, OutputError, ParameterError
 from scenarios.catalogue import campaign_names, paper_names, scenario_names, tuning_names
@@ -37,10 +36,11 @@ if TYPE_CHECKING:
     from scenarios.flight import Flight
     from scenarios.flight_comparison import FlightComparison
     from scenarios.identify.report import IdentifiedVehicle
+    from scenarios.loading import ScenarioFile
     from scenarios.papers.reproduction import Reproductions
     from scenarios.progress import Progress
     from scenarios.reaudit import Reaudit
-    from scenarios.results import Document, Listing, ScenarioFile
+    from scenarios.results import Document, Listing
     from scenarios.rollout import Rollout
     from scenarios.schema.scenario import Scenario
     from scenarios.tuning.tuning import TuningResult
@@ -91,6 +91,14 @@ else:  # as cyclopts reads them: it resolves all annotations where a command is 
     Flag = Annotated[bool, Parameter(negative="")]
     UserCode = UserForces = UserReference = Fields = Draws = Watched = Flown = Annotated[Any, Parameter(parse=False)]
 
+
+def _version() -> str:
+    """Return the line of `quadsim --version`."""
+    from importlib.metadata import version
+
+    return f"quadsim {version('quadsim')}"
+
+
 app: Final = App(
     name="quadsim",
     help="Fly model predictive controllers of quadrotors in MuJoCo; record, film and audit every flight.",
@@ -98,7 +106,7 @@ app: Final = App(
     "interrupted; 2 wrong input",
     help_format="plaintext",
     default_parameter=Parameter(show_default=False, negative_iterable=(), allow_repeating=True),
-    version=f"quadsim {__version__}",
+    version=_version,
 )
 _log: Final = logging.getLogger("quadsim")
 
@@ -316,6 +324,7 @@ def run(
         ...     flight.outcome, flight.directory.name
         ('satisfied', 'run')
     """
+    from quadsim.outputs import run_directory
     from scenarios import loading, user_code
     from scenarios.feasibility_check import hover_notes
     from scenarios.flight import require_rendering
@@ -358,15 +367,6 @@ def _write(
                 if error.path.parent == directory:  # a product that was requested explicitly
                     error.result = flight
                 raise
-
-
-def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> AbstractContextManager[Path]:
-    """Reserve a run directory: `out`, or `runs/NAME`, or the next free name unless `overwrite`."""
-    from quadsim.outputs import reserving
-
-    if out is not None:
-        return reserving(out, overwrite=overwrite)
-    return reserving(Path("runs") / name, overwrite=overwrite, free=not overwrite)
 
 
 def start(
@@ -946,6 +946,7 @@ def replay(
         Traceback (most recent call last):
         quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
     """
+    from quadsim.outputs import run_directory
     from scenarios.campaign.campaign import compare_replay, recorded_flight
     from scenarios.flight import require_rendering
     from scenarios.progress import reporting
@@ -1027,7 +1028,7 @@ def tune(
 def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) -> Iterator[dict[str, Any]]:
     """Yield the options of a command that adds flights to a directory; Ctrl-C says how to continue."""
     from quadsim.outputs import absolute
-    from scenarios.progress import watching
+    from scenarios.campaign.watching import watching
 
     if resume and overwrite:
         raise ParameterError("", "--overwrite", overwrite, "absent with --resume")
@@ -1117,6 +1118,7 @@ def export(
     import json
     import shlex
 
+    from quadsim.outputs import run_directory
     from scenarios import loading, results
     from scenarios.export import exporter, in_the_loop
     from scenarios.progress import reporting
@@ -1242,20 +1244,20 @@ def scenario(
     import json
     from dataclasses import replace
 
-    from scenarios import loading, results
+    from scenarios import loading
     from scenarios.courses.csv_course import Csv
     from scenarios.design.first_scenario import first_scenario
     from scenarios.schema.json_schema import scenario_schema
 
     if schema:
-        return results.ScenarioFile(json.dumps(scenario_schema(), indent=2) + "\n", scenario_schema())
+        return loading.ScenarioFile(json.dumps(scenario_schema(), indent=2) + "\n", scenario_schema())
     options = {"course": course, "law": controller, "tilt": tilt}
     choice: dict[str, Any] = {option: value for option, value in options.items() if value is not None}
     if vehicle is not None:
         for option, value in {"a scenario": name, "--set": changes, "--seed": seed}.items():
             if value:
                 raise ParameterError("", "--for", vehicle, f"given without {option}")
-        return results.ScenarioFile(first_scenario(load_vehicle(vehicle), str(vehicle), **choice).to_toml())
+        return loading.ScenarioFile(first_scenario(load_vehicle(vehicle), str(vehicle), **choice).to_toml())
     for option, value in choice.items():
         raise ParameterError("", f"--{'controller' if option == 'law' else option}", value, "given with --for alone")
     if name is None:
@@ -1264,7 +1266,7 @@ def scenario(
     whole = loading.assemble(name, changes, seed).resolved.scenario
     if isinstance(whole.reference, Csv):  # so that you may replace the table
         whole = whole.altered(reference=replace(whole.reference, sha256=None))
-    return results.ScenarioFile(whole.to_toml())
+    return loading.ScenarioFile(whole.to_toml())
 
 
 @app.command(
@@ -1399,7 +1401,7 @@ def doctor() -> Listing:
         >>> sorted(checks)
         ['machine', 'packages', 'rendering', 'solvers', 'viewer']
     """
-    from scenarios.machine import capabilities
+    from scenarios.doctor import capabilities
     from scenarios.results import Listing
 
     return Listing(capabilities())

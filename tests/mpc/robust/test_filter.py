@@ -14,7 +14,8 @@ from mpc.constraints import Bounds
 from mpc.ocp import Objective, Query
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
 from mpc.robust.filter import TERMINAL_TOLERANCE, SafetyFilter
-from mpc.solvers import make_backend, make_solver
+from mpc.solvers import make_backend
+from mpc.solvers.by_name import make_solver
 from quadsim.controller import UNCONSTRAINED, Command, StepInputs
 from quadsim.state import INDEX, Array
 from scenarios.assembly import Assembly

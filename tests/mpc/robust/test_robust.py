@@ -18,7 +18,8 @@ from mpc.heading import turn_horizontally
 from mpc.nonlinear.model import NonlinearModel, advance, nonlinear_model
 from mpc.observer import ObserverSettings
 from mpc.robust.controller import RobustMPC, RobustSettings, robust_problem
-from mpc.solvers import QPSolver, make_solver
+from mpc.solvers import QPSolver
+from mpc.solvers.by_name import make_solver
 from quadsim.controller import ACCEPTED, SOLVED, UNCONSTRAINED, Phase, StepInputs
 from quadsim.sim.effects.rotors import RotorDynamics
 from quadsim.state import INDEX, POSITION, Array, make_state

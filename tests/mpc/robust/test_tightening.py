@@ -30,7 +30,7 @@ from mpc.robust.tightening import (
     margins,
     observed,
 )
-from mpc.solvers import make_solver
+from mpc.solvers.by_name import make_solver
 from quadsim.controller import ACCEPTED, StepInputs
 from quadsim.errors import ParameterError
 from quadsim.state import INDEX, Array
