@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from mpc.baselines.geometric import GeometricController as GeometricController
     from mpc.baselines.lqr import LQR as LQR
     from mpc.baselines.pid import CascadedPID as CascadedPID
+    from mpc.condensing import Condensed as Condensed
+    from mpc.condensing import CondensedQP as CondensedQP
     from mpc.constraints import Bounds as Bounds
     from mpc.constraints import Constraint as Constraint
     from mpc.constraints import Penalty as Penalty
@@ -36,6 +38,7 @@ _MODULES = {
     "mpc.baselines.geometric": ("GeometricController",),
     "mpc.baselines.lqr": ("LQR",),
     "mpc.baselines.pid": ("CascadedPID",),
+    "mpc.condensing": ("Condensed", "CondensedQP"),
     "mpc.constraints": ("Bounds", "Constraint", "Penalty"),
     "mpc.linear": ("LinearMPC", "NominalPreparation"),
     "mpc.model": ("LinearModel", "hover_model"),

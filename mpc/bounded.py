@@ -24,7 +24,8 @@ from mpc.model import SHORTEST_LAG, hover_model
 from mpc.obstacles import AvoidanceSettings, Shape, Space
 from mpc.ocp import Objective, Problem, lqr_terminal_weight
 from mpc.qp import KKT_EVERY
-from mpc.solvers import ALIASES, CORE_OR_PIQP, SOLVERS, Solver, find_solver, make_solver
+from mpc.solvers import ALIASES, CORE_OR_PIQP, SOLVERS, Solver, find_solver
+from mpc.solvers.by_name import make_solver
 from quadsim.controller import CORE, ROTORS
 from quadsim.errors import ParameterError, UnknownNameError
 from quadsim.fields import NonNegative, Number, Pair, Positive, Weight
@@ -226,8 +227,8 @@ class Soft:
 class Polytope:
     """Linear constraints lower <= A v <= upper on states and rotor speeds.
 
-    Examples: a geofence, a velocity polytope, a bound on total thrust.  The flight is audited against the same rows, at
-    the physics rate.
+    For example a geofence, a velocity polytope, a bound on total thrust.  The flight is audited against the same rows,
+    at the physics rate.
     """
 
     name: Annotated[str, doc("name in reports; with several rows name_1, name_2, ...")] = field(

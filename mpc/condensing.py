@@ -6,6 +6,7 @@ Further cost terms add to them, further constraints add rows, and soft rows add 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, NamedTuple, TypeAlias
@@ -14,11 +15,12 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg import lapack
 
-from mpc.ocp import Problem, Query, predicted
+from mpc.constraints import Bounds
+from mpc.ocp import Equilibrium, Problem, Query, check_shape, predicted
 from mpc.paper import Prediction, cost, prediction, slew_matrix
 from mpc.qp import QP, PeriodQP, QPRows, Solution
 from quadsim.controller import UNCONSTRAINED
-from quadsim.state import Array
+from quadsim.state import N_STATES, REFERENCE_STATES, Array
 
 Flags: TypeAlias = np.ndarray[tuple[int], np.dtype[np.bool_]]
 
@@ -145,6 +147,23 @@ class Condensed:
         nothing = np.zeros((N, problem.objective.C_r.shape[0]))
         self.qp = self.assemble(Query(np.zeros(model.n), nothing, model.u_bar)).qp
 
+    @classmethod
+    def of(cls, problem: Problem) -> Condensed:
+        """Return the condensed QP of any problem; one without constraints has infinite bounds on its inputs."""
+        if problem.every_constraint:
+            return cls(problem)
+        none, anything = np.zeros(0), np.full(problem.model.nu, math.inf)
+        free = Bounds(
+            C_c=np.zeros((0, problem.model.n)),
+            y_min=none,
+            y_max=none,
+            delta_min=-anything,
+            delta_max=anything,
+            u_min=-anything,
+            u_max=anything,
+        )
+        return cls(replace(problem, bounds=free))
+
     @cached_property
     def _changing(self) -> tuple[Array, Array | None, Array, Array]:
         """The parts that do not depend on the model.
@@ -164,6 +183,27 @@ class Condensed:
         H = 2.0 * (np.kron(np.eye(N), objective.Q_u) + moves)
         factor = np.asarray(np.linalg.cholesky(objective.Q_y).T, float)
         return factor, _root(objective.terminal_weights[0]), H, S
+
+    def period(
+        self, state: Array, reference: Array, u_before: Array, equilibrium: Equilibrium | None = None
+    ) -> CondensedQP:
+        """Return the QP of one period as new arrays; see `mpc.ocp.Problem.qp`.
+
+        Raises:
+            ParameterError: an array has another shape.
+        """
+        problem = self._problem
+        state, reference, u_before = (np.asarray(array, float) for array in (state, reference, u_before))
+        n, u_bar = problem.model.n, problem.model.u_bar
+        check_shape("u_before", u_before, u_bar.shape)
+        if state.shape == (N_STATES,):
+            state = np.concatenate([state, u_before])[:n]
+        check_shape("state", state, (n,))
+        check_shape("reference", reference, (problem.horizon, len(REFERENCE_STATES)))
+        hover = Equilibrium(np.concatenate([np.zeros(N_STATES), u_bar])[:n], u_bar)
+        query = Query(state, problem.objective.desired(reference), u_before, equilibrium or hover)
+        qp = self.assemble(query).qp
+        return CondensedQP(*map(np.array, (qp.P, qp.c, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)))
 
     def assemble(self, query: Query) -> PeriodQP:
         """Return the QP of a period; without `Query.steps` its matrices are those of `qp` itself."""

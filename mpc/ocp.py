@@ -12,20 +12,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
 
+import mpc
 from mpc.constraints import Bounds, Constraint, Rows, renumbered
 from mpc.model import LinearModel
 from quadsim.errors import ParameterError
-from quadsim.state import N_STATES, REFERENCE_STATES, Array, Indices
-
-if TYPE_CHECKING:
-    from mpc.condensing import Condensed, CondensedQP
+from quadsim.state import REFERENCE_STATES, Array, Indices
 
 
 class Equilibrium(NamedTuple):
@@ -84,7 +82,8 @@ def lqr_terminal_weight(model: LinearModel, objective: Objective) -> Array:
     With it, the unconstrained optimum over N steps is that over an infinite horizon, except for the weight of input
     changes, which the DARE omits.
 
-    Raises:     ParameterError: the equation has no solution, for example if an undamped state has no weight.
+    Raises:
+        ParameterError: the equation has no solution, for example if an undamped state has no weight.
     """
     try:
         P = scipy.linalg.solve_discrete_are(model.A, model.B, objective.weights[0], objective.Q_u)
@@ -108,19 +107,19 @@ class Problem:
         if not isinstance(self.horizon, int) or self.horizon < 1:
             raise ParameterError("controller", "horizon", self.horizon, "a whole number >= 1")
         n, nu = self.model.n, self.model.nu
-        _check_shape("C_r", self.objective.C_r, (self.objective.C_r.shape[0], n))
-        _check_shape("Q_u", self.objective.Q_u, (nu, nu))
+        check_shape("C_r", self.objective.C_r, (self.objective.C_r.shape[0], n))
+        check_shape("Q_u", self.objective.Q_u, (nu, nu))
         for name, matrix, shape in (("Q_d", self.objective.Q_d, (nu, nu)), ("P", self.objective.P, (n, n))):
             if matrix is not None:
-                _check_shape(name, matrix, shape)
+                check_shape(name, matrix, shape)
         for constraint in self.every_constraint:
             m = constraint.lower.shape[-1]
             for name, matrix, columns in (("C", constraint.C, n), ("D", constraint.D, nu), ("E", constraint.E, nu)):
                 if matrix is not None:
                     steps = (self.horizon,) if matrix.ndim == 3 else ()
-                    _check_shape(f"{constraint.name}.{name}", matrix, (*steps, m, columns))
+                    check_shape(f"{constraint.name}.{name}", matrix, (*steps, m, columns))
             if constraint.lower.ndim == 2:
-                _check_shape(f"{constraint.name}.lower", constraint.lower, (self.horizon, m))
+                check_shape(f"{constraint.name}.lower", constraint.lower, (self.horizon, m))
 
     @property
     def equilibrium(self) -> Equilibrium:
@@ -132,7 +131,7 @@ class Problem:
         """The paper's constraints, in the order of `Bounds.constraints`, then the others."""
         return (*(self.bounds.constraints if self.bounds else ()), *self.constraints)
 
-    def condensed(self) -> Condensed:
+    def condensed(self) -> mpc.Condensed:
         """The QP in the inputs alone: its parts that are the same in all periods.
 
         Returns:
@@ -148,26 +147,12 @@ class Problem:
         return self._condensed
 
     @cached_property
-    def _condensed(self) -> Condensed:
-        from mpc.condensing import Condensed
-
-        if self.every_constraint:
-            return Condensed(self)
-        none, anything = np.zeros(0), np.full(self.model.nu, math.inf)
-        free = Bounds(
-            C_c=np.zeros((0, self.model.n)),
-            y_min=none,
-            y_max=none,
-            delta_min=-anything,
-            delta_max=anything,
-            u_min=-anything,
-            u_max=anything,
-        )
-        return Condensed(replace(self, bounds=free))
+    def _condensed(self) -> mpc.Condensed:
+        return mpc.Condensed.of(self)
 
     def qp(
         self, state: Array, reference: Array, u_before: Array, equilibrium: Equilibrium | None = None
-    ) -> CondensedQP:
+    ) -> mpc.CondensedQP:
         """The condensed QP of one period, as new numpy arrays for any solver.  Eqs. (27)-(29).
 
         The variables x are the inputs u(k), ..., u(k+N-1) [rad/s], so x[:4] is the command, and then the slacks of
@@ -191,19 +176,7 @@ class Problem:
             >>> bool(np.allclose(np.linalg.solve(H, -f)[:4], problem.model.u_bar))
             True
         """
-        from mpc.condensing import CondensedQP
-
-        state, reference, u_before = (np.asarray(given, float) for given in (state, reference, u_before))
-        n, u_bar = self.model.n, self.model.u_bar
-        _check_shape("u_before", u_before, u_bar.shape)
-        if state.shape == (N_STATES,):
-            state = np.concatenate([state, u_before])[:n]
-        _check_shape("state", state, (n,))
-        _check_shape("reference", reference, (self.horizon, len(REFERENCE_STATES)))
-        hover = Equilibrium(np.concatenate([np.zeros(N_STATES), u_bar])[:n], u_bar)
-        query = Query(state, self.objective.desired(reference), u_before, equilibrium or hover)
-        qp = self._condensed.assemble(query).qp
-        return CondensedQP(*map(np.array, (qp.P, qp.c, qp.G, qp.h_l, qp.h_u, qp.x_l, qp.x_u)))
+        return self._condensed.period(state, reference, u_before, equilibrium)
 
     @cached_property
     def rows(self) -> Rows:
@@ -298,7 +271,8 @@ class InfeasiblePeriod:
         object.__setattr__(self, "query", query._replace(state=query.state.copy(), u_before=query.u_before.copy()))
 
 
-def _check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
+def check_shape(name: str, value: Array, shape: tuple[int, ...]) -> None:
+    """Raise `ParameterError` unless an array of `[controller]` has a shape."""
     if value.shape != shape:
         raise ParameterError("controller", name, value.shape, f"of shape {shape}")
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    __version__: str
     from quadsim.controller import Command as Command
     from quadsim.controller import StepInputs as StepInputs
     from quadsim.errors import QuadsimError as QuadsimError
@@ -50,10 +51,9 @@ if TYPE_CHECKING:
     from scenarios.live.commands import live as live
     from scenarios.papers.commands import reproduce as reproduce
     from scenarios.rollout import Rollout as Rollout
+    from scenarios.scenario_summary import scenario_html as scenario_html
     from scenarios.schema.json_schema import scenario_schema as scenario_schema
     from scenarios.schema.scenario import Scenario as Scenario
-
-__version__ = "0.2.0"
 
 _FOLDER = Path(__file__).resolve().parents[1]
 _OWN = ("mpc", "scenarios")
@@ -111,6 +111,7 @@ _MODULES = {
     "scenarios.live.commands": "live",
     "scenarios.papers.commands": "reproduce",
     "scenarios.rollout": "Rollout",
+    "scenarios.scenario_summary": "scenario_html",
     "scenarios.schema.json_schema": "scenario_schema",
     "scenarios.schema.scenario": "Scenario",
 }
@@ -119,7 +120,11 @@ __all__ = [*_PUBLIC]
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name on first use."""
+    """Import a public name on first use; `__version__` is that of the installed distribution."""
+    if name == "__version__":
+        from importlib.metadata import version  # late: it takes longer than all else here
+
+        return globals().setdefault(name, version("quadsim"))
     if name not in _PUBLIC:
         raise AttributeError(f"module 'quadsim' has no attribute {name!r}")
     return globals().setdefault(name, getattr(importlib.import_module(_PUBLIC[name]), name))

@@ -19,6 +19,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from stat import S_IMODE, S_ISDIR, S_ISREG
 from typing import Any, Final
@@ -100,6 +101,13 @@ def reserving(
         for folder in made:
             with contextlib.suppress(OSError):
                 folder.rmdir()  # removes only an empty folder
+
+
+def run_directory(name: str, out: Path | str | None, *, overwrite: bool) -> AbstractContextManager[Path]:
+    """Reserve a run directory: `out`, or `runs/NAME`, or the next free name unless `overwrite`; see `reserving`."""
+    if out is not None:
+        return reserving(out, overwrite=overwrite)
+    return reserving(Path("runs") / name, overwrite=overwrite, free=not overwrite)
 
 
 @contextlib.contextmanager

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from cyclopts import App, Parameter
 
-from quadsim import __version__
 from quadsim.errors import FileError, InputError, ParameterError
 from scenarios.arguments import (
     Changes,
@@ -54,6 +53,13 @@ def _examples(*lines: str) -> str:
     return "\n  ".join(["examples:", *lines])
 
 
+def _version() -> str:
+    """Return the line of `quadsim --version`."""
+    from importlib.metadata import version
+
+    return f"quadsim {version('quadsim')}"
+
+
 app: Final = App(
     name="quadsim",
     help="Fly model predictive controllers of quadrotors in MuJoCo; record, film and audit every flight.",
@@ -61,7 +67,7 @@ app: Final = App(
     "interrupted; 2 wrong input",
     help_format="plaintext",
     default_parameter=Parameter(show_default=False, negative_iterable=(), allow_repeating=True),
-    version=f"quadsim {__version__}",
+    version=_version,
 )
 for _room, _content in ROOMS.items():
     for _word, _command in _content.commands.items():
@@ -282,9 +288,10 @@ def run(
         ...     flight.outcome, flight.directory.name
         ('satisfied', 'run')
     """
+    from quadsim.outputs import run_directory
     from scenarios import loading, user_code
     from scenarios.feasibility_check import hover_notes
-    from scenarios.flight import require_rendering, run_directory, write_run
+    from scenarios.flight import require_rendering, write_run
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
 
@@ -684,7 +691,7 @@ def doctor() -> Listing:
         >>> sorted(checks)
         ['machine', 'packages', 'rendering', 'solvers', 'viewer']
     """
-    from scenarios.machine import capabilities
+    from scenarios.doctor import capabilities
     from scenarios.results import Listing
 
     return Listing(capabilities())

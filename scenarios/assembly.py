@@ -64,7 +64,7 @@ from quadsim.vehicle import (
 from scenarios.courses.course import Course
 from scenarios.courses.followed import FollowedCourse
 from scenarios.courses.steps import Steps, switches
-from scenarios.limits import audited, space_limits
+from scenarios.limits import audit_notes, flyable, signal_limits, space_limits, sum_limits, with_law_bounds
 from scenarios.plugin import import_plugin, make_force, reason_of
 from scenarios.schema.events import Event, SensorFaultEvent, SetpointEvent
 from scenarios.schema.problems import parse_table
@@ -72,8 +72,8 @@ from scenarios.schema.writing import plain
 
 if TYPE_CHECKING:
     from mpc.ocp import Problem
-    from quadsim.controller import AutopilotLoop
-    from quadsim.flight.audit import Limit
+    from quadsim.controller import AutopilotLoop, Controller
+    from quadsim.flight.audit import Limit, SpaceLimit
     from quadsim.motion import Motion
     from scenarios.schema.controllers import AnyController
     from scenarios.schema.scenario import Scenario
@@ -385,8 +385,34 @@ class Assembly:
 
     @cached_property
     def limits(self) -> tuple[Limit, ...]:
-        """The limits of the audit."""
-        return audited(self)
+        """The limits of the audit: constraints, controller bounds, polytopes, obstacles and regions."""
+        return (*signal_limits(self.scenario, self._flyable), *sum_limits(self.scenario), *self._space_limits)
+
+    @property
+    def _flyable(self) -> dict[str, tuple[float, float]]:
+        return flyable(self.bounds, self.actual)
+
+    @property
+    def _space_limits(self) -> tuple[SpaceLimit, ...]:
+        scenario, regions = self.scenario, self.regions
+        if not scenario.obstacles and not regions:
+            return ()
+        return space_limits(scenario.obstacles, regions, self.actual.enclosing_radius)
+
+    @property
+    def with_bounds(self) -> Scenario:
+        """The scenario with its controller's bounds as constraints, to apply them to another controller."""
+        return self.scenario.altered(constraints=signal_limits(self.scenario, self._flyable))
+
+    def with_law_bounds(self, controller: Controller) -> Assembly:
+        """Return the assembly with the bounds of a user's controller as constraints of its scenario."""
+        scenario = with_law_bounds(self.scenario, controller)
+        return self if scenario is self.scenario else self.of(scenario)
+
+    @property
+    def audit_notes(self) -> list[str]:
+        """Notes on the audit, see `scenarios.limits.audit_notes`."""
+        return audit_notes(self.scenario, self.vehicle, self._flyable, audited=bool(self.limits))
 
     def computation(self, spec: AnyController | None = None) -> Computation | None:
         """Return the computation time of a controller, the scenario's by default; None if commands take no time."""
@@ -558,7 +584,7 @@ class Assembly:
         ground = scenario.effects.ground
         if ground is not None and (ground.contact or ground.effect):
             self._check_floor()
-        if limits := space_limits(self):
+        if limits := self._space_limits:
             start = self.initial_state(self.motion)[None, list(POSITION)]
             for limit in limits:
                 clear = float(limit.shape.clearance(np.zeros(1), start)[0]) - limit.radius

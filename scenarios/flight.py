@@ -30,7 +30,7 @@ from quadsim.flight.audit import (
 from quadsim.flight.log import FlightLog
 from quadsim.flight.parquet import FORMAT, log_tables, write_log
 from quadsim.flight.rundir import limit_to_json
-from quadsim.outputs import absolute, adding, amend, reserving, to_json, writing
+from quadsim.outputs import absolute, adding, amend, to_json, writing
 from quadsim.plausibility import implausible
 from quadsim.sim.airframe import outline
 from quadsim.sim.estimator import Tally
@@ -40,7 +40,6 @@ from quadsim.vehicle import Vehicle
 from scenarios.courses.csv_course import Csv
 from scenarios.feasibility_check import report
 from scenarios.flight_events import story
-from scenarios.limits import audit_notes
 from scenarios.machine import machine, versions
 from scenarios.mismatch import model_notes
 from scenarios.progress import Progress, reporting, silent
@@ -79,6 +78,8 @@ class Flight(Result):
         recorded: `summary.json` of a flight that was read; None for a new flight.
         infeasible_period: the first period whose QP had no answer; None if there is none, or the flight was read.
         own_code: whether a controller, force or autopilot flew that was passed in, which the scenario cannot repeat.
+        try_remedies: flies what the explanation of a failure suggests, see `scenarios.remedies.tried`; None for a
+            flight that was read.
 
     Examples:
         >>> import quadsim
@@ -100,6 +101,7 @@ class Flight(Result):
     recorded: Mapping[str, Any] | None = field(default=None, repr=False)
     infeasible_period: InfeasiblePeriod | None = field(default=None, repr=False)
     own_code: bool = field(default=False, repr=False)
+    try_remedies: Callable[[Mapping[str, Any], Flight], dict[str, Any]] | None = field(default=None, repr=False)
 
     @property
     def scenario(self) -> Scenario:
@@ -141,16 +143,14 @@ class Flight(Result):
         """Why the first QP without an answer had none, and what helps; None if all QPs had one.
 
         If all had one and a constraint does not hold, it explains the first SQP that did not converge, if any.  What is
-        advised has been flown, in `scenarios.infeasibility.MOST_FLOWN` flights at most; this takes seconds, once.
+        advised has been flown, in `scenarios.remedies.MOST_FLOWN` flights at most; this takes seconds, once.
 
         `sentence` and `advice` are for users; `docs/controllers.md` explains the other entries.
         """
         explanation = self._explanation
-        if self.recorded is not None or explanation is None:
+        if explanation is None or self.try_remedies is None:
             return explanation
-        from scenarios.infeasibility import tried
-
-        return tried(explanation, self)
+        return self.try_remedies(explanation, self)
 
     @cached_property
     def _explanation(self) -> Mapping[str, Any] | None:
@@ -486,13 +486,6 @@ def write_run(
                 raise
 
 
-def run_directory(name: str, out: str | Path | None, *, overwrite: bool) -> contextlib.AbstractContextManager[Path]:
-    """Reserve a run directory: `out`, or `runs/NAME`, or the next free name unless `overwrite`."""
-    if out is not None:
-        return reserving(out, overwrite=overwrite)
-    return reserving(Path("runs") / name, overwrite=overwrite, free=not overwrite)
-
-
 def require_rendering() -> None:
     """Raise if a requested video cannot be made here, before the flight.
 
@@ -534,7 +527,7 @@ def summarise(flight: Flight) -> dict[str, Any]:
         **({"events": events} if (events := story(scenario, log.control.t.size * scenario.control_period)) else {}),
         "tracking": numbers["tracking"],
         "constraints": [limit_to_json(finding) for finding in flight.findings],
-        "audit_notes": audit_notes(flight.assembly),
+        "audit_notes": flight.assembly.audit_notes,
         **({"model_notes": notes} if notes else {}),
         "control": numbers["control"],
         "diagnosis": flight._explanation,

@@ -8,69 +8,61 @@ the flight; `audit_notes` reports differences.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from mpc.bounded import Range
 from mpc.pilot import Pilot
 from quadsim.controller import Controller
 from quadsim.flight.audit import SUM, UNAUDITED_ADVICE, Limit, SpaceLimit
 from quadsim.report.table import format_number
+from quadsim.space import AnyObstacle, Corridor, Fence
+from quadsim.vehicle import Vehicle
 from scenarios.law_bounds import law_limits
 from scenarios.plugin import PluginController
-
-if TYPE_CHECKING:
-    from scenarios.assembly import Assembly
-    from scenarios.schema.scenario import Scenario
+from scenarios.schema.scenario import Scenario
 
 
-def audited(assembly: Assembly) -> tuple[Limit, ...]:
-    """Return the limits of the audit: constraints, controller bounds, obstacles and regions."""
-    scenario, bounds = assembly.scenario, _flyable(assembly)
-    return (
-        *_stated(scenario, bounds),
-        *_unnamed(scenario, bounds),
-        *_sum_limits(scenario),
-        *space_limits(assembly),
-    )
+def signal_limits(scenario: Scenario, bounds: Mapping[str, Range]) -> list[Limit]:
+    """Return the constraints of a scenario on single signals, then its controller's `bounds` without a constraint."""
+    return [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]
 
 
-def with_bounds_stated(assembly: Assembly) -> Scenario:
-    """Return the scenario with its controller's bounds as constraints, to apply them to another controller."""
-    scenario, bounds = assembly.scenario, _flyable(assembly)
-    return scenario.altered(constraints=[*_stated(scenario, bounds), *_unnamed(scenario, bounds)])
-
-
-def with_law_bounds(assembly: Assembly, controller: Controller) -> Assembly:
-    """Return the assembly with the bounds of a user's controller as constraints of its scenario; see `law_limits`."""
+def with_law_bounds(scenario: Scenario, controller: Controller) -> Scenario:
+    """Return the scenario with the bounds of a user's controller as constraints; see `law_limits`."""
     adapted = controller.law if isinstance(controller, Pilot) else controller
     if not isinstance(adapted, PluginController):
-        return assembly
-    scenario, named = assembly.scenario, _named(assembly.scenario)
+        return scenario
+    named = _named(scenario)
     limits = [
         limit
         for limit in law_limits(adapted.law, scenario.audited_names)
         if limit.signal == SUM or limit.signal not in named
     ]
-    return assembly.of(scenario.altered(constraints=[*scenario.constraints, *limits])) if limits else assembly
+    return scenario.altered(constraints=[*scenario.constraints, *limits]) if limits else scenario
 
 
-def audit_notes(assembly: Assembly) -> list[str]:
-    """Return notes on the audit: bounds without a constraint, and constraints that differ from the controller's."""
-    scenario, vehicle, bounds = assembly.scenario, assembly.vehicle, _flyable(assembly)
-    audited = [*_stated(scenario, bounds), *_unnamed(scenario, bounds)]
+def audit_notes(scenario: Scenario, vehicle: Vehicle, bounds: Mapping[str, Range], *, audited: bool) -> list[str]:
+    """Return notes on the audit: bounds without a constraint, and constraints that differ from the controller's.
+
+    Args:
+        scenario: the scenario.
+        vehicle: the modelled vehicle.
+        bounds: the controller's, see `flyable`.
+        audited: whether anything is audited at all.
+    """
     unnamed = [limit.name for limit in _unnamed(scenario, bounds)]
     absent = [entry.name for entry in scenario.constraints if not (entry.has_bounds or entry.signal in bounds)]
     notes = []
     if unnamed:
         notes.append(f"{', '.join(unnamed)}: audited as the controller bounds {'it' if len(unnamed) == 1 else 'them'}")
-    if not assembly.limits:
+    if not audited:
         notes.append(UNAUDITED_ADVICE)
     if absent:
         notes.append(f"{', '.join(absent)}: not audited, the controller has no such bound and the entry states none")
-    changes = [(0.0, assembly.bounds)] + [(at, spec.audited(vehicle)) for at, spec in scenario.controller_changes]
-    for limit in audited:
+    specs = [(0.0, scenario.controller), *scenario.controller_changes]
+    changes = [(at, spec.audited(vehicle)) for at, spec in specs]
+    for limit in signal_limits(scenario, bounds):
         for (at, now), (_, before) in zip(changes, [(0.0, {}), *changes], strict=False):
             pair = now.get(limit.signal)
             if pair is not None and pair not in (before.get(limit.signal), (limit.lower, limit.upper)):
@@ -82,9 +74,8 @@ def audit_notes(assembly: Assembly) -> list[str]:
     return notes
 
 
-def _flyable(assembly: Assembly) -> dict[str, Range]:
-    """Return the controller's bounds, those on speeds within the range that the vehicle's rotors have."""
-    bounds, vehicle = assembly.bounds, assembly.actual
+def flyable(bounds: Mapping[str, Range], vehicle: Vehicle) -> dict[str, Range]:
+    """Return a controller's bounds, those on speeds within the range that the actual vehicle's rotors have."""
     if "speed" in bounds:
         lower, upper = max(bounds["speed"][0], vehicle.speed_min), min(bounds["speed"][1], vehicle.speed_max)
         bounds = {**bounds, "speed": (lower, upper) if lower < upper else (vehicle.speed_min, vehicle.speed_max)}
@@ -125,12 +116,10 @@ def _range(lower: float, upper: float) -> str:
     return f"±{format_number(upper)}" if lower == -upper else f"{format_number(lower)} .. {format_number(upper)}"
 
 
-def space_limits(assembly: Assembly) -> tuple[SpaceLimit, ...]:
-    """Return the obstacles, then the regions, as limits."""
-    obstacles, regions = assembly.scenario.obstacles, assembly.regions
-    if not obstacles and not regions:
-        return ()
-    radius = assembly.actual.enclosing_radius
+def space_limits(
+    obstacles: Iterable[AnyObstacle], regions: Iterable[Corridor | Fence], radius: float
+) -> tuple[SpaceLimit, ...]:
+    """Return the obstacles, then the regions, as limits of a vehicle within a ball of a radius [m]."""
     return (
         *(SpaceLimit(name=obstacle.name, shape=obstacle, radius=radius) for obstacle in obstacles),
         *(
@@ -149,7 +138,8 @@ def space_limits(assembly: Assembly) -> tuple[SpaceLimit, ...]:
     )
 
 
-def _sum_limits(scenario: Scenario) -> tuple[Limit, ...]:
+def sum_limits(scenario: Scenario) -> tuple[Limit, ...]:
+    """Return the rows of the controller's polytopes as limits."""
     return tuple(
         Limit(
             name=name,

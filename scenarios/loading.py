@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from quadsim.errors import FileError, InputError
 from scenarios.assembly import Assembly
 from scenarios.catalogue import FLIGHTS, scenario_path
 from scenarios.courses.csv_course import Csv
+from scenarios.results import Document
 from scenarios.schema.bases import locate_files, read_scenario, replaced_tables, retyped
 from scenarios.schema.problems import ScenarioError
 from scenarios.schema.scenario import Scenario
@@ -80,6 +82,19 @@ def _of_types(problems: Sequence[str], path: Path, read: Mapping[str, Any], data
     for name, before in replaced_tables(path, scenario_path).items():
         if name in missing - {*types_before}:
             yield f"{name}: of another type than that of its base ({before}), it replaces it whole and inherits nothing"
+
+
+class ScenarioFile(Document):
+    """The text of a scenario file."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The parsed scenario."""
+        return parse_scenario(tomllib.loads(self.content))
+
+    def to_json(self) -> Any:
+        """Return its tables."""
+        return tomllib.loads(self.content) if self.data is None else self.data
 
 
 def parse_scenario(data: Mapping[str, Any], *, source: str = "scenario", directory: Path | None = None) -> Scenario:

@@ -26,7 +26,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from quadsim.errors import MissingPackageError, ParameterError, QuadsimError, described
-from scenarios.machine import usable_cores, versions
+from scenarios.machine import code_digest, usable_cores, versions
 
 Row = dict[str, Any]
 Rows = Generator[tuple[int, Row]]
@@ -323,6 +323,4 @@ def _threads(client: Any) -> int:
 @functools.cache
 def _code() -> dict[str, str]:
     """Return the versions of packages that determine a flight's numbers, and the digest of our code."""
-    from scenarios.campaign.store import code_digest
-
     return {name: versions()[name] for name in ("mujoco", "numpy", "scipy", "piqp")} | {"quadsim": code_digest()[:19]}

@@ -61,6 +61,7 @@ from quadsim.outputs import digest_of
 from quadsim.sim.effects import Force
 from quadsim.state import Array, State
 from quadsim.vehicle import N_ROTORS, Vehicle
+from scenarios.catalogue import CONTROLLERS
 
 FORM: Final = "package.module:Class"  # form of a controller's name
 ENTRY_POINTS: Final = "quadsim.controllers"
@@ -84,12 +85,6 @@ class _Code:
     settings: Annotated[dict[str, Any], doc("further arguments of the call, by name")] = field(default_factory=dict)
 
 
-def _name_no_law(schema: dict[str, Any]) -> None:
-    from scenarios.schema.controllers import LAWS
-
-    schema["not"] = {"enum": [*LAWS]}
-
-
 @dataclass(frozen=True, kw_only=True)
 class Plugin(ControllerTable, _Code):
     """A user-defined controller, called as MyController(vehicle, period=..., horizon=..., **settings)."""
@@ -97,7 +92,7 @@ class Plugin(ControllerTable, _Code):
     type: Annotated[
         str,
         doc("its code, as package.module:Class, or its name among the entry points quadsim.controllers"),
-    ] = field(metadata={"json_schema_extra": _name_no_law})
+    ] = field(metadata={"json_schema_extra": {"not": {"enum": [*CONTROLLERS]}}})
     horizon: Annotated[Horizon, doc("[periods] N, samples of the reference passed to a step")] = 50
 
     def __post_init__(self) -> None:

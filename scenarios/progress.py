@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import datetime
 import signal
 import threading
 import time as clock
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from scenarios.campaign.campaign import CampaignProgress, Watch
     from scenarios.console import PlainConsole
 
 Progress = Callable[[str, int, int], None]  # called with (activity, done, total) during long work
@@ -41,7 +39,7 @@ def reporting(progress: Progress | bool, *, bars: bool = True) -> Iterator[Progr
         yield silent
         return
     if not (screen := stderr()).is_terminal or not bars:
-        with _lines(screen) as tell:
+        with lines(screen) as tell:
             yield lambda stage, done, total: tell(f"{stage} {100 * done // total} %" if total > 1 else stage)
         return
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -60,7 +58,7 @@ def reporting(progress: Progress | bool, *, bars: bool = True) -> Iterator[Progr
 
 
 @contextlib.contextmanager
-def _lines(screen: PlainConsole) -> Iterator[Callable[[str], None]]:
+def lines(screen: PlainConsole) -> Iterator[Callable[[str], None]]:
     """Yield a function that takes what is done now; the latest is printed every `LINE_EVERY`, also while it lasts."""
     from scenarios import console
 
@@ -82,39 +80,3 @@ def _lines(screen: PlainConsole) -> Iterator[Callable[[str], None]]:
     finally:
         over.set()
         ticking.join()
-
-
-@contextlib.contextmanager
-def watching(progress: bool) -> Iterator[Watch]:
-    """Yield the function that shows a campaign's progress: a bar on a terminal, elsewhere a line at intervals."""
-    from scenarios.console import stderr
-
-    screen = stderr()
-    if not progress:
-        yield lambda state: None
-    elif screen.is_terminal:
-        from rich.progress import BarColumn, TextColumn
-        from rich.progress import Progress as Bars
-
-        with Bars(
-            TextColumn("flights"), BarColumn(), TextColumn("{task.description}"), console=screen, transient=True
-        ) as bars:
-            bar = bars.add_task("starting")
-            yield lambda state: bars.update(
-                bar, completed=state.flown, total=state.flights, description=_describe(state)
-            )
-    else:
-        with _lines(screen) as tell:
-            yield lambda state: tell(f"flights {_describe(state)}" if state.flown < state.flights else "report")
-
-
-def _describe(state: CampaignProgress) -> str:
-    """Return flights done, rate, time left and failures in one line."""
-    from scenarios.campaign.statistics import interval, proportion
-
-    share = proportion(state.failed, state.flown)
-    left = datetime.timedelta(seconds=round((state.flights - state.flown) / state.rate))
-    return (
-        f"{state.flown}/{state.flights}, {state.rate:.2f}/s, {left} left; "
-        f"{state.failed} failed ({interval(share['lower'], share['upper'])})"
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from quadsim.report.figure import Figure
-    from scenarios.schema.scenario import Scenario
 
 Shown: TypeAlias = "Iterable[RenderableType]"
 
@@ -126,21 +124,6 @@ class Document(Result):
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(self.content)}</pre>"
-
-
-class ScenarioFile(Document):
-    """The text of a scenario file."""
-
-    @property
-    def scenario(self) -> Scenario:
-        """The parsed scenario."""
-        from scenarios.loading import parse_scenario
-
-        return parse_scenario(tomllib.loads(self.content))
-
-    def to_json(self) -> Any:
-        """Return its tables."""
-        return tomllib.loads(self.content) if self.data is None else self.data
 
 
 class Listing(dict[str, Mapping[str, str]], Result):

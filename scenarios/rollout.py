@@ -27,7 +27,6 @@ from quadsim.state import Array
 from scenarios.assembly import Assembly
 from scenarios.flight import Flight
 from scenarios.flight_events import FlightEvents, Successor, prepared
-from scenarios.limits import with_law_bounds
 from scenarios.progress import Progress, silent
 from scenarios.schema.events import ControllerEvent, Event
 from scenarios.schema.scenario import LONGEST_FLIGHT, Scenario
@@ -136,7 +135,7 @@ class Rollout:
         if law is not None and any(isinstance(event, ControllerEvent) for event in scenario.events):
             raise ParameterError("", "controller", law, "absent where an event changes the scenario's controller")
         controller = assembly.controller() if law is None else law
-        assembly = with_law_bounds(assembly, controller)
+        assembly = assembly.with_law_bounds(controller)
         self.vehicle, self.actual, self.limits = assembly.vehicle, assembly.actual, assembly.limits
         self._started = scenario = assembly.scenario
         if assembly.user_autopilot is not None and not takes_targets(controller):
@@ -315,4 +314,12 @@ class Rollout:
             tallies={} if self._navigation is None else self._navigation.tallies,
             infeasible_period=self._events.first_infeasible_period(),
             own_code=self._own_code,
+            try_remedies=_try_remedies,
         )
+
+
+def _try_remedies(explanation: Mapping[str, Any], flight: Flight) -> dict[str, Any]:
+    """See `scenarios.remedies.tried`."""
+    from scenarios import remedies  # late: few flights need it
+
+    return remedies.tried(explanation, flight, lambda assembly, until: Rollout(assembly).fly(until=until))

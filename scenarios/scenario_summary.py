@@ -15,7 +15,16 @@ from scenarios.schema.scenario import Scenario
 
 
 def scenario_html(scenario: Scenario) -> str:
-    """A table of its parts, and its course; where the course cannot be built, why."""
+    """Return a scenario as notebooks show it: its parts, and its course over time or why it cannot be built.
+
+    Args:
+        scenario: the scenario.
+
+    Examples:
+        >>> import quadsim
+        >>> "<th>vehicle</th><td>lopes2011</td>" in quadsim.scenario_html(quadsim.load("hover"))
+        True
+    """
     controller = scenario.controller
     bounds = {name: f"{low:g} to {high:g}" for name, (low, high) in controller.output_bounds.items()}
     rows = {

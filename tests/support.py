@@ -19,7 +19,8 @@ from mpc.nonlinear.model import NonlinearModel, advance
 from mpc.ocp import Equilibrium, Objective, Problem, Query
 from mpc.robust.controller import RobustPreparation
 from mpc.robust.settings import Robust
-from mpc.solvers import Solver, make_solver
+from mpc.solvers import Solver
+from mpc.solvers.by_name import make_solver
 from quadsim.controller import Controller
 from quadsim.errors import described
 from quadsim.flight.log import RESIDUALS, ControlLog, FlightLog, PlantLog, TimingLog

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import TypeGuard
 
 import pytest
 
@@ -39,6 +40,10 @@ OF_ONE_PLACE = {
 """What only some outputs need, and where alone it is imported."""
 IMPORT_NAMES = {"pillow": "PIL", "rerun-sdk": "rerun"}
 """Distributions whose import name is not their own."""
+HANDING_OUT = ("quadsim", "mpc")
+"""Packages with a table of public names, each imported on first use; `quadsim` also starts the command."""
+MOST_CIRCLES, MOST_IN_CIRCLES, MOST_DEFINED_TWICE = 2, 11, 126
+"""Circles of imports, the modules in them, and public names that several modules define: these may only fall."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,6 +162,90 @@ def test_no_module_and_no_folder_imports_what_imports_it(imports: list[Import]) 
                 if item.imported.startswith(within) and imported != importer:
                     graph.setdefault(importer, set()).add(imported)
         tuple(TopologicalSorter(graph).static_order())  # raises where there is a cycle
+
+
+def circles(imports: list[Import]) -> list[list[str]]:
+    """Groups of modules that import one another, directly or through others, whether at start, late or for types.
+
+    What a package hands out by name is left out (`HANDING_OUT`), and so is that importing a module runs its packages.
+    """
+    ours, graph = modules(), dict[str, set[str]]()
+    for item in imports:
+        if item.imported in ours and item.importer not in HANDING_OUT and item.imported != item.importer:
+            graph.setdefault(item.importer, set()).add(item.imported)
+
+    def reached(start: str) -> set[str]:
+        todo, found = [start], set[str]()
+        while todo:
+            todo += (new := graph.get(todo.pop(), set()) - found)
+            found |= new
+        return found
+
+    reach = {name: reached(name) for name in graph}
+    groups = {tuple(sorted(other for other in reach[name] if name in reach.get(other, ()))) for name in graph}
+    return sorted(([*group] for group in groups if group), key=len, reverse=True)
+
+
+def test_a_circle_is_seen_even_if_it_closes_late_or_for_types_alone() -> None:
+    sources = {
+        "mpc.qp": "if TYPE_CHECKING:\n    from mpc.paper import Prediction",
+        "mpc.paper": "def cost():\n    from mpc import ocp",
+        "mpc.ocp": "import mpc.qp\nimport mpc.model",
+        "mpc.model": "import mpc.model",
+    }
+    ours = {*modules()}
+    found = [item for name, source in sources.items() for item in imports_of(name, source, ours)]
+    assert circles(found) == [["mpc.ocp", "mpc.paper", "mpc.qp"]]
+
+
+def test_modules_import_in_few_circles(imports: list[Import]) -> None:
+    result = circles(imports)
+    assert len(result) <= MOST_CIRCLES, result
+    assert sum(map(len, result)) <= MOST_IN_CIRCLES, result
+
+
+def test_two_values_alone_use_what_their_package_hands_out(imports: list[Import]) -> None:
+    """`Scenario.fly` is `quadsim.fly`, and `Problem.condensed` is `mpc.Condensed`: shorthands for users."""
+    users = {item.importer for item in imports if item.imported in HANDING_OUT and item.importer not in HANDING_OUT}
+    assert users == {"scenarios.schema.scenario", "mpc.ocp"}
+
+
+def public_names(source: str) -> set[str]:
+    """What a module defines at its top level, under an `if` too: classes, functions, constants and names of types.
+
+    Private names do not count, nor does what stands for an imported class where it is not needed (`Flight = Any`).
+    """
+
+    def names(body: list[ast.stmt]) -> Iterator[str]:
+        for node in body:
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                yield node.name
+            elif isinstance(node, ast.Assign) and ast.unparse(node.value) != "Any":
+                yield from (leaf.id for target in node.targets for leaf in ast.walk(target) if named(leaf))
+            elif isinstance(node, ast.AnnAssign) and named(node.target):
+                yield node.target.id
+            elif isinstance(node, ast.If | ast.Try):
+                yield from names([*node.body, *node.orelse])
+
+    def named(node: ast.AST) -> TypeGuard[ast.Name]:
+        return isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+
+    return {name for name in names(ast.parse(source).body) if not name.startswith("_")}
+
+
+def test_a_public_name_is_one_that_a_module_defines() -> None:
+    lines = "import a", "_B = 1", "C: int = 2", "d[0] = 3", "E = F = Any", "if a:", "    G, H = 4, 5", "def i(): j = 6"
+    source = "\n".join([*lines, "class K: l = 7"])
+    assert public_names(source) == {"C", "G", "H", "i", "K"}
+
+
+def test_few_public_names_are_defined_twice() -> None:
+    places: dict[str, list[str]] = {}
+    for module, path in modules().items():
+        for name in public_names(path.read_text()):
+            places.setdefault(name, []).append(module)
+    twice = {name: sorted(of) for name, of in sorted(places.items()) if len(of) > 1}
+    assert len(twice) <= MOST_DEFINED_TWICE, twice
 
 
 def test_what_is_imported_is_what_is_declared(imports: list[Import]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 from collections.abc import Callable
@@ -25,6 +26,13 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCKS = re.compile(r"^```python(?: exec)?\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PYTHON = {page: blocks for page in PAGES if (blocks := BLOCKS.findall(page.read_text(encoding="utf-8")))}
 """Pages with examples in Python."""
+SOURCES = [
+    path
+    for folder in ("quadsim", "mpc", "scenarios", "benchmarks", "examples")
+    for path in (ROOT / folder).rglob("*.py")
+]
+RUN_ON = re.compile(r"^ *(?:Args|Attributes|Examples|Raises|Returns|Yields):[ ]*\S", re.MULTILINE)
+"""A section of a docstring that starts on the line of its title, which no tool then takes for a section."""
 ENTRY_POINTS = {"quadsim.controllers"}
 """Groups of entry points, which are written like modules."""
 
@@ -132,6 +140,15 @@ def test_every_guide_has_a_figure_and_every_picture_says_what_it_shows() -> None
         assert all(shows for shows, _ in pictures), page.name
         drawn |= {page.name for _, file in pictures if "figures/" in file}
     assert {*guides} - drawn == {"commands.md", "live.md"}
+
+
+def test_sections_of_docstrings_have_their_titles_on_lines_of_their_own() -> None:
+    assert RUN_ON.search("Go.\n\n    Raises:     ValueError: it cannot.")
+    documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+    nodes = ((path, node) for path in SOURCES for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    texts = [(path, ast.get_docstring(node) or "") for path, node in nodes if isinstance(node, documented)]
+    assert sum("Raises:\n" in text for _, text in texts) > 100
+    assert not [(path.name, text) for path, text in texts if RUN_ON.search(text)]
 
 
 def test_documents_name_what_exists() -> None:

@@ -20,7 +20,7 @@ from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import Area, Band, Bound, Figure, Panel, Series, outlines
 from quadsim.sim.effects.battery import LIPO
 from quadsim.state import POSITION
-from scenarios.identify.page import trace_figure
+from scenarios.identify.identification_figures import trace_figure
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 FREE: Final[dict[str, Any]] = {"constraints": []}

@@ -16,7 +16,8 @@ YAW_SHARE: Final = 0.4  # bandwidth of heading over that of roll and pitch: abou
 def require_positive(name: str, value: float) -> None:
     """Reject a setting that is not a positive, finite number.
 
-    Raises:     ParameterError: it is not.
+    Raises:
+        ParameterError: it is not.
     """
     if not 0.0 < value < math.inf:
         raise ParameterError("controller", name, value, "positive and finite")
@@ -54,7 +55,8 @@ def bandwidths(*, period: float, lag: float) -> Bandwidths:
     loops have `YAW_SHARE` of the bandwidth of roll and pitch.  At a period of 50 ms and a lag of 25 ms: 10, 5, 2.5 and
     1.25 rad/s; PX4 uses 6.5, 1.8 and 0.95 from attitude to position.
 
-    Raises:     ParameterError: a number is out of range.
+    Raises:
+        ParameterError: a number is out of range.
     """
     require_positive("period", period)
     if not 0.0 <= lag < math.inf:

@@ -49,8 +49,9 @@ class FeedbackLaw(ABC):
     def step(self, now: StepInputs, state: Array, reference: Array) -> Command:
         """Return the law's command; on the ground the lowest speed, as fast as bounds allow; see `quadsim.controller`.
 
-        Raises:     CommandError: the state or the reference is not finite; no command is sent, and the law's state is
-        unchanged.
+        Raises:
+            CommandError: the state or the reference is not finite; no command is sent, and the law's state is
+                unchanged.
         """
         before = (self._before if now.acting is None else now.acting)[: self.model.nu]
         if now.phase in GROUNDED:

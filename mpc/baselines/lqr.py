@@ -82,7 +82,8 @@ def lqr_gain(model: LinearModel, objective: Objective) -> Array:
 
     K = (Q_u + B' P B)^-1 B' P A, with P the solution of the discrete algebraic Riccati equation.
 
-    Raises:     ParameterError: no such gain exists, for example because an unstable state has no weight.
+    Raises:
+        ParameterError: no such gain exists, for example because an unstable state has no weight.
     """
     Q = objective.C_r.T @ objective.Q_y @ objective.C_r
     try:

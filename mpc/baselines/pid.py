@@ -104,7 +104,8 @@ class CascadedPID(FeedbackLaw):
     def fly(self, memory: Memory, state: Array, target: Target, lower: Array, upper: Array) -> tuple[Array, Memory]:
         """Run all loops for one period, from a state (12,) and reachable speeds `lower` to `upper` (4,) [rad/s].
 
-        Returns:     (4,) rotor speeds [rad/s], and the loops' new state.
+        Returns:
+            (4,) rotor speeds [rad/s], and the loops' new state.
         """
         motion, k, inertia, period = motion_of(state), self.settings.bandwidths, self._inertia, self.settings.period
         force, velocity_integral = self._velocity_loop(memory, motion, target)

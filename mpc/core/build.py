@@ -34,7 +34,9 @@ def source_hash(folder: Path = FOLDER) -> str:
 def build(folder: Path = FOLDER) -> Path:
     """Compile the library; it replaces an older one atomically, and running processes keep theirs.
 
-    Raises:     FileNotFoundError: there is no compiler.     subprocess.CalledProcessError: the compiler fails.
+    Raises:
+        FileNotFoundError: there is no compiler.
+        subprocess.CalledProcessError: the compiler fails.
     """
     named = shlex.split(os.environ.get("CC", ""))
     compiler = named or [path for path in map(shutil.which, COMPILERS) if path][:1]

@@ -121,7 +121,9 @@ def _plain(value: float | Array) -> float | tuple[float, ...]:
 class CompiledMPC:
     """A law run by the library; it falls back as the C does on a target.
 
-    Raises:     MissingCoreError: there is no library.     ParameterError: the core cannot take the problem.
+    Raises:
+        MissingCoreError: there is no library.
+        ParameterError: the core cannot take the problem.
     """
 
     solver: Final = "compiled"

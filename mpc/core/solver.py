@@ -162,7 +162,8 @@ class Core:
     The search starts from the last optimum's active set, shifted by one step.  PIQP answers the problems that the core
     gives up or finds infeasible, and `answered_by` names it.
 
-    Raises:     MissingCoreError: there is no library.
+    Raises:
+        MissingCoreError: there is no library.
     """
 
     name: Final = CORE

@@ -99,8 +99,8 @@ class Tables:
 def tables(problem: Problem) -> Tables:
     """Return the tables of a problem.
 
-    Raises:     ParameterError: the core cannot take it: too large, rows that differ from step to step, or shared
-    slacks.
+    Raises:
+        ParameterError: the core cannot take it: too large, rows that differ from step to step, or shared slacks.
     """
     problem = with_constraints(problem)
     N, modes = problem.horizon, np.eye(problem.model.nu)

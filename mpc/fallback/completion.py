@@ -103,9 +103,11 @@ class StateCompletion:
     def complete(self, measured: Array, acting: Array, trim: Trim, *, free: bool = True) -> Array:
         """Return the complete state (12,) now.
 
-        Args:     measured: (12,), in part perhaps not finite; another shape counts as no measurement.     acting: (4,)
-        rotor speeds in force since the last state [rad/s].     trim: the equilibrium of the vehicle.     free: whether
-        the vehicle flies, as the model assumes; otherwise no channel counts as frozen.
+        Args:
+            measured: (12,), in part perhaps not finite; another shape counts as no measurement.
+            acting: (4,) rotor speeds in force since the last state [rad/s].
+            trim: the equilibrium of the vehicle.
+            free: whether the vehicle flies, as the model assumes; otherwise no channel counts as frozen.
         """
         if np.shape(measured) != (N_STATES,):
             measured = np.full(N_STATES, np.nan)

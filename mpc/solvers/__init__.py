@@ -17,7 +17,7 @@ from mpc.ocp import Problem, Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, Backend, KKTResiduals, Solution
 from quadsim.controller import ACCEPTED, CORE, GAIN
-from quadsim.errors import InputError, MissingCoreError, MissingPackageError, ParameterError, UnknownNameError
+from quadsim.errors import MissingPackageError, UnknownNameError
 from quadsim.state import Array
 
 Formulation: TypeAlias = Condensed | PartiallyCondensed
@@ -202,28 +202,6 @@ class Solver(Protocol):
 
     def solve(self, query: Query) -> Answer:
         """Return the optimum of a query; failures are reported in its status."""
-
-
-def make_solver(name: str, problem: Problem) -> Solver:
-    """Return a problem's solver by name: the core, or a QP solver that first tries the unconstrained optimum.
-
-    Raises:
-        UnknownNameError, MissingPackageError, MissingCoreError: the solver does not exist, or is not installed.
-        ParameterError: the core cannot take the problem.
-    """
-    if name not in (CORE, CORE_OR_PIQP):
-        return QPSolver(name, problem, free_first=True)
-    from mpc.core.solver import Core
-
-    try:
-        return Core(problem)
-    except InputError as error:
-        if name == CORE_OR_PIQP:
-            return make_solver("piqp", problem)
-        if isinstance(error, MissingCoreError):
-            raise
-        rule = f"a QP solver such as 'piqp' for this problem: {error}"
-        raise ParameterError("controller", "solver", CORE, rule) from error
 
 
 class QPSolver:

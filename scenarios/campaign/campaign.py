@@ -38,6 +38,7 @@ from scenarios.campaign.store import (
 )
 from scenarios.flight import Flight, to_pandas
 from scenarios.junit import Cases
+from scenarios.machine import code_digest
 from scenarios.many import MEMORY, TIMEOUT, count_workers
 from scenarios.results import EXIT_DONE, EXIT_FAILED, Result, Shown
 from scenarios.schema.scenario import Scenario
@@ -136,7 +137,7 @@ def fly_campaign(
     session = {"engine": engine, "workers": count_workers(workers, cluster), "flights": 0, "wall_s": None}
     if records.is_campaign(directory) and not (resume or overwrite):
         raise OutputError(directory, "a campaign is already there; continue it with --resume, or choose another --out")
-    records.code_digest()  # kept: a process that dies before its manifest is there could not be resumed
+    code_digest()  # kept: a process that dies before its manifest is there could not be resumed
     first = (records.CAMPAIGN_FILE, records.SCENARIO_FILE)
     with growing(directory, records.MANIFEST_FILE, overwrite=overwrite, first=first) as files:
         if records.is_campaign(directory):

@@ -230,8 +230,9 @@ def replay(
         Traceback (most recent call last):
         quadsim.errors.FileError: runs/campaigns/not-flown: is not a campaign: it has no manifest.json
     """
+    from quadsim.outputs import run_directory
     from scenarios.campaign.campaign import compare_replay, recorded_flight
-    from scenarios.flight import require_rendering, run_directory, write_run
+    from scenarios.flight import require_rendering, write_run
     from scenarios.progress import reporting
     from scenarios.rollout import Rollout
 
@@ -255,7 +256,7 @@ def replay(
 def _growing(target: Path, progress: Watched, *, resume: bool, overwrite: bool) -> Iterator[dict[str, Any]]:
     """Yield the options of a command that adds flights to a directory; Ctrl-C says how to continue."""
     from quadsim.outputs import absolute
-    from scenarios.progress import watching
+    from scenarios.campaign.watching import watching
 
     if resume and overwrite:
         raise ParameterError("", "--overwrite", overwrite, "absent with --resume")

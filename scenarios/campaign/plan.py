@@ -21,7 +21,6 @@ from scenarios.campaign.events import Event, parse_event
 from scenarios.campaign.rows import DRAW, TIMES, Row, flown_row, make_schema
 from scenarios.catalogue import campaign_path, scenario_path
 from scenarios.flight import Flight
-from scenarios.limits import with_law_bounds
 from scenarios.loading import parse_scenario
 from scenarios.machine import processor_name
 from scenarios.many import ERROR, MEMORY, fly_many
@@ -247,7 +246,7 @@ def flown_scenario(spec: CampaignFile, path: Path, settings: Sequence[str] = ())
 def audited(assembly: Assembly) -> Assembly:
     """Return the assembly with the bounds of a user's controller as constraints: the table has a column for each."""
     return (
-        with_law_bounds(assembly, assembly.controller())
+        assembly.with_law_bounds(assembly.controller())
         if isinstance(assembly.scenario.controller, Plugin)
         else assembly
     )

@@ -6,13 +6,11 @@ Rows are appended as files of their own below `parts/`.  When all is flown the p
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import io
 import shlex
 import sys
 import time as clock
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
@@ -22,8 +20,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from mpc.core.library import why_missing
-from quadsim.assets import models_dir
 from quadsim.errors import FileError, InputError
 from quadsim.flight.parquet import FORMAT, format_of, require_format
 from quadsim.flight.rundir import read_json, require_inside
@@ -31,7 +27,7 @@ from quadsim.outputs import SUMMARY_FILE, Growing, digest_of, to_json
 from scenarios.campaign.campaign_file import CampaignFile
 from scenarios.campaign.plan import Plan, load_plan
 from scenarios.campaign.rows import TIMES, Row, make_table, read_table, split_times
-from scenarios.machine import machine, versions
+from scenarios.machine import code_digest, digest_below, machine, versions
 from scenarios.plugin import Plugin, PluginForce, import_plugin
 
 MANIFEST_FILE: Final = "manifest.json"
@@ -39,7 +35,6 @@ CAMPAIGN_FILE: Final = "campaign.toml"
 SCENARIO_FILE: Final = "scenario.toml"
 CAMPAIGN: Final = "quadsim campaign"
 _FORM: Final = {"format": str, "name": str, "status": str, "flights": int, "flown": int, "sessions": list}
-_ROOT: Final = Path(__file__).resolve().parents[2]
 FLIGHTS_FILE: Final = "flights.parquet"
 TIMES_FILE: Final = "timing.parquet"
 FLUSH_S: Final = 5.0  # how long an answer may wait in memory before it is on the disk [s]
@@ -229,30 +224,12 @@ def flown_by(plan: Plan) -> dict[str, Any]:
     }
 
 
-@functools.cache
-def code_digest() -> str:
-    """Return the SHA-256 of all quadsim files that affect numbers: code, models, scenarios, and the core's presence."""
-    code = _digest([*(_ROOT / package for package in ("quadsim", "mpc", "scenarios")), models_dir()])
-    return code if why_missing() is None else f"{code}, without the core"
-
-
 def _user_code(spec: Plugin | PluginForce) -> str | None:
     """SHA-256 of a user's module, or of the whole package that it is in; None without a file."""
     file = getattr(sys.modules[import_plugin(spec).__module__.partition(".")[0]], "__file__", None)
     if file is None:
         return None
-    return _digest([Path(file).parent if Path(file).name == "__init__.py" else Path(file)])
-
-
-def _digest(roots: Iterable[Path]) -> str:
-    """SHA-256 of the code, models and scenarios in files and folders."""
-    digest = hashlib.sha256()
-    for root in roots:
-        for path in [root] if root.is_file() else sorted(root.rglob("*")):
-            if path.suffix in (".py", ".c", ".h", ".toml", ".xml") and path.is_file():
-                digest.update(f"{root.name}/{path.relative_to(root).as_posix()}\0".encode())
-                digest.update(path.read_bytes())
-    return f"sha256:{digest.hexdigest()}"
+    return digest_below([Path(file).parent if Path(file).name == "__init__.py" else Path(file)])
 
 
 def read_manifest(directory: Path) -> dict[str, Any]:

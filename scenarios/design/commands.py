@@ -15,7 +15,8 @@ from scenarios.catalogue import scenario_names
 
 if TYPE_CHECKING:
     from scenarios.design.vehicle_report import VehicleReport
-    from scenarios.results import Document, ScenarioFile
+    from scenarios.loading import ScenarioFile
+    from scenarios.results import Document
 else:
     Document = ScenarioFile = VehicleReport = Any
 
@@ -62,20 +63,20 @@ def scenario(
 
     from quadsim.assets import vehicle_path
     from quadsim.vehicle import load_vehicle
-    from scenarios import loading, results
+    from scenarios import loading
     from scenarios.courses.csv_course import Csv
     from scenarios.design.first_scenario import first_scenario
     from scenarios.schema.json_schema import scenario_schema
 
     if schema:
-        return results.ScenarioFile(json.dumps(scenario_schema(), indent=2) + "\n", scenario_schema())
+        return loading.ScenarioFile(json.dumps(scenario_schema(), indent=2) + "\n", scenario_schema())
     options = {"course": course, "law": controller, "tilt": tilt}
     choice: dict[str, Any] = {option: value for option, value in options.items() if value is not None}
     if vehicle is not None:
         for option, value in {"a scenario": name, "--set": changes, "--seed": seed}.items():
             if value:
                 raise ParameterError("", "--for", vehicle, f"given without {option}")
-        return results.ScenarioFile(
+        return loading.ScenarioFile(
             first_scenario(load_vehicle(vehicle_path(str(vehicle))), str(vehicle), **choice).to_toml()
         )
     for option, value in choice.items():
@@ -86,7 +87,7 @@ def scenario(
     whole = loading.assemble(name, changes, seed).resolved.scenario
     if isinstance(whole.reference, Csv):  # so that you may replace the table
         whole = whole.altered(reference=replace(whole.reference, sha256=None))
-    return results.ScenarioFile(whole.to_toml())
+    return loading.ScenarioFile(whole.to_toml())
 
 
 def vehicle_report(

@@ -47,9 +47,9 @@ def export(
     import json
     import shlex
 
+    from quadsim.outputs import run_directory
     from scenarios import loading, results
     from scenarios.export import exporter, in_the_loop
-    from scenarios.flight import run_directory
     from scenarios.progress import reporting
 
     flown, options = loading.load_scenario(scenario, changes, seed), {"precision": precision, "target": target}

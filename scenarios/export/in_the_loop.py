@@ -37,7 +37,6 @@ from quadsim.vehicle import N_ROTORS
 from scenarios.assembly import Assembly
 from scenarios.export.exporter import c_controller, exported_law, programs
 from scenarios.flight import Flight
-from scenarios.limits import with_bounds_stated
 from scenarios.loading import load_scenario
 from scenarios.progress import Progress, reporting
 from scenarios.rollout import Rollout
@@ -316,5 +315,5 @@ def _allowing(scenario: Scenario, spacing: float) -> Scenario:
         plant, sampled = (max(spacing, tolerance) for tolerance in limit.tolerances)
         return replace(limit, tolerance=plant, tolerance_sampled=sampled)
 
-    limits = [*map(widened, with_bounds_stated(Assembly(scenario)).constraints)]
+    limits = [*map(widened, Assembly(scenario).with_bounds.constraints)]
     return scenario.altered(constraints=limits)

@@ -63,7 +63,11 @@ class QuadrotorEnv(gymnasium.Env):  # type: ignore[misc]
     - `cost`: number of required constraints violated.
     - `time` [s], `phase` (`flying`, `landed`, ...), `reason` (why the flight ended; empty until then).
 
-    Attributes: `scenario` and `limits` of this episode, `actions`, and `observations` with the unit of each entry.
+    Attributes:
+        scenario: the scenario of this episode.
+        limits: the limits of its audit.
+        actions: what an action means.
+        observations: what an observation has, with the unit of each entry.
 
     Examples:
         >>> import numpy as np

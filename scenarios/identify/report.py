@@ -14,13 +14,15 @@ import numpy as np
 
 from quadsim.errors import InputError, ParameterError
 from quadsim.outputs import require_file, writing_file
+from quadsim.report.page import Section, render_page
 from quadsim.report.table import ABSENT, Cell, Grid, Mark, format_number, line
+from quadsim.report.to_plotly import to_plot
 from quadsim.state import shown_unit
 from quadsim.vehicle import Vehicle, load_vehicle
 from scenarios.identify.checks import check, spans
 from scenarios.identify.estimate import Estimate, Identification
 from scenarios.identify.fit import identify_records
-from scenarios.identify.page import render
+from scenarios.identify.identification_figures import horizon_figure, interval_figure, trace_figure
 from scenarios.identify.prediction import HORIZONS, QUANTITIES, Prediction, hold_out, predict
 from scenarios.identify.record import read_record
 from scenarios.identify.vehicle_file import interval, rounded, vehicle_text, verdict
@@ -216,8 +218,29 @@ def identify_logs(
             load_vehicle(new)  # the numbers as they are rounded
     if result.page is not None:
         with after(replace(result, page=None), result.page), writing_file(result.page, overwrite=overwrite) as new:
-            new.write_text(render(result), encoding="utf-8")
+            new.write_text(_render(result), encoding="utf-8")
     return result
+
+
+def _render(result: IdentifiedVehicle) -> str:
+    """Return the page as HTML."""
+    parameters, errors = result.tables()
+    trace = result.prediction.trace
+    figures = (trace_figure(trace), horizon_figure(result.prediction))
+    return render_page(
+        "identification",
+        f"Identified: {result.vehicle.name}",
+        [
+            Section(
+                title="Parameters",
+                plots=(to_plot(interval_figure(result.identification.estimates)),),
+                tables=(parameters,),
+            ),
+            Section(title="Prediction of flight not fitted", plots=tuple(map(to_plot, figures)), tables=(errors,)),
+        ],
+        verdict=result.verdict,
+        notes=result.sentences(),
+    )
 
 
 def _parameter(estimate: Estimate, known: Identification) -> tuple[Cell, ...]:

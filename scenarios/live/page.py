@@ -34,8 +34,9 @@ from quadsim.state import wrapped
 from scenarios.flight import Flight
 from scenarios.live import readout
 from scenarios.live.controls import ControllerTab, Steering, Widgets, disturb
+from scenarios.live.guard import Guard
 from scenarios.live.look import dressed
-from scenarios.live.serving import Guard, Pace
+from scenarios.live.pace import Pace
 from scenarios.live.session import Frame, Session
 from scenarios.live.stage import FIELD, VIEW, Stage
 from scenarios.schema.controllers import AnyController

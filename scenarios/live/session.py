@@ -30,7 +30,6 @@ from quadsim.state import POSITION, REFERENCE_NAMES, Array
 from scenarios.assembly import Assembly, preferring_core
 from scenarios.flight import Flight
 from scenarios.flight_events import Successor
-from scenarios.limits import with_bounds_stated
 from scenarios.progress import Progress, silent
 from scenarios.rollout import Rollout
 from scenarios.schema.controllers import AnyController
@@ -148,7 +147,7 @@ class Session:
         self._queue.clear()
         flown = [self.scenario]
         if self._against is not None:
-            flown.append(with_bounds_stated(Assembly(self.scenario)).altered(controller=self._against))
+            flown.append(Assembly(self.scenario).with_bounds.altered(controller=self._against))
         self.flights = tuple(Rollout(scenario, live=True) for scenario in flown)
         self._held, self._steered = _Hand(), False
         self.reason: str | None = None

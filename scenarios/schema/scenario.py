@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, get
 from annotated_types import Ge, Gt, Le, MaxLen, doc
 from pydantic import BeforeValidator, Field
 
+import quadsim
 from mpc.bounded import Polytope
 from quadsim.errors import InputError, ParameterError
 from quadsim.fields import Positive
@@ -37,9 +38,6 @@ from scenarios.schema.sensors import EstimatorSpec, SensorsSpec, check_sensing
 from scenarios.schema.settings import separate, set_field
 from scenarios.schema.writing import to_toml
 
-if TYPE_CHECKING:
-    from scenarios.flight import Flight
-
 
 @dataclass(frozen=True, kw_only=True)
 class _Overrides:
@@ -63,8 +61,6 @@ class _Modelled(_Overrides):
 
 
 if TYPE_CHECKING:
-    from scenarios.flight import Flight
-
     VehicleTable: TypeAlias = _Modelled
     ActualTable: TypeAlias = _Overrides
 else:
@@ -227,9 +223,7 @@ class Scenario:
         return f"<Scenario {self.name}: {parts}\n {self.description}>"
 
     def _repr_html_(self) -> str:
-        from scenarios.scenario_summary import scenario_html
-
-        return scenario_html(self)
+        return quadsim.scenario_html(self)
 
     def __dir__(self) -> list[str]:
         """Return the fields and methods for users, for completion in an interactive session."""
@@ -414,11 +408,9 @@ class Scenario:
         # A reference that was passed in as a function has its rows in memory.
         return other.altered(reference=self.reference) if other.reference == self.reference else other
 
-    def fly(self, **options: Any) -> Flight:
+    def fly(self, **options: Any) -> quadsim.Flight:
         """Fly the scenario; `scenario.fly(controller=...)` is `quadsim.fly(scenario, controller=...)`."""
-        from scenarios.app import fly
-
-        return fly(self, **options)
+        return quadsim.fly(self, **options)
 
     def to_toml(self) -> str:
         """Return the resolved file: every field, defaults included, with comments; parsing it gives this scenario."""

@@ -16,7 +16,8 @@ from mpc.ocp import Problem, Query
 from mpc.paper import prediction
 from mpc.qp import kkt_residuals
 from mpc.robust.tightening import TighteningSettings, position_margins
-from mpc.solvers import Answer, QPSolver, make_solver
+from mpc.solvers import Answer, QPSolver
+from mpc.solvers.by_name import make_solver
 from mpc.solvers.piqp import Piqp
 from quadsim.controller import SOLVED
 from quadsim.errors import ParameterError

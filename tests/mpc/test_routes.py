@@ -21,7 +21,8 @@ from mpc.constraints import Constraint, Penalty, tightened
 from mpc.model import LinearModel, continuous_model, discretise
 from mpc.ocp import Equilibrium, Objective, Problem, Query, lqr_terminal_weight
 from mpc.robust.settings import Robust
-from mpc.solvers import SOLVERS, Method, QPSolver, find_solver, make_solver, solver_entries
+from mpc.solvers import SOLVERS, Method, QPSolver, find_solver, solver_entries
+from mpc.solvers.by_name import make_solver
 from quadsim.controller import ACCEPTED, CORE, SOLVED, UNCONSTRAINED, StepInputs
 from quadsim.state import Array, make_state
 from quadsim.vehicle import Vehicle

@@ -18,7 +18,8 @@ from mpc.constraints import Penalty
 from mpc.ocp import Query
 from mpc.partial_condensing import PartiallyCondensed
 from mpc.qp import QP, kkt_residuals
-from mpc.solvers import CORE_OR_PIQP, SOLVERS, Answer, QPSolver, find_solver, make_backend, make_solver, solver_entries
+from mpc.solvers import CORE_OR_PIQP, SOLVERS, Answer, QPSolver, find_solver, make_backend, solver_entries
+from mpc.solvers.by_name import make_solver
 from mpc.solvers.daqp import DaqpDense
 from mpc.solvers.piqp import Piqp
 from quadsim.controller import CORE, GAIN, SOLVED, StepInputs

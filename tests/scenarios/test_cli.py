@@ -24,8 +24,8 @@ from scenarios.app import app
 from scenarios.campaign.plan import read_campaign
 from scenarios.catalogue import campaign_names, scenario_names
 from scenarios.cli import main
+from scenarios.doctor import capabilities
 from scenarios.loading import load_scenario
-from scenarios.machine import capabilities
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
 TABLES = ("--no-video", "--no-recording", "--no-figures")
@@ -140,7 +140,7 @@ def test_doctor_reports_a_package_that_does_not_work_and_the_rest(monkeypatch: p
         raise RuntimeError("libdaqp.so is of another machine")
 
     monkeypatch.setattr("mpc.solvers.daqp.DaqpDense.setup", broken)
-    monkeypatch.setattr("scenarios.machine._rendering", lambda: 1 / 0)
+    monkeypatch.setattr("scenarios.doctor._rendering", lambda: 1 / 0)
     checks = capabilities()
     assert checks["solvers"]["daqp"] == "fails: RuntimeError: libdaqp.so is of another machine"
     assert checks["rendering"]["video"] == "fails: ZeroDivisionError: division by zero"

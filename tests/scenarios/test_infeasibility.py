@@ -26,7 +26,7 @@ from quadsim.controller import ACCEPTED, Command, Controller, StepInputs
 from quadsim.errors import PlanExhaustedError
 from quadsim.state import INDEX, Array, make_state
 from quadsim.vehicle import Vehicle
-from scenarios import infeasibility
+from scenarios import infeasibility, remedies
 from scenarios.assembly import Assembly
 from scenarios.catalogue import scenario_path
 from scenarios.flight import Flight
@@ -404,7 +404,7 @@ def test_what_is_advised_keeps_the_flight_and_what_is_not_would_not_have() -> No
     result = flight.diagnosis
     assert result is not None
     assert flight.outcome == "lost"
-    until = round(result["time"] + infeasibility.AFTER, 9)
+    until = round(result["time"] + remedies.AFTER, 9)
     (helping,) = result["suggestions"]
     assert helping["settings"] == {"controller.type": "robust", "controller.soft": {}, "controller.rotor_lag": 0.02}
     helped = flown_with(flight, helping["settings"], until)
@@ -472,7 +472,7 @@ def test_the_flights_of_a_diagnosis_are_not_diagnosed_and_are_few(monkeypatch: p
     assert json.dumps(first.diagnosis) == json.dumps(first.summary["diagnosis"]) == json.dumps(second.diagnosis)
     assert len(calls) == 2
     assert set(flights) == {0.4}
-    assert 2 <= len(flights) <= 2 * infeasibility.MOST_FLOWN
+    assert 2 <= len(flights) <= 2 * remedies.MOST_FLOWN
 
 
 def test_nobody_but_the_summary_of_one_flight_pays_for_advice(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -486,7 +486,7 @@ def test_nobody_but_the_summary_of_one_flight_pays_for_advice(monkeypatch: pytes
         asked.append(1)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(infeasibility, "tried", interrupted)
+    monkeypatch.setattr(remedies, "tried", interrupted)
     flight = quadsim.fly(tilted, progress=False)
     assert flight.metrics["speed_max"] > 0.0
     assert flight.small_plot() is not None
@@ -512,7 +512,7 @@ def test_what_cannot_be_flown_again_is_advised_as_not_flown(monkeypatch: pytest.
     changed = quadsim.fly(tilted.replace({"events": [event]}), progress=False)
     assert changed.diagnosis is not None
     assert changed.diagnosis["advice"].startswith("to try, not flown, as an event had changed the controller: ")
-    monkeypatch.setattr(infeasibility, "LONGEST", 0.1)
+    monkeypatch.setattr(remedies, "LONGEST", 0.1)
     late = quadsim.fly(tilted, progress=False).diagnosis
     assert late is not None
     assert late["advice"].startswith("to try, not flown, as it would take more than 0.1 s of flight: ")

@@ -12,7 +12,6 @@ import quadsim
 from quadsim.flight.audit import UNAUDITED_ADVICE, Limit
 from scenarios.assembly import Assembly
 from scenarios.cli import main
-from scenarios.limits import audit_notes
 from scenarios.live.session import Session
 from scenarios.loading import load_scenario
 from scenarios.reaudit import reaudit
@@ -35,7 +34,7 @@ def test_a_bound_that_no_entry_names_is_audited_within_one_percent() -> None:
     limit = audited(scenario)["vz"]
     assert (limit.signal, limit.lower, limit.upper, limit.required) == ("vz", -0.5, 1.5, True)
     assert limit.tolerances == pytest.approx((0.01, 0.002))  # of half the band, 1 m/s
-    assert audit_notes(Assembly(scenario)) == ["vz: audited as the controller bounds it"]
+    assert Assembly(scenario).audit_notes == ["vz: audited as the controller bounds it"]
 
 
 def test_a_bound_on_velocity_that_is_violated_makes_the_flight_violated() -> None:
@@ -69,7 +68,7 @@ def test_an_entry_for_a_part_of_the_flight_leaves_the_bound_audited() -> None:
 def test_other_numbers_than_the_controllers_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     settings = ["constraints.roll.lower=-8.0", "constraints.roll.upper=8.0", "duration=0.5"]
     line = "roll: audited against ±8 deg, the controller bounds ±5 deg"
-    assert audit_notes(Assembly(load_scenario("hover", settings))) == [line]
+    assert Assembly(load_scenario("hover", settings)).audit_notes == [line]
     options = [part for setting in settings for part in ("--set", setting)]
     assert main(["run", "hover", *options, "--out", str(tmp_path / "run"), "--no-video", "--no-recording"]) == EXIT_DONE
     assert line in capsys.readouterr().out
@@ -88,14 +87,14 @@ def test_a_law_without_bounds_is_held_to_those_of_the_law_that_it_replaces(how: 
     }[how]()
     before = audited(hover())
     assert audited(scenario) == before
-    assert (before["roll"].upper, audit_notes(Assembly(scenario))) == (5.0, [])
+    assert (before["roll"].upper, Assembly(scenario).audit_notes) == (5.0, [])
 
 
 def test_an_entry_without_bounds_is_not_audited_where_no_law_has_had_any() -> None:
     entry = {"name": "climb", "signal": "vz"}
     scenario = hover(controller={"type": "pid"}).replace({"constraints": [entry]})
     assert audited(scenario) == {}
-    assert audit_notes(Assembly(scenario)) == [
+    assert Assembly(scenario).audit_notes == [
         UNAUDITED_ADVICE,
         "climb: not audited, the controller has no such bound and the entry states none",
     ]
@@ -105,7 +104,7 @@ def test_bounds_that_an_event_changes_are_reported_with_their_time() -> None:
     event = {"type": "controller", "at": 0.2, "fields": {"output_bounds.roll": [-3.0, 3.0]}}
     scenario = hover(events=[event])
     assert audited(scenario)["roll"].upper == 5.0
-    assert audit_notes(Assembly(scenario)) == ["roll: audited against ±5 deg, the controller bounds ±3 deg from 0.2 s"]
+    assert Assembly(scenario).audit_notes == ["roll: audited against ±5 deg, the controller bounds ±3 deg from 0.2 s"]
 
 
 def test_all_bounds_of_nonlinear_mpc_are_audited() -> None:

@@ -10,8 +10,9 @@ import pytest
 
 from scenarios import console
 from scenarios.campaign.campaign import CampaignProgress
+from scenarios.campaign.watching import watching
 from scenarios.console import PlainConsole
-from scenarios.progress import reporting, watching
+from scenarios.progress import reporting
 
 
 @pytest.fixture

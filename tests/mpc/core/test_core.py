@@ -25,7 +25,8 @@ from mpc.core.axes import axes
 from mpc.core.solver import PROBLEMS, Core, core_library, core_problem
 from mpc.ocp import Equilibrium, Problem, Query, lqr_terminal_weight
 from mpc.qp import kkt_residuals
-from mpc.solvers import Answer, Method, QPSolver, make_solver, solver_entries
+from mpc.solvers import Answer, Method, QPSolver, solver_entries
+from mpc.solvers.by_name import make_solver
 from quadsim.controller import ACCEPTED, CORE, GAIN, SOLVED, UNCONSTRAINED
 from quadsim.errors import MissingCoreError, ParameterError
 from quadsim.state import Array

@@ -30,8 +30,9 @@ from websockets.typing import Subprotocol
 from scenarios.cli import main
 from scenarios.flight import Flight
 from scenarios.live import serving
+from scenarios.live.guard import Guard
+from scenarios.live.pace import Pace
 from scenarios.live.page import Page
-from scenarios.live.serving import Guard, Pace
 from scenarios.live.session import Frame, Session
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_WRONG_INPUT

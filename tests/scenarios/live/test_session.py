@@ -19,7 +19,7 @@ from quadsim.errors import InputError
 from scenarios.cli import main
 from scenarios.live.commands import live
 from scenarios.live.knobs import knobs
-from scenarios.live.serving import LATE, Pace
+from scenarios.live.pace import LATE, Pace
 from scenarios.live.session import STRONGEST, Frame, Session, read_script
 from scenarios.loading import load_scenario
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT

@@ -17,8 +17,8 @@ import zstandard
 
 from quadsim.palette import line_colour
 from scenarios.live import look
+from scenarios.live.pace import Pace
 from scenarios.live.page import Page
-from scenarios.live.serving import Pace
 from scenarios.live.session import Frame, Session
 from scenarios.live.stage import _course
 from scenarios.loading import load_scenario

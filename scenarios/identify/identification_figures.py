@@ -1,49 +1,23 @@
-"""The page of an identified vehicle: intervals, measured against predicted, errors over the horizon, and gates."""
+"""The figures of an identified vehicle: intervals, measured against predicted, errors over the horizon."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from quadsim.palette import COLOUR, CYCLE
 from quadsim.report.figure import Figure, Panel, Series
-from quadsim.report.page import Section, render_page
-from quadsim.report.to_plotly import to_plot
 from quadsim.state import shown_unit
 from scenarios.identify.estimate import Estimate
 from scenarios.identify.prediction import HORIZONS, IDENTIFIED, QUANTITIES, START, THRUST_ONLY, Prediction, Trace
-
-if TYPE_CHECKING:
-    from scenarios.identify.report import IdentifiedVehicle
 
 _COLOURS: Final = dict(zip((IDENTIFIED, THRUST_ONLY, START), CYCLE, strict=False))
 _TRACED: Final = (
     *((f"v{axis}, world", "m/s") for axis in "xyz"),
     *((f"{axis} rate", "rad/s") for axis in ("roll", "pitch", "yaw")),
 )
-
-
-def render(result: IdentifiedVehicle) -> str:
-    """Return the page as HTML."""
-    parameters, errors = result.tables()
-    trace = result.prediction.trace
-    figures = (trace_figure(trace), horizon_figure(result.prediction))
-    return render_page(
-        "identification",
-        f"Identified: {result.vehicle.name}",
-        [
-            Section(
-                title="Parameters",
-                plots=(to_plot(interval_figure(result.identification.estimates)),),
-                tables=(parameters,),
-            ),
-            Section(title="Prediction of flight not fitted", plots=tuple(map(to_plot, figures)), tables=(errors,)),
-        ],
-        verdict=result.verdict,
-        notes=result.sentences(),
-    )
 
 
 def interval_figure(estimates: Sequence[Estimate]) -> Figure:

@@ -1,0 +1,45 @@
+"""The progress of a campaign: a bar on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+from collections.abc import Iterator
+
+from scenarios.campaign.campaign import CampaignProgress, Watch
+from scenarios.campaign.statistics import interval, proportion
+from scenarios.progress import lines
+
+
+@contextlib.contextmanager
+def watching(progress: bool) -> Iterator[Watch]:
+    """Yield the function that shows a campaign's progress: a bar on a terminal, elsewhere a line at intervals."""
+    from scenarios.console import stderr
+
+    screen = stderr()
+    if not progress:
+        yield lambda state: None
+    elif screen.is_terminal:
+        from rich.progress import BarColumn, TextColumn
+        from rich.progress import Progress as Bars
+
+        with Bars(
+            TextColumn("flights"), BarColumn(), TextColumn("{task.description}"), console=screen, transient=True
+        ) as bars:
+            bar = bars.add_task("starting")
+            yield lambda state: bars.update(
+                bar, completed=state.flown, total=state.flights, description=_describe(state)
+            )
+    else:
+        with lines(screen) as tell:
+            yield lambda state: tell(f"flights {_describe(state)}" if state.flown < state.flights else "report")
+
+
+def _describe(state: CampaignProgress) -> str:
+    """Return flights done, rate, time left and failures in one line."""
+    share = proportion(state.failed, state.flown)
+    left = datetime.timedelta(seconds=round((state.flights - state.flown) / state.rate))
+    return (
+        f"{state.flown}/{state.flights}, {state.rate:.2f}/s, {left} left; "
+        f"{state.failed} failed ({interval(share['lower'], share['upper'])})"
+    )

@@ -1,0 +1,69 @@
+"""What this machine can do, tried out: render, show flights, solve."""
+
+from __future__ import annotations
+
+import shutil
+import time as clock
+from collections.abc import Callable
+from functools import partial
+
+from quadsim.errors import FlightError, QuadsimError
+from scenarios.loading import assemble
+from scenarios.machine import machine, usable_cores, versions
+
+
+def capabilities() -> dict[str, dict[str, str]]:
+    """Return this machine's capabilities by section; every installed QP solver solves one constrained step."""
+    from mpc.solvers import solver_entries
+    from quadsim.report.recording import viewer_problem
+
+    here = machine()
+    return {
+        "machine": {
+            "system": here["system"],
+            "processor": f"{here['processor']}, {usable_cores()} of {here['cores']} cores usable",
+            "disk": f"{shutil.disk_usage('.').free / 1e9:.1f} GB free here",
+        },
+        "packages": versions(),
+        "rendering": {"video": _tried(_rendering)},
+        "viewer": {"native": viewer_problem() or "can be opened", "browser": "quadsim view RUN --web"},
+        "solvers": {
+            name: _tried(partial(_try_solver, name)) if entry.installed else entry.line
+            for name, entry in solver_entries().items()
+        },
+    }
+
+
+def _rendering() -> str:
+    from quadsim.report.film.video import rendering_backend
+
+    return f"renders off screen through {rendering_backend().upper()}"
+
+
+def _tried(call: Callable[[], str]) -> str:
+    """Return what a part of this machine can do, or why it cannot: a broken one must not hide the others."""
+    try:
+        return call()
+    except QuadsimError as error:
+        return str(error)
+    except Exception as error:  # of a package that is installed and does not work
+        return f"fails: {type(error).__name__}: {error}"
+
+
+def _try_solver(name: str) -> str:
+    """Solve the first step of the paper's constrained flight."""
+    from quadsim.controller import SOLVED, StepInputs
+
+    assembly = assemble("paper-constrained", [f"controller.solver={name}"])
+    started = clock.perf_counter()
+    controller = assembly.controller()
+    built = clock.perf_counter()
+    controller.reset(assembly.initial_speeds)
+    reference = assembly.reference(controller.horizon + 1)[1:]
+    try:
+        command = controller.step(StepInputs(), assembly.initial_state(), reference)
+    except FlightError as error:
+        return f"fails: {error}"
+    verdict = "works" if command.status == SOLVED else f"answers {command.status}"
+    setup_ms, step_ms = 1e3 * (built - started), 1e3 * (clock.perf_counter() - built)
+    return f"{verdict}: set up in {setup_ms:.0f} ms, first step in {step_ms:.1f} ms"
