@@ -4,7 +4,7 @@
 
 .NOTPARALLEL:
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test rooms peers firmware betaflight check format docs build numbers reproduce pins clean
+.PHONY: help setup demo test test-all rooms peers firmware betaflight check format docs build numbers reproduce pins clean
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -47,10 +47,13 @@ demo: setup  ## fly the paper's two flights and compare them, under runs/ (OPTIO
 	@$(QUADSIM) run paper-constrained --out $(RUNS)/paper-constrained --overwrite $(OPTIONS)
 	@$(QUADSIM) compare $(RUNS)/paper-unconstrained $(RUNS)/paper-constrained --out $(RUNS)/comparison --overwrite
 
-test rooms peers firmware betaflight numbers reproduce: export OMP_NUM_THREADS := 1
-test rooms peers firmware betaflight numbers reproduce: export OPENBLAS_NUM_THREADS := 1
-test rooms peers firmware betaflight numbers reproduce: export MKL_NUM_THREADS := 1
-test: setup $(VENV)/.browser  ## run every test that needs no peer (OPTIONS="-k audit" for some)
+test test-all rooms peers firmware betaflight numbers reproduce: export OMP_NUM_THREADS := 1
+test test-all rooms peers firmware betaflight numbers reproduce: export OPENBLAS_NUM_THREADS := 1
+test test-all rooms peers firmware betaflight numbers reproduce: export MKL_NUM_THREADS := 1
+test: setup $(VENV)/.browser  ## three minutes: all tests but the slow groups, of each its witness (OPTIONS="-k audit" for some)
+	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope -m "not slow or witness" $(OPTIONS)
+
+test-all: setup $(VENV)/.browser  ## run every test that needs no peer
 	@$(PY) -m pytest -q -n $(WORKERS) --dist loadscope $(OPTIONS)
 
 rooms: setup  ## take each feature room away, in a copy, and see the rest pass (OPTIONS=live for one)

@@ -14,6 +14,8 @@ from mpc.core.library import why_missing
 from quadsim.errors import RenderingUnavailableError
 from quadsim.report.film.video import rendering_backend
 
+pytestmark = pytest.mark.slow("benchmarks")
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -34,6 +36,7 @@ def quick(name: str, tmp_path: Path) -> list[dict[str, Any]]:
     return records
 
 
+@pytest.mark.witness("benchmarks")
 def test_solvers_agree_on_the_optimum(tmp_path: Path) -> None:
     records = {(record["scenario"], record["solver"]): record for record in quick("solvers", tmp_path)}
     names = ["piqp-multistage", "piqp-dense", "daqp"]

@@ -48,7 +48,14 @@ LINES = [
 QUADSIM = [*dict.fromkeys(line.partition("#")[0].strip() for line in LINES if line.startswith("quadsim "))]
 ELSEWHERE = ("quadsim view", "--cluster", "--fly")
 """`view` opens a window and stays; a cluster, and what takes an emulator, have tests of their own."""
-RUNNABLE = [line for line in QUADSIM if not any(word in line for word in ELSEWHERE)]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+SLOW, WITNESS = pytest.mark.slow("commands"), pytest.mark.witness("commands")
+RUNNABLE = [
+    pytest.param(line, marks=[SLOW, WITNESS] if line in README else SLOW)
+    for line in QUADSIM
+    if not any(word in line for word in ELSEWHERE)
+]
+"""`make test` runs those of the README."""
 
 
 def arguments_of(line: str) -> list[str]:

@@ -33,6 +33,7 @@ SOURCES = [
 ]
 RUN_ON = re.compile(r"^ *(?:Args|Attributes|Examples|Raises|Returns|Yields):[ ]*\S", re.MULTILINE)
 """A section of a docstring that starts on the line of its title, which no tool then takes for a section."""
+SLOW, WITNESS = pytest.mark.slow("pages"), pytest.mark.witness("pages")
 ENTRY_POINTS = {"quadsim.controllers"}
 """Groups of entry points, which are written like modules."""
 
@@ -111,14 +112,16 @@ def test_documents_link_to_files_that_exist_and_the_site_has_every_page() -> Non
 
 
 @pytest.mark.usefixtures("campaigns_here")
-@pytest.mark.parametrize("document", PYTHON, ids=lambda path: path.name)
-def test_python_on_the_pages_runs(document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "page", [pytest.param(page, id=page.name, marks=[SLOW, WITNESS] if page == PAGES[0] else SLOW) for page in PYTHON]
+)
+def test_python_on_the_pages_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The blocks of a page in their order, as the notebook that it is too."""
     mpl.use("Agg")
     monkeypatch.chdir(tmp_path)
     module = ModuleType("page")
-    for block in PYTHON[document]:
-        exec(compile(block, document, "exec"), module.__dict__)
+    for block in PYTHON[page]:
+        exec(compile(block, page, "exec"), module.__dict__)
 
 
 def test_code_on_the_pages_is_not_cut_in_a_window_of_1280_pixels() -> None:

@@ -72,6 +72,7 @@ def test_the_lines_of_the_pages_are_those_of_the_example(
     assert "my-controller" in capsys.readouterr().out
 
 
+@pytest.mark.slow("pages")
 def test_the_scenarios_of_the_pages_on_controllers_fly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("controllers", "linear", "robust")
     page = "".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8") for name in names)

@@ -21,6 +21,8 @@ from mpc.core.build import NAME
 from mpc.core.library import why_missing
 from quadsim import __version__
 
+pytestmark = pytest.mark.slow("packages")
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("quadsim", "mpc", "scenarios")
 DATA = ("*.py", "py.typed", "*.toml", "*.csv", "*.xml", "*.j2", "*.css", "*.js", "export/c/*", "core/c/*")
@@ -60,6 +62,7 @@ def run_alone(command: list[str | Path], directory: Path) -> str:
     return done.stdout
 
 
+@pytest.mark.witness("packages")
 def test_wheel_holds_every_file_of_the_packages(dist: Path) -> None:
     files = {path for package in PACKAGES for pattern in DATA for path in (ROOT / package).rglob(pattern)}
     expected = {path.relative_to(ROOT).as_posix() for path in files}
@@ -117,6 +120,7 @@ def test_version_is_the_same_everywhere(dist: Path) -> None:
     assert (changes[1], citation[1]) == (__version__, __version__)
 
 
+@pytest.mark.witness("packages")
 def test_every_requirement_is_pinned() -> None:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = [line for line in lines if not line.startswith("#")]

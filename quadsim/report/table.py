@@ -14,7 +14,7 @@ ABSENT: Final = "-"
 
 
 class Mark(StrEnum):
-    """What a reader should see in a cell at a glance; words and commands are set otherwise than numbers."""
+    """What a reader should see in a cell at a glance; words are set otherwise than numbers."""
 
     NONE = ""
     BEST = "best"
@@ -22,7 +22,6 @@ class Mark(StrEnum):
     WARN = "warn"
     BAD = "bad"
     TEXT = "text"
-    CODE = "code"
 
 
 @dataclass(frozen=True, kw_only=True)

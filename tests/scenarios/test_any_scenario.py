@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from drawn_events import HAPPENING, kind, number
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -211,9 +212,21 @@ def accepted(table: dict[str, Any]) -> Scenario | None:
     return scenario
 
 
+@pytest.mark.witness("any scenario")
+@settings(max_examples=3, derandomize=True, database=None)
+@given(table=tables())
+def test_a_few_valid_scenarios_fly_and_their_resolved_files_fly_them_again(table: dict[str, Any]) -> None:
+    flies_and_flies_again(table)
+
+
+@pytest.mark.slow("any scenario")
 @settings(max_examples=25, derandomize=True, database=None)
 @given(table=tables())
 def test_any_valid_scenario_flies_and_its_resolved_file_flies_it_again(table: dict[str, Any]) -> None:
+    flies_and_flies_again(table)
+
+
+def flies_and_flies_again(table: dict[str, Any]) -> None:
     scenario = accepted(table)
     if scenario is None:
         return

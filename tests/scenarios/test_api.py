@@ -60,13 +60,15 @@ def flight() -> Flight:
 
 CONSTANTS = {"STATE_NAMES"}
 """Public names that are no functions or classes, and so have no docstring to run."""
+SLOW, WITNESS = pytest.mark.slow("docstrings"), pytest.mark.witness("docstrings")
+NAMES = [*sorted({*quadsim.__all__} - CONSTANTS), *(f"gym.{name}" for name in quadsim.gym.__all__)]
 RENDERS = {"film"}
 """Whose examples need a machine that renders."""
 
 
 @pytest.mark.usefixtures("undrawn", "campaigns_here")
 @pytest.mark.parametrize(
-    "name", [*sorted({*quadsim.__all__} - CONSTANTS), *(f"gym.{name}" for name in quadsim.gym.__all__)]
+    "name", [pytest.param(name, marks=[SLOW, WITNESS] if name in ("fly", "load") else SLOW) for name in NAMES]
 )
 def test_every_docstring_has_an_example_that_runs(
     name: str, fly_known: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

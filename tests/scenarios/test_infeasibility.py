@@ -36,6 +36,8 @@ from scenarios.rollout import Rollout
 from scenarios.schema.scenario import Scenario
 from scenarios.schema.settings import get_field
 
+pytestmark = pytest.mark.slow("diagnosis")
+
 TILTED = make_state(euler=(math.radians(20.0), 0.0, 0.0))
 FENCE = '{ name = "fence", of = ["x", "y"], rows = [[1.0, 1.0]], upper = [6.8] }'
 LEAST = '{ name = "least", of = ["speed_1", "speed_2", "speed_3", "speed_4"], rows = [[1, 1, 1, 1]], lower = [780] }'
@@ -182,6 +184,7 @@ def setting(field: str, value: object) -> str:
     return f"{field}={json.dumps(value)}"
 
 
+@pytest.mark.witness("diagnosis")
 @pytest.mark.parametrize("name", CASES)
 def test_each_culprit_is_named_and_each_suggestion_makes_it_feasible(name: str, file: str) -> None:
     case = CASES[name]

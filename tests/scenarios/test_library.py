@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from _pytest.mark.structures import ParameterSet
 from golden_numbers import library_entry, read
 
 from mpc.answer import INFEASIBLE
@@ -57,7 +58,14 @@ def flown_here() -> list[str]:
     return [each.name for each in loaded().values() if each.group != "papers" or each.duration <= SHORT]
 
 
-@pytest.fixture(scope="module", params=flown_here())
+def flights() -> list[ParameterSet]:
+    """`make test` flies the two that other modules need as well."""
+    slow, witness = pytest.mark.slow("library"), pytest.mark.witness("library")
+    quick = ("paper-constrained", "paper-unconstrained")
+    return [pytest.param(name, marks=[slow, witness] if name in quick else slow) for name in flown_here()]
+
+
+@pytest.fixture(scope="module", params=flights())
 def flight(request: pytest.FixtureRequest, fly_once: Callable[..., Flight]) -> Flight:
     """Each scenario, flown once for all tests that use it."""
     return fly_once(request.param) if request.param in SHARED else Rollout(loaded()[request.param]).fly()

@@ -20,6 +20,8 @@ import quadsim
 from quadsim.flight import rundir
 from quadsim.vehicle import Vehicle
 
+pytestmark = pytest.mark.slow("process")
+
 LAW = """
 import os, signal, sys, time
 class Law:
@@ -74,6 +76,7 @@ def test_a_module_that_exits_does_not_pass_a_check(tmp_path: Path) -> None:
     assert (done.returncode, (tmp_path / "v.xml").exists()) == (2, False)
 
 
+@pytest.mark.witness("process")
 def test_an_inner_loop_that_raises_ends_the_flight_there() -> None:
     class Inner:
         rate = 500.0

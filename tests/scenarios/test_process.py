@@ -17,6 +17,8 @@ import pytest
 from quadsim.flight import rundir
 from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 
+pytestmark = pytest.mark.slow("process")
+
 ROOT = Path(__file__).resolve().parents[2]
 TABLES = ("--no-video", "--no-recording", "--no-figures")
 SHORT = ("--set", "duration=0.5")
@@ -26,6 +28,7 @@ def environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(ROOT)}
 
 
+@pytest.mark.witness("process")
 def test_a_reader_that_goes_away_gets_no_traceback_and_no_status_0() -> None:
     """`quadsim list | true`."""
     command = [sys.executable, "-m", "scenarios.entry", "list"]

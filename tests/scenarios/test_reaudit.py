@@ -158,6 +158,7 @@ def test_tables_that_contradict_each_other_are_reported(
         reaudit(runs / "good")
 
 
+@pytest.mark.slow("reaudit")
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
@@ -165,7 +166,7 @@ def test_tables_that_contradict_each_other_are_reported(
         ("slow-solver", {"computation.delay": 0.12}),
         ("slow-solver", {"computation": {"delay": 0.06, "jitter": 0.03, "plan": False}}),
         ("robust", {"computation": {"delay": 0.06, "jitter": 0.03}, "controller.delay": 0.06}),
-        ("stalled-solver", {"computation": {"delay": 0.06}}),
+        pytest.param("stalled-solver", {"computation": {"delay": 0.06}}, marks=pytest.mark.witness("reaudit")),
     ],
 )
 def test_commands_are_followed_to_when_they_act(name: str, changes: dict[str, Any], tmp_path: Path) -> None:
@@ -222,6 +223,7 @@ def test_a_margin_between_the_rows_is_believed(flown: Path, tmp_path: Path) -> N
     assert reaudit(run).satisfied
 
 
+@pytest.mark.slow("reaudit")
 @pytest.mark.parametrize("rate", [1000.0, 1.0])
 @pytest.mark.parametrize("name", ["nan-position", "hard-landing", "lost-rotor"])
 def test_what_a_run_records_is_what_its_tables_give(

@@ -25,6 +25,8 @@ from quadsim.rotation import body_to_euler_rates
 from quadsim.state import EULER_RATE, INDEX, VELOCITY, Array, make_state
 from quadsim.vehicle import Vehicle
 
+pytestmark = pytest.mark.slow("targets")
+
 PERIOD, STEP = 0.02, 0.005
 FAST, SLOW = (0.02, 0.035, 0.035, 0.1), (0.072, 0.037, 0.037, 0.06)
 LAGS = pytest.mark.parametrize("lag", [FAST, SLOW], ids=["fast", "slow"])
@@ -120,6 +122,7 @@ def at_hover(law: GeometricController, vehicle: Vehicle, lag: tuple[float, ...])
     return np.asarray(np.linalg.eigvals(A))
 
 
+@pytest.mark.witness("targets")
 @LAGS
 def test_the_inner_loop_makes_the_lag_a_pole_beside_those_of_the_gains(
     vehicle: Vehicle, lag: tuple[float, ...]
@@ -138,6 +141,7 @@ def test_the_inner_loop_makes_the_lag_a_pole_beside_those_of_the_gains(
     assert allowed.k_attitude == pytest.approx([1.0 / 0.33, 1.0 / 0.33, settings.k_attitude[2]])
 
 
+@pytest.mark.witness("targets")
 @LAGS
 @COMMANDS
 def test_it_recovers_from_30_degrees(vehicle: Vehicle, lag: tuple[float, ...], commands: str) -> None:
@@ -203,6 +207,7 @@ def test_the_translation_s_integral_removes_the_offset_and_the_autopilot_has_the
     assert not law._integrals.rotation.any()
 
 
+@pytest.mark.witness("targets")
 @COMMANDS
 def test_targets_stay_within_their_bounds_and_integrals_hold_there(vehicle: Vehicle, commands: str) -> None:
     weight = vehicle.mass * vehicle.gravity

@@ -56,7 +56,7 @@ def worst(problem: Problem, answer: Answer) -> float:
     return max(residuals.primal, residuals.dual, residuals.stationarity / scale, residuals.complementarity / scale)
 
 
-@pytest.mark.parametrize(("name", "draws"), [("paper-constrained", 500), ("robust", 500), ("robust-lag50", 50)])
+@pytest.mark.parametrize(("name", "draws"), [("paper-constrained", 100), ("robust", 100), ("robust-lag50", 20)])
 def test_drawn_states_are_answered_cold_and_warm_as_by_daqp(name: str, draws: int) -> None:
     """Warm, from the active set of another state altogether."""
     rng, problem = np.random.default_rng(1), paper_problem(name)
@@ -91,7 +91,12 @@ SCENARIOS = {  # periods by who answered them; what these would be, were they th
 }
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
+SLOW, WITNESS = pytest.mark.slow("core"), pytest.mark.witness("core")
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[SLOW, WITNESS] if name == "paper-constrained" else SLOW) for name in SCENARIOS]
+)
 def test_flights_are_exact_in_every_period_and_those_of_piqp(name: str) -> None:
     settings = [*SCENARIOS[name], "controller.kkt_every=1"]
     flight, other = (Rollout(load_scenario(name, [*settings, f"controller.solver={by}"])).fly() for by in (CORE, PIQP))

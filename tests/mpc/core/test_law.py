@@ -27,7 +27,8 @@ FLIGHTS = (
 )
 
 
-@pytest.mark.parametrize("name", FLIGHTS)
+@pytest.mark.slow("core")
+@pytest.mark.parametrize("name", [pytest.param(FLIGHTS[0], marks=pytest.mark.witness("core")), *FLIGHTS[1:]])
 def test_a_compiled_flight_is_the_flight(name: str) -> None:
     scenario = quadsim.load(name)
     by_python = scenario if name == "paper-unconstrained" else scenario.replace({"controller.solver": "core"})

@@ -148,11 +148,12 @@ def test_two_seconds_of_failures_are_hovered_through(vehicle: Vehicle, undisturb
     assert distance(log, undisturbed)[-1] < 0.1
 
 
+@pytest.mark.slow("fallback")
 @pytest.mark.parametrize(
     ("kind", "duration", "channels"),
     [
         *[(FaultKind.NAN, 1.0, (name,)) for name in SensorName],
-        (FaultKind.NAN, 1.0, tuple(SensorName)),
+        pytest.param(FaultKind.NAN, 1.0, tuple(SensorName), marks=pytest.mark.witness("fallback")),
         *[(FaultKind.FREEZE, 0.5, (name,)) for name in SensorName],
         (FaultKind.FREEZE, 0.5, tuple(SensorName)),
     ],
@@ -173,6 +174,7 @@ def test_a_stall_is_flown_through(vehicle: Vehicle, undisturbed: FlightLog) -> N
     assert distance(log, undisturbed).max() < 0.1
 
 
+@pytest.mark.slow("fallback")
 def test_a_state_lost_for_long_is_hovered_through(vehicle: Vehicle) -> None:
     faults = [SensorFault(sensor=name, kind=FaultKind.NAN, start=FAULT, stop=FAULT + 3.0) for name in SensorName]
     log = fly_paper(vehicle, sensors=faults)

@@ -387,10 +387,11 @@ def pushed_tilt(vehicle: Vehicle, course: Course, *, rotor_lag: float, delay: fl
 TURNS, ALL = alternating(3.0, 0.0), alternating(6.0, STATED.acceleration)
 
 
+@pytest.mark.slow("tightening")
 @pytest.mark.parametrize(
     ("course", "rotor_lag", "delay"),
     [
-        (TURNS, 0.0, 0.0),
+        pytest.param(TURNS, 0.0, 0.0, marks=pytest.mark.witness("tightening")),
         (TURNS, LAG, 0.05),
         (ALL, 0.0, 0.05),
         (ALL, LAG, 0.05),

@@ -32,6 +32,8 @@ from scenarios.campaign.store import read_manifest
 from scenarios.machine import processor_name
 from scenarios.rollout import Rollout
 
+pytestmark = pytest.mark.slow("campaigns")
+
 CAMPAIGN: dict[str, Any] = {
     "name": "little",
     "scenario": "hover",
@@ -107,6 +109,7 @@ def content(result: Result) -> tuple[bytes, str]:
     return (result.directory / "flights.parquet").read_bytes(), json.dumps(summary)
 
 
+@pytest.mark.witness("campaigns")
 def test_results_are_the_same_bytes_with_any_worker(plan: Plan, whole: Result, by_two: Result, tmp_path: Path) -> None:
     engines = {"backwards": Alone(backwards=True), "one": 1}
     results = [whole, by_two, *(fly_campaign(plan, tmp_path / name, engine) for name, engine in engines.items())]

@@ -27,6 +27,8 @@ from scenarios.campaign.campaign_report import (
 from scenarios.campaign.rows import Summary
 from scenarios.campaign.statistics import estimate, interval, percent
 
+pytestmark = pytest.mark.slow("campaigns")
+
 MakeCampaign = Callable[..., pa.Table]
 
 HOSTILE = "<script>alert(1)</script> & more"
@@ -68,6 +70,7 @@ def without_scripts(page: str) -> str:
     return re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
 
 
+@pytest.mark.witness("campaigns")
 def test_the_page_shows_what_the_flights_show(estimated: Summary, reported: Path) -> None:
     directory = reported
     text = without_scripts((directory / "index.html").read_text())

@@ -23,6 +23,8 @@ from scenarios.assembly import Assembly
 from scenarios.design.first_scenario import BASELINE_SHARE, CLEARANCE, COURSES, LAWS, ROOM, first_scenario
 from scenarios.loading import parse_scenario
 
+pytestmark = pytest.mark.slow("first flights")
+
 ALL = {vehicle.name: vehicle for vehicle in vehicles()}
 HARDEST = ("random-08", "random-17")
 """The slowest rotors, and the one that strays most."""
@@ -91,6 +93,7 @@ def test_the_figure_eight_comes_near_to_what_it_is_made_for() -> None:
     assert 25.0 < flight.tilt < 32.0
 
 
+@pytest.mark.witness("first flights")
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("course", COURSES)
 def test_the_file_states_what_is_flown(course: str, law: str) -> None:

@@ -23,6 +23,8 @@ from quadsim.state import INDEX
 from scenarios.campaign.plan import load_plan
 from scenarios.catalogue import scenario_names
 
+pytestmark = pytest.mark.slow("gym")
+
 HOVER = np.zeros(4, np.float32)
 
 
@@ -83,6 +85,7 @@ def test_actions_are_within_the_controllers_bounds_or_the_vehicles() -> None:
     assert free.action_space.high.tolist() == [vehicle.speed_max] * 4
 
 
+@pytest.mark.witness("gym")
 @pytest.mark.parametrize(
     ("name", "action"),
     [("motion-capture", "deviations"), ("late-commands", "speeds"), ("torrente-loop4-drag", "speeds")],
@@ -137,6 +140,7 @@ def test_cost_counts_required_constraints_beyond_their_tolerance() -> None:
     assert infos[-1]["cost"] == 2.0
 
 
+@pytest.mark.witness("gym")
 def test_a_lost_vehicle_terminates_and_time_truncates() -> None:
     env = quadsim.gym.make_env(short("hover", 3.0))
     env.reset()

@@ -22,6 +22,8 @@ sys.path.insert(0, str(ROOT / "examples"))
 import imitation  # noqa: E402
 import safety_filter  # noqa: E402
 
+pytestmark = pytest.mark.slow("gym")
+
 
 def random_episode(env: gymnasium.Env[Any, Any], seed: int) -> tuple[list[dict[str, Any]], bool]:
     env.reset(seed=seed)
@@ -89,6 +91,7 @@ def test_a_filter_whose_model_has_rotor_lag_finds_its_plans() -> None:
     assert 0 < env.interventions < env.steps
 
 
+@pytest.mark.witness("gym")
 def test_what_is_safe_passes_to_the_bit() -> None:
     env = quadsim.gym.MPCSafetyFilter(quadsim.gym.make_env(safety_filter.filtered_air("gust"), action="speeds"))
     env.reset(seed=0)

@@ -40,6 +40,7 @@ from scenarios.rollout import Rollout
 
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 PATIENCE = 60.0
+pytestmark = pytest.mark.slow("live")
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
 
 
@@ -311,6 +312,7 @@ def test_the_address_alone_opens_the_page(served: Served) -> None:
         assert "HttpOnly" in response.headers["Set-Cookie"]
 
 
+@pytest.mark.witness("live")
 def test_a_push_by_the_mouse_acts_and_ends(tab: Any, served: Served) -> None:
     box = tab.locator("canvas").first.bounding_box()
     x, y = box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0

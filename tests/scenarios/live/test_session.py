@@ -74,6 +74,7 @@ def same_bits(session: Session, which: int = 0) -> bool:
     )
 
 
+@pytest.mark.slow("live")
 @settings(max_examples=8, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 20), INPUTS), max_size=12))
 def test_a_saved_session_flies_to_the_same_bits(given: list[tuple[int, dict[str, Any]]]) -> None:
@@ -298,6 +299,7 @@ def test_a_script_that_is_none_is_refused(tmp_path: Path, text: str, refusal: st
         read_script(path)
 
 
+@pytest.mark.slow("live")
 def test_an_input_that_is_refused_in_flight_is_named_with_its_time_and_status_1(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -317,6 +319,7 @@ def test_an_input_that_is_refused_in_flight_is_named_with_its_time_and_status_1(
     assert opened[-1] == f"quadsim view {out}"
 
 
+@pytest.mark.slow("live")
 def test_a_finished_run_is_flown_on_unless_check_refuses_it_and_none_of_its_code_is_imported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -364,6 +367,7 @@ def test_a_running_constraint_on_the_course_ends_where_a_person_steers(session: 
     assert hold.satisfied
 
 
+@pytest.mark.slow("live")
 def test_the_scenario_made_for_sessions_can_have_every_input_and_withstands_a_broken_rotor() -> None:
     assert inspect.signature(live).parameters["scenario"].default == "playground"
     session = Session(load_scenario("playground"))

@@ -31,6 +31,8 @@ from scenarios.results import EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT
 from scenarios.rollout import Rollout
 from scenarios.schema.problems import ScenarioError
 
+pytestmark = pytest.mark.slow("papers")
+
 HEAD = 'title = "A paper"\nauthors = "N. N."\nabout = "A hover"\n'
 NUMBER = """
 [[numbers]]
@@ -82,6 +84,7 @@ def test_the_first_seconds_at_8_m_s_are_those_of_the_specification() -> None:
     np.testing.assert_allclose(positions, expected, atol=1e-6)
 
 
+@pytest.mark.witness("papers")
 def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
     assert {"quadrotor-uav", "torrente2021"} <= {*paper_names()}
     for name in paper_names():
@@ -94,6 +97,7 @@ def test_every_shipped_number_names_a_flight_that_can_be_flown() -> None:
     assert flown == {name for name in scenario_names() if load_scenario(name).group == "papers"}
 
 
+@pytest.mark.witness("papers")
 @pytest.mark.parametrize(
     ("relation", "ours", "within"),
     [
@@ -126,6 +130,7 @@ def test_a_flight_that_ends_early_reproduces_nothing(tmp_path: Path) -> None:
     assert "| time flown | s | 0.5 | - | - | 1 | no |" in grid_to_markdown(result.grid)
 
 
+@pytest.mark.witness("papers")
 def test_the_command_prints_and_fails_beyond_tolerance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good = written(tmp_path, ("0.5", "absolute = 0.0"))
     report = tmp_path / "verdicts.xml"

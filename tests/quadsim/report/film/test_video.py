@@ -30,6 +30,8 @@ from quadsim.state import EULER, INDEX, POSITION
 from scenarios.loading import load_scenario
 from scenarios.rollout import Rollout
 
+pytestmark = pytest.mark.slow("films")
+
 
 @pytest.fixture(scope="module")
 def backend() -> str:
@@ -53,6 +55,7 @@ def decode(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     return frames, meta
 
 
+@pytest.mark.witness("films")
 def test_the_film_has_the_frames_requested(
     backend: str, short_run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
