@@ -174,9 +174,7 @@ def test_help_loads_little_and_list_no_simulator() -> None:
     assert not loaded & {"mujoco", "pydantic", "pyarrow", "pandas"}
 
 
-OF_CONTROLLERS = re.compile(
-    r"(?:^|[._])(law|controller|pilot|guard|spec|inner|autopilot|previous|agent|successor)\w*$"
-)
+OF_CONTROLLERS = re.compile(r"(?:^|[._])(law|controller|pilot|guard|spec|inner|autopilot|previous|agent|successor)\w*$")
 """Names of what flies: controllers, their laws, guards and inner loops, and of their tables (`spec`)."""
 
 
